@@ -1,0 +1,78 @@
+# Two commands on a fresh machine: `make demo` and `make test`. Both set up .venv first, once.
+# Needs python3.11 with venv, and make. Another interpreter: make setup PY=/path/to/python3.11
+
+PY ?= python3.11
+TORCH := torch==2.13.0
+UV := uv==0.13.8
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+OK := $(VENV)/.ok
+LOCK_VENV := build/lock-venv
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test check bench lock clean
+
+help: ## list the verbs
+	@echo "usage: make VERB"
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-6s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+setup: $(OK) ## make .venv with the locked packages and go1exp in it (redone when pyproject.toml or the lock changes)
+
+$(OK): pyproject.toml requirements/lock.txt
+	@$(PY) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "go1exp needs Python 3.11 or newer with venv, but '$(PY)' is missing, older or has no venv."; \
+	  echo "Install python3.11 or name one: make setup PY=/path/to/python3.11"; exit 1; } >&2
+	@echo "setup 1/5: virtual environment in $(VENV), from $$($(PY) --version)"
+	@rm -f $@
+	@$(PY) -m venv $(VENV)
+	@echo "setup 2/5: $(TORCH)"
+	@$(PIP) install -qq "$(TORCH)"
+	@echo "setup 3/5: packages of requirements/lock.txt"
+	@$(PIP) install -qq --require-hashes --no-deps -r requirements/lock.txt
+	@echo "setup 4/5: go1exp itself, editable"
+	@$(PIP) install -qq --no-build-isolation --no-deps -e .
+	@echo "setup 5/5: check that the packages fit together"
+	@$(PIP) check
+	@touch $@
+
+demo: setup ## run the demonstration
+	@echo "demo: go1exp demo"
+	@$(BIN)/go1exp demo
+
+test: setup ## run the tests
+	@echo "test: pytest"
+	@$(BIN)/python -m pytest -n 2 -q --durations=15
+
+check: setup ## formatting, lint and types; changes nothing
+	@echo "check 1/3: ruff format"
+	@$(BIN)/ruff format --check .
+	@echo "check 2/3: ruff check"
+	@$(BIN)/ruff check .
+	@echo "check 3/3: mypy"
+	@$(BIN)/mypy
+
+bench: setup ## measure the speed of the environment and of training
+	@echo "bench 1/2: environment"
+	@$(BIN)/go1exp bench suite=env
+	@echo "bench 2/2: training"
+	@$(BIN)/go1exp bench suite=train
+
+# An override that never applies takes torch, and with it the CUDA packages, out of the resolution.
+lock: ## resolve requirements/base.in into requirements/lock.txt, keeping the pins that still fit
+	@echo "lock 1/2: $(UV) in $(LOCK_VENV)"
+	@$(PY) -m venv $(LOCK_VENV)
+	@$(LOCK_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input "$(UV)"
+	@echo "lock 2/2: requirements/lock.txt"
+	@echo "torch ; python_version < '3'" > build/no-torch.txt
+	@$(LOCK_VENV)/bin/uv pip compile -q requirements/base.in --override build/no-torch.txt --python-version 3.11 \
+	  --generate-hashes --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" \
+	  -o requirements/lock.txt
+	@! grep -n '://' requirements/lock.txt || { echo "requirements/lock.txt names an address" >&2; exit 1; }
+
+clean: ## remove .venv, build products and caches; keeps runs/ and outputs/
+	@echo "clean: $(VENV), build products and caches"
+	@rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@find go1exp tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,27 @@
+"""Train, test and deploy locomotion policies for the Unitree Go1 in MuJoCo."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+# Torch's idle OpenMP threads would spin on the cores that MuJoCo's threads need between two policy steps: on two cores
+# that costs a third of the environment's speed. Read by OpenMP when torch is first imported; a user's choice stands.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+__version__ = "0.1.0"
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def data_root() -> Path:
+    """Folder that holds ``conf/`` and ``assets/``: the package itself in a wheel, the repository root in a checkout.
+
+    The repository root counts only with its ``pyproject.toml``, so a stranger's ``conf/`` in site-packages never does.
+    """
+    if (_PACKAGE / "conf").is_dir():
+        return _PACKAGE
+    root = _PACKAGE.parent
+    if (root / "conf").is_dir() and (root / "pyproject.toml").is_file():
+        return root
+    raise FileNotFoundError(f"go1exp: no conf/ in {_PACKAGE} and no checkout around it")

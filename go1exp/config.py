@@ -1,0 +1,355 @@
+"""Hydra in, plain frozen dataclasses out. Nothing below this module sees a YAML or an OmegaConf.
+
+``compose`` turns overrides into a plain dict; ``parse`` turns that dict into a ``TrainConfig`` or raises one
+``ConfigError`` that lists everything wrong with it. Neither imports torch's machinery nor builds anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+import go1exp.actuator
+import go1exp.mdp  # noqa: F401  (registers every term)
+from go1exp.registry import (
+    STRICT,
+    ConfigError,
+    Fraction,
+    NonNegative,
+    Positive,
+    Term,
+    as_json,
+    bind,
+    explain,
+    unknown_name,
+)
+from go1exp.robot import RobotConfig
+from go1exp.terrain import TerrainConfig
+
+Count = Annotated[int, Field(ge=1)]
+CountOrZero = Annotated[int, Field(ge=0)]
+
+
+@dataclass(frozen=True)
+class SimConfig:
+    """Time: the physics step and the policy's period, s; the episode length, s; where in an episode robots begin."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    physics_dt: Annotated[float, Field(gt=0, le=0.02)]
+    policy_dt: Annotated[float, Field(gt=0, le=0.1)]
+    episode_s: Positive
+    spread_starts: bool
+
+    @property
+    def decimation(self) -> int:
+        """Physics steps per policy step."""
+        return round(self.policy_dt / self.physics_dt)
+
+    @property
+    def episode_steps(self) -> int:
+        """Policy steps per episode."""
+        return round(self.episode_s / self.policy_dt)
+
+
+@dataclass(frozen=True)
+class ActionConfig:
+    """Action to joint target: target = nominal stance + ``scale`` (rad) x action cut at +-``clip``."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    scale: Positive
+    clip: Positive
+
+
+@dataclass(frozen=True)
+class BackendConfig:
+    """The physics engine: ``cpu`` (MuJoCo's batch) and its threads, 0 for all cores."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: Literal["cpu"]
+    threads: CountOrZero
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """One environment: everything that shapes what a policy sees, does and is paid for."""
+
+    sim: SimConfig
+    action: ActionConfig
+    robot: RobotConfig
+    terrain: TerrainConfig
+    backend: BackendConfig
+    actuator: Term
+    command: Term
+    reward: tuple[Term, ...]
+    rand: tuple[Term, ...]
+    observation: tuple[Term, ...]
+    event: tuple[Term, ...]
+    termination: tuple[Term, ...]
+    curriculum: tuple[Term, ...]
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """The learner. Symbols and defaults: paper, section III-A; what it does not print: Isaac Lab's Spot task.
+
+    Attributes:
+        num_envs: environments that run side by side.
+        iterations: rollouts, each followed by an update.
+        steps: policy steps per environment and iteration.
+        epochs: passes over a rollout.
+        minibatches: gradient steps per pass; must divide num_envs x steps.
+        learning_rate: of Adam; the first value if the schedule is adaptive.
+        schedule: ``adaptive`` steers the rate by the KL divergence (rsl_rl's rule), ``fixed`` keeps it.
+        desired_kl: the divergence per update that ``adaptive`` aims at.
+        learning_rate_range: its bounds.
+        gamma: discount factor.
+        gae_lambda: of the advantage estimator.
+        clip_range: of the probability ratio.
+        value_clip: of the value function's change, null for none.
+        entropy: weight of the entropy bonus.
+        value_coef: weight of the value loss.
+        max_grad_norm: gradient clip, norm over actor and critic together.
+        normalize_advantage: over each minibatch, as SB3 does.
+        init_std: initial standard deviation of the actions.
+        hidden: layers of actor and critic each.
+        activation: between them.
+        matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    num_envs: Count
+    iterations: Count
+    steps: Count
+    epochs: Count
+    minibatches: Count
+    learning_rate: Positive
+    schedule: Literal["adaptive", "fixed"]
+    desired_kl: Positive
+    learning_rate_range: tuple[Positive, Positive]
+    gamma: Fraction
+    gae_lambda: Fraction
+    clip_range: Positive
+    value_clip: Positive | None
+    entropy: NonNegative
+    value_coef: NonNegative
+    max_grad_norm: Positive
+    normalize_advantage: bool
+    init_std: Positive
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    activation: Literal["elu", "relu", "tanh"]
+    matmul_precision: Literal["highest", "bf16"]
+
+
+@dataclass(frozen=True)
+class WandbConfig:
+    """Weights & Biases: project, ``offline`` / ``online``, and an optional group and entity."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    project: Annotated[str, Field(min_length=1)]
+    mode: Literal["offline", "online"]
+    group: str | None
+    entity: str | None
+
+
+@dataclass(frozen=True)
+class LoggerConfig:
+    """Where metrics go besides the progress bar."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    csv: bool
+    tensorboard: bool
+    wandb: WandbConfig | None
+
+
+@dataclass(frozen=True)
+class CheckpointConfig:
+    """A checkpoint ``every`` so many iterations; the newest ``keep`` stay."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    every: Count
+    keep: Count
+
+
+@dataclass(frozen=True)
+class ProcessConfig:
+    """Settings at the top level of the YAML.
+
+    Attributes:
+        seed: of everything random.
+        device: torch device of policy and update (the environment's is its backend's).
+        torch_threads: threads of torch, 0 for its own choice.
+        resume: run folder to continue, or null.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    seed: CountOrZero
+    device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
+    torch_threads: CountOrZero
+    resume: str | None
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    task: TaskConfig
+    ppo: PPOConfig
+    logger: LoggerConfig
+    checkpoint: CheckpointConfig
+    process: ProcessConfig
+
+
+class RewardSlots(BaseModel):
+    """What a reward group reads beside the term's own parameters: the weight, per second."""
+
+    model_config = STRICT
+    weight: float
+
+
+class ObservationSlots(BaseModel):
+    """Half-width of the uniform noise added to the term."""
+
+    model_config = STRICT
+    noise: NonNegative = 0.0
+
+
+class RandomizationSlots(BaseModel):
+    """When a model term draws: once per environment, or at each of its resets."""
+
+    model_config = STRICT
+    when: Literal["startup", "reset"] = "reset"
+
+
+SECTIONS: dict[str, type] = {
+    "sim": SimConfig,
+    "action": ActionConfig,
+    "robot": RobotConfig,
+    "terrain": TerrainConfig,
+    "backend": BackendConfig,
+    "ppo": PPOConfig,
+    "logger": LoggerConfig,
+    "checkpoint": CheckpointConfig,
+}
+"""Sections of the configuration that are one dataclass each."""
+
+ONE_TERM = ("actuator", "command")
+"""Groups of which a configuration uses one member; its key ``term`` names it."""
+
+MANY_TERMS: dict[str, type[BaseModel] | None] = {
+    "reward": RewardSlots,
+    "rand": RandomizationSlots,
+    "observation": ObservationSlots,
+    "event": None,
+    "termination": None,
+    "curriculum": None,
+}
+"""Groups that are a mapping of terms, with the keys that the group reads beside each term's parameters."""
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
+def _section(kind: type, settings: Any, path: str) -> tuple[Any, list[str]]:
+    """Validate one section; return the dataclass (or None) and the problems."""
+    if not isinstance(settings, Mapping):
+        return None, [f"{path} = {settings!r}: must be a mapping"]
+    try:
+        return _adapter(kind).validate_json(as_json(settings)), []
+    except ValidationError as error:
+        return None, explain(error, path, [f.name for f in fields(kind)])
+
+
+def _terms(group: str, settings: Any) -> tuple[tuple[Term, ...], list[str]]:
+    if not isinstance(settings, Mapping):
+        return (), [f"{group} = {settings!r}: must be a mapping of terms"]
+    bound = [bind(group, key, value, f"{group}.{key}", MANY_TERMS[group]) for key, value in settings.items()]
+    return tuple(term for term, _ in bound if term), [p for _, problems in bound for p in problems]
+
+
+def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[dict[str, Any], list[str]]:
+    """Validate the named parts of a composed configuration; return them by name, and the problems."""
+    parts: dict[str, Any] = {}
+    problems: list[str] = []
+    for name in wanted:
+        if name not in container:
+            problems.append(f"{name}: required, but not given")
+            continue
+        settings = container[name]
+        if name in SECTIONS:
+            parts[name], found = _section(SECTIONS[name], settings, name)
+        elif name in MANY_TERMS:
+            parts[name], found = _terms(name, settings)
+        elif not isinstance(settings, Mapping) or "term" not in settings:
+            found = [f"{name}.term: required, but not given"]
+        else:
+            parts[name], found = bind(name, str(settings["term"]), settings, name)
+        problems += found
+    return parts, problems
+
+
+def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
+    """Rules between sections."""
+    problems = []
+    if sim := parts.get("sim"):
+        for name, longer, shorter in (("policy_dt", sim.policy_dt, sim.physics_dt), ("episode_s", sim.episode_s, sim.policy_dt)):
+            ratio = longer / shorter
+            if ratio < 1 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
+                unit = "sim.physics_dt" if name == "policy_dt" else "sim.policy_dt"
+                problems.append(f"sim.{name} = {longer}: must be a whole multiple of {unit} = {shorter}")
+    if (ppo := parts.get("ppo")) and ppo.num_envs * ppo.steps % ppo.minibatches:
+        problems.append(
+            f"ppo.minibatches = {ppo.minibatches}: must divide ppo.num_envs x ppo.steps = {ppo.num_envs * ppo.steps}"
+        )
+    if ppo and not ppo.learning_rate_range[0] <= ppo.learning_rate <= ppo.learning_rate_range[1]:
+        problems.append(
+            f"ppo.learning_rate = {ppo.learning_rate}: must lie in ppo.learning_rate_range = "
+            f"{list(ppo.learning_rate_range)}"
+        )
+    if "observation" in parts and not parts["observation"]:
+        problems.append("observation: at least one term is required")
+    if parts.get("curriculum") and (terrain := parts.get("terrain")) and terrain.kind == "flat":
+        problems.append("curriculum.terrain_level: needs graded ground; use terrain=rough, or curriculum=none")
+    for term in parts.get("rand") or ():
+        if term.entry.traits["kind"] == "state" and term.slots["when"] == "startup":
+            problems.append(f"rand.{term.key}.when = 'startup': a random initial state is drawn at every reset; use reset")
+    return problems
+
+
+def parse_task(container: Mapping[str, Any]) -> TaskConfig:
+    """Validate the environment's part of a composed configuration; raise ConfigError with every problem."""
+    wanted = tuple(f.name for f in fields(TaskConfig))
+    parts, problems = parse_parts(container, wanted)
+    problems += _cross_rules(parts)
+    if problems:
+        raise ConfigError(problems)
+    return TaskConfig(**parts)
+
+
+def parse_train(container: Mapping[str, Any]) -> TrainConfig:
+    """Validate a composed training configuration; raise ConfigError with every problem."""
+    task_names = tuple(f.name for f in fields(TaskConfig))
+    others = ("ppo", "logger", "checkpoint")
+    top = tuple(f.name for f in fields(ProcessConfig))
+    known = (*task_names, *others, *top)
+    problems = [unknown_name(key, key, known, "key") for key in container if key not in known]
+    parts, found = parse_parts(container, (*task_names, *others))
+    process, complaints = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
+    problems += found + complaints + _cross_rules(parts)
+    if problems:
+        raise ConfigError(problems)
+    task = TaskConfig(**{name: parts[name] for name in task_names})
+    return TrainConfig(task=task, **{name: parts[name] for name in others}, process=process)

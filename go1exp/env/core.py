@@ -1,0 +1,413 @@
+"""The batched environment step.
+
+N environments always. Nothing in ``step`` branches on data, changes a shape or waits for the device: resets, pushes,
+command changes and curriculum moves are masks. On a GPU that lets the whole step be one captured graph; on the CPU it
+makes environment i of a batch compute exactly what it would compute alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.actuator.setup import Actuator, ActuatorSetup
+from go1exp.config import BackendConfig, TaskConfig
+from go1exp.env.faults import NumericalFault
+from go1exp.mdp.derived import rotate_inverse
+from go1exp.mdp.foot_timers import FootTimers
+from go1exp.mdp.ground import GroundHeight
+from go1exp.mdp.kinematics import KinematicState
+from go1exp.physics.backend import PhysicsBackend
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import Sensors, build_model
+from go1exp.randomness import EnvRandom
+from go1exp.registry import Term
+from go1exp.terrain import build_terrain
+from go1exp.types import Snapshot
+
+THIGHS, CALVES, TRUNK = slice(0, 4), slice(4, 8), slice(8, 13)
+"""Columns of the link contact block (``physics/scene.py``); the trunk's are trunk with head, and the four hips."""
+
+MAP_MARGIN = 1.0
+"""Distance from the edge of a height field at which an episode ends, m."""
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one policy step returns, all float32 or bool and valid until the next step."""
+
+    observation: Tensor
+    """(N, O) what the policy sees next; of a new episode where one ended."""
+    reward: Tensor
+    """(N,)"""
+    terminated: Tensor
+    """(N,) bool, the robot fell."""
+    truncated: Tensor
+    """(N,) bool, time is up or the robot left the map."""
+    final_observation: Tensor
+    """(N, O) the observation before any reset."""
+    episode_return: Tensor
+    """(N,) sum of rewards so far; of the whole episode where one ended."""
+    episode_length: Tensor
+    """(N,) int64 steps so far; of the whole episode where one ended."""
+
+
+def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+    """Build the physics engine that the configuration names."""
+    return MujocoCpu(model, sensors, num_envs, config.threads)
+
+
+class Go1Core:
+    """N Go1 robots, from configuration to step.
+
+    Args:
+        task: what to build.
+        num_envs: N.
+        seed: of everything random in the environment.
+        first_env: number of the first environment, so that one of a batch can be replayed alone.
+        noise: add the observation noise (off in evaluation).
+        spread_starts: let first episodes begin at random times (training only).
+    """
+
+    def __init__(
+        self,
+        task: TaskConfig,
+        num_envs: int,
+        seed: int = 0,
+        *,
+        first_env: int = 0,
+        noise: bool = True,
+        spread_starts: bool = False,
+    ) -> None:
+        self.task, self.num_envs, self.noise = task, num_envs, noise
+        self._spread_starts = spread_starts
+        self.terrain = build_terrain(task.terrain)
+        model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt)
+        self.backend = make_backend(task.backend, model, sensors, num_envs)
+        self.device = self.backend.qpos.device
+        self.random = EnvRandom(seed, num_envs, first_env, self.device)
+        self._state = KinematicState.of(self.backend.qpos, self.backend.qvel)
+        self._build_ground(first_env)
+        self._build_terms()
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
+
+        self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
+        self.target, self.torque = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
+        self.joint_acc = zeros(robot.NUM_JOINTS)
+        self.spawn = zeros(3)
+        self.steps = zeros(dtype=torch.int64)
+        self.episode_return = zeros()
+        self.reward_sums = torch.zeros(len(self._rewards), dtype=torch.float64, device=self.device)
+        self.term_values = zeros(len(self._rewards))
+        self.feet = FootTimers(num_envs, task.sim.physics_dt, self.device)
+        self._touched = torch.zeros_like(self._link_contacts)
+        self._calf_touched = torch.zeros_like(self._foot_contact[..., 0])
+        self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
+        self._started = False
+
+    # ------------------------------------------------------------------ construction
+
+    def _build_ground(self, first_env: int) -> None:
+        """Prepare height lookup, tiles and the place of each environment on them."""
+        t = self.terrain
+
+        def to_device(array: Any) -> Tensor:
+            return torch.as_tensor(array, dtype=torch.float32, device=self.device)
+
+        self._ground = GroundHeight(to_device(t.heights), t.x0, t.y0, t.resolution)
+        self._origins = to_device(t.tile_origins)
+        rows, cols = t.tile_origins.shape[:2]
+        env = torch.arange(first_env, first_env + self.num_envs, device=self.device)
+        self.tile_column = env % cols
+        self.level = torch.zeros_like(env)
+        self._max_level = rows - 1
+        self._bounded = t.config.kind != "flat"
+        self._map = to_device(t.extent)
+        start = self.task.curriculum[0]().start_level_max if self.task.curriculum else self._max_level
+        self._start_levels = min(start, self._max_level) + 1
+
+    def _build_terms(self) -> None:
+        """Turn the configured terms into callables, and make per-environment the model fields that will vary."""
+        task, sim = self.task, self.task.sim
+        setup = ActuatorSetup(
+            self.num_envs,
+            sim.physics_dt,
+            task.robot.effort_limit,
+            task.robot.velocity_limit,
+            self.device,
+            self.backend.qpos.dtype,
+        )
+        self.actuator: Actuator = task.actuator(setup)
+        self.command = task.command(self.random.stream("command"))
+        self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}
+        self._curriculum = [t() for t in task.curriculum]
+        self._rewards = [t for t in task.reward if t.slots["weight"] != 0.0]
+        weights = [t.slots["weight"] * sim.policy_dt for t in self._rewards]
+        self._weights = torch.tensor(weights, dtype=torch.float32, device=self.device)
+        widths = [t.entry.traits["size"] for t in task.observation]
+        self.observation_size = sum(widths)
+        noise = [t.slots["noise"] for t in task.observation]
+        self._noise = torch.tensor(noise, device=self.device).repeat_interleave(torch.tensor(widths)).float()
+        self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
+        self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
+        for term in self._model_terms:
+            for name in term.entry.traits["fields"]:
+                self.backend.field(name)
+        blocks = self.backend.sensors
+        readings = self.backend.sensordata
+        self._foot_contact = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))
+        self._link_contacts = readings[:, blocks.link_contacts]
+        self._foot_pos_w = readings[:, blocks.foot_pos_w].unflatten(1, (robot.NUM_LEGS, 3))
+        self._foot_vel_w = readings[:, blocks.foot_vel_w].unflatten(1, (robot.NUM_LEGS, 3))
+
+    # ------------------------------------------------------------------ reset
+
+    def reset(self) -> Tensor:
+        """Start all episodes anew and return the first observations (N, O)."""
+        everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if not self._started:
+            self.level.copy_(self._initial_levels())
+            self._randomize_model("startup", everyone)
+        self._restart(everyone)
+        if self._spread_starts and not self._started:
+            self.steps.copy_(self.random.stream("spread").integers(self.task.sim.episode_steps, 1).squeeze(1))
+        self._started = True
+        self._advance_world(everyone)
+        return self._observe(self.snapshot())
+
+    def reseed(self, seed: int) -> None:
+        """Make the next ``reset`` the first one of an environment built with ``seed``."""
+        self.random.reseed(seed)
+        self._started = False
+
+    def _initial_levels(self) -> Tensor:
+        return self.random.stream("level").integers(self._start_levels, 1).squeeze(1)
+
+    def _randomize_model(self, when: str, mask: Tensor) -> None:
+        """Draw the model terms of ``when`` in the rows of ``mask``."""
+        due = [t for t in self._model_terms if t.slots["when"] == when]
+        for term in due:
+            term(self.backend, self.random.stream(f"rand.{term.key}"), mask)
+        if any(t.entry.traits.get("derived") for t in due):
+            self.backend.derive_constants(mask)
+
+    def _restart(self, mask: Tensor) -> None:
+        """Put the rows of ``mask`` at the start of a new episode."""
+        self._randomize_model("reset", mask)
+        rows = mask.unsqueeze(1)
+        self.spawn.copy_(torch.where(rows, self._origins[self.level, self.tile_column], self.spawn))
+        qpos, qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
+        fresh = KinematicState.of(qpos, qvel)
+        fresh.base_pos_w.copy_(self.spawn)
+        fresh.base_pos_w[:, 2] += robot.NOMINAL_HEIGHT
+        fresh.base_quat_w[:, 0] = 1.0
+        fresh.joint_pos.copy_(self._nominal)
+        for term in self._state_terms:
+            term(fresh, self.random.stream(f"rand.{term.key}"))
+        self.backend.reset(mask, qpos, qvel)
+        self.actuator.reset(mask)
+        self.feet.reset(mask)
+        for tensor in (self.action, self.previous_action, self.torque, self.joint_acc):
+            tensor.mul_(~rows)
+        self.target.copy_(torch.where(rows, self._nominal, self.target))
+        self.steps.mul_(~mask)
+        self.episode_return.mul_(~mask)
+
+    # ------------------------------------------------------------------ step
+
+    def step(self, action: Tensor) -> StepResult:
+        """Apply actions (N, 12) for one policy period.
+
+        Order: physics, failure and time limit, reward, last observation, resets of ended episodes, new commands,
+        pushes, first observation. A push and a new command are therefore seen before they are answered.
+        """
+        self._advance_physics(action)
+        self.steps += 1
+        s = self.snapshot()
+        terminated = reduce(torch.logical_or, [t(s) for t in self.task.termination], self._nobody())
+        truncated = ((self.steps >= self.task.sim.episode_steps) | self._off_map()) & ~terminated
+        reward = self._reward(s)
+        self.episode_return += reward
+        final_observation = self._observe(s)
+        episode_return, episode_length = self.episode_return.clone(), self.steps.clone()
+
+        ended = terminated | truncated
+        self._move_levels(ended)
+        self._restart(ended)
+        self._advance_world(ended)
+        observation = self._observe(self.snapshot())
+        return StepResult(
+            observation, reward, terminated, truncated, final_observation, episode_return, episode_length
+        )
+
+    def _advance_physics(self, action: Tensor) -> None:
+        """Run the substeps of one policy step."""
+        clip = self.task.action.clip
+        self.previous_action.copy_(self.action)
+        self.action.copy_(action.clamp(-clip, clip))
+        self.target.copy_(self._nominal + self.task.action.scale * self.action)
+        target = self.target.to(self.backend.qpos.dtype)
+        q, qd = self._state.joint_pos, self._state.joint_vel
+        self.feet.begin_step()
+        self._touched.zero_()
+        self._calf_touched.zero_()
+        for _ in range(self.task.sim.decimation):
+            torque = self.actuator.torque(target, q, qd)
+            speed = qd.clone()
+            self.backend.step(torque)
+            feet = self._foot_contact[..., 0]
+            self.feet.update(feet > 0)
+            # Counts, largest over the substeps; a calf's contacts without those of its foot.
+            torch.maximum(self._touched, self._link_contacts, out=self._touched)
+            torch.maximum(self._calf_touched, self._link_contacts[:, CALVES] - feet, out=self._calf_touched)
+        self.torque.copy_(torque)
+        self.joint_acc.copy_((qd - speed) / self.task.sim.physics_dt)
+
+    def _advance_world(self, restart: Tensor) -> None:
+        """Let the policy period pass for commands and events; ``restart`` (N,) begins anew."""
+        dt = self.task.sim.policy_dt
+        self.command.advance(dt, restart)
+        for happening in self.events.values():
+            happening.advance(self._state, dt, restart)
+
+    def _nobody(self) -> Tensor:
+        return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def _off_map(self) -> Tensor:
+        """(N,) bool: at the edge of a height field, beyond which there is no ground."""
+        if not self._bounded:
+            return self._nobody()
+        xy = self._state.base_pos_w[:, :2]
+        low, high = self._map[[0, 2]] + MAP_MARGIN, self._map[[1, 3]] - MAP_MARGIN
+        return ((xy < low) | (xy > high)).any(-1)
+
+    def _reward(self, s: Snapshot) -> Tensor:
+        """(N,) sum of weight x term x policy period."""
+        for k, term in enumerate(self._rewards):
+            self.term_values[:, k] = term(s)
+        weighted = self.term_values * self._weights
+        self.reward_sums += weighted.sum(0)
+        return weighted.sum(-1)
+
+    def _move_levels(self, ended: Tensor) -> None:
+        """Apply the curriculum to the episodes that ended."""
+        for rule in self._curriculum:
+            travelled = (self._state.base_pos_w[:, :2] - self.spawn[:, :2]).norm(dim=-1).float()
+            commanded = self.command.value[:, :2].norm(dim=-1) * self.task.sim.episode_s
+            anywhere = self.random.stream("relevel").integers(self._max_level + 1, 1).squeeze(1)
+            tile = self.task.terrain.tile_size
+            after = rule(self.level, travelled, commanded, tile, self._max_level, anywhere)
+            self.level.copy_(torch.where(ended, after, self.level))
+
+    # ------------------------------------------------------------------ what the MDP sees
+
+    def snapshot(self) -> Snapshot:
+        """Return the present moment as the MDP sees it; staleness of sensors as in ``physics/backend.py``."""
+        state = self._state
+        quat = state.base_quat_w.float()
+        gravity = torch.zeros(self.num_envs, 3, device=self.device)
+        gravity[:, 2] = -1.0
+        foot_pos = self._foot_pos_w.float()
+        ground = self._ground(foot_pos[..., :2]) if self._bounded else 0.0
+        timers = self.feet
+        return Snapshot(
+            base_pos_w=state.base_pos_w.float(),
+            base_quat_w=quat,
+            base_lin_vel_b=rotate_inverse(quat, state.base_lin_vel_w.float()),
+            base_ang_vel_b=state.base_ang_vel_b.float(),
+            projected_gravity_b=rotate_inverse(quat, gravity),
+            joint_pos=state.joint_pos.float(),
+            joint_vel=state.joint_vel.float(),
+            joint_acc=self.joint_acc,
+            joint_torque=self.torque,
+            joint_target=self.target,
+            action=self.action,
+            previous_action=self.previous_action,
+            command=self.command.value,
+            foot_height=foot_pos[..., 2] - ground,
+            foot_vel_w=self._foot_vel_w.float(),
+            foot_force=self._foot_contact[..., 1:].norm(dim=-1).float(),
+            foot_contact=timers.contact > 0,
+            foot_air_time=timers.air,
+            foot_contact_time=timers.contact,
+            foot_last_air_time=timers.last_air,
+            foot_last_contact_time=timers.last_contact,
+            foot_touchdown=timers.touchdown,
+            thigh_contact=self._touched[:, THIGHS] > 0,
+            calf_contact=self._calf_touched > 0,
+            trunk_contact=(self._touched[:, TRUNK] > 0).any(-1),
+            episode_time=self.steps * self.task.sim.policy_dt,
+        )
+
+    def _observe(self, s: Snapshot) -> Tensor:
+        """(N, O) the configured observation of a snapshot, with its noise if that is on."""
+        clean = torch.cat([t(s) for t in self.task.observation], dim=-1)
+        if not self.noise:
+            return clean
+        return clean + self._noise * self.random.stream("noise").uniform(self.observation_size, low=-1.0)
+
+    # ------------------------------------------------------------------ faults, metrics, state
+
+    def check(self, result: StepResult) -> None:
+        """Raise NumericalFault if anything in the step is not finite. Waits for the device."""
+        if torch.isfinite(result.reward.sum() + result.final_observation.sum()):
+            return
+        named = {"action": self.action, "torque": self.torque, "qpos": self.backend.qpos, "qvel": self.backend.qvel}
+        named |= {f"reward.{t.key}": self.term_values[:, k] for k, t in enumerate(self._rewards)}
+        named |= {"observation": result.final_observation}
+        for name, values in named.items():
+            bad = ~torch.isfinite(values.reshape(self.num_envs, -1)).all(-1)
+            if bad.any():
+                env = int(bad.nonzero()[0])
+                dump = {key: value[env].cpu().numpy() for key, value in named.items()}
+                raise NumericalFault(name, f"in environment {env} at step {int(result.episode_length[env])}", dump)
+
+    def drain_metrics(self, steps: int) -> dict[str, float]:
+        """Return means since the last call, ``steps`` policy steps ago: each reward term per second, the level."""
+        rates = (self.reward_sums / (steps * self.num_envs * self.task.sim.policy_dt)).tolist()
+        self.reward_sums.zero_()
+        metrics = {f"reward/{t.key}": rate for t, rate in zip(self._rewards, rates, strict=True)}
+        if self._bounded:
+            metrics["curriculum/terrain_level"] = float(self.level.float().mean())
+        return metrics
+
+    _BUFFERS = (
+        "action",
+        "previous_action",
+        "target",
+        "torque",
+        "joint_acc",
+        "spawn",
+        "steps",
+        "episode_return",
+        "reward_sums",
+        "level",
+    )
+
+    def _parts(self) -> dict[str, Any]:
+        """Everything with a state of its own."""
+        events = {f"event.{name}": part for name, part in self.events.items()}
+        named = {"backend": self.backend, "random": self.random, "actuator": self.actuator}
+        return {**named, "command": self.command, "feet": self.feet, **events}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything needed to continue bit for bit."""
+        own = {name: getattr(self, name).clone() for name in self._BUFFERS}
+        return {"core": own, "started": self._started, **{k: p.state_dict() for k, p in self._parts().items()}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``, bit for bit, in an environment of the same configuration and size."""
+        for name in self._BUFFERS:
+            getattr(self, name).copy_(state["core"][name])
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        self._started = state["started"]
+
+

@@ -1,0 +1,89 @@
+"""One Go1 as a Gymnasium environment: the core with N = 1 and the batch axis removed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from go1exp.config import TaskConfig
+from go1exp.env.core import Go1Core
+from go1exp.env.sb3_env import spaces
+
+
+class Go1Env(gym.Env[np.ndarray, np.ndarray]):
+    """A Go1 from configuration; registered as ``Go1-v0``.
+
+    ``gymnasium.make("Go1-v0", overrides=["reward=paper", "rand=none"])`` takes the command line's overrides.
+
+    Args:
+        overrides: as after ``go1exp train``; the run-time settings among them are ignored.
+        task: a parsed configuration instead.
+        noise: add the configured observation noise.
+        env_index: behave like this environment of a batch with the same seed.
+        render_mode: ``rgb_array`` or None.
+
+    Raises:
+        go1exp.registry.ConfigError: if an override does not fit.
+        go1exp.env.faults.NumericalFault: from ``step`` when a value is not finite.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
+
+    def __init__(
+        self,
+        overrides: Sequence[str] = (),
+        *,
+        task: TaskConfig | None = None,
+        noise: bool = True,
+        env_index: int = 0,
+        render_mode: str | None = None,
+    ) -> None:
+        if task is None:
+            from go1exp.compose import compose
+            from go1exp.config import parse_task
+
+            task = parse_task(compose("train", overrides))
+        self.core = Go1Core(task, 1, first_env=env_index, noise=noise)
+        self.observation_space, self.action_space = spaces(self.core)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / task.sim.policy_dt)}
+        self.render_mode = render_mode
+        self._camera: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """Start an episode; a seed makes it and all that follow reproducible."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.core.reseed(seed)
+        return self.core.reset()[0].numpy().copy(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply an action (12,) for one policy period."""
+        result = self.core.step(torch.as_tensor(action, dtype=torch.float32).unsqueeze(0))
+        self.core.check(result)
+        observation = result.final_observation[0].numpy().copy()
+        return observation, float(result.reward[0]), bool(result.terminated[0]), bool(result.truncated[0]), {}
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Return a picture (480, 640, 3) uint8 if the render mode is ``rgb_array``."""
+        if self.render_mode != "rgb_array":
+            return None
+        if self._camera is None:
+            from go1exp.evaluate.camera import Camera
+
+            self._camera = Camera(self.core)
+        return self._camera.frame(0)
+
+    def close(self) -> None:
+        """Release the renderer."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+
+
+def register() -> None:
+    """Make ``Go1-v0`` known to Gymnasium; the time limit is the configuration's own."""
+    gym.register(id="Go1-v0", entry_point="go1exp.env.gym_env:Go1Env")

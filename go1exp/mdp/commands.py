@@ -1,0 +1,62 @@
+"""Velocity commands: a class holds ``value`` (N, 3), x and y in m/s and yaw rate in rad/s, body frame."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from go1exp.memory import Memory
+from go1exp.randomness import Stream
+from go1exp.registry import Fraction, Range, command
+
+
+@command("uniform_velocity")
+class UniformVelocity(Memory):
+    """Velocities drawn uniformly per axis, held for a random time, sometimes zero (paper, section II-B.1)."""
+
+    memory = ("value", "time_left")
+
+    def __init__(
+        self,
+        stream: Stream,
+        *,
+        lin_vel_x: Range = (-2.0, 3.0),
+        lin_vel_y: Range = (-1.5, 1.5),
+        ang_vel_z: Range = (-1.5, 1.5),
+        hold_time: Range = (0.3, 10.0),
+        standing_fraction: Fraction = 0.1,
+    ) -> None:
+        """Keep the ranges (m/s, m/s, rad/s, s); ``standing_fraction`` of the draws is exactly zero."""
+        device = stream.key.device
+        ranges = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z, hold_time], device=device)
+        self._low, self._high = ranges.unbind(1)
+        self._standing_fraction = standing_fraction
+        self._stream = stream
+        self.value = torch.zeros(len(stream.key), 3, device=device)
+        self.time_left = torch.zeros(len(stream.key), device=device)
+
+    def advance(self, dt: float, restart: Tensor) -> None:
+        """Let ``dt`` s pass; draw anew where the time is up or ``restart`` (N,) bool is set."""
+        self.time_left -= dt
+        due = (self.time_left <= 1e-6) | restart
+        draw = self._stream.uniform(4, low=self._low, high=self._high)
+        standing = self._stream.uniform(1) < self._standing_fraction
+        self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * ~standing, self.value))
+        self.time_left.copy_(torch.where(due, draw[:, 3], self.time_left))
+
+
+@command("fixed_velocity")
+class FixedVelocity(Memory):
+    """One velocity for all time; evaluation writes a row per environment into ``value``."""
+
+    memory = ("value",)
+
+    def __init__(
+        self, stream: Stream, *, lin_vel_x: float = 0.5, lin_vel_y: float = 0.0, ang_vel_z: float = 0.0
+    ) -> None:
+        """Keep the velocity (m/s, m/s, rad/s); ``stream`` only tells the number of environments."""
+        velocity = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z], device=stream.key.device)
+        self.value = velocity.repeat(len(stream.key), 1)
+
+    def advance(self, dt: float, restart: Tensor) -> None:
+        """Nothing changes with time."""

@@ -1,0 +1,36 @@
+"""Things that happen to the robot during an episode: a class called once a policy step on the live state."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from go1exp.mdp.kinematics import KinematicState
+from go1exp.memory import Memory
+from go1exp.randomness import Stream
+from go1exp.registry import Range, event
+
+
+@event("push")
+class Push(Memory):
+    """Now and then the trunk's horizontal velocity is set to a random value (paper, section II-B.1).
+
+    The paper sets the velocity where its peers add to it; it does not say for which axes: x and y of the world here.
+    """
+
+    memory = ("time_left",)
+
+    def __init__(self, stream: Stream, *, interval: Range = (10.0, 15.0), velocity: Range = (-1.0, 1.0)) -> None:
+        """Keep the ranges: ``interval`` between pushes in s, ``velocity`` per axis in m/s."""
+        self._stream, self._interval, self._velocity = stream, interval, velocity
+        self.time_left = torch.zeros(len(stream.key), device=stream.key.device)
+
+    def advance(self, state: KinematicState, dt: float, restart: Tensor) -> None:
+        """Let ``dt`` s pass, push where it is time, and start a new wait there and where ``restart`` (N,) is set."""
+        self.time_left -= dt
+        due = (self.time_left <= 1e-6) & ~restart
+        velocity = self._stream.uniform(2, low=self._velocity[0], high=self._velocity[1])
+        live = state.base_lin_vel_w[:, :2]
+        live.copy_(torch.where(due.unsqueeze(1), velocity.to(live.dtype), live))
+        wait = self._stream.uniform(1, low=self._interval[0], high=self._interval[1]).squeeze(1)
+        self.time_left.copy_(torch.where(due | restart, wait, self.time_left))

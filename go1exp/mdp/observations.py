@@ -1,0 +1,56 @@
+"""Observation terms: Snapshot -> ``(N, k)`` float32, unscaled. The list in the YAML is concatenated in its order.
+
+Table II of the paper. The noise beside a term in the YAML is the half-width of a uniform distribution, drawn anew at
+each policy step and element.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from go1exp.mdp.derived import joint_deviation
+from go1exp.registry import observation
+from go1exp.types import Snapshot
+
+
+@observation("base_linear_velocity", size=3)
+def base_linear_velocity(s: Snapshot) -> Tensor:
+    """Velocity of the trunk origin in the trunk frame, (N, 3) m/s. On the robot it comes from an estimator."""
+    assert s.base_lin_vel_b is not None
+    return s.base_lin_vel_b
+
+
+@observation("base_angular_velocity", size=3)
+def base_angular_velocity(s: Snapshot) -> Tensor:
+    """Angular velocity in the trunk frame, (N, 3) rad/s. The table prints omega_yaw, with three components."""
+    return s.base_ang_vel_b
+
+
+@observation("projected_gravity", size=3)
+def projected_gravity(s: Snapshot) -> Tensor:
+    """Direction of gravity in the trunk frame, (N, 3), unit length."""
+    return s.projected_gravity_b
+
+
+@observation("velocity_command", size=3)
+def velocity_command(s: Snapshot) -> Tensor:
+    """Commanded velocity x, y (m/s) and yaw rate (rad/s) in the trunk frame, (N, 3)."""
+    return s.command
+
+
+@observation("joint_position", size=12)
+def joint_position(s: Snapshot) -> Tensor:
+    """Joint angles relative to the nominal stance, (N, 12) rad."""
+    return joint_deviation(s)
+
+
+@observation("joint_velocity", size=12)
+def joint_velocity(s: Snapshot) -> Tensor:
+    """Joint speeds, (N, 12) rad/s."""
+    return s.joint_vel
+
+
+@observation("previous_action", size=12)
+def previous_action(s: Snapshot) -> Tensor:
+    """The policy's last output, unscaled, (N, 12); zero after a reset."""
+    return s.action

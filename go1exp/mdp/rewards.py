@@ -1,0 +1,207 @@
+"""The 19 reward and penalty terms of the paper's Table III, in the reading of ``reward=paper``.
+
+Dowdy and Chagas Vaz, "Isaac Sim-to-Real", CASE 2025, print "general expressions" of terms whose names and weights
+are those of Isaac Lab's Spot task. Where an expression is well-posed it is computed as printed; where it is not, the
+term is the Spot definition with the paper's constants, and ``rewards_literal.py`` holds the table to the letter.
+``docs/paper.md`` compares both line by line.
+
+Every term takes a Snapshot and returns a magnitude ``(N,)``, non-negative; the weight in the YAML carries the sign.
+The sum of weight x term is multiplied by the policy's period (0.02 s), as in Isaac Lab, so a weight is a rate per
+second.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS, foot_speed_xy, is_moving, joint_deviation
+from go1exp.registry import Fraction, NonNegative, Positive, reward
+from go1exp.types import Snapshot
+
+
+@reward("feet_air_time")
+def feet_air_time(s: Snapshot, *, mode_time: Positive = 0.175, speed_threshold: NonNegative = 0.5) -> Tensor:
+    """Steps of the right length: time in the running phase of each foot, s, as long as it is below ``mode_time``.
+
+    Moving: sum_i T_i [T_i < m], T_i = max(air, contact time). Standing: sum_i clip(contact - air, -m, m).
+    Swing and stance count alike, so that the best gait changes phase every ``mode_time``. Sum over feet, s.
+    Printed: sum_i (t_air,i - 0.175), which pays for never landing; source of the form: Isaac Lab, Spot `air_time`.
+    """
+    phase = torch.maximum(s.foot_air_time, s.foot_contact_time)
+    stepping = torch.where(phase < mode_time, phase, torch.zeros_like(phase))
+    standing = (s.foot_contact_time - s.foot_air_time).clamp(-mode_time, mode_time)
+    return torch.where(is_moving(s, speed_threshold).unsqueeze(-1), stepping, standing).sum(-1)
+
+
+@reward("feet_air_time_touchdown")
+def feet_air_time_touchdown(s: Snapshot, *, threshold: NonNegative = 0.175) -> Tensor:
+    """Long swings, paid at touchdown: sum_i (last air time_i - threshold) [foot i touched down], s; can be negative.
+
+    The other reading of the paper's first row (Isaac Lab, `feet_air_time`); zero while no motion is commanded.
+    """
+    gain = ((s.foot_last_air_time - threshold) * s.foot_touchdown).sum(-1)
+    return gain * (s.command[:, :2].norm(dim=-1) > 0)
+
+
+@reward("linear_velocity_error")
+def linear_velocity_error(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Tracking of the commanded planar velocity: exp(-|v*_xy - v_xy| / scale); scale in m/s. Table III."""
+    assert s.base_lin_vel_b is not None
+    return torch.exp(-(s.command[:, :2] - s.base_lin_vel_b[:, :2]).norm(dim=-1) / scale)
+
+
+@reward("angular_velocity_error")
+def angular_velocity_error(s: Snapshot, *, scale: Positive = 2.0) -> Tensor:
+    """Tracking of the commanded yaw rate: exp(-|w*_z - w_z| / scale); scale in rad/s. Table III."""
+    return torch.exp(-(s.command[:, 2] - s.base_ang_vel_b[:, 2]).abs() / scale)
+
+
+@reward("gait")
+def gait(
+    s: Snapshot, *, scale: Positive = 0.1, max_error: Positive = 0.2, speed_threshold: NonNegative = 0.5
+) -> Tensor:
+    """Trot: product of two synchrony and four asynchrony factors in (0, 1]; 0 while standing.
+
+    sync(i, j) = exp(-(min((A_i - A_j)^2, e^2) + min((C_i - C_j)^2, e^2)) / scale) over diagonal legs, async(i, j) the
+    same with A_i - C_j and C_i - A_j over the other pairs; A and C are running air and contact times, e = ``max_error``
+    in s, ``scale`` in s2. Source: Table III, with the factors of Isaac Lab's Spot `GaitReward`.
+    """
+    air, contact = s.foot_air_time, s.foot_contact_time
+
+    def mismatch(a: Tensor, b: Tensor) -> Tensor:
+        return (a - b).square().clamp(max=max_error**2)
+
+    error = torch.zeros_like(air[:, 0])
+    for i, j in SYNC_PAIRS:
+        error = error + mismatch(air[:, i], air[:, j]) + mismatch(contact[:, i], contact[:, j])
+    for i, j in ASYNC_PAIRS:
+        error = error + mismatch(air[:, i], contact[:, j]) + mismatch(contact[:, i], air[:, j])
+    return torch.exp(-error / scale) * is_moving(s, speed_threshold)
+
+
+@reward("foot_clearance")
+def foot_clearance(
+    s: Snapshot, *, target_height: Positive = 0.08, scale: Positive = 0.05, speed_scale: Positive = 2.0
+) -> Tensor:
+    """Moving feet at the right height: exp(-sum_i (z_i - h)^2 tanh(k u_i) / scale), in (0, 1].
+
+    z is the height of the foot's centre over the ground, u its horizontal speed; h in m, ``scale`` in m2,
+    ``speed_scale`` k in s/m. Printed without magnitude or speed: exp(-sum (z_i - 0.08)); form of Isaac Lab's Spot task.
+    """
+    assert s.foot_height is not None
+    error = (s.foot_height - target_height).square() * torch.tanh(speed_scale * foot_speed_xy(s))
+    return torch.exp(-error.sum(-1) / scale)
+
+
+@reward("action_smoothness")
+def action_smoothness(s: Snapshot) -> Tensor:
+    """Change of the policy's output, |a_t - a_t-1|, unscaled actions. Table III."""
+    return (s.action - s.previous_action).norm(dim=-1)
+
+
+@reward("air_time_variance")
+def air_time_variance(s: Snapshot, *, max_time: Positive = 0.5) -> Tensor:
+    """Unequal legs: variance over feet of the last swing time plus that of the last stance time, s2.
+
+    Times are cut at ``max_time``. Printed as a double sum of signed differences, which is zero for any gait; Spot form.
+    """
+    air, contact = s.foot_last_air_time.clamp(max=max_time), s.foot_last_contact_time.clamp(max=max_time)
+    return air.var(dim=-1) + contact.var(dim=-1)
+
+
+@reward("base_motion")
+def base_motion(s: Snapshot, *, heave_weight: Fraction = 0.8) -> Tensor:
+    """Heaving, rolling and pitching: h v_z^2 + (1 - h) (|w_x| + |w_y|), h = ``heave_weight``.
+
+    Printed as |w_x + w_y|, which a roll and an equal pitch cancel; form of Isaac Lab's Spot task.
+    """
+    assert s.base_lin_vel_b is not None
+    tilt_rate = s.base_ang_vel_b[:, :2].abs().sum(-1)
+    return heave_weight * s.base_lin_vel_b[:, 2].square() + (1.0 - heave_weight) * tilt_rate
+
+
+@reward("base_orientation")
+def base_orientation(s: Snapshot) -> Tensor:
+    """Tilt, |g_xy| = sin(angle between trunk and vertical). Table III."""
+    return s.projected_gravity_b[:, :2].norm(dim=-1)
+
+
+@reward("foot_slip")
+def foot_slip(s: Snapshot) -> Tensor:
+    """Sliding of feet that bear force: sum_i [contact_i] u_i, horizontal speed, m/s.
+
+    Printed as the norm over the feet; the sum is the Spot form.
+    """
+    return (foot_speed_xy(s) * s.foot_contact).sum(-1)
+
+
+@reward("foot_force")
+def foot_force(s: Snapshot) -> Tensor:
+    """Hard footfalls: sum_i |F_i|^2, N2. Table III."""
+    return s.foot_force.square().sum(-1)
+
+
+@reward("joint_torque")
+def joint_torque(s: Snapshot) -> Tensor:
+    """Effort, |tau|, N m. Table III."""
+    return s.joint_torque.norm(dim=-1)
+
+
+@reward("joint_acceleration")
+def joint_acceleration(s: Snapshot) -> Tensor:
+    """Jerkiness, |qdd| over the last physics substep, rad/s2. Table III."""
+    assert s.joint_acc is not None
+    return s.joint_acc.norm(dim=-1)
+
+
+@reward("joint_velocity")
+def joint_velocity(s: Snapshot) -> Tensor:
+    """Fast joints, |qd|, rad/s. Table III."""
+    return s.joint_vel.norm(dim=-1)
+
+
+@reward("joint_deviation")
+def joint_deviation_(s: Snapshot, *, standing_scale: NonNegative = 5.0, speed_threshold: NonNegative = 0.5) -> Tensor:
+    """Distance from the nominal stance, |q - q0|, rad; times ``standing_scale`` while standing.
+
+    Printed as a sum of signed differences, which left and right cancel; form of Isaac Lab's Spot task.
+    """
+    distance = joint_deviation(s).norm(dim=-1)
+    return torch.where(is_moving(s, speed_threshold), distance, standing_scale * distance)
+
+
+@reward("joint_position_limit")
+def joint_position_limit(s: Snapshot, *, soft_factor: Fraction = 0.95) -> Tensor:
+    """Joints at a limit: number of joints outside the range shrunk by ``soft_factor`` about its centre, 0 to 12.
+
+    Printed for the upper limit alone; both ends count here.
+    """
+    limits = torch.as_tensor(robot.soft_limits(soft_factor), dtype=s.joint_pos.dtype, device=s.joint_pos.device)
+    outside = (s.joint_pos <= limits[:, 0]) | (s.joint_pos >= limits[:, 1])
+    return outside.sum(-1).to(s.joint_pos.dtype)
+
+
+@reward("joint_velocity_limit")
+def joint_velocity_limit(s: Snapshot, *, limit: tuple[Positive, Positive, Positive] = robot.VELOCITY_LIMIT) -> Tensor:
+    """Joints at top speed: number of joints with |qd| >= limit (hip, thigh, calf, rad/s), 0 to 12.
+
+    Printed for positive speed alone; both directions count here.
+    """
+    top = torch.as_tensor(robot.per_joint(limit), dtype=s.joint_vel.dtype, device=s.joint_vel.device)
+    return (s.joint_vel.abs() >= top).sum(-1).to(s.joint_vel.dtype)
+
+
+@reward("thigh_contact")
+def thigh_contact(s: Snapshot) -> Tensor:
+    """Thighs that touch the ground, 0 to 4. Table III."""
+    assert s.thigh_contact is not None
+    return s.thigh_contact.sum(-1).to(s.joint_pos.dtype)
+
+
+@reward("calf_contact")
+def calf_contact(s: Snapshot) -> Tensor:
+    """Calves that touch the ground, 0 to 4; the foot does not count. Table III."""
+    assert s.calf_contact is not None
+    return s.calf_contact.sum(-1).to(s.joint_pos.dtype)

@@ -1,0 +1,92 @@
+"""``backend=cpu``: MuJoCo's own batch of simulations on its C++ thread pool."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import MODEL_FIELDS, Batch
+from torch import Tensor
+
+from go1exp.physics.scene import Sensors
+
+STATE_FIELDS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl")
+"""What one simulation carries from step to step (no activations, no applied forces in this model)."""
+
+
+class MujocoCpu:
+    """N simulations on ``threads`` threads; the same bits whatever their number (see ``PhysicsBackend``)."""
+
+    def __init__(self, model: mujoco.MjModel, sensors: Sensors, num_envs: int, threads: int = 0) -> None:
+        """Allocate; ``threads`` = 0 takes all cores."""
+        self.model, self.sensors, self.num_envs = model, sensors, num_envs
+        self._batch = Batch(model, num_envs, nthread=threads)
+        self.qpos = torch.from_numpy(self._batch.bind("qpos"))
+        self.qvel = torch.from_numpy(self._batch.bind("qvel"))
+        self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
+        with warnings.catch_warnings():  # an output, shared read-only: torch has no such notion
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            self.sensordata = torch.from_numpy(self._batch.bind("sensordata"))
+        self._fields: dict[str, Tensor] = {}
+
+    def step(self, torque: Tensor) -> None:
+        """Advance one physics step under joint torques (N, 12), N m."""
+        self._ctrl.copy_(torque)
+        self._batch.step()
+
+    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """Put the rows of ``mask`` into a state at rest in memory: no warm start, time 0, sensors current."""
+        rows = mask.nonzero().squeeze(1)
+        if len(rows) == 0:
+            return
+        ids = rows.numpy()
+        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.qpos[rows] = qpos[rows].to(self.qpos.dtype)
+        self.qvel[rows] = qvel[rows].to(self.qvel.dtype)
+        self._batch.forward(ids)
+
+    def field(self, name: str) -> Tensor:
+        """Live per-environment values of a model field."""
+        if name not in self._fields:
+            self._fields[name] = torch.from_numpy(self._batch.expand(name))
+        return self._fields[name]
+
+    def nominal(self, name: str) -> Tensor:
+        """The compiled model's values of that field (a copy)."""
+        return torch.tensor(getattr(self.model, name))
+
+    def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
+        """Indices of named bodies or geoms."""
+        return torch.tensor([getattr(self.model, kind)(name).id for name in names])
+
+    def derive_constants(self, mask: Tensor) -> None:
+        """Run ``mj_setConst`` in the rows of ``mask``."""
+        rows = mask.nonzero().squeeze(1)
+        if len(rows):
+            self._batch.set_const(rows.numpy())
+
+    def env_model(self, env: int) -> mujoco.MjModel:
+        """Return environment ``env``'s model, randomised fields included, to render or inspect it."""
+        return self._batch.get_model(env)
+
+    def env_data(self, env: int) -> mujoco.MjData:
+        """Return environment ``env``'s state as an MjData of ``env_model``, to render or inspect it."""
+        return self._batch.get_data(env)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the simulations' states and every model field that differs between them, derived ones included."""
+        expanded = {name: self._batch.expanded(name) for name in MODEL_FIELDS}
+        return {
+            "state": {name: torch.from_numpy(np.array(self._batch.bind(name))) for name in STATE_FIELDS},
+            "fields": {name: torch.from_numpy(np.array(v)) for name, v in expanded.items() if v is not None},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``, bit for bit."""
+        for name, value in state["fields"].items():
+            self.field(name).copy_(value)
+        for name in STATE_FIELDS:
+            self._batch.bind(name)[:] = state["state"][name].numpy()

@@ -1,0 +1,99 @@
+"""Robot + ground + sensors -> one compiled MuJoCo model, the same for every backend.
+
+Whatever the MDP needs beyond qpos and qvel is a sensor declared here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+
+from go1exp import robot
+from go1exp.physics.model import load_robot
+from go1exp.physics.terrain_geom import add_to_spec
+from go1exp.robot import RobotConfig
+from go1exp.terrain import Terrain
+
+DECORATION_GROUP = 2
+"""Geom group of the shapes that are only for the eye; they cost kinematics and are left out of training."""
+
+_DATA_FOUND = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
+_DATA_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+_REDUCE_NONE, _REDUCE_NETFORCE = 0, 3
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Where each quantity lies in ``sensordata``: contiguous blocks, so that reading one is a view, not a copy.
+
+    Legs in the order of ``robot.LEGS``.
+    """
+
+    foot_pos_w: slice
+    """4 x 3: centre of the foot spheres, m."""
+    foot_vel_w: slice
+    """4 x 3: their velocity, m/s."""
+    foot_contact: slice
+    """4 x 4: number of contacts of the foot sphere, then the net contact force on it, N."""
+    link_contacts: slice
+    """13: number of contacts of thighs (4), calves with their feet (4), trunk with head (1), hips (4)."""
+
+
+def build_model(
+    config: RobotConfig, terrain: Terrain, physics_dt: float, decoration: bool = False
+) -> tuple[mujoco.MjModel, Sensors]:
+    """Compile the scene.
+
+    Args:
+        config: which Go1.
+        terrain: the ground, which touches every collision shape of the robot.
+        physics_dt: timestep, s.
+        decoration: keep the shapes that are only for the eye (they change no trajectory).
+    """
+    spec = load_robot(config.inertia)
+    if not decoration:
+        for geom in list(spec.geoms):
+            if geom.group == DECORATION_GROUP:
+                spec.delete(geom)
+    spec.option.timestep = physics_dt
+    # A fault must be seen, not healed: MuJoCo would otherwise reset a robot whose state is not finite.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    for kind, name in enumerate(robot.JOINT_KINDS):
+        for leg in robot.LEGS:
+            joint = spec.joint(f"{leg}_{name}")
+            joint.armature = config.armature[kind]
+            joint.damping[0] = config.damping[kind]
+            joint.frictionloss = config.friction_loss[kind]
+            motor = spec.actuator(f"{leg}_{name}")
+            motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            motor.forcerange = [-config.effort_limit[kind], config.effort_limit[kind]]
+    add_to_spec(spec, terrain)
+    sensors = _add_sensors(spec)
+    return spec.compile(), sensors
+
+
+def _add_sensors(spec: mujoco.MjSpec) -> Sensors:
+    """Declare the sensors, block by block, and return where they will lie."""
+    site, geom, body = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
+    end = 0
+
+    def block(targets: list[str], size: int, kind: mujoco.mjtSensor, objtype: mujoco.mjtObj, intprm: list[int]) -> slice:
+        nonlocal end
+        start = end
+        for target in targets:
+            name = f"{target}_{kind.name.removeprefix('mjSENS_').lower()}"
+            spec.add_sensor(name=name, type=kind, objtype=objtype, objname=target, intprm=[*intprm, 0, 0, 0][:3])
+            end += size
+        return slice(start, end)
+
+    feet = [f"{leg}_foot" for leg in robot.LEGS]
+    links = [f"{leg}_{part}" for part in ("thigh", "calf") for leg in robot.LEGS]
+    links += ["trunk", *(f"{leg}_hip" for leg in robot.LEGS)]
+    contact = mujoco.mjtSensor.mjSENS_CONTACT
+    return Sensors(
+        foot_pos_w=block(feet, 3, mujoco.mjtSensor.mjSENS_FRAMEPOS, site, []),
+        foot_vel_w=block(feet, 3, mujoco.mjtSensor.mjSENS_FRAMELINVEL, site, []),
+        foot_contact=block(feet, 4, contact, geom, [_DATA_FOUND | _DATA_FORCE, _REDUCE_NETFORCE, 1]),
+        link_contacts=block(links, 1, contact, body, [_DATA_FOUND, _REDUCE_NONE, 1]),
+    )

@@ -1,0 +1,212 @@
+"""Name in a YAML file -> one function or class, with its parameters checked before anything is built.
+
+A term is registered under the name that the YAML uses; its keyword-only parameters, with their annotations and
+defaults, are its schema::
+
+    @reward("foot_slip")
+    def foot_slip(s: Snapshot, *, speed_scale: Positive = 0.1) -> Tensor: ...
+
+Problems are collected, not raised one by one, so that a user sees all of them at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import json
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Annotated, Any, TypeVar, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+STRICT = ConfigDict(extra="forbid", strict=True)
+"""Pydantic settings of every schema: no unknown key, no silent conversion between types."""
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Range = tuple[float, float]
+"""``[low, high]`` of a uniform distribution; low <= high is checked wherever one is declared."""
+
+
+class ConfigError(ValueError):
+    """One or more things wrong with a configuration; the message has one line for each, starting with its key path."""
+
+    def __init__(self, problems: Iterable[str]) -> None:
+        self.problems = list(problems)
+        super().__init__("\n".join(self.problems))
+
+
+def nearest(name: str, known: Iterable[str], most: int = 3) -> list[str]:
+    """Return up to ``most`` names of ``known`` that look like ``name``, best first."""
+    return difflib.get_close_matches(name, list(known), n=most, cutoff=0.5)
+
+
+def unknown_name(path: str, name: str, known: Iterable[str], what: str) -> str:
+    """Word the complaint about a name that does not exist."""
+    known = sorted(known)
+    close = nearest(name, known)
+    hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else f"known: {', '.join(known) or 'none'}"
+    return f"{path}: unknown {what} {name!r}; {hint}"
+
+
+def as_json(settings: Any) -> str:
+    """Dump settings for a strict schema: pydantic takes lists for tuples and mappings for dataclasses only from JSON."""
+    return json.dumps(settings)
+
+
+def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str]:
+    """Translate a pydantic error into lines ``key.path = value: what is wrong``."""
+    lines = []
+    for e in error.errors():
+        key = ".".join([path, *map(str, e["loc"])]).strip(".")
+        if e["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+            lines.append(unknown_name(key, str(e["loc"][-1]), known, "key") + f" (given: {e['input']!r})")
+        elif e["type"] == "value_error" and not e["loc"]:  # a dataclass's own rules, one "key: rule" per line
+            lines += [f"{path}.{line}".strip(".") for line in e["msg"].removeprefix("Value error, ").splitlines()]
+        elif e["type"] in ("missing", "missing_argument"):
+            lines.append(f"{key}: required, but not given")
+        else:
+            lines.append(f"{key} = {e['input']!r}: {e['msg'].removeprefix('Value error, ').lower()}")
+    return lines
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One registered member: its group, name and target, and what the group wants to know about it (``traits``)."""
+
+    group: str
+    name: str
+    target: Callable[..., Any]
+    traits: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def doc(self) -> str:
+        """First line of the docstring."""
+        return (inspect.getdoc(self.target) or "").split("\n")[0]
+
+    @cached_property
+    def parameters(self) -> dict[str, inspect.Parameter]:
+        """The keyword-only parameters, which the YAML may set."""
+        found = inspect.signature(self.target).parameters.values()
+        return {p.name: p for p in found if p.kind is inspect.Parameter.KEYWORD_ONLY}
+
+    @cached_property
+    def schema(self) -> type[BaseModel]:
+        """Pydantic model of the parameters."""
+        function = self.target.__init__ if inspect.isclass(self.target) else self.target  # type: ignore[misc]
+        scope = vars(sys.modules[self.target.__module__])
+        fields: dict[str, Any] = {}
+        for name, p in self.parameters.items():
+            # Only these annotations are evaluated: the positional ones name tensors, which need no import here.
+            stub = type(name, (), {"__annotations__": {name: function.__annotations__[name]}})
+            kind = get_type_hints(stub, globalns=dict(scope), include_extras=True)[name]
+            fields[name] = (kind, ... if p.default is p.empty else p.default)
+        return create_model(self.name, __config__=STRICT, **fields)
+
+    def check(self, parameters: Mapping[str, Any], path: str) -> tuple[dict[str, Any], list[str]]:
+        """Validate ``parameters``; return them with defaults filled in, and the problems found."""
+        try:
+            values = self.schema.model_validate_json(as_json(parameters)).model_dump()
+        except ValidationError as error:
+            return {}, explain(error, path, self.parameters)
+        return values, [
+            f"{path}.{name} = {list(value)!r}: low must not exceed high"
+            for name, value in values.items()
+            if self.schema.model_fields[name].annotation == Range and value[0] > value[1]
+        ]
+
+
+_REGISTRY: dict[str, dict[str, Entry]] = {}
+
+
+def register(group: str, name: str, **traits: Any) -> Callable[[F], F]:
+    """Class or function decorator: make the target known to ``group`` as ``name``."""
+
+    def decorate(target: F) -> F:
+        members = _REGISTRY.setdefault(group, {})
+        if name in members:
+            raise ValueError(f"{group} term {name!r} is registered twice")
+        members[name] = Entry(group, name, target, traits)
+        return target
+
+    return decorate
+
+
+reward = partial(register, "reward")
+observation = partial(register, "observation")
+randomization = partial(register, "rand")
+command = partial(register, "command")
+event = partial(register, "event")
+termination = partial(register, "termination")
+curriculum = partial(register, "curriculum")
+actuator = partial(register, "actuator")
+
+
+def members(group: str) -> dict[str, Entry]:
+    """All members of ``group`` by name, in the order in which they were registered."""
+    return dict(_REGISTRY.get(group, {}))
+
+
+def groups() -> list[str]:
+    """The names of all groups that have members."""
+    return list(_REGISTRY)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A registered member as one configuration uses it.
+
+    ``key`` is the YAML key (``slip_tight``), ``entry`` the member it names, ``parameters`` its checked parameters,
+    ``slots`` what the group itself reads (a reward's ``weight``, an observation's ``noise``).
+    """
+
+    key: str
+    entry: Entry
+    parameters: Mapping[str, Any]
+    slots: Mapping[str, Any] = field(default_factory=dict)
+
+    def __call__(self, *args: Any) -> Any:
+        """Call the member (for a class: construct it) with ``args`` and the configured parameters."""
+        return self.entry.target(*args, **self.parameters)
+
+
+def bind(
+    group: str, key: str, settings: Any, path: str, slots: type[BaseModel] | None = None
+) -> tuple[Term | None, list[str]]:
+    """Resolve one YAML item ``key: settings`` of ``group``; return the term (None if bad) and the problems found.
+
+    ``settings`` holds the term's parameters beside the group's own ``slots``; an item named differently from its
+    term says ``term: name``.
+    """
+    if settings is None:
+        settings = {}
+    if not isinstance(settings, Mapping):
+        return None, [f"{path} = {settings!r}: must be a mapping of parameters, such as {{}}"]
+    settings = dict(settings)
+    name = settings.pop("term", key)
+    entry = members(group).get(name)
+    if entry is None:
+        return None, [unknown_name(path, str(name), members(group), f"{group} term")]
+    slot_names = set(slots.model_fields) if slots else set()
+    own = {k: v for k, v in settings.items() if k in slot_names}
+    rest = {k: v for k, v in settings.items() if k not in slot_names}
+    values, problems = entry.check(rest, path)
+    if problems and slot_names:  # so that a misspelt slot finds its name too
+        known = [*entry.parameters, *slot_names]
+        strange = [k for k in rest if k not in entry.parameters]
+        others = [p for p in problems if not any(p.startswith(f"{path}.{k}: unknown key") for k in strange)]
+        named = [unknown_name(f"{path}.{k}", k, known, "key") + f" (given: {rest[k]!r})" for k in strange]
+        problems = others + named
+    checked: dict[str, Any] = {}
+    if slots:
+        try:
+            checked = slots.model_validate_json(as_json(own)).model_dump()
+        except ValidationError as error:
+            problems += explain(error, path, slot_names)
+    return (None, problems) if problems else (Term(key, entry, values, checked), [])

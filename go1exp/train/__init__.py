@@ -1,0 +1,1 @@
+"""Training: SB3's PPO with a KL-adaptive learning rate, run folders, checkpoints, metrics."""

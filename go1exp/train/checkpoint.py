@@ -1,0 +1,121 @@
+"""Checkpoints: everything that training needs to go on as if it had never stopped.
+
+One file per checkpoint, written beside its final name and renamed when complete, read back without unpickling code.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.train.ppo import AdaptivePPO
+
+FORMAT = 1
+SUFFIX = ".pt"
+
+
+def checkpoints(run: Path) -> list[Path]:
+    """Return the complete checkpoints of a run folder, oldest first."""
+    return sorted((run / "checkpoints").glob(f"*{SUFFIX}"))
+
+
+def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
+    """Write the present state as the newest checkpoint and delete all but ``keep``; never leaves a partial file."""
+    folder = run / "checkpoints"
+    folder.mkdir(parents=True, exist_ok=True)
+    final = folder / f"{ppo.iteration:06d}{SUFFIX}"
+    partial = final.with_suffix(".partial")
+    with partial.open("wb") as file:
+        torch.save(_state(ppo), file)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(final)
+    for old in checkpoints(run)[:-keep]:
+        old.unlink()
+    return final
+
+
+def load_latest(run: Path) -> tuple[dict[str, Any], Path]:
+    """Read the newest checkpoint that is whole; a damaged one is skipped with a warning.
+
+    Raises:
+        FileNotFoundError: if the folder holds none.
+    """
+    for path in reversed(checkpoints(run)):
+        try:
+            return read(path), path
+        except Exception as error:  # a truncated or overwritten file fails in many ways
+            warnings.warn(f"{path}: damaged checkpoint skipped ({type(error).__name__}: {error})", stacklevel=2)
+    raise FileNotFoundError(f"{run}: no checkpoint to load (looked for checkpoints/*{SUFFIX})")
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read one checkpoint.
+
+    Raises:
+        ValueError: if it was written by an incompatible version.
+    """
+    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    if state.get("format") != FORMAT:
+        raise ValueError(f"{path}: checkpoint format {state.get('format')!r}, this version reads {FORMAT}")
+    return state
+
+
+def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
+    """Put ``ppo`` and its environment into the state of a checkpoint."""
+    ppo.policy.load_state_dict(state["policy"])
+    ppo.policy.optimizer.load_state_dict(state["optimizer"])
+    ppo.iteration = state["iteration"]
+    ppo.num_timesteps = state["num_timesteps"]
+    ppo._n_updates = state["n_updates"]
+    assert ppo.ep_info_buffer is not None
+    ppo.ep_info_buffer.extend(state["episodes"])
+    _core(ppo).load_state_dict(state["env"])
+    ppo._last_obs = state["last_obs"].numpy()
+    ppo._last_episode_starts = state["last_episode_starts"].numpy()
+    rng = state["rng"]
+    torch.set_rng_state(rng["torch"])
+    if rng["cuda"] is not None and torch.cuda.is_available():
+        torch.cuda.set_rng_state(rng["cuda"])
+    kind, keys, position, has_gauss, cached = rng["numpy"]
+    np.random.set_state((kind, keys.numpy().astype(np.uint32), position, has_gauss, cached))
+    version, words, gauss = rng["python"]
+    random.setstate((version, tuple(words), gauss))
+
+
+def _core(ppo: AdaptivePPO) -> Any:
+    env = ppo.get_env()
+    assert isinstance(env, Go1VecEnv)
+    return env.core
+
+
+def _state(ppo: AdaptivePPO) -> dict[str, Any]:
+    kind, keys, position, has_gauss, cached = np.random.get_state()  # type: ignore[misc]
+    version, words, gauss = random.getstate()
+    assert ppo.ep_info_buffer is not None
+    assert isinstance(ppo._last_obs, np.ndarray)
+    return {
+        "format": FORMAT,
+        "iteration": ppo.iteration,
+        "num_timesteps": ppo.num_timesteps,
+        "n_updates": ppo._n_updates,
+        "episodes": list(ppo.ep_info_buffer),
+        "policy": ppo.policy.state_dict(),
+        "optimizer": ppo.policy.optimizer.state_dict(),
+        "env": _core(ppo).state_dict(),
+        "last_obs": torch.from_numpy(ppo._last_obs.copy()),
+        "last_episode_starts": torch.from_numpy(np.asarray(ppo._last_episode_starts).copy()),
+        "rng": {
+            "torch": torch.get_rng_state(),
+            "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
+            "numpy": [kind, torch.from_numpy(keys.astype(np.int64)), position, has_gauss, cached],
+            "python": [version, list(words), gauss],
+        },
+    }

@@ -1,0 +1,199 @@
+"""Stable-Baselines3's PPO with rsl_rl's KL-adaptive learning rate.
+
+SB3's loss and loop are used as they are. The rule needs two things that SB3 does not keep: the action means at
+collection (the buffer below stores them) and a look at every minibatch between forward pass and gradient step (a hook
+on the optimiser).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
+from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor, nn
+
+from go1exp.config import PPOConfig
+from go1exp.env.faults import NumericalFault
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
+KL_FACTOR = 2.0
+"""The rate changes when the divergence is off the desired one by this factor (rsl_rl)."""
+RATE_FACTOR = 1.5
+"""And then by this factor."""
+
+
+def gaussian_kl(old_mean: Tensor, old_log_std: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """Return KL(old || new) of diagonal Gaussians, summed over the last axis: analytic, without sampling.
+
+    sum_d [ln(s_d / s0_d) + (s0_d^2 + (m0_d - m_d)^2) / (2 s_d^2) - 1/2]; means (B, A), log standard deviations (A,).
+    """
+    variance = torch.exp(2.0 * log_std)
+    spread = torch.exp(2.0 * old_log_std) + (old_mean - mean).square()
+    return (log_std - old_log_std + spread / (2.0 * variance) - 0.5).sum(-1)
+
+
+def adapted_rate(rate: float, kl: float, desired: float, bounds: tuple[float, float]) -> float:
+    """Return the learning rate for the next gradient step (rsl_rl 5.4, ``algorithms/ppo.py``)."""
+    if kl > KL_FACTOR * desired:
+        return max(bounds[0], rate / RATE_FACTOR)
+    if 0.0 < kl < desired / KL_FACTOR:
+        return min(bounds[1], rate * RATE_FACTOR)
+    return rate
+
+
+class Bf16MlpExtractor(MlpExtractor):
+    """SB3's two networks with bfloat16 matrix products while training; weights and everything else stay float32."""
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the latents of actor and critic, float32."""
+        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.training):
+            pi, vf = super().forward(features)
+        return pi.float(), vf.float()
+
+
+class GaussianPolicy(ActorCriticPolicy):
+    """SB3's actor-critic, which remembers the distribution of its last forward pass."""
+
+    last_distribution: DiagGaussianDistribution
+
+    def __init__(self, *args: Any, bf16: bool = False, **kwargs: Any) -> None:
+        self._bf16 = bf16
+        super().__init__(*args, **kwargs)
+
+    def _build_mlp_extractor(self) -> None:
+        if not self._bf16:
+            return super()._build_mlp_extractor()
+        self.mlp_extractor = Bf16MlpExtractor(
+            self.features_dim, net_arch=self.net_arch, activation_fn=self.activation_fn, device=self.device
+        )
+        return None
+
+    def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
+        distribution = super()._get_action_dist_from_latent(latent_pi)
+        assert isinstance(distribution, DiagGaussianDistribution)
+        self.last_distribution = distribution
+        return distribution
+
+
+class MeanRolloutBuffer(RolloutBuffer):
+    """A rollout that also keeps the action means at collection, and knows those of the minibatch now in use."""
+
+    policy: GaussianPolicy
+    means: np.ndarray
+    current_means: Tensor
+
+    def reset(self) -> None:
+        """Empty the buffer."""
+        super().reset()
+        self.means = np.zeros((self.buffer_size, self.n_envs, self.action_dim), dtype=np.float32)
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """Store one step and the means of the forward pass that chose its actions."""
+        self.means[self.pos] = self.policy.last_distribution.distribution.mean.detach().cpu().numpy()
+        super().add(*args, **kwargs)
+
+    def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
+        """Yield shuffled minibatches."""
+        if not self.generator_ready:
+            self.means = self.swap_and_flatten(self.means)
+        yield from super().get(batch_size)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> RolloutBufferSamples:
+        self.current_means = self.to_torch(self.means[batch_inds])
+        return super()._get_samples(batch_inds, env)
+
+
+class AdaptivePPO(PPO):
+    """PPO that steers its learning rate and reports after each iteration.
+
+    ``after_iteration(ppo)`` is called when an iteration is complete: rollout, update and metrics, nothing half done.
+    """
+
+    rollout_buffer: MeanRolloutBuffer
+    policy: GaussianPolicy
+
+    def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str) -> None:
+        self.config = config
+        self.iteration = 0
+        self.after_iteration: Callable[[AdaptivePPO], None] = lambda ppo: None
+        super().__init__(
+            GaussianPolicy,
+            env,
+            learning_rate=config.learning_rate,
+            n_steps=config.steps,
+            batch_size=config.num_envs * config.steps // config.minibatches,
+            n_epochs=config.epochs,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            clip_range=config.clip_range,
+            clip_range_vf=config.value_clip,
+            normalize_advantage=config.normalize_advantage,
+            ent_coef=config.entropy,
+            vf_coef=config.value_coef,
+            max_grad_norm=config.max_grad_norm,
+            rollout_buffer_class=MeanRolloutBuffer,
+            policy_kwargs={
+                "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
+                "activation_fn": ACTIVATIONS[config.activation],
+                "log_std_init": float(np.log(config.init_std)),
+                "bf16": config.matmul_precision == "bf16",
+            },
+            seed=seed,
+            device=device,
+        )
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.rollout_buffer.policy = self.policy
+        self.policy.optimizer.register_step_pre_hook(self._before_gradient_step)
+
+    def _maybe_recommend_cpu(self, mlp_class_name: str = "ActorCriticPolicy") -> None:
+        """Say nothing: the user chose the device."""
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        """Leave the rate where the last minibatch put it; SB3 would set it from a schedule over time."""
+
+    def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
+        """Check the gradient and set the learning rate of the step about to be taken."""
+        for name, parameter in self.policy.named_parameters():
+            if parameter.grad is not None and not torch.isfinite(parameter.grad.sum()):
+                raise NumericalFault(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}", {})
+        with torch.no_grad():
+            mean = self.policy.last_distribution.distribution.mean
+            kl = gaussian_kl(self.rollout_buffer.current_means, self._old_log_std, mean, self.policy.log_std).mean()
+        self._kl.append(float(kl))
+        if self.config.schedule == "adaptive":
+            group = optimizer.param_groups[0]
+            group["lr"] = adapted_rate(
+                group["lr"], self._kl[-1], self.config.desired_kl, self.config.learning_rate_range
+            )
+
+    def train(self) -> None:
+        """Update on the rollout, then close the iteration."""
+        self._old_log_std = self.policy.log_std.detach().clone()
+        self._kl: list[float] = []
+        super().train()
+        self.iteration += 1
+        self.logger.record("train/kl", float(np.mean(self._kl)))
+        self.logger.record("train/learning_rate", self.policy.optimizer.param_groups[0]["lr"])
+        assert self.ep_info_buffer is not None
+        if self.ep_info_buffer:
+            self.logger.record("rollout/return", safe_mean([e["r"] for e in self.ep_info_buffer]))
+            self.logger.record("rollout/length", safe_mean([e["l"] for e in self.ep_info_buffer]))
+        self.after_iteration(self)
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """Do nothing: SB3 writes between rollout and update, which would put two iterations into one row."""
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "after_iteration", "_kl", "_old_log_std"]

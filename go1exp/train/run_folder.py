@@ -1,0 +1,92 @@
+"""The run folder: what was run, with what, and where its results are.
+
+``config.yaml`` (resolved), ``meta.json`` (git commit, versions, machine, hashes of assets), ``metrics.csv``,
+``timing.csv``, ``checkpoints/``. Whatever comes later reads the run's own configuration, never today's ``conf/``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from go1exp import __version__, data_root
+
+PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco-core", "numpy", "hydra-core")
+
+
+def write(run: Path, container: dict[str, Any]) -> None:
+    """Create a run folder and say what is about to run in it.
+
+    Raises:
+        OSError: if the folder cannot be written; the message names it.
+    """
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        (run / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(container)))
+        (run / "meta.json").write_text(json.dumps(_meta(container), indent=2) + "\n")
+    except OSError as error:
+        raise OSError(error.errno, f"run folder cannot be written: {error.strerror}", str(run)) from error
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """Return the run's own resolved configuration.
+
+    Raises:
+        FileNotFoundError: if ``run`` is not a run folder.
+    """
+    path = run / "config.yaml"
+    if not path.is_file():
+        raise FileNotFoundError(f"{run}: not a run folder (it has no config.yaml)")
+    container = OmegaConf.to_container(OmegaConf.load(path))
+    assert isinstance(container, dict)
+    return {str(k): v for k, v in container.items()}
+
+
+def _meta(container: dict[str, Any]) -> dict[str, Any]:
+    def version(package: str) -> str | None:
+        try:
+            return importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            return None
+
+    assets = sorted(p for p in (data_root() / "assets").rglob("*.xml"))
+    return {
+        "go1exp": __version__,
+        "git": _git("rev-parse", "HEAD"),
+        "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
+        "seed": container.get("seed"),
+        "packages": {name: version(name) for name in PACKAGES},
+        "python": platform.python_version(),
+        "machine": {"processor": _processor(), "cores": os.cpu_count()},
+        "assets_sha256": {
+            str(p.relative_to(data_root())): hashlib.sha256(p.read_bytes()).hexdigest() for p in assets
+        },
+    }
+
+
+def _git(*arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(data_root()), *arguments], capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

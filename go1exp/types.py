@@ -1,0 +1,70 @@
+"""What the MDP sees of one moment: the ``Snapshot``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One policy step of N robots, float32 unless stated; what a source cannot measure is None.
+
+    Joints and legs in the order of ``robot.py``; ``_b`` is the trunk frame, ``_w`` the world frame. Joint and base
+    state are current. Contact forces and foot kinematics are MuJoCo sensors and describe the last physics substep,
+    2 ms before the state (see ``physics/backend.py``); timers and ``*_contact`` flags cover every substep of the step.
+    """
+
+    base_pos_w: Tensor | None
+    """(N, 3) trunk origin, m."""
+    base_quat_w: Tensor
+    """(N, 4) w-x-y-z, trunk to world."""
+    base_lin_vel_b: Tensor | None
+    """(N, 3) velocity of the trunk origin, m/s."""
+    base_ang_vel_b: Tensor
+    """(N, 3) rad/s."""
+    projected_gravity_b: Tensor
+    """(N, 3) direction of gravity, unit length; (0, 0, -1) when level."""
+    joint_pos: Tensor
+    """(N, 12) rad."""
+    joint_vel: Tensor
+    """(N, 12) rad/s."""
+    joint_acc: Tensor | None
+    """(N, 12) velocity change over the last physics substep, rad/s2."""
+    joint_torque: Tensor
+    """(N, 12) torque applied in the last physics substep, N m."""
+    joint_target: Tensor
+    """(N, 12) position target in force, rad."""
+    action: Tensor
+    """(N, 12) the policy's output of this step, unscaled."""
+    previous_action: Tensor
+    """(N, 12) that of the step before (zero after a reset)."""
+    command: Tensor
+    """(N, 3) commanded velocity: x, y in m/s, yaw rate in rad/s, body frame."""
+    foot_height: Tensor | None
+    """(N, 4) height of the centre of each foot sphere over the ground below it, m (0.023 when standing on it)."""
+    foot_vel_w: Tensor | None
+    """(N, 4, 3) velocity of the foot centres, m/s."""
+    foot_force: Tensor
+    """(N, 4) magnitude of the ground's force on each foot, N."""
+    foot_contact: Tensor
+    """(N, 4) bool, the foot bears force now."""
+    foot_air_time: Tensor
+    """(N, 4) duration of the running swing phase, 0 in stance, s."""
+    foot_contact_time: Tensor
+    """(N, 4) duration of the running stance phase, 0 in swing, s."""
+    foot_last_air_time: Tensor
+    """(N, 4) duration of the last completed swing phase, s."""
+    foot_last_contact_time: Tensor
+    """(N, 4) duration of the last completed stance phase, s."""
+    foot_touchdown: Tensor
+    """(N, 4) bool, the foot touched down during this policy step."""
+    thigh_contact: Tensor | None
+    """(N, 4) bool, the thigh touched the ground during this policy step."""
+    calf_contact: Tensor | None
+    """(N, 4) bool, the calf (without the foot) touched the ground during this policy step."""
+    trunk_contact: Tensor | None
+    """(N,) bool, trunk, head or a hip touched the ground during this policy step."""
+    episode_time: Tensor
+    """(N,) time since the last reset, s."""
