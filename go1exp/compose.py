@@ -1,4 +1,4 @@
-"""Hydra's side of the configuration: groups, composition, and complaints that name the nearest key."""
+"""Hydra's side of the configuration: where it lies, its groups, composition outside an application."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def register_groups() -> None:
 
 def as_container(config: DictConfig) -> dict[str, Any]:
     """Resolve interpolations and return plain dicts and lists."""
-    container = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    container = OmegaConf.to_container(config, resolve=True)
     assert isinstance(container, dict)
     return {str(k): v for k, v in container.items()}
 
@@ -38,3 +38,18 @@ def compose(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
     GlobalHydra.instance().clear()
     with initialize_config_dir(config_folder(), version_base="1.3"):
         return as_container(hydra_compose(name, list(overrides)))
+
+
+def flat_keys(name: str) -> list[str]:
+    """Return every key path of ``conf/<name>.yaml`` with its defaults, groups included."""
+    found: list[str] = []
+
+    def walk(node: Any, path: str) -> None:
+        found.append(path)
+        if isinstance(node, dict):
+            for key, value in node.items():
+                walk(value, f"{path}.{key}")
+
+    for key, value in compose(name).items():
+        walk(value, key)
+    return found

@@ -98,7 +98,7 @@ class TaskConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """The learner. Symbols and defaults: paper, section III-A; what it does not print: Isaac Lab's Spot task.
+    """The learner. Its numbers in ``conf/ppo`` are the paper's (section III-A) and, where it prints none, Isaac Lab's.
 
     Attributes:
         num_envs: environments that run side by side.
@@ -258,6 +258,7 @@ MANY_TERMS: dict[str, type[BaseModel] | None] = {
 }
 """Groups that are a mapping of terms, with the keys that the group reads beside each term's parameters."""
 
+
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
@@ -305,7 +306,10 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
     """Rules between sections."""
     problems = []
     if sim := parts.get("sim"):
-        for name, longer, shorter in (("policy_dt", sim.policy_dt, sim.physics_dt), ("episode_s", sim.episode_s, sim.policy_dt)):
+        for name, longer, shorter in (
+            ("policy_dt", sim.policy_dt, sim.physics_dt),
+            ("episode_s", sim.episode_s, sim.policy_dt),
+        ):
             ratio = longer / shorter
             if ratio < 1 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
                 unit = "sim.physics_dt" if name == "policy_dt" else "sim.policy_dt"
@@ -321,11 +325,20 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
         )
     if "observation" in parts and not parts["observation"]:
         problems.append("observation: at least one term is required")
-    if parts.get("curriculum") and (terrain := parts.get("terrain")) and terrain.kind == "flat":
-        problems.append("curriculum.terrain_level: needs graded ground; use terrain=rough, or curriculum=none")
+    terrain: Any = parts.get("terrain")
+    for rule in (parts.get("curriculum") or ()) if terrain else ():
+        top, start = terrain.rows - 1, rule.parameters["start_level_max"]
+        if terrain.kind == "flat":
+            problems.append(f"curriculum.{rule.key}: needs graded ground; use terrain=rough, or curriculum=none")
+        elif start > top:
+            problems.append(
+                f"curriculum.{rule.key}.start_level_max = {start}: terrain.rows = {top + 1} allows up to {top}"
+            )
     for term in parts.get("rand") or ():
         if term.entry.traits["kind"] == "state" and term.slots["when"] == "startup":
-            problems.append(f"rand.{term.key}.when = 'startup': a random initial state is drawn at every reset; use reset")
+            problems.append(
+                f"rand.{term.key}.when = 'startup': a random initial state is drawn at every reset; use reset"
+            )
     return problems
 
 
@@ -345,7 +358,11 @@ def parse_train(container: Mapping[str, Any]) -> TrainConfig:
     others = ("ppo", "logger", "checkpoint")
     top = tuple(f.name for f in fields(ProcessConfig))
     known = (*task_names, *others, *top)
-    problems = [unknown_name(key, key, known, "key") for key in container if key not in known]
+    problems = [
+        f"{unknown_name(key, key, known, 'key')} (given: {value!r})"
+        for key, value in container.items()
+        if key not in known
+    ]
     parts, found = parse_parts(container, (*task_names, *others))
     process, complaints = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
     problems += found + complaints + _cross_rules(parts)

@@ -20,22 +20,36 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Annotated, Any, TypeVar, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-STRICT = ConfigDict(extra="forbid", strict=True)
-"""Pydantic settings of every schema: no unknown key, no silent conversion between types."""
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+"""Pydantic settings of every schema: no unknown key, no silent conversion between types, finite numbers only."""
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Range = tuple[float, float]
-"""``[low, high]`` of a uniform distribution; low <= high is checked wherever one is declared."""
+
+
+def _ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+    if bounds[0] > bounds[1]:
+        raise ValueError("low must not exceed high")
+    return bounds
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+"""``[low, high]`` of a uniform distribution."""
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
+FractionRange = Annotated[tuple[Fraction, Fraction], AfterValidator(_ordered)]
+
+
+class Expected(RuntimeError):
+    """Base of failures whose message says all there is to say; the command line prints it without a traceback."""
 
 
 class ConfigError(ValueError):
-    """One or more things wrong with a configuration; the message has one line for each, starting with its key path."""
+    """Things wrong with a configuration; the message has one line for each, starting with its key path."""
 
     def __init__(self, problems: Iterable[str]) -> None:
         self.problems = list(problems)
@@ -99,7 +113,7 @@ class Entry:
     @cached_property
     def schema(self) -> type[BaseModel]:
         """Pydantic model of the parameters."""
-        function = self.target.__init__ if inspect.isclass(self.target) else self.target  # type: ignore[misc]
+        function = self.target.__init__ if inspect.isclass(self.target) else self.target
         scope = vars(sys.modules[self.target.__module__])
         fields: dict[str, Any] = {}
         for name, p in self.parameters.items():
@@ -115,11 +129,7 @@ class Entry:
             values = self.schema.model_validate_json(as_json(parameters)).model_dump()
         except ValidationError as error:
             return {}, explain(error, path, self.parameters)
-        return values, [
-            f"{path}.{name} = {list(value)!r}: low must not exceed high"
-            for name, value in values.items()
-            if self.schema.model_fields[name].annotation == Range and value[0] > value[1]
-        ]
+        return values, []
 
 
 _REGISTRY: dict[str, dict[str, Entry]] = {}

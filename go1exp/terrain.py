@@ -18,8 +18,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict
-from scipy.ndimage import gaussian_filter
-from scipy.special import erf
 
 from go1exp.registry import STRICT
 
@@ -260,6 +258,9 @@ def _unit_boxes(config: TerrainConfig, along: FloatArray, flat_to: float, rng: n
 
 def _unit_bumps(config: TerrainConfig, size: int, rng: np.random.Generator) -> FloatArray:
     """Return smooth noise in -1..1 with uniform distribution, (size, size)."""
+    from scipy.ndimage import gaussian_filter  # here, since checking a configuration should not wait for SciPy
+    from scipy.special import erf
+
     # White noise under a Gaussian of width s has autocorrelation exp(-r^2 / (4 s^2)).
     noise = gaussian_filter(rng.standard_normal((size, size)), 0.5 * config.bump_length / config.resolution)
     return erf(noise / math.sqrt(2.0 * np.mean(noise**2)))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp.actuator.setup import ActuatorSetup
 from go1exp.memory import Memory
 from go1exp.registry import NonNegative, actuator
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @actuator("pd")

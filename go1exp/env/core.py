@@ -26,7 +26,6 @@ from go1exp.physics.backend import PhysicsBackend
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
 from go1exp.randomness import EnvRandom
-from go1exp.registry import Term
 from go1exp.terrain import build_terrain
 from go1exp.types import Snapshot
 
@@ -243,9 +242,7 @@ class Go1Core:
         self._restart(ended)
         self._advance_world(ended)
         observation = self._observe(self.snapshot())
-        return StepResult(
-            observation, reward, terminated, truncated, final_observation, episode_return, episode_length
-        )
+        return StepResult(observation, reward, terminated, truncated, final_observation, episode_return, episode_length)
 
     def _advance_physics(self, action: Tensor) -> None:
         """Run the substeps of one policy step."""
@@ -409,5 +406,3 @@ class Go1Core:
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
         self._started = state["started"]
-
-

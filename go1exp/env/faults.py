@@ -6,8 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from go1exp.registry import Expected
 
-class NumericalFault(RuntimeError):
+
+class NumericalFault(Expected):
     """A value is NaN or infinite.
 
     Attributes:

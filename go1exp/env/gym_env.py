@@ -67,7 +67,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         observation = result.final_observation[0].numpy().copy()
         return observation, float(result.reward[0]), bool(result.terminated[0]), bool(result.truncated[0]), {}
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """Return a picture (480, 640, 3) uint8 if the render mode is ``rgb_array``."""
         if self.render_mode != "rgb_array":
             return None

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp.memory import Memory
 from go1exp.randomness import Stream
-from go1exp.registry import Fraction, Range, command
+from go1exp.registry import Fraction, PositiveRange, Range, command
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @command("uniform_velocity")
@@ -23,7 +27,7 @@ class UniformVelocity(Memory):
         lin_vel_x: Range = (-2.0, 3.0),
         lin_vel_y: Range = (-1.5, 1.5),
         ang_vel_z: Range = (-1.5, 1.5),
-        hold_time: Range = (0.3, 10.0),
+        hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
     ) -> None:
         """Keep the ranges (m/s, m/s, rad/s, s); ``standing_fraction`` of the draws is exactly zero."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from go1exp.registry import curriculum
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def terrain_levels_after(

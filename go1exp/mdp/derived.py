@@ -5,11 +5,15 @@ Everywhere else ``scipy.spatial.transform.Rotation`` is the tool; these run on `
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SYNC_PAIRS = ((1, 2), (0, 3))
 """Legs of a trot that move together: front left with rear right, front right with rear left (``robot.LEGS``)."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.memory import Memory
 from go1exp.randomness import Stream
-from go1exp.registry import Range, event
+from go1exp.registry import PositiveRange, Range, event
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @event("push")
@@ -20,7 +24,9 @@ class Push(Memory):
 
     memory = ("time_left",)
 
-    def __init__(self, stream: Stream, *, interval: Range = (10.0, 15.0), velocity: Range = (-1.0, 1.0)) -> None:
+    def __init__(
+        self, stream: Stream, *, interval: PositiveRange = (10.0, 15.0), velocity: Range = (-1.0, 1.0)
+    ) -> None:
         """Keep the ranges: ``interval`` between pushes in s, ``velocity`` per axis in m/s."""
         self._stream, self._interval, self._velocity = stream, interval, velocity
         self.time_left = torch.zeros(len(stream.key), device=stream.key.device)

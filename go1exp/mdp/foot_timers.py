@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.memory import Memory
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 
 class FootTimers(Memory):
-    """Running and last completed swing and stance times, (N, 4), s, kept at the physics rate as Isaac Lab's sensor does.
+    """Running and last completed swing and stance times, (N, 4), s, at the physics rate as Isaac Lab's sensor has them.
 
     ``air`` and ``contact`` are the running phases, one of them zero; ``last_air`` and ``last_contact`` the last
     completed ones; ``touchdown`` (bool) tells whether a swing ended since ``begin_step``.

@@ -6,11 +6,14 @@ each policy step and element.
 
 from __future__ import annotations
 
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from go1exp.mdp.derived import joint_deviation
 from go1exp.registry import observation
 from go1exp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @observation("base_linear_velocity", size=3)

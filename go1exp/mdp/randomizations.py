@@ -8,16 +8,18 @@ write the state of a reset. All draws are independent per element. Table I of th
 from __future__ import annotations
 
 import math
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.mdp.derived import quat_from_rotvec, quat_multiply
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.randomness import Stream
-from go1exp.registry import Range, randomization
+from go1exp.registry import FractionRange, PositiveRange, Range, randomization
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FEET = tuple(f"{leg}_foot" for leg in robot.LEGS)
 Operation = Literal["set", "add", "scale"]
@@ -37,7 +39,9 @@ class ModelFields(Protocol):
         """Indices of named bodies or geoms."""
 
 
-def _vary(model: ModelFields, name: str, where: tuple[Tensor | int, ...], mask: Tensor, op: Operation, draw: Tensor) -> None:
+def _vary(
+    model: ModelFields, name: str, where: tuple[Tensor | int, ...], mask: Tensor, op: Operation, draw: Tensor
+) -> None:
     """Write ``op(nominal, draw)`` into ``field[mask][where]``."""
     live, nominal = model.field(name), model.nominal(name)
     index = (slice(None), *where)
@@ -49,7 +53,7 @@ def _vary(model: ModelFields, name: str, where: tuple[Tensor | int, ...], mask: 
 
 @randomization("foot_friction", kind="model", fields=("geom_friction",))
 def foot_friction(
-    model: ModelFields, stream: Stream, mask: Tensor, *, range: Range = (0.4, 1.1), operation: Operation = "set"
+    model: ModelFields, stream: Stream, mask: Tensor, *, range: PositiveRange = (0.4, 1.1), operation: Operation = "set"
 ) -> None:
     """Sliding friction coefficient of each foot; the foot's value is the contact's. Table I: new, (0.4, 1.1)."""
     draw = stream.uniform(len(FEET), low=range[0], high=range[1])
@@ -57,7 +61,7 @@ def foot_friction(
 
 
 @randomization("foot_restitution", kind="model", fields=("geom_solref",))
-def foot_restitution(model: ModelFields, stream: Stream, mask: Tensor, *, range: Range = (0.0, 0.2)) -> None:
+def foot_restitution(model: ModelFields, stream: Stream, mask: Tensor, *, range: FractionRange = (0.0, 0.2)) -> None:
     """Coefficient of restitution of each foot, by the damping ratio of its contact.
 
     MuJoCo has no restitution; its contact is a spring-damper of damping ratio z, which returns the fraction
@@ -78,7 +82,7 @@ def center_of_mass(model: ModelFields, stream: Stream, mask: Tensor, *, range: R
 
 
 @randomization("link_mass", kind="model", fields=("body_mass", "body_inertia"), derived=True)
-def link_mass(model: ModelFields, stream: Stream, mask: Tensor, *, range: Range = (0.8, 1.3)) -> None:
+def link_mass(model: ModelFields, stream: Stream, mask: Tensor, *, range: PositiveRange = (0.8, 1.3)) -> None:
     """Mass of every link, scaled by a factor of its own; inertia scales along. Table I: scale, (0.8, 1.3)."""
     bodies = model.ids("body", ("trunk", *robot.JOINTS))
     factor = stream.uniform(len(bodies), low=range[0], high=range[1])

@@ -1,24 +1,29 @@
 """The 19 reward and penalty terms of the paper's Table III, in the reading of ``reward=paper``.
 
-Dowdy and Chagas Vaz, "Isaac Sim-to-Real", CASE 2025, print "general expressions" of terms whose names and weights
-are those of Isaac Lab's Spot task. Where an expression is well-posed it is computed as printed; where it is not, the
-term is the Spot definition with the paper's constants, and ``rewards_literal.py`` holds the table to the letter.
-``docs/paper.md`` compares both line by line.
+Dowdy and Chagas Vaz, "Isaac Sim-to-Real", CASE 2025, print "general expressions"; most of the names and several of the
+weights are those of Isaac Lab's Spot task. A term is computed as printed unless the expression is ill-posed or plainly
+abbreviates the Spot definition; then it is that definition with the paper's constants. ``rewards_literal.py`` holds
+the table to the letter, and ``docs/paper.md`` compares both line by line.
 
-Every term takes a Snapshot and returns a magnitude ``(N,)``, non-negative; the weight in the YAML carries the sign.
+Every term takes a Snapshot and returns a magnitude ``(N,)``, non-negative unless it says otherwise; the weight in the
+YAML carries the sign.
 The sum of weight x term is multiplied by the policy's period (0.02 s), as in Isaac Lab, so a weight is a rate per
 second.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS, foot_speed_xy, is_moving, joint_deviation
 from go1exp.registry import Fraction, NonNegative, Positive, reward
 from go1exp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @reward("feet_air_time")
@@ -26,8 +31,9 @@ def feet_air_time(s: Snapshot, *, mode_time: Positive = 0.175, speed_threshold: 
     """Steps of the right length: time in the running phase of each foot, s, as long as it is below ``mode_time``.
 
     Moving: sum_i T_i [T_i < m], T_i = max(air, contact time). Standing: sum_i clip(contact - air, -m, m).
-    Swing and stance count alike, so that the best gait changes phase every ``mode_time``. Sum over feet, s.
-    Printed: sum_i (t_air,i - 0.175), which pays for never landing; source of the form: Isaac Lab, Spot `air_time`.
+    Swing and stance count alike, so that the best gait changes phase every ``mode_time``. Sum over feet, s;
+    negative for a standing robot with its feet in the air. Printed: sum_i (t_air,i - 0.175), which pays for never
+    landing; source of the form: Isaac Lab, Spot `air_time`.
     """
     phase = torch.maximum(s.foot_air_time, s.foot_contact_time)
     stepping = torch.where(phase < mode_time, phase, torch.zeros_like(phase))

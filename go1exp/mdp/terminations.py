@@ -6,14 +6,16 @@ The time limit is not a term: it truncates, and belongs to ``sim.episode_s``.
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from go1exp.registry import termination
 from go1exp.types import Snapshot
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @termination("trunk_contact")

@@ -82,7 +82,9 @@ def _add_sensors(spec: mujoco.MjSpec) -> Sensors:
     site, geom, body = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
     end = 0
 
-    def block(targets: list[str], size: int, kind: mujoco.mjtSensor, objtype: mujoco.mjtObj, intprm: list[int]) -> slice:
+    def block(
+        targets: list[str], size: int, kind: mujoco.mjtSensor, objtype: mujoco.mjtObj, intprm: list[int]
+    ) -> slice:
         nonlocal end
         start = end
         for target in targets:

@@ -47,7 +47,7 @@ def add_to_spec(spec: mujoco.MjSpec, terrain: Terrain) -> mujoco.MjsGeom:
             height=300,
         )
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FLOOR
-        material.texrepeat = [1.0, 1.0]  # with texuniform: per metre, so a square has an edge of 0.5 m
+        material.texrepeat = [2.0, 2.0]  # with texuniform: per metre, so a square has an edge of 0.5 m
         material.texuniform = True
     else:
         material.rgba = [0.52, 0.50, 0.45, 1.0]

@@ -85,7 +85,7 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     if rng["cuda"] is not None and torch.cuda.is_available():
         torch.cuda.set_rng_state(rng["cuda"])
     kind, keys, position, has_gauss, cached = rng["numpy"]
-    np.random.set_state((kind, keys.numpy().astype(np.uint32), position, has_gauss, cached))
+    np.random.set_state((kind, keys.numpy().astype(np.uint32), position, has_gauss, cached))  # noqa: NPY002 (SB3's)
     version, words, gauss = rng["python"]
     random.setstate((version, tuple(words), gauss))
 
@@ -97,7 +97,7 @@ def _core(ppo: AdaptivePPO) -> Any:
 
 
 def _state(ppo: AdaptivePPO) -> dict[str, Any]:
-    kind, keys, position, has_gauss, cached = np.random.get_state()  # type: ignore[misc]
+    kind, keys, position, has_gauss, cached = np.random.get_state(legacy=True)  # noqa: NPY002 (SB3 draws from it)
     version, words, gauss = random.getstate()
     assert ppo.ep_info_buffer is not None
     assert isinstance(ppo._last_obs, np.ndarray)
@@ -115,7 +115,7 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
         "rng": {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
-            "numpy": [kind, torch.from_numpy(keys.astype(np.int64)), position, has_gauss, cached],
+            "numpy": [kind, torch.from_numpy(np.asarray(keys).astype(np.int64)), position, has_gauss, cached],
             "python": [version, list(words), gauss],
         },
     }

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import csv
 import os
+import uuid
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
 from go1exp.config import LoggerConfig, WandbConfig
+from go1exp.registry import Expected
 
 CLOCK = "time/"
 """Prefix of metrics that depend on the machine's clock; they have a file of their own."""
 
 
 class CsvWriter(KVWriter):
-    """One row per iteration in ``metrics.csv``; wall-clock figures in ``timing.csv``, so that the first is reproducible.
+    """One row per iteration in ``metrics.csv``; wall-clock figures in ``timing.csv``, so the first is reproducible.
 
     Columns are those of the first row. Rows after ``iteration`` are cut off, so that a run resumed from an older
     checkpoint does not hold an iteration twice.
@@ -68,10 +70,10 @@ class WandbWriter(KVWriter):
         try:
             import wandb
         except ImportError as error:
-            raise RuntimeError("logger=wandb needs the package wandb: pip install wandb, or use logger=local") from error
+            raise Expected("logger=wandb needs the package wandb: pip install wandb, or use logger=local") from error
         identity = run / "wandb_id"
         if not identity.exists():
-            identity.write_text(wandb.util.generate_id())
+            identity.write_text(uuid.uuid4().hex[:8])
         self._run = wandb.init(
             project=config.project,
             entity=config.entity,
@@ -90,7 +92,7 @@ class WandbWriter(KVWriter):
 
     def close(self) -> None:
         """Finish the run."""
-        self._run.finish(quiet=True)
+        self._run.finish()
 
 
 def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[str, Any]) -> Logger:

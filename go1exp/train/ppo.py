@@ -51,6 +51,16 @@ def adapted_rate(rate: float, kl: float, desired: float, bounds: tuple[float, fl
     return rate
 
 
+def policy_settings(config: PPOConfig) -> dict[str, Any]:
+    """Return the keyword arguments of ``GaussianPolicy`` that a configuration stands for."""
+    return {
+        "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
+        "activation_fn": ACTIVATIONS[config.activation],
+        "log_std_init": float(np.log(config.init_std)),
+        "bf16": config.matmul_precision == "bf16",
+    }
+
+
 class Bf16MlpExtractor(MlpExtractor):
     """SB3's two networks with bfloat16 matrix products while training; weights and everything else stay float32."""
 
@@ -142,12 +152,7 @@ class AdaptivePPO(PPO):
             vf_coef=config.value_coef,
             max_grad_norm=config.max_grad_norm,
             rollout_buffer_class=MeanRolloutBuffer,
-            policy_kwargs={
-                "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
-                "activation_fn": ACTIVATIONS[config.activation],
-                "log_std_init": float(np.log(config.init_std)),
-                "bf16": config.matmul_precision == "bf16",
-            },
+            policy_kwargs=policy_settings(config),
             seed=seed,
             device=device,
         )

@@ -23,7 +23,8 @@ class Progress:
         if sys.stderr.isatty():
             try:
                 from rich.console import Console
-                from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeRemainingColumn
+                from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+                from rich.progress import Progress as Bar
             except ImportError:
                 return
             self._bar = Bar(

@@ -66,9 +66,7 @@ def _meta(container: dict[str, Any]) -> dict[str, Any]:
         "packages": {name: version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "machine": {"processor": _processor(), "cores": os.cpu_count()},
-        "assets_sha256": {
-            str(p.relative_to(data_root())): hashlib.sha256(p.read_bytes()).hexdigest() for p in assets
-        },
+        "assets_sha256": {str(p.relative_to(data_root())): hashlib.sha256(p.read_bytes()).hexdigest() for p in assets},
     }
 
 

@@ -31,9 +31,7 @@ def build(config: TrainConfig) -> AdaptivePPO:
     """Build learner and environment."""
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)
-    core = Go1Core(
-        config.task, config.ppo.num_envs, config.process.seed, spread_starts=config.task.sim.spread_starts
-    )
+    core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=config.task.sim.spread_starts)
     return AdaptivePPO(config.ppo, Go1VecEnv(core), config.process.seed, config.process.device)
 
 
@@ -87,7 +85,7 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path) -> Adaptive
             if left > 0:
                 ppo.learn(left, reset_num_timesteps=ppo.iteration == 0)
         except NumericalFault as fault:
-            np.savez(run / "fault.npz", **fault.dump)
+            np.savez(run / "fault.npz", allow_pickle=False, **fault.dump)
             (run / "fault.json").write_text(json.dumps({"quantity": fault.quantity, "message": str(fault)}) + "\n")
             raise
         finally:

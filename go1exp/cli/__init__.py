@@ -1,0 +1,78 @@
+"""The command line: ``go1exp VERB key=value ...``. Every verb is a Hydra application in a module of its own.
+
+This module imports nothing heavy, so that help and tab completion answer at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+
+VERBS = {
+    "train": "train a policy from configuration",
+    "eval": "run a trained policy through a grid of commands: errors, falls, a table and JSON",
+    "play": "watch a trained policy: a clip without a display, a live viewer with one",
+    "list": "list terms, groups and their choices, one line each",
+    "bench": "measure speed as ratios in one run",
+}
+"""Verb -> one line; the module has the verb's name (``list`` is ``listing``)."""
+
+MODULES = {"eval": "evaluate", "list": "listing"}
+"""Modules that cannot have their verb's name."""
+
+HELP = """usage: go1exp VERB [key=value ...]
+
+{verbs}
+
+  go1exp VERB --help       what a verb does, its settings, examples
+  go1exp train reward=paper rand=table1
+  go1exp train -m experiment=ablation/no_gait,ablation/no_noise
+  go1exp eval run=runs/NAME
+  eval "$(go1exp -sc install=bash)"      tab completion
+"""
+
+
+def main() -> int:
+    """Run the verb on the command line; return the exit status."""
+    arguments = sys.argv[1:]
+    if arguments[:1] == ["-sc"] and len(arguments) > 1:
+        return _complete(arguments[1])
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(HELP.format(verbs="\n".join(f"  {verb:8} {text}" for verb, text in VERBS.items())), end="")
+        return 0
+    if arguments[0] in ("-V", "--version"):
+        from go1exp import __version__
+
+        print(f"go1exp {__version__}")
+        return 0
+    verb, rest = arguments[0], arguments[1:]
+    if verb not in VERBS:
+        import difflib
+
+        close = difflib.get_close_matches(verb, VERBS, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(VERBS)}"
+        print(f"go1exp: unknown verb {verb!r}; {hint}", file=sys.stderr)
+        return 2
+    return _module(verb).APP.run(rest)
+
+
+def _module(verb: str):  # type: ignore[no-untyped-def]  # a module with an APP
+    return importlib.import_module(f"go1exp.cli.{MODULES.get(verb, verb)}")
+
+
+def _complete(request: str) -> int:
+    """Serve tab completion: verbs here, everything after the verb by that verb's Hydra application."""
+    action, _, shell = request.partition("=")
+    line = os.environ.get("COMP_LINE", "")
+    words = line.split(" ")
+    if action == "query" and len(words) <= 2:
+        print("\n".join(v for v in VERBS if v.startswith(words[-1] if len(words) == 2 else "")))
+        return 0
+    verb = words[1] if action == "query" else "train"
+    if verb not in VERBS:
+        return 0
+    if action == "query":
+        os.environ["COMP_LINE"] = " ".join([words[0], *words[2:]])
+        os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
+    return _module(verb).APP.run(["-sc", f"{action}={shell}"])

@@ -1,0 +1,156 @@
+"""What all verbs share: Hydra around a task function, and errors as one clean message."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import shutil
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from go1exp.compose import as_container, config_folder, flat_keys, register_groups
+from go1exp.registry import ConfigError, Expected, nearest, unknown_name
+
+BAD_CONFIG, FAILED, STOPPED = 2, 1, 130
+"""Exit statuses: configuration refused before anything was built; the work failed; a signal ended it."""
+
+
+@dataclass(frozen=True)
+class App:
+    """One verb: ``conf/<name>.yaml`` and the function that gets the composed, resolved configuration.
+
+    ``task`` returns an exit status, or None for 0. ConfigError, OSError and ``Expected`` are answers, not bugs: their
+    message is printed without a traceback.
+    """
+
+    name: str
+    task: Callable[[dict[str, Any]], int | None]
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Run with command-line arguments; print errors; return the exit status."""
+        # Hydra would print its own report and leave; this makes it raise to here instead.
+        own_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
+        os.environ["HYDRA_FULL_ERROR"] = "1"
+        defer("torch")
+        warnings.filterwarnings("ignore", message="The `render_mode` attribute is not defined")
+        register_groups()
+        status: list[int | None] = []
+        failure: list[Exception] = []
+
+        def task(config: DictConfig) -> None:
+            try:
+                status.append(self.task(as_container(config)))
+            except Exception as error:
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    raise  # the launcher, which may sit on another machine, has to know
+                failure.append(error)  # Hydra would print a report of its own
+
+        version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
+        sys.argv = [f"go1exp {self.name}", *arguments]
+        try:
+            hydra.main(**version, config_path=config_folder(), config_name=self.name)(task)()
+            if failure:
+                raise failure[0]
+        except Exception as error:
+            if own_traceback:
+                raise
+            code, message = self._explain(error, arguments)
+            print(f"go1exp {self.name}: {message}", file=sys.stderr)
+            return code
+        return next((s for s in status if s), 0) or 0
+
+    def _explain(self, error: Exception, arguments: Sequence[str]) -> tuple[int, str]:
+        """Return exit status and message of an exception; re-raise what is a bug."""
+        if isinstance(error, ConfigError):
+            lines = error.problems
+            return BAD_CONFIG, lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems", *lines])
+        if isinstance(error, MissingConfigException):
+            return BAD_CONFIG, _missing_choice(error)
+        if isinstance(error, HydraException | OmegaConfBaseException):
+            return BAD_CONFIG, self._bad_override(error, arguments)
+        if isinstance(error, OSError):
+            return FAILED, f"{error.strerror}: {error.filename}" if error.strerror and error.filename else str(error)
+        if isinstance(error, Expected):
+            return FAILED, str(error)
+        raise error
+
+    def _bad_override(self, error: Exception, arguments: Sequence[str]) -> str:
+        """Name the key that Hydra refused, the value, and the nearest keys that exist."""
+        text = str(error)
+        match = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([^']+)'", text)
+        if not match:
+            cause = error.__cause__ or error
+            return " ".join(line.strip() for line in str(cause).splitlines() if line.strip())
+        key = match.group(1)
+        given = next((a for a in arguments if a.lstrip("+~").split("=")[0].split("@")[0] == key), key)
+        known = flat_keys(self.name)
+        close = nearest(key, known) or nearest(key.rsplit(".", 1)[-1], known)
+        hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else "see go1exp list"
+        return f"{given}: no such key {key!r}; {hint}"
+
+
+def _missing_choice(error: MissingConfigException) -> str:
+    options = list(error.options or [])
+    missing = error.missing_cfg_file or ""
+    group, _, choice = missing.rpartition("/")
+    if options and group:
+        return unknown_name(f"{group}={choice}", choice, options, f"choice of {group}")
+    return str(error).split("\n")[0]
+
+
+class _Deferred(ModuleType):
+    """Stands for a module until something of it is used (``importlib.util.LazyLoader`` loads at the next import)."""
+
+    def __getattr__(self, attribute: str) -> Any:
+        sys.modules.pop(self.__name__, None)
+        real = importlib.import_module(self.__name__)
+        self.__dict__.update(real.__dict__)
+        return getattr(real, attribute)
+
+
+def defer(name: str) -> None:
+    """Make ``import name`` free: torch takes over a second, and a misspelt key should not wait for that."""
+    sys.modules.setdefault(name, _Deferred(name))
+
+
+def run_dir() -> Path:
+    """Return the folder that Hydra gave to this job."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def discard(run: Path) -> None:
+    """Delete a run folder in which nothing ran: it holds no more than Hydra's notes."""
+    if run.is_dir() and {p.name for p in run.iterdir()} <= {".hydra", "train.log"}:
+        shutil.rmtree(run)
+
+
+def spinner(total: int, what: str) -> Callable[[int, int], None]:
+    """Return a callback ``(done, total)`` that shows a progress bar in a terminal and nothing elsewhere."""
+    if not sys.stderr.isatty():
+        return lambda done, total: None
+    from rich.console import Console
+    from rich.progress import Progress
+
+    bar = Progress(console=Console(stderr=True), transient=True)
+    task = bar.add_task(what, total=total)
+    bar.start()
+
+    def update(done: int, total: int) -> None:
+        bar.update(task, completed=done, total=total)
+        if done >= total:
+            bar.stop()
+
+    return update

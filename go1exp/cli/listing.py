@@ -1,0 +1,62 @@
+"""``go1exp list``."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from go1exp.cli.app import App
+
+
+def _task(container: dict[str, Any]) -> None:
+    import go1exp.actuator
+    import go1exp.mdp  # noqa: F401  (registers every term)
+    from go1exp import registry
+    from go1exp.cli.settings import ListSettings, parse
+
+    settings = parse(ListSettings, container)
+    choices = _choices()
+    known = [*registry.groups(), *(g for g in choices if g not in registry.groups())]
+    if settings.group is not None and settings.group not in known:
+        raise registry.ConfigError([registry.unknown_name("group", settings.group, known, "group")])
+    for group in known:
+        if settings.group in (None, group):
+            _print_group(group, choices.get(group, []), settings.what)
+
+
+def _print_group(group: str, choices: list[tuple[str, str]], what: str) -> None:
+    from go1exp import registry
+
+    terms = registry.members(group)
+    print(group)
+    if what != "terms":
+        for name, about in choices:
+            print(f"  {group}={name:26} {about}")
+    if what != "groups":
+        for entry in terms.values():
+            print(f"  {entry.name:{len(group) + 27}} {entry.doc}")
+            if entry.parameters:
+                print(f"  {'':{len(group) + 27}}   {', '.join(_parameter(p) for p in entry.parameters.values())}")
+    print()
+
+
+def _parameter(p: inspect.Parameter) -> str:
+    return p.name if p.default is p.empty else f"{p.name}={p.default!r}"
+
+
+def _choices() -> dict[str, list[tuple[str, str]]]:
+    """Return the files of each group with the first line of their comment."""
+    from go1exp import data_root
+
+    found: dict[str, list[tuple[str, str]]] = {}
+    for file in sorted((data_root() / "conf").rglob("*.yaml")):
+        parts = file.relative_to(data_root() / "conf").with_suffix("").parts
+        if len(parts) > 1:
+            group = "rand" if parts[0] == "randomization" else parts[0]
+            comments = [line[1:].strip() for line in file.read_text().splitlines() if line.startswith("#")]
+            about = next((c for c in comments if not c.startswith("@package")), "")
+            found.setdefault(group, []).append(("/".join(parts[1:]), about))
+    return found
+
+
+APP = App("list", _task)

@@ -1,0 +1,56 @@
+"""``go1exp play``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from go1exp.cli.app import App, spinner
+
+
+def _task(container: dict[str, Any]) -> None:
+    from go1exp.cli.settings import PlaySettings, parse
+
+    settings = parse(PlaySettings, container)
+    run = Path(settings.run)
+
+    from go1exp.config import parse_train
+    from go1exp.env.core import Go1Core
+    from go1exp.evaluate import video
+    from go1exp.evaluate.policy import load_policy
+    from go1exp.evaluate.rollout import EvalConfig, evaluation_task
+    from go1exp.train import run_folder
+
+    trained = parse_train(run_folder.read_config(run))
+    policy, _ = load_policy(run, trained.ppo, Path(settings.checkpoint) if settings.checkpoint else None)
+    shown = EvalConfig(
+        commands=(settings.command,),
+        episodes=1,
+        duration_s=settings.seconds,
+        settle_s=0.0,
+        noise=settings.noise,
+        rand=settings.rand,
+        push=settings.push,
+        terrain=settings.terrain,
+        policy_dt=None,
+        seed=settings.seed,
+    )
+    core = Go1Core(evaluation_task(trained.task, shown), 1, settings.seed, noise=settings.noise)
+    if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
+        video.live(core, policy)
+        return
+    core.command.value[:] = core.command.value.new_tensor(settings.command)
+    out = Path(settings.out) if settings.out else run / "play.mp4"
+    progress = spinner(1, "filming")
+    frames = list(video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress))
+    video.write_mp4(out, frames, settings.fps)
+    video.write_strip(out.with_suffix(".png"), frames)
+    print(f"written to {out} and {out.with_suffix('.png')}")
+
+
+def _has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+APP = App("play", _task)

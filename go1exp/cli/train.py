@@ -1,0 +1,67 @@
+"""``go1exp train``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+
+from go1exp.cli.app import STOPPED, App, discard, run_dir
+from go1exp.registry import ConfigError
+
+RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "backend.threads", "device")
+"""Settings that a resumed run may change: none of them changes what was computed so far (the last three may change
+what comes after in the last bits)."""
+
+
+def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
+    """Return the run's own configuration with the changes that resuming allows."""
+    from go1exp.train import run_folder
+
+    config = OmegaConf.create(run_folder.read_config(run))
+    refused = []
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if key == "resume" or key.lstrip("+").startswith("hydra"):
+            continue
+        if key in RESUMABLE:
+            config.merge_with_dotlist([f"{key}={value}"])
+        else:
+            refused.append(f"{override}: a resumed run keeps its configuration; only {', '.join(RESUMABLE)} may change")
+    if refused:
+        raise ConfigError(refused)
+    container = OmegaConf.to_container(config)
+    assert isinstance(container, dict)
+    return {str(k): v for k, v in container.items()}
+
+
+def _task(container: dict[str, Any]) -> int | None:
+    from go1exp.config import parse_train
+
+    run = run_dir()
+    try:
+        config = parse_train(container)
+    except ConfigError:
+        discard(run)
+        raise
+    if config.process.resume:
+        run = Path(config.process.resume)
+        container = _resumed(run, list(HydraConfig.get().overrides.task))
+        config = parse_train(container)
+
+    from go1exp.train import run_folder, trainer
+
+    run_folder.write(run, container)
+    print(f"run folder {run}")
+    try:
+        trainer.train(config, container, run)
+    except trainer.Stopped:
+        print(f"stopped; go on with: go1exp train resume={run}")
+        return STOPPED
+    print(f"done; now: go1exp eval run={run}")
+    return None
+
+
+APP = App("train", _task)

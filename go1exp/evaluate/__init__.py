@@ -1,0 +1,1 @@
+"""Judging a policy: command grids, tables, pictures."""

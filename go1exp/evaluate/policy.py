@@ -1,0 +1,53 @@
+"""A trained policy as a function, from a run folder alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.config import PPOConfig
+from go1exp.train import checkpoint
+from go1exp.train.ppo import GaussianPolicy, policy_settings
+
+Policy = Callable[[Tensor], Tensor]
+"""Observations (N, O) float32 -> actions (N, 12), deterministic."""
+
+
+def load_policy(run: Path, config: PPOConfig, which: Path | None = None) -> tuple[Policy, dict[str, Any]]:
+    """Load the policy of a run.
+
+    Args:
+        run: run folder.
+        config: the run's own learner settings (they hold the network's shape).
+        which: a checkpoint file; the newest if None.
+
+    Returns:
+        The policy, and the checkpoint's ``iteration`` and ``num_timesteps`` with its ``file``.
+
+    Raises:
+        FileNotFoundError: if there is no checkpoint.
+    """
+    state, path = (checkpoint.read(which), which) if which else checkpoint.load_latest(run)
+    size = state["policy"]["mlp_extractor.policy_net.0.weight"].shape[1]
+    network = GaussianPolicy(
+        Box(-np.inf, np.inf, (size,), np.float32),
+        Box(-1.0, 1.0, (robot.NUM_JOINTS,), np.float32),
+        lambda _: 0.0,
+        **policy_settings(config),
+    )
+    network.load_state_dict(state["policy"])
+    network.set_training_mode(False)
+
+    def policy(observation: Tensor) -> Tensor:
+        with torch.no_grad():
+            return network._predict(observation, deterministic=True)
+
+    about = {"iteration": state["iteration"], "num_timesteps": state["num_timesteps"], "file": str(path)}
+    return policy, about

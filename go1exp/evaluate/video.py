@@ -1,0 +1,307 @@
+"""Films of a policy: recorded to a file or to pictures for a page, or live in a window."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from functools import cache
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from imageio.v2 import get_writer
+from PIL import Image, ImageDraw, ImageFont
+
+from go1exp.env.core import Go1Core
+from go1exp.evaluate.camera import (
+    AZIMUTH,
+    COMMAND_RGB,
+    DISTANCE,
+    ELEVATION,
+    MEASURED_RGB,
+    Camera,
+    Picture,
+    RenderingUnavailable,
+    Stage,
+    draw_velocities,
+)
+from go1exp.evaluate.policy import Policy
+from go1exp.mdp.commands import FixedVelocity
+
+AVERAGE_TIME = 0.5
+"""Time over which the velocity in the caption is averaged, s: about a gait cycle."""
+
+GIF_COLOURS = 128
+"""Of the 256 that a GIF may have; fewer compress better."""
+
+
+def record(
+    core: Go1Core,
+    policy: Policy,
+    seconds: float,
+    env: int = 0,
+    fps: float = 25,
+    on_frame: Callable[[int, int], None] | None = None,
+    *,
+    caption: bool = True,
+    width: int = 640,
+    height: int = 480,
+) -> Iterator[Picture]:
+    """Reset the environments, run the policy, and yield ``seconds`` x ``fps`` pictures of one of them.
+
+    Args:
+        core: the environments; all of them run.
+        policy: what acts.
+        seconds: simulated time to film; an episode that ends in it is followed by the next.
+        env: which to film.
+        fps: pictures per simulated second.
+        on_frame: told the progress: pictures done, pictures in all.
+        caption: write time, command and velocity (mean over 0.5 s) on the picture.
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+
+    Raises:
+        RenderingUnavailable: at once, if there is nothing to draw with.
+        NumericalFault: while iterating, when a value is not finite.
+    """
+    camera = Camera(core, width, height)  # here, not in the generator: what cannot be drawn is known before it starts
+    return _frames(camera, policy, seconds, env, fps, on_frame or (lambda done, total: None), caption)
+
+
+def _frames(
+    camera: Camera,
+    policy: Policy,
+    seconds: float,
+    env: int,
+    fps: float,
+    on_frame: Callable[[int, int], None],
+    caption: bool,
+) -> Iterator[Picture]:
+    core = camera.stage.core
+    dt = core.task.sim.policy_dt
+    total, step = round(seconds * fps), 0
+    try:
+        observation = core.reset()
+        measured = deque([_velocity(core, env)], maxlen=max(1, round(AVERAGE_TIME / dt)))
+        for k in range(total):
+            while (step + 0.5) * dt < k / fps:
+                result = core.step(policy(observation))
+                core.check(result)
+                observation = result.observation
+                step += 1
+                if result.terminated[env] or result.truncated[env]:
+                    measured.clear()
+                measured.append(_velocity(core, env))
+            picture = camera.frame(env)
+            if caption:
+                _write_caption(picture, step * dt, core.command.value[env].tolist(), np.mean(measured, 0).tolist())
+            on_frame(k + 1, total)
+            yield picture
+    finally:
+        camera.close()
+
+
+def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
+    """Write an H.264 film that browsers play; the frames are consumed one by one.
+
+    Raises:
+        OSError: if it cannot be written; no partial file is left.
+        ValueError: if there are no frames.
+    """
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError(f"{path}: a film needs at least one frame")
+    with _complete(path) as partial:
+        # imageio.v3 has no writer that takes frames one by one and ends ffmpeg when one fails to come. Both sides must
+        # be even for yuv420p, the only format that every browser plays; imageio would make them multiples of 16.
+        film = get_writer(partial, "FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", macro_block_size=2)
+        with closing(film):
+            for picture in chain([first], frames):
+                film.append_data(picture)
+
+
+def write_strip(path: Path, frames: Sequence[Picture], count: int = 6, size: int = 320) -> None:
+    """Write ``count`` evenly spaced frames side by side as one PNG, each cropped to its middle, ``size`` pixels high.
+
+    Raises:
+        OSError: if it cannot be written.
+        ValueError: if there are no frames.
+    """
+    if not len(frames):
+        raise ValueError(f"{path}: a strip needs at least one frame")
+    chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
+    gap = max(1, size // 80)
+    strip = Image.new("RGB", (len(chosen) * (size + gap) - gap, size), "white")
+    for k, index in enumerate(chosen):
+        picture = frames[index]
+        height, width = picture.shape[:2]
+        side = min(height, width)
+        top, left = (height - side) // 2, (width - side) // 2
+        square = Image.fromarray(picture[top : top + side, left : left + side])
+        strip.paste(square.resize((size, size), Image.Resampling.LANCZOS), (k * (size + gap), 0))
+    with _complete(path) as partial:
+        strip.save(partial, optimize=True)
+
+
+def write_gif(path: Path, frames: Iterable[Picture], fps: float = 12, width: int = 320) -> None:
+    """Write a small looping GIF of frames that are ``fps`` apart (of a film at 25, every second is about 12).
+
+    Raises:
+        OSError: if it cannot be written.
+        ValueError: if there are no frames.
+    """
+    small = [Image.fromarray(f).resize((width, round(width * f.shape[0] / f.shape[1]))) for f in frames]
+    if not small:
+        raise ValueError(f"{path}: a GIF needs at least one frame")
+    # One palette for all, and no dithering: else still ground would flicker. An octree keeps the few bright pixels.
+    palette = small[len(small) // 2].quantize(GIF_COLOURS, method=Image.Quantize.FASTOCTREE)
+    first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in small)
+    with _complete(path) as partial:
+        first.save(partial, save_all=True, append_images=rest, duration=10 * round(100 / fps), loop=0)
+
+
+@contextmanager
+def _complete(path: Path) -> Iterator[Path]:
+    """Give a file beside ``path`` to write, and rename it when it is complete."""
+    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.touch()
+        yield partial
+        partial.replace(path)
+    except OSError as error:
+        reason = f"cannot be written: {error.strerror or error}"
+        raise OSError(error.errno or errno.EIO, reason, str(path)) from error
+    finally:
+        with suppress(OSError):
+            partial.unlink()
+
+
+def _velocity(core: Go1Core, env: int) -> list[float]:
+    """Velocity of the trunk in its own frame: x and y, m/s, and yaw rate, rad/s."""
+    s = core.snapshot()
+    assert s.base_lin_vel_b is not None
+    return [*s.base_lin_vel_b[env, :2].tolist(), float(s.base_ang_vel_b[env, 2])]
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """Figures of one width, so that running numbers stand still."""
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSansMono.ttf")), size)
+
+
+def _write_caption(picture: Picture, seconds: float, command: Sequence[float], measured: Sequence[float]) -> None:
+    """Write two lines on the lower edge, narrow enough to survive a crop to a square."""
+    height, width = picture.shape[:2]
+    font = _font(max(7, width // 50))
+    line = round(1.35 * font.size)
+    band = picture[height - round(2.5 * line) :]
+    band[:] = (0.35 * band).astype(np.uint8)
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    rows = (("command ", command, COMMAND_RGB), ("measured", measured, MEASURED_RGB))
+    for k, (name, (x, y, yaw), rgb) in enumerate(rows):
+        text = f"{name} {x:+5.2f} {y:+5.2f} m/s {yaw:+5.2f} rad/s"
+        prefix = f"{seconds:5.1f} s  "
+        left = 0.5 * (width - font.getlength(prefix + text))
+        top = height - round((2.25 - k) * line)
+        if k == 0:
+            draw.text((left, top), prefix, "white", font)
+        draw.text((left + font.getlength(prefix), top), text, tuple(round(255 * c) for c in rgb), font)
+    picture[:] = np.asarray(image)
+
+
+# ---------------------------------------------------------------------- live
+
+STEERING = {
+    265: (0, 0.1),  # up: faster forward
+    264: (0, -0.1),  # down
+    44: (1, 0.1),  # comma: left
+    46: (1, -0.1),  # full stop: right
+    263: (2, 0.2),  # left arrow: turn left
+    262: (2, -0.2),  # right arrow
+}
+"""GLFW key -> axis of the command and its change, m/s or rad/s."""
+
+KEYS = "arrows: forward, back, turn\n, and .: sideways\nspace: stand"
+
+
+def steer(command: list[float], key: int) -> None:
+    """Change a command (x, y, yaw) as a key of the live window says."""
+    if key == 32:
+        command[:] = [0.0, 0.0, 0.0]
+    elif key in STEERING:
+        axis, change = STEERING[key]
+        command[axis] = round(command[axis] + change, 6)
+
+
+def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
+    """Show one environment in a window in real time until it is closed; the keyboard gives all the command.
+
+    Raises:
+        RenderingUnavailable: if there is no display.
+        NumericalFault: when a value is not finite.
+    """
+    command = core.command.value[env].tolist()
+    stage, dt = Stage(core), core.task.sim.policy_dt
+    with _window(stage, lambda key: steer(command, key)) as window:
+        core.command = FixedVelocity(core.random.stream("command"))
+        core.command.value[:] = torch.tensor(command)
+        observation = core.reset()
+        window.cam.azimuth, window.cam.elevation, window.cam.distance = AZIMUTH, ELEVATION, 1.3 * DISTANCE
+        due = time.perf_counter()
+        while window.is_running():
+            core.command.value[:] = torch.tensor(command)
+            result = core.step(policy(observation))
+            core.check(result)
+            observation = result.observation
+            with window.lock():
+                moved = stage.place(env)
+                window.cam.lookat[:] = stage.data.qpos[:3]
+                window.user_scn.ngeom = 0
+                draw_velocities(window.user_scn, stage, core.command.value[env], stage.data.qvel[:2])
+            if moved:
+                window.update_hfield(0)
+            x, y, yaw = command
+            window.set_texts((None, None, KEYS, f"{x:+.1f} {y:+.1f} m/s\n{yaw:+.1f} rad/s\n"))
+            window.sync()
+            due = max(due + dt, time.perf_counter())
+            time.sleep(max(0.0, due - time.perf_counter()))
+
+
+@contextmanager
+def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
+    """Open MuJoCo's window on a stage and close it in the end; ``on_key`` is told GLFW's key codes."""
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if not display:  # MuJoCo would wait for ever for a window that never comes
+        raise RenderingUnavailable(
+            "cannot open a window: there is no display (DISPLAY and WAYLAND_DISPLAY are unset); record a film instead"
+        )
+    try:
+        import glfw
+        from mujoco.viewer import launch_passive
+    except (ImportError, RuntimeError) as error:
+        raise RenderingUnavailable(f"cannot open a window: {error}") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if not glfw.init():
+            raise RenderingUnavailable(f"cannot open a window: the display {display!r} does not answer")
+    others = set(threading.enumerate())
+    try:
+        with launch_passive(
+            stage.model, stage.data, key_callback=on_key, show_left_ui=False, show_right_ui=False
+        ) as window:
+            yield window
+    finally:  # an interpreter that ended before the window has gone would hang
+        for thread in set(threading.enumerate()) - others:
+            thread.join(5.0)

@@ -1,0 +1,843 @@
+"""What every registered term promises, whichever it is; a new one is picked up from the registry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.actuator.setup import ActuatorSetup
+from go1exp.config import TaskConfig
+from go1exp.mdp.kinematics import KinematicState
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import build_model
+from go1exp.randomness import EnvRandom, Stream
+from go1exp.registry import Entry, groups, members
+from go1exp.terrain import build_terrain
+from go1exp.types import Snapshot
+
+ODD = 37
+"""Size of a batch that no vector register divides."""
+
+
+def each(group: str, **traits: Any) -> Any:
+    """Parametrise a test over the members of a group that have these traits."""
+    found = {n: e for n, e in members(group).items() if all(e.traits.get(k) == v for k, v in traits.items())}
+    assert found, f"no {group} terms"
+    return pytest.mark.parametrize("entry", found.values(), ids=found.keys())
+
+
+# All groups
+
+EVERY = [entry for group in groups() for entry in members(group).values()]
+
+
+@pytest.mark.parametrize("entry", EVERY, ids=[f"{e.group}.{e.name}" for e in EVERY])
+def test_a_term_is_described_by_one_sentence(entry: Entry) -> None:
+    assert entry.doc.endswith("."), entry.doc
+    assert entry.doc[0].isupper()
+
+
+@pytest.mark.parametrize("entry", EVERY, ids=[f"{e.group}.{e.name}" for e in EVERY])
+def test_the_defaults_of_a_term_pass_its_own_schema(entry: Entry) -> None:
+    defaults = {name: p.default for name, p in entry.parameters.items() if p.default is not p.empty}
+    checked, problems = entry.check(defaults, entry.name)
+    assert problems == []
+    assert {k: checked[k] for k in defaults} == defaults
+
+
+@pytest.mark.parametrize("entry", EVERY, ids=[f"{e.group}.{e.name}" for e in EVERY])
+def test_a_term_refuses_a_parameter_it_does_not_have(entry: Entry) -> None:
+    _, problems = entry.check({"no_such_thing": 1.0}, entry.name)
+    assert any("no_such_thing" in p for p in problems)
+
+
+# Functions of a snapshot
+
+
+def random_snapshot(n: int, seed: int = 0) -> Snapshot:
+    """Robots in the middle of something: every quantity of a plausible size, phases consistent."""
+    rng = np.random.default_rng(seed)
+    low, high = robot.JOINT_POS_LIMITS.T
+    quat = Rotation.random(n, random_state=seed)
+    touching = rng.random((n, 4)) < 0.5
+    phase = rng.uniform(0.002, 0.4, (n, 4))
+    values: dict[str, Any] = {
+        "base_pos_w": rng.normal(0.0, 3.0, (n, 3)),
+        "base_quat_w": quat.as_quat(scalar_first=True),
+        "base_lin_vel_b": rng.normal(0.0, 0.7, (n, 3)),
+        "base_ang_vel_b": rng.normal(0.0, 1.0, (n, 3)),
+        "projected_gravity_b": quat.inv().apply([0.0, 0.0, -1.0]),
+        "joint_pos": rng.uniform(1.02 * low, 1.02 * high, (n, 12)),
+        "joint_vel": rng.normal(0.0, 15.0, (n, 12)),
+        "joint_acc": rng.normal(0.0, 300.0, (n, 12)),
+        "joint_torque": rng.normal(0.0, 10.0, (n, 12)),
+        "joint_target": rng.uniform(low, high, (n, 12)),
+        "action": rng.normal(0.0, 1.0, (n, 12)),
+        "previous_action": rng.normal(0.0, 1.0, (n, 12)),
+        "command": rng.normal(0.0, 1.0, (n, 3)) * (rng.random((n, 1)) < 0.7),
+        "foot_height": rng.uniform(0.02, 0.2, (n, 4)),
+        "foot_vel_w": rng.normal(0.0, 1.0, (n, 4, 3)),
+        "foot_force": touching * rng.uniform(0.0, 100.0, (n, 4)),
+        "foot_contact": touching,
+        "foot_air_time": ~touching * phase,
+        "foot_contact_time": touching * phase,
+        "foot_last_air_time": rng.uniform(0.0, 0.7, (n, 4)),
+        "foot_last_contact_time": rng.uniform(0.0, 0.7, (n, 4)),
+        "foot_touchdown": touching & (phase < 0.02),
+        "thigh_contact": rng.random((n, 4)) < 0.3,
+        "calf_contact": rng.random((n, 4)) < 0.3,
+        "trunk_contact": rng.random(n) < 0.3,
+        "episode_time": rng.uniform(0.0, 20.0, n),
+    }
+    assert values.keys() == {f.name for f in fields(Snapshot)}
+    tensors = {k: torch.as_tensor(v) for k, v in values.items()}
+    return Snapshot(**{k: v if v.dtype == torch.bool else v.float() for k, v in tensors.items()})
+
+
+def rows(s: Snapshot, which: slice) -> Snapshot:
+    return Snapshot(**{f.name: getattr(s, f.name)[which].clone() for f in fields(Snapshot)})
+
+
+def mirrored(s: Snapshot) -> Snapshot:
+    """The same moment seen in a mirror that stands in the world's x-z plane."""
+    legs, joints = list(robot.MIRROR_LEGS), list(robot.MIRROR_JOINTS)
+    polar, axial = torch.tensor([1.0, -1.0, 1.0]), torch.tensor([-1.0, 1.0, -1.0])
+    flips = {
+        "base_pos_w": polar,
+        "base_quat_w": torch.tensor([1.0, -1.0, 1.0, -1.0]),
+        "base_lin_vel_b": polar,
+        "base_ang_vel_b": axial,
+        "projected_gravity_b": polar,
+        "command": torch.tensor([1.0, -1.0, -1.0]),
+    }
+    new = {}
+    for f in fields(Snapshot):
+        value: Tensor = getattr(s, f.name)
+        if f.name in flips:
+            new[f.name] = value * flips[f.name]
+        elif f.name in ("trunk_contact", "episode_time"):
+            new[f.name] = value.clone()
+        elif value.shape[1] == robot.NUM_JOINTS:
+            new[f.name] = value[:, joints] * torch.tensor(robot.MIRROR_JOINT_SIGNS)
+        else:
+            new[f.name] = value[:, legs] * (polar if f.name == "foot_vel_w" else 1)
+    return Snapshot(**new)
+
+
+def test_the_mirror_is_a_mirror() -> None:
+    s = random_snapshot(50)
+    twice = mirrored(mirrored(s))
+    for f in fields(Snapshot):
+        assert torch.equal(getattr(s, f.name), getattr(twice, f.name)), f.name
+    image = mirrored(s)
+    for quat, gravity in [(image.base_quat_w, image.projected_gravity_b)]:
+        seen = Rotation.from_quat(quat.numpy(), scalar_first=True).inv().apply([0.0, 0.0, -1.0])
+        np.testing.assert_allclose(gravity.numpy(), seen, atol=1e-6)
+
+
+ONE_SIDED = {
+    "base_motion_literal": "a roll changes sign in the mirror, a pitch does not",
+    "joint_deviation_literal": "hip angles change sign in the mirror",
+    "joint_position_limit_literal": "a hip at its upper stop is one at its lower stop in the mirror",
+    "joint_velocity_limit_literal": "hip speeds change sign in the mirror",
+}
+"""Terms that are not the same in the mirror, as printed in the paper, and why."""
+
+
+@each("reward")
+def test_a_reward_is_one_finite_number_per_robot(entry: Entry) -> None:
+    for n in (1, ODD):
+        value = entry.target(random_snapshot(n))
+        assert value.shape == (n,)
+        assert value.dtype == torch.float32
+        assert torch.isfinite(value).all()
+
+
+@each("reward")
+def test_a_reward_tells_robots_apart(entry: Entry) -> None:
+    if entry.name != "air_time_variance_literal":  # identically zero
+        assert entry.target(random_snapshot(500)).unique().numel() > 1
+
+
+@pytest.mark.parametrize("group", ["reward", "observation", "termination"])
+def test_a_robot_gets_the_same_alone_and_in_a_batch_bit_for_bit(group: str) -> None:
+    s = random_snapshot(ODD)
+    for name, entry in members(group).items():
+        together = entry.target(s)
+        for i in range(ODD):
+            assert torch.equal(entry.target(rows(s, slice(i, i + 1))), together[i : i + 1]), (name, i)
+        for size in (2, 4, 8, 16):
+            assert torch.equal(entry.target(rows(s, slice(0, size))), together[:size]), (name, size)
+
+
+@pytest.mark.parametrize("group", ["reward", "observation", "termination"])
+def test_a_term_leaves_the_snapshot_alone(group: str) -> None:
+    s, before = random_snapshot(ODD), random_snapshot(ODD)
+    for name, entry in members(group).items():
+        entry.target(s)
+        for f in fields(Snapshot):
+            assert torch.equal(getattr(s, f.name), getattr(before, f.name)), (name, f.name)
+
+
+@each("reward")
+def test_a_reward_is_the_same_in_the_mirror_unless_it_is_known_not_to_be(entry: Entry) -> None:
+    s = random_snapshot(500)
+    there, here = entry.target(mirrored(s)), entry.target(s)
+    same = torch.allclose(there, here, rtol=1e-5, atol=5e-6)
+    assert same == (entry.name not in ONE_SIDED)
+
+
+@each("reward")
+def test_a_penalty_or_reward_is_not_negative_unless_it_is_signed(entry: Entry) -> None:
+    signed = {"feet_air_time", "feet_air_time_touchdown", "feet_air_time_literal", "joint_deviation_literal"}
+    if entry.name not in signed | {"air_time_variance_literal"}:
+        assert entry.target(random_snapshot(500)).min() >= 0.0
+
+
+@each("observation")
+def test_an_observation_is_as_wide_as_it_says(entry: Entry) -> None:
+    for n in (1, ODD):
+        value = entry.target(random_snapshot(n))
+        assert value.shape == (n, entry.traits["size"])
+        assert value.dtype == torch.float32
+
+
+@each("termination")
+def test_a_termination_is_one_flag_per_robot_and_a_standing_robot_goes_on(entry: Entry) -> None:
+    s = random_snapshot(ODD)
+    flag = entry.target(s)
+    assert flag.shape == (ODD,)
+    assert flag.dtype == torch.bool
+    assert flag.any()
+    assert not flag.all()
+    upright = {f.name: getattr(s, f.name) for f in fields(Snapshot)}
+    upright["projected_gravity_b"] = torch.tensor([0.0, 0.0, -1.0]).repeat(ODD, 1)
+    upright["trunk_contact"] = torch.zeros(ODD, dtype=torch.bool)
+    assert not entry.target(Snapshot(**upright)).any()
+
+
+def test_tilt_ends_an_episode_past_its_angle_whichever_way_the_robot_leans() -> None:
+    tilt = members("termination")["tilt"].target
+    values = {f.name: getattr(random_snapshot(2), f.name) for f in fields(Snapshot)}
+    for axis in ([1, 0, 0], [0, 1, 0], [0.6, -0.8, 0]):
+        for limit in (0.5, 1.2, 2.0):
+            turns = Rotation.from_rotvec(np.outer([limit - 0.01, limit + 0.01], axis))
+            gravity = torch.as_tensor(turns.inv().apply([0.0, 0.0, -1.0])).float()
+            assert tilt(Snapshot(**{**values, "projected_gravity_b": gravity}), max_angle=limit).tolist() == [
+                False,
+                True,
+            ]
+
+
+# Randomisations of the model
+
+
+@pytest.fixture
+def make_backend(make_task: Callable[..., TaskConfig]) -> Callable[[int], MujocoCpu]:
+    task = make_task("rand=none")
+    model, sensors = build_model(task.robot, build_terrain(task.terrain), task.sim.physics_dt)
+    return lambda n: MujocoCpu(model, sensors, n, threads=1)
+
+
+def stream(n: int, seed: int = 0, first_env: int = 0) -> Stream:
+    return EnvRandom(seed, n, first_env).stream("here")
+
+
+def everyone(n: int) -> Tensor:
+    return torch.ones(n, dtype=torch.bool)
+
+
+def model_fields(backend: MujocoCpu) -> dict[str, Tensor]:
+    """Copies of all fields that differ between environments."""
+    return backend.state_dict()["fields"]
+
+
+def start_from(backend: MujocoCpu, entry: Entry) -> dict[str, Tensor]:
+    for name in entry.traits["fields"]:
+        backend.field(name)
+    return model_fields(backend)
+
+
+NOTHING: dict[str, list[dict[str, Any]]] = {
+    "foot_friction": [
+        {"range": (0.8, 0.8), "operation": "set"},
+        {"range": (1.0, 1.0), "operation": "scale"},
+        {"range": (0.0, 0.0), "operation": "add"},
+    ],
+    "foot_restitution": [{"range": (0.0, 0.0)}],
+    "center_of_mass": [{"range": (0.0, 0.0)}],
+    "link_mass": [{"range": (1.0, 1.0)}],
+}
+"""Parameters of model terms at which the robot stays the nominal one (its feet: friction 0.8, no bounce)."""
+
+
+@each("rand", kind="model")
+def test_a_model_term_changes_masked_rows_of_its_declared_fields_only(
+    entry: Entry, make_backend: Callable[[int], MujocoCpu]
+) -> None:
+    backend, mask = make_backend(5), torch.tensor([True, False, True, False, True])
+    before = start_from(backend, entry)
+    assert set(before) == set(entry.traits["fields"])
+    entry.target(backend, stream(5), mask)
+    after = model_fields(backend)
+    assert set(after) == set(entry.traits["fields"])
+    for name, values in after.items():
+        changed = (values != before[name]).flatten(1).any(1)
+        assert torch.equal(changed, mask), name
+
+
+@each("rand", kind="model")
+def test_a_model_term_draws_the_same_from_the_same_seed_and_other_values_from_another(
+    entry: Entry, make_backend: Callable[[int], MujocoCpu]
+) -> None:
+    results = []
+    for seed in (7, 7, 8):
+        backend = make_backend(3)
+        entry.target(backend, stream(3, seed), everyone(3))
+        results.append(model_fields(backend))
+    for name in entry.traits["fields"]:
+        assert torch.equal(results[0][name], results[1][name])
+        assert not torch.equal(results[0][name], results[2][name])
+        first, second, third = results[0][name]
+        assert not torch.equal(first, second)
+        assert not torch.equal(second, third)
+
+
+@each("rand", kind="model")
+def test_a_model_term_draws_from_the_nominal_model_not_from_its_last_draw(
+    entry: Entry, make_backend: Callable[[int], MujocoCpu]
+) -> None:
+    backend = make_backend(3)
+    entry.target(backend, stream(3, 1), everyone(3))
+    first = model_fields(backend)
+    entry.target(backend, stream(3, 2), everyone(3))
+    entry.target(backend, stream(3, 1), everyone(3))
+    for name, values in model_fields(backend).items():
+        assert torch.equal(values, first[name]), name
+
+
+@each("rand", kind="model")
+def test_a_model_term_gives_a_robot_the_same_alone_and_in_a_batch(
+    entry: Entry, make_backend: Callable[[int], MujocoCpu]
+) -> None:
+    batch, alone = make_backend(4), make_backend(1)
+    entry.target(batch, stream(4), everyone(4))
+    entry.target(alone, stream(1, first_env=2), everyone(1))
+    for name in entry.traits["fields"]:
+        assert torch.equal(batch.field(name)[2], alone.field(name)[0])
+
+
+@each("rand", kind="model")
+def test_a_model_term_with_a_range_of_one_nominal_value_changes_nothing(
+    entry: Entry, make_backend: Callable[[int], MujocoCpu]
+) -> None:
+    for parameters in NOTHING[entry.name]:
+        backend = make_backend(3)
+        before = start_from(backend, entry)
+        entry.target(backend, stream(3), everyone(3), **parameters)
+        for name, values in model_fields(backend).items():
+            # A value that is set is a float32 draw; one that is scaled or shifted must not move at all.
+            rtol = 1e-7 if parameters.get("operation", "set") == "set" else 0.0
+            np.testing.assert_allclose(values, before[name], rtol=rtol, atol=0, err_msg=f"{name} {parameters}")
+
+
+@each("rand", kind="model")
+def test_a_model_term_that_writes_what_mujoco_derives_from_says_so(entry: Entry) -> None:
+    inputs = set(mujoco.MjModel._setconst_inputs)
+    assert bool(entry.traits.get("derived")) == bool(inputs & set(entry.traits["fields"]))
+
+
+def named(model: mujoco.MjModel, kind: str, names: list[str]) -> list[int]:
+    return [getattr(model, kind)(name).id for name in names]
+
+
+FEET = [f"{leg}_foot" for leg in robot.LEGS]
+LINKS = ["trunk", *robot.JOINTS]
+
+
+def test_foot_friction_is_drawn_per_foot_and_nothing_else_slides(make_backend: Callable[[int], MujocoCpu]) -> None:
+    backend = make_backend(200)
+    members("rand")["foot_friction"].target(backend, stream(200), everyone(200))
+    friction = backend.field("geom_friction").numpy()
+    geoms = named(backend.model, "geom", FEET)
+    feet = friction[:, geoms, 0]
+    assert feet.min() >= 0.4
+    assert feet.max() <= 1.1
+    assert feet.mean() == pytest.approx(0.75, abs=0.02)
+    assert feet.std() == pytest.approx(0.7 / math.sqrt(12), abs=0.02)
+    assert np.abs(np.corrcoef(feet.T) - np.eye(4)).max() < 0.25
+    others = np.ones_like(backend.model.geom_friction, dtype=bool)
+    others[geoms, 0] = False
+    assert (friction == backend.model.geom_friction)[:, others].all()
+
+
+@pytest.mark.parametrize(("operation", "expected"), [("set", 0.5), ("scale", 0.4), ("add", 1.3)])
+def test_the_operation_of_foot_friction_says_what_a_draw_of_one_half_means(
+    make_backend: Callable[[int], MujocoCpu], operation: str, expected: float
+) -> None:
+    backend = make_backend(1)
+    term = members("rand")["foot_friction"].target
+    term(backend, stream(1), everyone(1), range=(0.5, 0.5), operation=operation)
+    values = backend.field("geom_friction")[0, named(backend.model, "geom", FEET), 0]
+    assert values.tolist() == pytest.approx([expected] * 4)  # of a nominal 0.8
+
+
+def test_link_mass_scales_mass_and_inertia_of_a_link_alike(make_backend: Callable[[int], MujocoCpu]) -> None:
+    backend = make_backend(200)
+    members("rand")["link_mass"].target(backend, stream(200), everyone(200))
+    bodies = named(backend.model, "body", LINKS)
+    assert sorted(bodies) == list(range(1, backend.model.nbody))
+    ratio = backend.field("body_mass").numpy()[:, bodies] / backend.model.body_mass[bodies]
+    assert ratio.min() >= 0.8
+    assert ratio.max() <= 1.3
+    assert ratio.mean() == pytest.approx(1.05, abs=0.01)
+    assert np.abs(np.corrcoef(ratio.T) - np.eye(13)).max() < 0.3
+    inertia = backend.field("body_inertia").numpy()[:, bodies] / backend.model.body_inertia[bodies]
+    np.testing.assert_allclose(inertia, np.repeat(ratio[:, :, None], 3, axis=2), rtol=1e-12)
+
+
+def test_center_of_mass_moves_the_trunk_s_alone(make_backend: Callable[[int], MujocoCpu]) -> None:
+    backend = make_backend(200)
+    members("rand")["center_of_mass"].target(backend, stream(200), everyone(200))
+    shift = backend.field("body_ipos").numpy() - backend.model.body_ipos
+    trunk = backend.model.body("trunk").id
+    assert np.abs(shift[:, trunk]).max() <= 0.025 + 1e-9
+    assert np.abs(shift[:, trunk]).min(axis=0).max() < 0.005  # every axis has small and large shifts of its own
+    assert np.abs(np.corrcoef(shift[:, trunk].T) - np.eye(3)).max() < 0.25
+    assert not np.delete(shift, trunk, axis=1).any()
+
+
+def bounce(solref: np.ndarray) -> float:
+    """Speed after over speed before of a free ball that meets a plane with these contact parameters."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = 0.0005, [0.0, 0.0, 0.0]
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1])
+    ball = spec.worldbody.add_body(pos=[0, 0, 0.05])
+    ball.add_freejoint()
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.023, 0, 0], mass=3.0, priority=1, solref=solref)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[2] = -0.5
+    mujoco.mj_step(model, data, 600)
+    assert data.qvel[2] > 0.0
+    return float(data.qvel[2]) / 0.5
+
+
+@pytest.mark.parametrize("restitution", [0.15, 0.3, 0.6])
+def test_a_free_mass_bounces_with_the_restitution_it_was_given(
+    make_backend: Callable[[int], MujocoCpu], restitution: float
+) -> None:
+    backend = make_backend(1)
+    term = members("rand")["foot_restitution"].target
+    term(backend, stream(1), everyone(1), range=(restitution, restitution))
+    foot = backend.field("geom_solref")[0, backend.model.geom("FR_foot").id].numpy()
+    assert bounce(foot) == pytest.approx(restitution, abs=0.05)
+
+
+TABLE_I: dict[str, Any] = {
+    "foot_friction": (0.4, 1.1),
+    "center_of_mass": (-0.025, 0.025),
+    "link_mass": (0.8, 1.3),
+    "body_velocity": (-0.25, 0.25),
+    "body_position": (-0.5, 0.5),
+    "body_orientation": (-0.02, 0.02),
+    "joint_positions": (-0.3, 0.3),
+    "joint_velocities": (-2.5, 2.5),
+}
+
+
+def test_the_ranges_are_those_of_table_i_in_the_file_and_by_default(make_task: Callable[..., TaskConfig]) -> None:
+    assert {t.key: tuple(t.parameters["range"]) for t in make_task("rand=table1").rand} == TABLE_I
+    assert {name: members("rand")[name].parameters["range"].default for name in TABLE_I} == TABLE_I
+
+
+# Randomisations of the initial state
+
+
+def start_states(n: int) -> KinematicState:
+    """Where the environment starts before any randomisation: nominal stance, at rest, float64."""
+    qpos, qvel = torch.zeros(n, 19, dtype=torch.float64), torch.zeros(n, 18, dtype=torch.float64)
+    qpos[:, 2], qpos[:, 3] = 0.33, 1.0
+    qpos[:, 7:] = torch.as_tensor(robot.NOMINAL_STANCE)
+    return KinematicState.of(qpos, qvel)
+
+
+def parts(state: KinematicState) -> dict[str, Tensor]:
+    return {f.name: getattr(state, f.name).clone() for f in fields(KinematicState)}
+
+
+WRITES = {
+    "body_velocity": {"base_lin_vel_w", "base_ang_vel_b"},
+    "body_position": {"base_pos_w"},
+    "body_orientation": {"base_quat_w"},
+    "joint_positions": {"joint_pos"},
+    "joint_velocities": {"joint_vel"},
+}
+
+
+@each("rand", kind="state")
+def test_a_state_term_changes_its_own_part_of_the_state_in_every_row(entry: Entry) -> None:
+    state = start_states(6)
+    before = parts(state)
+    entry.target(state, stream(6))
+    for name, values in parts(state).items():
+        changed = (values != before[name]).any(1)
+        assert changed.all() if name in WRITES[entry.name] else not changed.any(), name
+
+
+@each("rand", kind="state")
+def test_a_state_term_with_a_range_of_zero_changes_nothing(entry: Entry) -> None:
+    operations: list[dict[str, Any]] = [{}]
+    if "operation" in entry.parameters:
+        operations = [{"operation": "add"}, {"operation": "scale"}]
+    for parameters in operations:
+        state = start_states(6)
+        before = parts(state)
+        entry.target(state, stream(6), range=(0.0, 0.0), **parameters)
+        for name, values in parts(state).items():
+            assert torch.equal(values, before[name]), name
+
+
+@each("rand", kind="state")
+def test_a_state_term_draws_by_seed_and_gives_a_robot_the_same_alone_and_in_a_batch(entry: Entry) -> None:
+    batch, again, other, alone = start_states(4), start_states(4), start_states(4), start_states(1)
+    entry.target(batch, stream(4, 7))
+    entry.target(again, stream(4, 7))
+    entry.target(other, stream(4, 8))
+    entry.target(alone, stream(1, 7, first_env=3))
+    for name, values in parts(batch).items():
+        assert torch.equal(values, parts(again)[name])
+        assert torch.equal(values[3], parts(alone)[name][0])
+        assert torch.equal(values, parts(other)[name]) == (name not in WRITES[entry.name])
+
+
+def test_state_terms_add_uniform_draws_of_table_i() -> None:
+    state, n = start_states(2000), 2000
+    for name in ("body_velocity", "body_position", "joint_velocities"):
+        members("rand")[name].target(state, stream(n))
+    for values, half, columns in [
+        (state.base_lin_vel_w, 0.25, 3),
+        (state.base_ang_vel_b, 0.25, 3),
+        (state.base_pos_w[:, :2], 0.5, 2),
+        (state.joint_vel, 2.5, 12),
+    ]:
+        assert values.shape == (n, columns)
+        assert values.abs().max() <= half
+        assert values.abs().max() > 0.98 * half
+        assert (values.mean(0).abs() < 0.06 * half).all()
+        assert (np.abs(np.corrcoef(values.numpy().T) - np.eye(columns)) < 0.1).all()
+    assert (state.base_pos_w[:, 2] == 0.33).all()
+
+
+def test_joint_positions_scale_or_shift_the_stance_and_stop_at_the_hard_limits() -> None:
+    term, n = members("rand")["joint_positions"].target, 500
+    nominal = torch.as_tensor(robot.NOMINAL_STANCE)
+    scaled, shifted, wild = start_states(n), start_states(n), start_states(n)
+    term(scaled, stream(n))
+    factor = scaled.joint_pos / nominal
+    inside = (scaled.joint_pos > -2.818) & (scaled.joint_pos < -0.888) | (nominal > -1.0)
+    assert factor[inside].min() >= 0.7 - 1e-6
+    assert factor[inside].max() <= 1.3 + 1e-6
+    term(shifted, stream(n), operation="add")
+    assert (shifted.joint_pos - nominal).abs().max() <= 0.3 + 1e-6
+    term(wild, stream(n), range=(-9.0, 9.0), operation="add")
+    low, high = torch.as_tensor(robot.JOINT_POS_LIMITS).unbind(1)
+    assert ((wild.joint_pos >= low) & (wild.joint_pos <= high)).all()
+    assert (wild.joint_pos == low).any(0).all()
+    assert (wild.joint_pos == high).any(0).all()
+
+
+def test_body_orientation_turns_the_trunk_by_the_rotation_vector_that_is_drawn() -> None:
+    n = 50
+    for low, high in [(-0.02, 0.02), (-1.0, 1.0)]:
+        state = start_states(n)
+        tilted = Rotation.random(n, random_state=0)
+        state.base_quat_w.copy_(torch.as_tensor(tilted.as_quat(scalar_first=True)))
+        members("rand")["body_orientation"].target(state, stream(n), range=(low, high))
+        drawn = stream(n).uniform(3, low=low, high=high).double().numpy()
+        expected = Rotation.from_rotvec(drawn) * tilted
+        got = Rotation.from_quat(state.base_quat_w.numpy(), scalar_first=True)
+        assert (expected.inv() * got).magnitude().max() < 1e-6
+        np.testing.assert_allclose(state.base_quat_w.norm(dim=1), 1.0, atol=1e-6)
+
+
+# Actuators
+
+
+def actuator_setup(n: int) -> ActuatorSetup:
+    return ActuatorSetup(
+        n, 0.002, robot.EFFORT_LIMIT, robot.VELOCITY_LIMIT, device=torch.device("cpu"), dtype=torch.float64
+    )
+
+
+def joint_noise(n: int, scale: float, seed: int = 0) -> Tensor:
+    return torch.as_tensor(np.random.default_rng(seed).normal(0.0, scale, (n, 12)))
+
+
+@each("actuator")
+def test_an_actuator_never_exceeds_the_torque_limit(entry: Entry) -> None:
+    actuator = entry.target(actuator_setup(20))
+    limit = torch.tensor([23.7, 23.7, 35.55] * 4, dtype=torch.float64)
+    reached = torch.zeros(12, dtype=torch.bool)
+    for k in range(20):
+        tau = actuator.torque(joint_noise(20, 5.0, k), joint_noise(20, 5.0, k + 100), joint_noise(20, 20.0, k + 200))
+        assert tau.shape == (20, 12)
+        assert (tau.abs() <= limit).all()
+        reached |= (tau.abs() > 0.999 * limit).any(0)
+    assert reached.all()
+
+
+@each("actuator")
+def test_an_actuator_gives_no_torque_without_error_at_rest(entry: Entry) -> None:
+    actuator = entry.target(actuator_setup(3))
+    q = torch.as_tensor(robot.NOMINAL_STANCE).repeat(3, 1)
+    for _ in range(10):
+        assert not actuator.torque(q, q, torch.zeros_like(q)).any()
+
+
+@each("actuator")
+def test_an_actuator_drives_a_robot_the_same_alone_and_in_a_batch(entry: Entry) -> None:
+    batch, alone = entry.target(actuator_setup(5)), [entry.target(actuator_setup(1)) for _ in range(5)]
+    for k in range(30):
+        inputs = joint_noise(5, 0.3, k), joint_noise(5, 0.3, k + 100), joint_noise(5, 3.0, k + 200)
+        if k == 15:
+            batch.reset(torch.tensor([False, True, False, True, False]))
+            for i in (1, 3):
+                alone[i].reset(torch.tensor([True]))
+        together = batch.torque(*inputs)
+        for i in range(5):
+            single = alone[i].torque(*(x[i : i + 1] for x in inputs))
+            assert torch.equal(together[i : i + 1], single), (k, i)
+
+
+@each("actuator")
+def test_an_actuator_continues_from_its_saved_state_and_leaves_its_inputs_alone(entry: Entry) -> None:
+    first, second = entry.target(actuator_setup(3)), entry.target(actuator_setup(3))
+    for k in range(20):
+        inputs = joint_noise(3, 0.3, k), joint_noise(3, 0.3, k + 100), joint_noise(3, 3.0, k + 200)
+        copies = [x.clone() for x in inputs]
+        tau = first.torque(*inputs)
+        assert all(torch.equal(a, b) for a, b in zip(inputs, copies, strict=True))
+        if k >= 10:
+            assert torch.equal(tau, second.torque(*inputs))
+        elif k == 9:
+            second.load_state_dict(first.state_dict())
+
+
+def test_pd_is_the_law_of_the_firmware() -> None:
+    pd = members("actuator")["pd"].target(actuator_setup(1), kp=20.0, kd=0.5)
+    target, q, qd = torch.zeros(3, 1, 12, dtype=torch.float64)
+    target[0, 0], q[0, 0], qd[0, 0] = 0.3, 0.1, -2.0  # 20 x 0.2 + 0.5 x 2
+    qd[0, 1] = 4.0  # -0.5 x 4
+    target[0, 2], target[0, 3], target[0, 4] = 9.0, -9.0, 9.0
+    assert pd.torque(target, q, qd)[0, :6].tolist() == pytest.approx([5.0, -2.0, 35.55, -23.7, 23.7, 0.0])
+
+
+# Commands
+
+DT = 0.02
+
+
+@each("command")
+def test_a_command_is_a_velocity_that_a_robot_gets_alone_and_in_a_batch(entry: Entry) -> None:
+    batch, alone = entry.target(stream(6)), entry.target(stream(1, first_env=4))
+    restart = everyone(6)
+    for k in range(100):
+        batch.advance(DT, restart)
+        alone.advance(DT, restart[4:5])
+        assert batch.value.shape == (6, 3)
+        assert batch.value.dtype == torch.float32
+        assert torch.equal(batch.value[4:5], alone.value), k
+        restart = torch.tensor([k % 7 == 0, False, False, k == 3, k % 20 == 0, False])
+
+
+@each("command")
+def test_a_command_keeps_one_tensor_and_continues_from_its_saved_state(entry: Entry) -> None:
+    random = EnvRandom(0, 6)
+    first = entry.target(random.stream("command"))
+    held = first.value
+    first.advance(DT, everyone(6))
+    for _ in range(50):
+        first.advance(DT, ~everyone(6))
+    twin_random = EnvRandom(5, 6)
+    second = entry.target(twin_random.stream("command"))
+    twin_random.load_state_dict(random.state_dict())
+    second.load_state_dict(first.state_dict())
+    for _ in range(300):
+        first.advance(DT, ~everyone(6))
+        second.advance(DT, ~everyone(6))
+        assert torch.equal(first.value, second.value)
+    assert first.value is held
+
+
+def test_uniform_velocities_fill_their_ranges_and_a_tenth_stand_still() -> None:
+    n = 5000
+    command = members("command")["uniform_velocity"].target(stream(n))
+    command.advance(DT, everyone(n))
+    standing = (command.value == 0.0).all(1)
+    assert standing.float().mean() == pytest.approx(0.1, abs=0.015)
+    moving = command.value[~standing]
+    assert (moving != 0.0).all()
+    bounds = torch.tensor([[-2.0, 3.0], [-1.5, 1.5], [-1.5, 1.5]])  # paper, section II-B.1
+    assert (moving >= bounds[:, 0]).all()
+    assert (moving <= bounds[:, 1]).all()
+    np.testing.assert_allclose(moving.mean(0), bounds.mean(1), atol=0.06)
+    np.testing.assert_allclose(moving.std(0), (bounds[:, 1] - bounds[:, 0]) / math.sqrt(12), rtol=0.03)
+    assert (np.abs(np.corrcoef(moving.numpy().T) - np.eye(3)) < 0.05).all()
+    assert command.time_left.min() >= 0.3
+    assert command.time_left.max() <= 10.0
+
+
+def test_uniform_velocities_are_held_for_a_time_within_the_range_and_change_for_one_robot_at_a_time() -> None:
+    n, steps, hold = 40, 300, (0.3, 1.0)
+    command = members("command")["uniform_velocity"].target(stream(n), hold_time=hold, standing_fraction=0.0)
+    command.advance(DT, everyone(n))
+    seen, changes = command.value.clone(), [[0] for _ in range(n)]
+    for k in range(1, steps):
+        command.advance(DT, ~everyone(n))
+        for i in (command.value != seen).any(1).nonzero().flatten().tolist():
+            assert (command.value[i] != seen[i]).all()
+            changes[i].append(k)
+        seen = command.value.clone()
+    times = np.concatenate([np.diff(c) for c in changes]) * DT
+    assert len(times) > 5 * n
+    assert times.min() >= hold[0] - 1e-6
+    assert times.max() <= hold[1] + DT + 1e-6  # rounded up to a step
+    assert times.mean() == pytest.approx(0.65 + DT / 2, abs=0.03)
+
+
+def test_a_restart_draws_a_new_velocity_and_a_new_time_for_the_restarted_only() -> None:
+    command = members("command")["uniform_velocity"].target(stream(8), hold_time=(5.0, 10.0), standing_fraction=0.0)
+    command.advance(DT, everyone(8))
+    value, left, mask = command.value.clone(), command.time_left.clone(), torch.arange(8) % 2 == 0
+    command.advance(DT, mask)
+    assert ((command.value != value).all(1) == mask).all()
+    np.testing.assert_allclose(command.time_left[~mask], left[~mask] - DT, atol=1e-6)
+    assert (command.time_left[mask] >= 5.0).all()
+    assert (command.time_left[mask] != left[mask] - DT).all()
+
+
+def test_a_hold_time_of_a_whole_number_of_steps_is_that_number_of_steps() -> None:
+    for steps in (1, 5, 15, 50):
+        command = members("command")["uniform_velocity"].target(
+            stream(3), hold_time=(steps * DT, steps * DT), standing_fraction=0.0
+        )
+        command.advance(DT, everyone(3))
+        for _ in range(4):
+            before = command.value.clone()
+            for _ in range(steps - 1):
+                command.advance(DT, ~everyone(3))
+                assert torch.equal(command.value, before)
+            command.advance(DT, ~everyone(3))
+            assert (command.value != before).all()
+
+
+def test_a_fixed_velocity_stays_and_takes_a_row_for_each_robot() -> None:
+    command = members("command")["fixed_velocity"].target(stream(3), lin_vel_x=1.0, lin_vel_y=-0.5, ang_vel_z=0.25)
+    assert command.value.tolist() == [[1.0, -0.5, 0.25]] * 3
+    command.value[1] = torch.tensor([0.0, 0.0, 1.0])
+    command.advance(DT, everyone(3))
+    assert command.value.tolist() == [[1.0, -0.5, 0.25], [0.0, 0.0, 1.0], [1.0, -0.5, 0.25]]
+
+
+# Events
+
+
+@each("event")
+def test_an_event_leaves_a_restarted_robot_alone_and_is_the_same_alone_and_in_a_batch(entry: Entry) -> None:
+    batch, alone = entry.target(stream(5)), entry.target(stream(1, first_env=3))
+    state, single = start_states(5), start_states(1)
+    batch.advance(state, 30.0, everyone(5))
+    alone.advance(single, 30.0, everyone(1))
+    for name, values in parts(start_states(5)).items():
+        assert torch.equal(getattr(state, name), values), name
+    for _ in range(30):
+        batch.advance(state, 1.0, ~everyone(5))
+        alone.advance(single, 1.0, ~everyone(1))
+        for name, values in parts(single).items():
+            assert torch.equal(getattr(state, name)[3:4], values), name
+
+
+@each("event")
+def test_an_event_continues_from_its_saved_state(entry: Entry) -> None:
+    random, twin_random = EnvRandom(0, 4), EnvRandom(9, 4)
+    first, second = entry.target(random.stream("push")), entry.target(twin_random.stream("push"))
+    a, b = start_states(4), start_states(4)
+    first.advance(a, 1.0, everyone(4))
+    for _ in range(20):
+        first.advance(a, 1.0, ~everyone(4))
+    twin_random.load_state_dict(random.state_dict())
+    second.load_state_dict(first.state_dict())
+    for name, values in parts(a).items():
+        getattr(b, name).copy_(values)
+    for _ in range(40):
+        first.advance(a, 1.0, ~everyone(4))
+        second.advance(b, 1.0, ~everyone(4))
+        for name, values in parts(a).items():
+            assert torch.equal(values, getattr(b, name))
+
+
+def test_a_push_sets_the_horizontal_velocity_every_ten_to_fifteen_seconds() -> None:
+    n, dt = 30, 0.1
+    push, state = members("event")["push"].target(stream(n)), start_states(n)
+    push.advance(state, dt, everyone(n))
+    times: list[list[float]] = [[0.0] for _ in range(n)]
+    for k in range(1, 600):
+        state.base_lin_vel_w[:] = 5.0
+        before = parts(state)
+        push.advance(state, dt, ~everyone(n))
+        pushed = (state.base_lin_vel_w[:, :2] != 5.0).all(1)
+        assert torch.equal(pushed, (state.base_lin_vel_w != 5.0).any(1))
+        assert (state.base_lin_vel_w[pushed, :2].abs() <= 1.0).all()  # set, whatever it was before
+        for name, values in parts(state).items():
+            if name != "base_lin_vel_w":
+                assert torch.equal(values, before[name])
+        assert (state.base_lin_vel_w[:, 2] == 5.0).all()
+        for i in pushed.nonzero().flatten().tolist():
+            times[i].append(k * dt)
+    waits = np.concatenate([np.diff(t) for t in times])
+    assert len(waits) > 3 * n
+    assert waits.min() >= 10.0 - 1e-4
+    assert waits.max() <= 15.0 + dt + 1e-4
+    assert waits.mean() == pytest.approx(12.5 + dt / 2, abs=0.3)
+
+
+def test_a_restart_begins_a_new_wait_for_a_push() -> None:
+    push, state = members("event")["push"].target(stream(2), interval=(1.0, 1.0)), start_states(2)
+    push.advance(state, 0.1, everyone(2))
+    for k in range(1, 15):
+        push.advance(state, 0.1, torch.tensor([False, k == 5]))
+        pushed = (state.base_lin_vel_w[:, :2] != 0.0).all(1).tolist()
+        assert pushed == [k >= 10, False]
+    push.advance(state, 0.1, ~everyone(2))
+    assert (state.base_lin_vel_w[:, :2] != 0.0).all()
+
+
+# Curricula
+
+
+@each("curriculum")
+def test_a_curriculum_keeps_levels_on_the_map_and_judges_each_robot_by_itself(entry: Entry) -> None:
+    rule, n = entry.target(), 300
+    rng = np.random.default_rng(0)
+    level, anywhere = (torch.as_tensor(rng.integers(0, 10, n)) for _ in range(2))
+    walked, told = (torch.as_tensor(rng.uniform(0, top, n)).float() for top in (8.0, 20.0))
+    after = rule(level, walked, told, 8.0, 9, anywhere)
+    assert after.shape == (n,)
+    assert after.dtype == torch.int64
+    assert after.min() >= 0
+    assert after.max() <= 9
+    assert ((after - level).abs() <= 1)[level < 9].all()
+    for i in range(0, n, 29):
+        row = slice(i, i + 1)
+        assert torch.equal(rule(level[row], walked[row], told[row], 8.0, 9, anywhere[row]), after[row])

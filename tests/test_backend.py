@@ -1,0 +1,489 @@
+"""The batch of simulations against serial ``mj_step`` loops, bit for bit, and against the rule of ``backend.py``."""
+
+from __future__ import annotations
+
+import copy
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from go1exp import robot
+from go1exp.config import TaskConfig
+from go1exp.env.core import Go1Core
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import Sensors, build_model
+from go1exp.registry import members
+from go1exp.terrain import build_terrain
+
+FEET = [f"{leg}_foot" for leg in robot.LEGS]
+Build = Callable[..., MujocoCpu]
+
+
+@pytest.fixture
+def scene(make_task: Callable[..., TaskConfig]) -> Callable[..., tuple[mujoco.MjModel, Sensors]]:
+    def build(*overrides: str) -> tuple[mujoco.MjModel, Sensors]:
+        task = make_task(*overrides)
+        return build_model(task.robot, build_terrain(task.terrain), task.sim.physics_dt)
+
+    return build
+
+
+@pytest.fixture
+def make_backend(scene: Callable[..., tuple[mujoco.MjModel, Sensors]]) -> Build:
+    return lambda n, *overrides, threads=1: MujocoCpu(*scene(*overrides), n, threads)
+
+
+def initial(n: int, height: float = robot.NOMINAL_HEIGHT, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Robots near the nominal stance, each a little different: qpos (n, 19), qvel (n, 18)."""
+    rng = np.random.default_rng(seed)
+    qpos, qvel = np.zeros((n, 19)), rng.normal(0.0, 0.3, (n, 18))
+    qpos[:, :2], qpos[:, 2] = rng.uniform(-0.5, 0.5, (n, 2)), height
+    qpos[:, 3:7] = Rotation.from_rotvec(rng.normal(0.0, 0.1, (n, 3))).as_quat(scalar_first=True)
+    qpos[:, 7:] = robot.NOMINAL_STANCE + rng.normal(0.0, 0.1, (n, 12))
+    return torch.as_tensor(qpos), torch.as_tensor(qvel)
+
+
+def torques(n: int, steps: int, seed: int = 0) -> torch.Tensor:
+    """Torques (steps, n, 12) that change every step and sometimes exceed the limit."""
+    return torch.as_tensor(np.random.default_rng(seed).normal(0.0, 10.0, (steps, n, 12)))
+
+
+def everyone(n: int) -> torch.Tensor:
+    return torch.ones(n, dtype=torch.bool)
+
+
+def randomize(backend: MujocoCpu, seed: int = 0) -> dict[str, np.ndarray]:
+    """Give every simulation masses, a trunk COM and foot friction of its own; return what was written."""
+    n, model = backend.num_envs, backend.model
+    rng = np.random.default_rng(seed)
+    factor = rng.uniform(0.8, 1.3, (n, model.nbody))
+    own = {
+        "body_mass": model.body_mass * factor,
+        "body_inertia": model.body_inertia * factor[:, :, None],
+        "body_ipos": model.body_ipos
+        + rng.uniform(-0.025, 0.025, (n, model.nbody, 3)) * (np.arange(model.nbody) == 1)[:, None],
+        "geom_friction": model.geom_friction * rng.uniform(0.6, 1.2, (n, model.ngeom, 1)),
+    }
+    for name, values in own.items():
+        backend.field(name).copy_(torch.as_tensor(values))
+    backend.derive_constants(everyone(n))
+    return own
+
+
+def own_model(nominal: mujoco.MjModel, own: dict[str, np.ndarray], env: int) -> mujoco.MjModel:
+    """One simulation's model, made without the batch."""
+    model = copy.copy(nominal)
+    for name, values in own.items():
+        getattr(model, name)[:] = values[env]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def start(model: mujoco.MjModel, qpos: torch.Tensor, qvel: torch.Tensor) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos.numpy(), qvel.numpy()
+    mujoco.mj_forward(model, data)
+    return data
+
+
+GROUNDS = pytest.mark.parametrize(
+    "ground", [(), ("terrain=rough", "terrain.rows=3", "terrain.cols=3")], ids=["flat", "rough"]
+)
+
+
+@GROUNDS
+def test_a_batch_is_a_serial_loop_over_its_own_models_bit_for_bit(make_backend: Build, ground: tuple[str, ...]) -> None:
+    n, steps = 3, 250
+    backend = make_backend(n, *ground)
+    own = randomize(backend)
+    qpos, qvel = initial(n)
+    backend.reset(everyone(n), qpos, qvel)
+    models = [own_model(backend.model, own, i) for i in range(n)]
+    serial = [start(models[i], qpos[i], qvel[i]) for i in range(n)]
+    touched = False
+    for ctrl in torques(n, steps):
+        backend.step(ctrl)
+        for i, data in enumerate(serial):
+            data.ctrl[:] = ctrl[i].numpy()
+            mujoco.mj_step(models[i], data)
+            touched |= data.ncon > 0
+            np.testing.assert_array_equal(backend.qpos[i], data.qpos)
+            np.testing.assert_array_equal(backend.qvel[i], data.qvel)
+            np.testing.assert_array_equal(backend.sensordata[i], data.sensordata)
+    assert touched
+
+
+DERIVED = ["body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0"]
+
+
+def test_derived_constants_follow_the_masses_of_each_simulation(make_backend: Build) -> None:
+    backend = make_backend(3)
+    own = randomize(backend)
+    for i in range(3):
+        mine, theirs = backend.env_model(i), own_model(backend.model, own, i)
+        for name in [*own, *DERIVED]:
+            np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)
+        assert mine.body_subtreemass[1] == pytest.approx(own["body_mass"][i].sum())
+        assert mine.body_subtreemass[1] != backend.model.body_subtreemass[1]
+
+
+def test_constants_are_derived_in_masked_rows_only(make_backend: Build) -> None:
+    backend = make_backend(4)
+    randomize(backend)
+    before = [backend.env_model(i).dof_invweight0.copy() for i in range(4)]
+    backend.field("body_mass").mul_(1.5)
+    mask = torch.tensor([False, True, False, True])
+    backend.derive_constants(~everyone(4))
+    backend.derive_constants(mask)
+    changed = [not np.array_equal(backend.env_model(i).dof_invweight0, before[i]) for i in range(4)]
+    assert changed == mask.tolist()
+
+
+def test_the_number_of_threads_changes_no_bit(make_backend: Build) -> None:
+    n = 7
+    one, two = make_backend(n, threads=1), make_backend(n, threads=2)
+    for backend in (one, two):
+        randomize(backend)
+        backend.reset(everyone(n), *initial(n))
+    for ctrl in torques(n, 150):
+        one.step(ctrl)
+        two.step(ctrl)
+    assert torch.equal(one.qpos, two.qpos)
+    assert torch.equal(one.qvel, two.qvel)
+    assert torch.equal(one.sensordata, two.sensordata)
+
+
+def test_a_reset_touches_only_masked_rows_and_they_go_on_like_new(make_backend: Build) -> None:
+    n = 5
+    backend, twin, new = make_backend(n), make_backend(n), make_backend(n)
+    for b in (backend, twin):
+        b.reset(everyone(n), *initial(n))
+        for ctrl in torques(n, 120):
+            b.step(ctrl)
+    mask = torch.tensor([False, True, False, False, True])
+    garbage = torch.full((n, 19), torch.nan, dtype=torch.float64), torch.full((n, 18), torch.nan, dtype=torch.float64)
+    fresh = initial(n, seed=5)
+    wanted = [torch.where(mask.unsqueeze(1), good, bad) for good, bad in zip(fresh, garbage, strict=True)]
+    backend.reset(mask, *wanted)
+    new.reset(everyone(n), *fresh)
+    assert torch.equal(backend.qpos[mask], fresh[0][mask])
+    assert torch.equal(backend.qvel[mask], fresh[1][mask])
+    for ctrl in [None, *torques(n, 60, seed=1)]:
+        if ctrl is not None:
+            for b in (backend, twin, new):
+                b.step(ctrl)
+        for name in ("qpos", "qvel", "sensordata"):
+            after = getattr(backend, name)
+            assert torch.equal(after[~mask], getattr(twin, name)[~mask]), name
+            assert torch.equal(after[mask], getattr(new, name)[mask]), name
+
+
+def test_a_reset_of_nobody_changes_nothing(make_backend: Build) -> None:
+    backend = make_backend(2)
+    backend.reset(everyone(2), *initial(2))
+    for ctrl in torques(2, 20):
+        backend.step(ctrl)
+    before = [x.clone() for x in (backend.qpos, backend.qvel, backend.sensordata)]
+    backend.reset(~everyone(2), *initial(2, seed=3))
+    assert all(torch.equal(a, b) for a, b in zip(before, (backend.qpos, backend.qvel, backend.sensordata), strict=True))
+
+
+def feet_at(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """Positions and velocities of the feet (4 x 3, 4 x 3) in a state, m and m/s."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    sites, velocity = [model.site(name).id for name in FEET], np.zeros((4, 3))
+    jacobian = np.zeros((3, model.nv))
+    for k, site in enumerate(sites):
+        mujoco.mj_jacSite(model, data, jacobian, None, site)
+        velocity[k] = jacobian @ data.qvel
+    return np.stack([data.site_xpos[sites], velocity])
+
+
+def feet_sensed(backend: MujocoCpu, env: int) -> np.ndarray:
+    s = backend.sensors
+    readings = [backend.sensordata[env, block].reshape(4, 3).numpy() for block in (s.foot_pos_w, s.foot_vel_w)]
+    return np.stack(readings)
+
+
+def test_after_a_step_sensors_describe_the_state_before_it_and_after_a_reset_the_new_state(make_backend: Build) -> None:
+    n = 2
+    backend = make_backend(n)
+    backend.reset(everyone(n), *initial(n))
+    for ctrl in torques(n, 30):
+        before = backend.qpos.numpy().copy(), backend.qvel.numpy().copy()
+        backend.step(ctrl)
+        for i in range(n):
+            np.testing.assert_allclose(
+                feet_sensed(backend, i), feet_at(backend.model, before[0][i], before[1][i]), atol=1e-12
+            )
+    now = feet_at(backend.model, backend.qpos[0].numpy(), backend.qvel[0].numpy())
+    assert np.abs(feet_sensed(backend, 0) - now).max() > 1e-4
+    qpos, qvel = initial(n, seed=8)
+    backend.reset(torch.tensor([False, True]), qpos, qvel)
+    np.testing.assert_allclose(
+        feet_sensed(backend, 1), feet_at(backend.model, qpos[1].numpy(), qvel[1].numpy()), atol=1e-12
+    )
+
+
+def test_contact_forces_after_a_reset_are_those_of_the_new_state(make_backend: Build) -> None:
+    backend = make_backend(2)
+    block = backend.sensors.foot_contact
+    for height, touching in [(0.30, True), (0.6, False)]:
+        qpos, qvel = initial(2, height)
+        qpos[:, 3:7], qpos[:, 7:] = torch.tensor([1.0, 0, 0, 0]), torch.as_tensor(robot.NOMINAL_STANCE)
+        backend.reset(everyone(2), qpos, 0 * qvel)
+        count = backend.sensordata[:, block].reshape(2, 4, 4)[..., 0]
+        force = backend.sensordata[:, block].reshape(2, 4, 4)[..., 1:]
+        assert ((count > 0) == touching).all()
+        assert ((force.norm(dim=-1) > 1.0) == touching).all()
+
+
+@GROUNDS
+def test_a_saved_state_continues_bit_for_bit_in_another_batch(make_backend: Build, ground: tuple[str, ...]) -> None:
+    n = 3
+    first, second = make_backend(n, *ground), make_backend(n, *ground)
+    randomize(first, seed=1)
+    first.reset(everyone(n), *initial(n))
+    for ctrl in torques(n, 100):
+        first.step(ctrl)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    randomize(second, seed=2)  # somewhere else, with other robots
+    second.reset(everyone(n), *initial(n, seed=4))
+    second.step(torques(n, 1)[0])
+    second.load_state_dict(torch.load(file, weights_only=True))
+    assert torch.equal(first.qpos, second.qpos)
+    for ctrl in torques(n, 100, seed=1):
+        first.step(ctrl)
+        second.step(ctrl)
+        assert torch.equal(first.qpos, second.qpos)
+        assert torch.equal(first.qvel, second.qvel)
+        assert torch.equal(first.sensordata, second.sensordata)
+    for i in range(n):
+        assert first.env_data(i).time == second.env_data(i).time == pytest.approx(0.4)
+        for name in ("body_mass", *DERIVED):
+            np.testing.assert_array_equal(getattr(first.env_model(i), name), getattr(second.env_model(i), name))
+
+
+def test_a_saved_state_does_not_move_with_the_simulation(make_backend: Build) -> None:
+    backend = make_backend(2)
+    randomize(backend)
+    backend.reset(everyone(2), *initial(2))
+    state = backend.state_dict()
+    copies = copy.deepcopy(state)
+    for ctrl in torques(2, 20):
+        backend.step(ctrl)
+    backend.field("body_mass").mul_(2.0)
+    for kind in ("state", "fields"):
+        for name, value in state[kind].items():
+            assert torch.equal(value, copies[kind][name]), name
+
+
+def test_the_step_tensors_stay_the_same_objects_in_memory(make_backend: Build) -> None:
+    backend = make_backend(2)
+    addresses = [x.data_ptr() for x in (backend.qpos, backend.qvel, backend.sensordata, backend.field("body_mass"))]
+    backend.reset(everyone(2), *initial(2))
+    backend.step(torques(2, 1)[0])
+    backend.load_state_dict(backend.state_dict())
+    now = [x.data_ptr() for x in (backend.qpos, backend.qvel, backend.sensordata, backend.field("body_mass"))]
+    assert now == addresses
+
+
+# What the contact sensors mean
+
+
+def stand(backend: MujocoCpu, seconds: float) -> np.ndarray:
+    """Hold the nominal stance and return the contact block (N, 4, 4) averaged over the last 0.1 s."""
+    n = backend.num_envs
+    qpos, qvel = torch.zeros(n, 19, dtype=torch.float64), torch.zeros(n, 18, dtype=torch.float64)
+    qpos[:, 2], qpos[:, 3] = 0.32, 1.0
+    qpos[:, 7:] = torch.as_tensor(robot.NOMINAL_STANCE)
+    backend.reset(everyone(n), qpos, qvel)
+    target, readings = torch.as_tensor(robot.NOMINAL_STANCE), []
+    for _ in range(round(seconds / 0.002)):
+        backend.step(50.0 * (target - backend.qpos[:, 7:]) - 2.0 * backend.qvel[:, 6:])
+        readings.append(backend.sensordata[:, backend.sensors.foot_contact].reshape(n, 4, 4).numpy().copy())
+    return np.mean(readings[-50:], axis=0)
+
+
+@pytest.mark.parametrize(
+    ("ground", "mass"),
+    [
+        ((), 12.743),
+        (("robot=go1_rotor_complete",), 13.099),
+        (("terrain=rough", "terrain.rows=1", "terrain.cols=1"), 12.743),
+    ],
+    ids=["plane", "with rotors", "height field"],
+)
+def test_the_forces_on_the_feet_of_a_standing_robot_add_up_to_its_weight(
+    make_backend: Build, ground: tuple[str, ...], mass: float
+) -> None:
+    contact = stand(make_backend(2, *ground), 1.2)
+    assert (contact[..., 0] > 0).all()
+    force = contact[..., 1:].sum(axis=1)  # over the feet
+    np.testing.assert_allclose(np.abs(force[:, 2]), mass * 9.81, rtol=5e-3)
+    np.testing.assert_allclose(force[:, :2], 0.0, atol=1.0)
+    assert (np.abs(contact[..., 3]) > 15.0).all()  # each of them bears a share
+
+
+def test_the_contact_force_is_the_one_on_the_foot_as_the_sensors_say(make_backend: Build) -> None:
+    """`Sensors.foot_contact`: "the net contact force on it", so the ground pushes a foot up."""
+    assert (stand(make_backend(1), 0.5)[..., 3] > 0.0).all()
+
+
+def random_poses(backend: MujocoCpu, n: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Robots in any posture, turned any way up, with their lowest shape 3 to 40 mm in the ground."""
+    rng = np.random.default_rng(seed)
+    low, high = robot.JOINT_POS_LIMITS.T
+    qpos = np.zeros((n, 19))
+    qpos[:, 2] = 1.0
+    qpos[:, 3:7] = Rotation.random(n, random_state=seed).as_quat(scalar_first=True)
+    qpos[:, 7:] = rng.uniform(low, high, (n, 12))
+    data, nearest = mujoco.MjData(backend.model), np.zeros(6)
+    floor = backend.model.geom("floor").id
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_forward(backend.model, data)
+        gaps = [
+            mujoco.mj_geomDistance(backend.model, data, floor, g, 3.0, nearest)
+            for g in range(backend.model.ngeom)
+            if g != floor
+        ]
+        q[2] -= min(gaps) + rng.uniform(0.003, 0.04)
+    return torch.as_tensor(qpos), torch.zeros(n, 18, dtype=torch.float64)
+
+
+PARTS = ("foot", "thigh", "calf", "trunk")
+
+
+def counted(model: mujoco.MjModel, qpos: np.ndarray) -> dict[str, Any]:
+    """Contacts of one pose by geom, from MuJoCo's own list: per leg for foot, thigh and calf without foot."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    found: dict[str, Any] = {
+        "foot": np.zeros(4),
+        "thigh": np.zeros(4),
+        "calf": np.zeros(4),
+        "trunk": 0,
+        "hip": np.zeros(4),
+    }
+    for contact in data.contact:
+        assert model.geom("floor").id in contact.geom
+        geom = next(int(g) for g in contact.geom if g != model.geom("floor").id)
+        name, body = model.geom(geom).name, model.body(model.geom_bodyid[geom]).name
+        if body == "trunk":
+            found["trunk"] += 1
+            continue
+        leg, part = body.split("_")
+        found["foot" if name.endswith("_foot") else part][robot.LEGS.index(leg)] += 1
+    return found
+
+
+def test_contact_counts_are_those_of_mujocos_contact_list_in_any_posture(make_backend: Build) -> None:
+    n = 200
+    backend = make_backend(n)
+    backend.reset(everyone(n), *random_poses(backend, n))
+    feet = backend.sensordata[:, backend.sensors.foot_contact].reshape(n, 4, 4)[..., 0].numpy()
+    links = backend.sensordata[:, backend.sensors.link_contacts].numpy()
+    seen = dict.fromkeys([*PARTS, "hip"], 0.0)
+    for i in range(n):
+        want = counted(backend.model, backend.qpos[i].numpy())
+        np.testing.assert_array_equal(feet[i], want["foot"])
+        np.testing.assert_array_equal(links[i, 0:4], want["thigh"])
+        np.testing.assert_array_equal(links[i, 4:8] - feet[i], want["calf"])
+        assert links[i, 8] == want["trunk"]
+        np.testing.assert_array_equal(links[i, 9:13], want["hip"])
+        for part in seen:
+            seen[part] += np.sum(want[part])
+    assert all(count >= 5 for count in seen.values()), seen
+
+
+def test_the_snapshot_names_the_parts_that_touch_and_a_foot_is_no_calf(make_core: Callable[..., Go1Core]) -> None:
+    """With one physics step per policy step, the flags of the step are those of the pose it began with."""
+    n = 150
+    core = make_core("sim.policy_dt=0.002", "rand=none", "event=none", "termination=none", num_envs=n, noise=False)
+    core.reset()
+    assert isinstance(core.backend, MujocoCpu)
+    qpos, qvel = random_poses(core.backend, n, seed=1)
+    core.backend.reset(everyone(n), qpos, qvel)
+    core.step(torch.zeros(n, 12))
+    s = core.snapshot()
+    assert s.thigh_contact is not None
+    assert s.calf_contact is not None
+    assert s.trunk_contact is not None
+    calf_beside_foot = 0
+    for i in range(n):
+        want = counted(core.backend.model, qpos[i].numpy())
+        np.testing.assert_array_equal(s.foot_contact[i], want["foot"] > 0)
+        np.testing.assert_array_equal(s.thigh_contact[i], want["thigh"] > 0)
+        np.testing.assert_array_equal(s.calf_contact[i], want["calf"] > 0)
+        assert s.trunk_contact[i] == (want["trunk"] > 0 or want["hip"].any())
+        calf_beside_foot += bool(((want["foot"] > 0) & (want["calf"] > 0)).any())
+    alone = s.foot_contact & ~s.calf_contact
+    assert alone.sum() > 5
+    assert (s.calf_contact & ~s.foot_contact).sum() > 5
+    assert members("termination")["trunk_contact"].target(s).sum() > 5
+
+
+@pytest.mark.parametrize(
+    ("joints", "height", "turn", "touching"),
+    [
+        # Belly on the ground, legs straight up beside it.
+        ([0.0, 3.14, -0.9], 0.056, None, {"trunk"}),
+        # Nominal stance, all feet in the ground by 5 mm or more.
+        (list(robot.NOMINAL_STANCE), 0.31, None, {"foot"}),
+        # Kneeling: thighs forward and down, shanks folded up behind the knee; the shank's own end is the lowest point.
+        ([0.0, -0.6, -2.8], 0.1872, None, {"calf"}),
+        # On the back, legs up.
+        (list(robot.NOMINAL_STANCE), 0.055, [np.pi, 0.0, 0.0], {"trunk"}),
+    ],
+    ids=["belly", "feet", "knees", "back"],
+)
+def test_a_known_posture_touches_with_the_right_part(
+    make_core: Callable[..., Go1Core], joints: list[float], height: float, turn: list[float] | None, touching: set[str]
+) -> None:
+    core = make_core("sim.policy_dt=0.002", "rand=none", "event=none", "termination=none", num_envs=1, noise=False)
+    core.reset()
+    quat = Rotation.from_rotvec(turn or [0.0, 0.0, 0.0]).as_quat(scalar_first=True)
+    qpos = torch.as_tensor(np.concatenate([[0.0, 0.0, height], quat, np.tile(joints, 12 // len(joints))]))
+    core.backend.reset(everyone(1), qpos.unsqueeze(0), torch.zeros(1, 18, dtype=torch.float64))
+    core.step(torch.zeros(1, 12))
+    s = core.snapshot()
+    assert s.thigh_contact is not None
+    assert s.calf_contact is not None
+    assert s.trunk_contact is not None
+    flags = {"foot": s.foot_contact, "thigh": s.thigh_contact, "calf": s.calf_contact, "trunk": s.trunk_contact}
+    for part, flag in flags.items():
+        assert flag.all() if part in touching else not flag.any(), part
+
+
+def test_a_robot_never_meets_itself(make_backend: Build) -> None:
+    backend = make_backend(50)
+    qpos, qvel = random_poses(backend, 50)
+    qpos[:, 2] += 1.0
+    backend.reset(everyone(50), qpos, qvel)
+    assert not backend.sensordata[:, backend.sensors.link_contacts].any()
+    assert not backend.sensordata[:, backend.sensors.foot_contact].any()
+
+
+def test_a_fault_is_seen_and_not_healed(make_backend: Build, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """MuJoCo would by itself put a robot whose state is not finite back to where the model starts."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file
+    backend = make_backend(2)
+    backend.reset(everyone(2), *initial(2))
+    backend.qvel[0, 7] = torch.nan
+    backend.step(torques(2, 1)[0])
+    assert not torch.isfinite(backend.qvel[0]).all()
+    assert torch.isfinite(backend.qpos[1]).all()
+    assert torch.isfinite(backend.qvel[1]).all()

@@ -1,0 +1,376 @@
+"""Every file of conf/ works, ablations take away what they are named after, and the paper's numbers are the paper's."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+
+from go1exp import data_root, registry
+from go1exp.compose import compose, config_folder
+from go1exp.config import TrainConfig, parse_train
+from go1exp.env.core import Go1Core
+from go1exp.mdp import rewards
+from go1exp.registry import ConfigError, Term
+
+CONF = data_root() / "conf"
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def groups() -> list[str]:
+    """The groups of conf/train.yaml."""
+    defaults = OmegaConf.to_container(OmegaConf.load(CONF / "train.yaml"))["defaults"]  # type: ignore[call-overload,index]
+    return [str(group) for item in defaults if isinstance(item, dict) for group in item]
+
+
+def choices() -> list[str]:
+    found = []
+    for group in groups():
+        folder = CONF / ("randomization" if group == "rand" else group)
+        names = [file.relative_to(folder).with_suffix("").as_posix() for file in sorted(folder.rglob("*.yaml"))]
+        found += [f"{group}={name}" for name in names]
+    return found
+
+
+ABLATIONS = [c.removeprefix("experiment=ablation/") for c in choices() if c.startswith("experiment=ablation/")]
+NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
+
+
+@pytest.mark.parametrize("choice", [c for c in choices() if not c.startswith("experiment=ablation/")])
+def test_every_file_composes_and_parses(choice: str) -> None:
+    parse_train(compose("train", [choice, *NEEDS.get(choice, [])]))
+
+
+def test_every_group_has_a_folder_and_a_choice() -> None:
+    assert {c.split("=")[0] for c in choices()} == set(groups())
+
+
+# ---------------------------------------------------------------------- overlays
+
+REWARD_GROUPS = {
+    "no_gait_shaping": ["feet_air_time", "gait", "air_time_variance", "foot_clearance"],
+    "no_smoothness": ["action_smoothness", "joint_acceleration", "joint_velocity"],
+    "no_effort": ["joint_torque", "foot_force"],
+    "no_posture": ["base_motion", "base_orientation", "joint_deviation"],
+    "no_contact": ["foot_slip", "foot_force", "thigh_contact", "calf_contact"],
+    "no_limits": ["joint_position_limit", "joint_velocity_limit"],
+}
+NEUTRAL: dict[str, dict[str, Any]] = {
+    "foot_friction": {"range": [1.0, 1.0], "operation": "scale"},
+    "center_of_mass": {"range": [0.0, 0.0]},
+    "link_mass": {"range": [1.0, 1.0]},
+    "body_velocity": {"range": [0.0, 0.0]},
+    "body_position": {"range": [0.0, 0.0]},
+    "body_orientation": {"range": [0.0, 0.0]},
+    "joint_positions": {"range": [0.0, 0.0]},
+    "joint_velocities": {"range": [0.0, 0.0]},
+}
+
+
+def flat(node: Any, path: str = "") -> dict[str, Any]:
+    """Leaves of nested mappings by dotted path; an empty mapping has none."""
+    if not isinstance(node, Mapping):
+        return {path: node}
+    return {k: v for key, child in node.items() for k, v in flat(child, f"{path}.{key}".strip(".")).items()}
+
+
+@cache
+def default() -> dict[str, Any]:
+    return flat(compose("train"))
+
+
+def ablated(name: str, base: Mapping[str, Any]) -> dict[str, Any]:
+    """What the configuration ``base`` is without what the ablation's name says."""
+    if name in ("no_push", "no_rand"):
+        gone = {"no_push": "event.", "no_rand": "rand."}[name]
+        return {k: v for k, v in base.items() if not k.startswith(gone)}
+    if name == "no_noise":
+        return {k: 0.0 if k.endswith(".noise") else v for k, v in base.items()}
+    if name.startswith("no_rand_"):
+        term = name.removeprefix("no_rand_")
+        return {**base, **{f"rand.{term}.{k}": v for k, v in NEUTRAL[term].items()}}
+    terms = REWARD_GROUPS.get(name, [name.removeprefix("no_")])
+    return {**base, **{f"reward.{term}.weight": 0.0 for term in terms}}
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_an_ablation_changes_what_it_says_and_nothing_else(name: str) -> None:
+    container = compose("train", [f"experiment=ablation/{name}"])
+    parse_train(container)
+    changed = flat(container)
+    assert changed == ablated(name, default())
+    assert changed != default()
+
+
+def test_every_row_of_the_tables_has_its_ablation() -> None:
+    singles = [f"no_{term}" for term in TABLE_3] + [f"no_rand_{term}" for term in TABLE_1]
+    assert set(singles) | set(REWARD_GROUPS) | {"no_noise", "no_push", "no_rand"} == set(ABLATIONS)
+
+
+def test_ablations_work_on_other_choices_too() -> None:
+    other = ["reward=paper_literal", "rand=text"]
+    expected = flat(compose("train", other))
+    names = [name for name in ABLATIONS if name != "no_rand"]
+    for name in names:
+        expected = ablated(name, expected)
+    every = ",".join(f"ablation/{name}" for name in names)
+    container = compose("train", [*other, f"experiment=[{every}]"])
+    parse_train(container)
+    assert flat(container) == expected
+
+
+def test_an_ablation_works_on_the_papers_setting() -> None:
+    base = flat(compose("train", ["experiment=paper"]))
+    for name in ("no_gait", "no_push", "no_rand"):
+        expected = ablated(name, base)
+        assert flat(compose("train", [f"experiment=[paper,ablation/{name}]"])) == expected
+        assert flat(compose("train", ["experiment=paper", f"+experiment/ablation={name}"])) == expected
+
+
+def test_the_command_line_beats_an_experiment() -> None:
+    values = flat(compose("train", ["experiment=ablation/no_gait", "reward.gait.weight=2.0"]))
+    assert values["reward.gait.weight"] == 2.0
+    assert compose("train", ["experiment=ablation/no_push", "event=push"])["event"]
+    assert compose("train", ["experiment=paper", "ppo=cpu"])["ppo"] == compose("train")["ppo"]
+
+
+def test_the_default_is_the_papers_task_on_flat_ground() -> None:
+    paper = flat(compose("train", ["experiment=paper_flat"]))
+    assert {k: v for k, v in paper.items() if not k.startswith("ppo.")} == {
+        k: v for k, v in default().items() if not k.startswith("ppo.")
+    }
+
+
+def test_an_ablated_reward_is_not_computed(make_core: Callable[..., Go1Core]) -> None:
+    metrics = make_core("experiment=ablation/no_limits", num_envs=1).drain_metrics(1)
+    assert "reward/gait" in metrics
+    assert not [key for key in metrics if key.endswith("_limit")]
+
+
+@pytest.mark.parametrize("term", NEUTRAL)
+def test_a_neutral_range_equals_the_term_removed(term: str, make_core: Callable[..., Go1Core]) -> None:
+    def rollout(*overrides: str) -> torch.Tensor:
+        core = make_core("sim.episode_s=0.1", *overrides, num_envs=2)
+        seen = [core.reset(), core.backend.qpos.clone()]
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(12):
+            result = core.step(torch.randn(2, 12, generator=generator))
+            seen += [result.observation.clone(), core.backend.qpos.clone()]
+        return torch.cat(seen, dim=1)
+
+    neutral = rollout(f"experiment=ablation/no_rand_{term}")
+    torch.testing.assert_close(neutral, rollout(f"~rand.{term}"), rtol=0, atol=0)
+    assert not torch.equal(neutral, rollout())
+
+
+# ---------------------------------------------------------------------- the paper, typed from its pages
+
+TABLE_1 = {  # term: operation, range
+    "foot_friction": ("New", (0.4, 1.1)),
+    "center_of_mass": ("Add", (-0.025, 0.025)),
+    "link_mass": ("Scale", (0.8, 1.3)),
+    "body_velocity": ("Add", (-0.25, 0.25)),
+    "body_position": ("Add", (-0.5, 0.5)),
+    "body_orientation": ("Add", (-0.02, 0.02)),
+    "joint_positions": ("Scale", (-0.3, 0.3)),
+    "joint_velocities": ("Scale", (-2.5, 2.5)),
+}
+TABLE_2 = {  # term: size, injected noise
+    "base_linear_velocity": (3, 0.02),
+    "base_angular_velocity": (3, 0.01),
+    "projected_gravity": (3, 0.05),
+    "velocity_command": (3, 0.0),
+    "joint_position": (12, 0.05),
+    "joint_velocity": (12, 0.1),
+    "previous_action": (12, 0.0),
+}
+TABLE_3 = {  # term: weight
+    "feet_air_time": 5.0,
+    "linear_velocity_error": 5.0,
+    "angular_velocity_error": 5.0,
+    "gait": 10.0,
+    "foot_clearance": 5.0,
+    "action_smoothness": -1.5,
+    "air_time_variance": -1.0,
+    "base_motion": -2.0,
+    "base_orientation": -5.0,
+    "foot_slip": -1.0,
+    "foot_force": -0.00002,
+    "joint_torque": -0.0005,
+    "joint_acceleration": -0.0002,
+    "joint_velocity": -0.015,
+    "joint_deviation": -0.75,
+    "joint_position_limit": -100.0,
+    "joint_velocity_limit": -10.0,
+    "thigh_contact": -10.0,
+    "calf_contact": -1.0,
+}
+
+
+@cache
+def parsed(*overrides: str) -> TrainConfig:
+    return parse_train(compose("train", overrides))
+
+
+@pytest.fixture
+def paper() -> TrainConfig:
+    return parsed("experiment=paper")
+
+
+def by_key(terms: tuple[Term, ...]) -> dict[str, Term]:
+    return {term.key: term for term in terms}
+
+
+@pytest.mark.parametrize("choice", ["paper", "paper_literal"])
+def test_table_3_has_the_printed_rows_in_order_and_weights(choice: str) -> None:
+    terms = parsed(f"reward={choice}").task.reward
+    assert [(term.key, term.slots["weight"]) for term in terms] == list(TABLE_3.items())
+
+
+def test_table_3_has_the_printed_constants(paper: TrainConfig) -> None:
+    terms, literal = by_key(paper.task.reward), by_key(parsed("reward=paper_literal").task.reward)
+    assert terms["feet_air_time"].parameters["mode_time"] == 0.175
+    assert literal["feet_air_time"].parameters["threshold"] == 0.175
+    for choice in (terms, literal):
+        assert choice["linear_velocity_error"].parameters["scale"] == 1.0
+        assert choice["angular_velocity_error"].parameters["scale"] == 2.0
+        assert choice["foot_clearance"].parameters["target_height"] == 0.08
+
+
+def test_the_literal_table_uses_every_literal_term() -> None:
+    used = {term.entry.name for term in parsed("reward=paper_literal").task.reward}
+    assert {name for name in registry.members("reward") if name.endswith("_literal")} == used - set(TABLE_3)
+
+
+def test_table_1_has_the_printed_ranges(paper: TrainConfig) -> None:
+    terms = by_key(paper.task.rand)
+    assert {key: term.parameters["range"] for key, term in terms.items()} == {k: r for k, (_, r) in TABLE_1.items()}
+    assert terms["foot_friction"].parameters["operation"] == "set"
+    assert terms["joint_positions"].parameters["operation"] == "scale"
+
+
+def test_table_2_has_the_printed_sizes_and_noise_in_order(paper: TrainConfig) -> None:
+    rows = [(t.key, (t.entry.traits["size"], t.slots["noise"])) for t in paper.task.observation]
+    assert rows == list(TABLE_2.items())
+    assert sum(size for size, _ in TABLE_2.values()) == 48
+
+
+def test_section_2_commands_pushes_terrain_and_actions(paper: TrainConfig) -> None:
+    task = paper.task
+    velocities = {"lin_vel_x": (-2.0, 3.0), "lin_vel_y": (-1.5, 1.5), "ang_vel_z": (-1.5, 1.5)}
+    assert task.command.parameters == {**velocities, "hold_time": (0.3, 10.0), "standing_fraction": 0.1}
+    (push,) = task.event
+    assert (push.key, push.parameters) == ("push", {"interval": (10.0, 15.0), "velocity": (-1.0, 1.0)})
+    assert task.terrain.kind == "tiles"
+    assert min(task.terrain.boxes_proportion, task.terrain.bumps_proportion, task.terrain.ramps_proportion) > 0
+    assert [term.key for term in task.curriculum] == ["terrain_level"]
+    assert task.action.scale == 0.2
+    assert (task.actuator.parameters["kp"], task.actuator.parameters["kd"]) == (20.0, 0.5)
+
+
+def test_section_3_network_ppo_and_time_steps(paper: TrainConfig) -> None:
+    ppo, sim = paper.ppo, paper.task.sim
+    assert (ppo.num_envs, ppo.iterations) == (4096, 5000)
+    assert (ppo.hidden, ppo.activation) == ((512, 256, 128), "elu")
+    assert (ppo.schedule, ppo.learning_rate, ppo.desired_kl) == ("adaptive", 0.001, 0.01)
+    assert (ppo.entropy, ppo.gamma, ppo.gae_lambda) == (0.0025, 0.99, 0.95)
+    assert (sim.physics_dt, sim.policy_dt) == (0.002, 0.02)
+
+
+def test_what_the_paper_leaves_out_is_isaac_labs(paper: TrainConfig) -> None:
+    ppo = paper.ppo
+    assert (ppo.steps, ppo.epochs, ppo.minibatches) == (24, 5, 4)
+    assert (ppo.clip_range, ppo.value_coef, ppo.max_grad_norm, ppo.init_std) == (0.2, 0.5, 1.0, 1.0)
+    assert ppo.learning_rate_range == (1e-5, 1e-2)
+    assert paper.task.sim.episode_s == 20.0
+
+
+def test_defaults_in_the_code_are_the_papers(paper: TrainConfig) -> None:
+    """So that a term added by hand, as ``+reward.gait={weight: 10.0}``, is the paper's term."""
+    task = paper.task
+    terms = [*task.reward, *task.rand, *task.event, *task.termination, *task.curriculum, task.command, task.actuator]
+    for term in terms:
+        for name, parameter in term.entry.parameters.items():
+            assert parameter.default == term.parameters[name], f"{term.entry.name}.{name}"
+
+
+# ---------------------------------------------------------------------- examples in the documentation
+
+
+def fences(language: str) -> list[str]:
+    """Fenced blocks of that language in the pages about configuration."""
+    text = "\n".join((DOCS / page).read_text() for page in ("paper.md", "configuration.md"))
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+COMMANDS = [
+    line for block in fences("bash") for line in block.splitlines() if line.startswith("go1exp") and " --" not in line
+]
+COMPLAINTS = [block for block in fences("console") if block.startswith("$ go1exp train ")]
+
+
+def jobs(overrides: list[str]) -> list[list[str]]:
+    """The overrides of each job of a multirun."""
+    runs: list[list[str]] = [[]]
+    with initialize_config_dir(config_folder(), version_base="1.3"):
+        parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+        for override in parser.parse_overrides(overrides):
+            if override.is_sweep_override():
+                ways = [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+            else:
+                ways = [override.input_line or ""]
+            runs = [[*run, way] for run in runs for way in ways]
+    return runs
+
+
+def test_the_page_on_the_paper_has_every_row() -> None:
+    rows = re.findall(r"^\|[^|]*\(`(\w+)`\) \| ([^|]*) \|", (DOCS / "paper.md").read_text(), re.MULTILINE)
+    assert {name for name, _ in rows} >= {*TABLE_1, *TABLE_2, *TABLE_3}
+    weights = {name: float(cell.replace("−", "-")) for name, cell in rows[: len(TABLE_3)]}
+    assert weights == TABLE_3
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_in_the_documentation_compose_and_parse(command: str) -> None:
+    verb, *overrides = shlex.split(command, comments=True)[1:]
+    assert verb == "train"
+    runs = [overrides]
+    if overrides[:1] == ["-m"]:
+        runs = jobs(overrides[1:])
+        assert len(runs) > 1
+    for run in (runs[0], runs[-1]):
+        parse_train(compose("train", run))
+
+
+@pytest.mark.parametrize("block", COMPLAINTS)
+def test_complaints_in_the_documentation_are_true(block: str) -> None:
+    command, *message = block.splitlines()
+    with pytest.raises((ConfigError, HydraException)) as caught:
+        parse_train(compose("train", shlex.split(command)[3:]))
+    said = [line.strip() for line in str(caught.value).splitlines()]
+    assert [line.strip() for line in message if line.strip() not in said] == []
+
+
+def test_the_documented_reward_works(monkeypatch: pytest.MonkeyPatch, make_core: Callable[..., Go1Core]) -> None:
+    members = {group: dict(registry.members(group)) for group in registry.groups()}
+    monkeypatch.setattr(registry, "_REGISTRY", members)
+    (code,) = fences("python")
+    (line,) = (block for block in fences("yaml") if block.startswith("joint_power"))
+    exec(code, dict(vars(rewards)))
+    settings = line.split("#")[0].partition(":")[2].strip()
+    core = make_core(f"+reward.joint_power={settings}", num_envs=1)
+    core.reset()
+    for _ in range(3):
+        core.step(torch.full((1, 12), 3.0))
+    assert core.drain_metrics(3)["reward/joint_power"] < 0

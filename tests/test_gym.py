@@ -1,0 +1,339 @@
+"""The borders: Gymnasium and Stable-Baselines3."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+from go1exp.config import TaskConfig
+from go1exp.env.core import Go1Core
+from go1exp.env.faults import NumericalFault
+from go1exp.env.gym_env import Go1Env, register
+from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.registry import ConfigError
+
+Make = Callable[..., Go1Core]
+
+ONE_THREAD = "backend.threads=1"
+LIVELY = (ONE_THREAD, "sim.episode_s=0.4", "event.push.interval=[0.1,0.3]", "command.hold_time=[0.06,0.2]")
+QUIET = (ONE_THREAD, "rand=none", "event=none", "termination=none", "command=forward")
+
+
+@pytest.fixture
+def registered() -> Iterator[None]:
+    """`Go1-v0`, whether importing go1exp announces it or not."""
+    announced = "Go1-v0" in gymnasium.registry
+    if not announced:
+        register()
+    yield
+    if not announced:
+        gymnasium.registry.pop("Go1-v0")
+
+
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A folder of its own, as MuJoCo writes its warnings to a file where it runs."""
+    monkeypatch.chdir(tmp_path)
+
+
+def actions(n: int, steps: int, scale: float = 1.0, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0.0, scale, (steps, n, 12)).astype(np.float32)
+
+
+# Gymnasium
+
+
+def test_gymnasiums_own_checker_is_content() -> None:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        check_env(Go1Env([ONE_THREAD]), skip_render_check=True)
+    # An observation has no bounds, and actions are in units of their own scale.
+    allowed = ("infinity. This is probably too", "we recommend using a symmetric and normalized space")
+    assert [str(w.message) for w in said if not any(a in str(w.message) for a in allowed)] == []
+
+
+def test_gymnasium_makes_it_by_name_with_overrides(registered: None) -> None:
+    env = gymnasium.make("Go1-v0", overrides=[*QUIET, "action.clip=3.0", "sim.episode_s=0.1"])
+    try:
+        assert isinstance(env.unwrapped, Go1Env)
+        assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (48,), np.float32)
+        assert env.action_space == gymnasium.spaces.Box(-3.0, 3.0, (12,), np.float32)
+        assert env.metadata["render_fps"] == 50
+        observation, info = env.reset(seed=1)
+        assert env.observation_space.contains(observation)
+        assert info == {}
+        for k in range(1, 6):
+            observation, reward, terminated, truncated, info = env.step(np.zeros(12, np.float32))
+            assert env.observation_space.contains(observation)
+            assert type(reward) is float
+            assert type(terminated) is type(truncated) is bool
+            assert (terminated, truncated) == (False, k == 5)
+    finally:
+        env.close()
+
+
+def test_the_render_rate_is_that_of_the_policy() -> None:
+    assert Go1Env([*QUIET, "sim.policy_dt=0.01"]).metadata["render_fps"] == 100
+    assert Go1Env(QUIET).metadata["render_fps"] == 50
+
+
+def test_a_misspelt_override_is_refused_when_the_environment_is_made(registered: None) -> None:
+    with pytest.raises(ConfigError, match="foot_slip"):
+        gymnasium.make("Go1-v0", overrides=["+reward.foot_slipp={weight: -1.0}"])
+
+
+def trajectory(env: Go1Env, seed: int | None, steps: int = 50) -> list[np.ndarray]:
+    seen = [env.reset(seed=seed)[0]]
+    for action in actions(1, steps)[:, 0]:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        seen.append(np.append(observation, [reward, terminated, truncated]))
+        if terminated or truncated:
+            seen.append(env.reset()[0])
+    return seen
+
+
+def test_a_seed_decides_an_episode_and_all_that_follow() -> None:
+    env = Go1Env(LIVELY)
+    first, again, other = trajectory(env, 5), trajectory(env, 5), trajectory(env, 6)
+    new = trajectory(Go1Env(LIVELY), 5)
+    assert len(first) > 52  # more than one episode
+    for a, b, c in zip(first, again, new, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_without_a_seed_the_next_episode_is_another_one() -> None:
+    env = Go1Env(LIVELY)
+    first, second = env.reset(seed=5)[0], env.reset()[0]
+    assert not np.array_equal(first, second)
+
+
+def test_arrays_of_the_single_environment_are_the_callers_own() -> None:
+    env = Go1Env(LIVELY)
+    observation, _ = env.reset(seed=0)
+    kept, copy = [observation], [observation.copy()]
+    for action in actions(1, 30)[:, 0]:
+        given = action.copy()
+        observation = env.step(action)[0]
+        np.testing.assert_array_equal(action, given)
+        kept.append(observation)
+        copy.append(observation.copy())
+    for a, b in zip(kept, copy, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_a_single_environment_shows_a_policy_what_that_environment_of_a_batch_shows(
+    make_task: Callable[..., TaskConfig], noise: bool
+) -> None:
+    """New commands and pushes are in the observation that the policy acts on next."""
+    task = make_task(*LIVELY, "termination=none", "sim.episode_s=2.0")
+    batch, env = quiet_batch(Go1Core(task, 4, noise=noise)), Go1Env(task=task, noise=noise, env_index=2)
+    batch.seed(9)
+    expected = batch.reset()
+    np.testing.assert_array_equal(env.reset(seed=9)[0], expected[2])
+    for k, action in enumerate(actions(4, 40, 0.5)):
+        expected, reward, _, _ = batch.step(action)
+        observation, alone, *_ = env.step(action[2])
+        assert alone == reward[2], k
+        np.testing.assert_array_equal(observation, expected[2], err_msg=f"step {k}")
+
+
+def test_a_single_environment_ends_with_its_last_observation() -> None:
+    env = Go1Env([*QUIET, "sim.episode_s=0.1"], noise=False)
+    env.reset(seed=0)
+    for action in actions(1, 5, 0.5)[:, 0]:
+        observation, _, _, truncated, _ = env.step(action)
+    assert truncated
+    np.testing.assert_array_equal(observation[36:], action)  # not that of a new episode, which would be zero
+    assert observation[12:36].any()
+    assert not env.reset()[0][36:].any()
+
+
+def test_a_fault_stops_the_single_environment_until_it_is_reset(elsewhere: None) -> None:
+    env = Go1Env(QUIET)
+    env.reset(seed=0)
+    with pytest.raises(NumericalFault, match="action is not finite"):
+        env.step(np.full(12, np.nan, np.float32))
+    assert np.isfinite(env.reset(seed=0)[0]).all()
+
+
+# Stable-Baselines3
+
+
+def quiet_batch(core: Go1Core) -> Any:
+    """Build it whatever it says; ``test_it_is_built_without_a_word`` minds that."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Go1VecEnv(core)
+
+
+def test_it_is_built_without_a_word(make_core: Make) -> None:
+    env = Go1VecEnv(make_core(*QUIET))
+    assert env.render_mode is None
+
+
+def test_the_batch_has_the_spaces_of_one_environment(make_core: Make) -> None:
+    env = quiet_batch(make_core(*QUIET, num_envs=3))
+    assert env.num_envs == 3
+    assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (48,), np.float32)
+    assert env.action_space == gymnasium.spaces.Box(-100.0, 100.0, (12,), np.float32)
+
+
+def test_sb3_gets_arrays_of_the_shapes_and_types_it_expects(make_core: Make) -> None:
+    env = quiet_batch(make_core(*LIVELY, num_envs=3))
+    observation = env.reset()
+    for action in [None, *actions(3, 25)]:
+        if action is not None:
+            observation, reward, done, infos = env.step(action)
+            assert reward.shape == (3,)
+            assert reward.dtype == np.float32
+            assert done.shape == (3,)
+            assert done.dtype == np.bool_
+            assert isinstance(infos, list)
+            assert len(infos) == 3
+        assert isinstance(observation, np.ndarray)
+        assert observation.shape == (3, 48)
+        assert observation.dtype == np.float32
+
+
+def test_infos_tell_how_an_episode_ended_and_what_was_seen_last(make_core: Make) -> None:
+    """Three robots; the second is put on its back just before the time limit of the others."""
+    core = make_core(*QUIET[:3], "command=forward", "sim.episode_s=0.2", num_envs=3, noise=False)
+    env = quiet_batch(core)
+    env.reset()
+    returns, given = np.zeros(3), actions(3, 10, 0.3)
+    for k, action in enumerate(given, start=1):
+        if k == 7:
+            core.backend.qpos[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+        observation, reward, done, infos = env.step(action)
+        returns += reward
+        if k == 7:
+            assert done.tolist() == [False, True, False]
+            assert infos[0] == infos[2] == {}
+            info, fall = infos[1], returns[1]
+            assert info["TimeLimit.truncated"] is False
+            assert info["episode"]["l"] == 7
+            assert info["episode"]["r"] == pytest.approx(fall, rel=1e-6)
+            assert info["terminal_observation"][8] > 0.8  # on its back
+            np.testing.assert_array_equal(info["terminal_observation"][36:], action[1])
+            np.testing.assert_allclose(observation[1, 6:9], [0.0, 0.0, -1.0])
+            returns[1] = 0.0
+        elif k < 10:
+            assert not done.any()
+            assert infos == [{}, {}, {}]
+    assert done.tolist() == [True, False, True]
+    for i in (0, 2):
+        assert infos[i].keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
+        assert infos[i]["TimeLimit.truncated"] is True
+        assert infos[i]["episode"]["l"] == 10
+        assert infos[i]["episode"]["r"] == pytest.approx(returns[i], rel=1e-6)
+        assert infos[i]["terminal_observation"].dtype == np.float32
+        np.testing.assert_array_equal(infos[i]["terminal_observation"][36:], given[-1][i])
+        assert not observation[i, 36:].any()
+    assert infos[1] == {}
+
+
+def test_arrays_of_the_batch_are_the_callers_own(make_core: Make) -> None:
+    env = quiet_batch(make_core(*LIVELY, num_envs=3))
+    kept, copies = [env.reset()], []
+    copies.append(np.copy(kept[0]))
+    returned = env.core.episode_return
+    for action in actions(3, 30):
+        given = action.copy()
+        observation, reward, done, infos = env.step(action)
+        np.testing.assert_array_equal(action, given)
+        for array in (observation, reward, done, *(i["terminal_observation"] for i in infos if i)):
+            kept.append(array)
+            copies.append(np.copy(array))
+        before = returned.clone()
+        reward += 1e6  # as SB3 does with the bootstrap value
+        copies[-2 - sum(map(bool, infos))] = np.copy(reward)
+        assert torch.equal(returned, before)
+    assert len(kept) > 92
+    for a, b in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_a_caller_does_to_an_observation_does_not_reach_the_robots(make_core: Make) -> None:
+    first, second = (quiet_batch(make_core(*LIVELY, num_envs=3)) for _ in range(2))
+    a, b = first.reset(), second.reset()
+    for action in actions(3, 25):
+        np.testing.assert_array_equal(a, b)
+        a[:] = np.nan
+        a, reward, done, _ = first.step(action)
+        b, expected, _, _ = second.step(action)
+        np.testing.assert_array_equal(reward, expected)
+        reward[:], done[:] = np.nan, True
+
+
+def test_seeding_the_batch_makes_it_reproducible(make_core: Make) -> None:
+    env, new = (quiet_batch(make_core(*LIVELY, num_envs=3, seed=s)) for s in (1, 2))
+    env.reset()
+    for action in actions(3, 10):
+        env.step(action)
+    env.seed(4)
+    new.seed(4)
+    first, second = env.reset(), new.reset()
+    np.testing.assert_array_equal(first, second)
+    for action in actions(3, 30, seed=1):
+        for a, b in zip(env.step(action)[:3], new.step(action)[:3], strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(env.reset(), first)  # the seed is used once
+
+
+def test_the_batch_and_the_core_are_the_same_thing(make_core: Make) -> None:
+    env, core = quiet_batch(make_core(*LIVELY, num_envs=3)), make_core(*LIVELY, num_envs=3)
+    np.testing.assert_array_equal(env.reset(), core.reset().numpy())
+    ends = 0
+    for action in actions(3, 40):
+        observation, reward, done, infos = env.step(action)
+        result = core.step(torch.as_tensor(action))
+        np.testing.assert_array_equal(observation, result.observation.numpy())
+        np.testing.assert_array_equal(reward, result.reward.numpy())
+        np.testing.assert_array_equal(done, (result.terminated | result.truncated).numpy())
+        for i, info in enumerate(infos):
+            assert bool(info) == done[i]
+            if info:
+                ends += 1
+                np.testing.assert_array_equal(info["terminal_observation"], result.final_observation[i].numpy())
+                assert info["TimeLimit.truncated"] == bool(result.truncated[i])
+    assert ends >= 6
+
+
+def test_an_attribute_that_does_not_exist_is_said_not_to(make_core: Make) -> None:
+    """SB3 asks whether a batch has an attribute by trying to get it."""
+    env = quiet_batch(make_core(*QUIET, num_envs=3))
+    assert env.get_attr("num_envs") == [3, 3, 3]
+    assert env.get_attr("num_envs", indices=[0, 2]) == [3, 3]
+    assert env.get_attr("num_envs", indices=1) == [3]
+    assert env.has_attr("num_envs")
+    assert not env.has_attr("no_such_thing")
+
+
+def test_single_environments_of_a_batch_cannot_be_changed_or_called(make_core: Make) -> None:
+    env = quiet_batch(make_core(*QUIET, num_envs=2))
+    with pytest.raises(NotImplementedError, match="noise"):
+        env.set_attr("noise", False)
+    with pytest.raises(NotImplementedError, match="render"):
+        env.env_method("render")
+    assert env.env_is_wrapped(gymnasium.Wrapper) == [False, False]
+    env.close()
+
+
+def test_a_fault_stops_the_batch(make_core: Make, elsewhere: None) -> None:
+    env = quiet_batch(make_core(*QUIET, num_envs=3))
+    env.reset()
+    action = np.zeros((3, 12), np.float32)
+    action[1, 0] = np.nan
+    with pytest.raises(NumericalFault, match="action is not finite in environment 1"):
+        env.step(action)

@@ -1,0 +1,441 @@
+"""Every reward term against numbers worked out by hand from paper Table III and Isaac Lab's Spot task."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from go1exp import robot
+from go1exp.config import TaskConfig
+from go1exp.registry import members
+from go1exp.types import Snapshot
+
+WALK = [0.5, 0.0, 0.0]
+"""A command, so that the robot counts as moving."""
+
+FR, FL, RR, RL = range(4)
+"""Columns of the feet, by the vendor's order."""
+
+
+def snapshot(n: int = 1, **changes: Any) -> Snapshot:
+    """N robots that have stood in the nominal stance for a second, with ``changes`` (broadcast over the robots)."""
+    stance = list(robot.NOMINAL_STANCE)
+    rest: dict[str, Any] = {
+        "base_pos_w": [0.0, 0.0, 0.325],
+        "base_quat_w": [1.0, 0.0, 0.0, 0.0],
+        "base_lin_vel_b": [0.0] * 3,
+        "base_ang_vel_b": [0.0] * 3,
+        "projected_gravity_b": [0.0, 0.0, -1.0],
+        "joint_pos": stance,
+        "joint_vel": [0.0] * 12,
+        "joint_acc": [0.0] * 12,
+        "joint_torque": [0.0] * 12,
+        "joint_target": stance,
+        "action": [0.0] * 12,
+        "previous_action": [0.0] * 12,
+        "command": [0.0] * 3,
+        "foot_height": [0.023] * 4,
+        "foot_vel_w": [[0.0] * 3] * 4,
+        "foot_force": [31.25] * 4,
+        "foot_contact": [True] * 4,
+        "foot_air_time": [0.0] * 4,
+        "foot_contact_time": [1.0] * 4,
+        "foot_last_air_time": [0.0] * 4,
+        "foot_last_contact_time": [0.0] * 4,
+        "foot_touchdown": [False] * 4,
+        "thigh_contact": [False] * 4,
+        "calf_contact": [False] * 4,
+        "trunk_contact": False,
+        "episode_time": 1.0,
+    }
+    assert rest.keys() == {f.name for f in fields(Snapshot)}
+    assert changes.keys() <= rest.keys()
+    tensors = {}
+    for name, value in rest.items():
+        base = torch.tensor(value)
+        base = base if base.dtype == torch.bool else base.float()
+        new = torch.as_tensor(changes.get(name, base)).to(base.dtype)
+        tensors[name] = new.expand(n, *base.shape).clone()
+    return Snapshot(**tensors)
+
+
+def with_joints(**angles: float) -> list[float]:
+    """Joint vector of the nominal stance with some joints moved, rad."""
+    q = list(robot.NOMINAL_STANCE)
+    for joint, angle in angles.items():
+        q[robot.JOINTS.index(joint)] = angle
+    return q
+
+
+def feet(**values: Any) -> list[Any]:
+    """Per-leg values by leg name, zero for legs that are not named."""
+    empty = [0.0] * 3 if any(isinstance(v, list) for v in values.values()) else 0.0
+    return [values.get(leg, empty) for leg in robot.LEGS]
+
+
+def evaluate(name: str, s: Snapshot, **parameters: Any) -> torch.Tensor:
+    return members("reward")[name].target(s, **parameters)
+
+
+class Case(NamedTuple):
+    """A situation (changes of the snapshot), parameters off their defaults, and the term's value in it."""
+
+    term: str
+    says: str
+    changes: dict[str, Any]
+    expected: float
+    parameters: dict[str, Any] = {}  # noqa: RUF012  (never written)
+
+
+TROT_PHASE = {"foot_air_time": feet(FR=0.1, RL=0.1), "foot_contact_time": feet(FL=0.1, RR=0.1)}
+PACE_PHASE = {"foot_air_time": feet(FR=0.1, RR=0.1), "foot_contact_time": feet(FL=0.1, RL=0.1)}
+BOUND_PHASE = {"foot_air_time": feet(FR=0.1, FL=0.1), "foot_contact_time": feet(RR=0.1, RL=0.1)}
+PRONK_PHASE = {"foot_air_time": [0.1] * 4, "foot_contact_time": [0.0] * 4}
+APART = {"foot_air_time": [0.0, 1.0, 2.0, 3.0], "foot_contact_time": [10.0, 20.0, 30.0, 40.0]}
+SLIDING = {
+    "foot_vel_w": feet(FR=[3.0, -4.0, 9.0], FL=[0.0, 1.0, 9.0], RR=[0.5, 0.0, -9.0]),
+    "foot_contact": [True, False, True, True],
+}
+TENTH_OFF = [q + 0.1 for q in robot.NOMINAL_STANCE]
+FAST = {
+    "joint_vel": [30.2, 30.0, 20.1, -30.2, -30.0, -20.1, 30.05, 30.2, 20.0, 0.0, -30.2, -20.0],
+}
+"""Above 30.1, 30.1 and 20.06 rad/s: FR hip and calf and RR thigh forwards, FL hip and calf and RL thigh backwards."""
+
+CASES = [
+    # 4 x 0.175: standing, long contact is cut at mode_time.
+    Case("feet_air_time", "standing on all feet", {}, 0.7),
+    Case(
+        "feet_air_time",
+        "standing with a foot lifted for 0.1 s",  # 3 x 0.175 - 0.1
+        {"foot_air_time": feet(FL=0.1), "foot_contact_time": [1.0, 0.0, 1.0, 1.0]},
+        0.425,
+    ),
+    Case(
+        "feet_air_time",
+        "standing with a foot lifted for long",  # 3 x 0.175 - 0.175
+        {"foot_air_time": feet(FL=0.3), "foot_contact_time": [1.0, 0.0, 1.0, 1.0]},
+        0.35,
+    ),
+    Case(
+        "feet_air_time",
+        "moving: only phases shorter than mode_time pay",  # 0.1 + 0.05
+        {"command": WALK, "foot_air_time": feet(FR=0.1, RL=0.3), "foot_contact_time": feet(FL=0.05, RR=0.25)},
+        0.15,
+    ),
+    Case(
+        "feet_air_time",
+        "moving: another mode_time",  # 0.1 + 0.3 + 0.05 + 0.25
+        {"command": WALK, "foot_air_time": feet(FR=0.1, RL=0.3), "foot_contact_time": feet(FL=0.05, RR=0.25)},
+        0.7,
+        {"mode_time": 0.31},
+    ),
+    Case("feet_air_time", "told to turn is moving", {"command": [0.0, 0.0, -0.01]}, 0.0),
+    Case("feet_air_time", "drifting at 0.57 m/s is moving", {"base_lin_vel_b": [0.4, -0.4, 0.0]}, 0.0),
+    Case("feet_air_time", "drifting at 0.42 m/s is standing", {"base_lin_vel_b": [0.3, -0.3, 0.0]}, 0.7),
+    Case("feet_air_time", "falling is not moving", {"base_lin_vel_b": [0.0, 0.0, -2.0]}, 0.7),
+    Case(
+        "feet_air_time",
+        "another speed threshold",
+        {"base_lin_vel_b": [0.3, -0.3, 0.0]},
+        0.0,
+        {"speed_threshold": 0.4},
+    ),
+    Case(
+        "feet_air_time_touchdown",
+        "two feet land after 0.3 and 0.1 s",  # 0.125 - 0.075; the others do not land
+        {"command": WALK, "foot_last_air_time": [0.3, 0.1, 0.5, 0.0], "foot_touchdown": [True, True, False, False]},
+        0.05,
+    ),
+    Case(
+        "feet_air_time_touchdown",
+        "another threshold",
+        {"command": WALK, "foot_last_air_time": [0.3, 0.1, 0.5, 0.0], "foot_touchdown": [True, True, False, False]},
+        0.2,
+        {"threshold": 0.1},
+    ),
+    Case(
+        "feet_air_time_touchdown",
+        "nothing without a commanded velocity",
+        {"command": [0.0, 0.0, 1.0], "foot_last_air_time": [0.3] * 4, "foot_touchdown": [True] * 4},
+        0.0,
+    ),
+    Case("linear_velocity_error", "no error", {"command": WALK, "base_lin_vel_b": [0.5, 0.0, 0.7]}, 1.0),
+    Case(
+        "linear_velocity_error",
+        "an error of 0.6 and 0.8 m/s",  # exp(-1)
+        {"command": [1.0, 0.0, 1.0], "base_lin_vel_b": [0.4, 0.8, 0.0]},
+        0.36787944,
+    ),
+    Case(
+        "linear_velocity_error",
+        "the same error on another scale",  # exp(-1/2)
+        {"command": [1.0, 0.0, 1.0], "base_lin_vel_b": [0.4, 0.8, 0.0]},
+        0.60653066,
+        {"scale": 2.0},
+    ),
+    Case("angular_velocity_error", "no error", {"command": [0, 0, 0.7], "base_ang_vel_b": [3.0, 3.0, 0.7]}, 1.0),
+    Case(
+        "angular_velocity_error",
+        "turning the wrong way by 2 rad/s",  # exp(-2/2)
+        {"command": [0.0, 0.0, 1.0], "base_ang_vel_b": [0.0, 0.0, -1.0]},
+        0.36787944,
+    ),
+    Case("gait", "a perfect trot", {"command": WALK, **TROT_PHASE}, 1.0),
+    # Pace, bound and pronk: eight of the twelve squared differences are 0.1^2; exp(-0.08 / 0.1).
+    Case("gait", "a pace", {"command": WALK, **PACE_PHASE}, 0.44932896),
+    Case("gait", "a bound", {"command": WALK, **BOUND_PHASE}, 0.44932896),
+    Case("gait", "a pronk", {"command": WALK, **PRONK_PHASE}, 0.44932896),
+    Case("gait", "a pace on another scale", {"command": WALK, **PACE_PHASE}, 0.67032005, {"scale": 0.2}),
+    # Eight differences of 0.05^2, by the cut; exp(-0.02 / 0.1).
+    Case("gait", "a pace with errors cut at 0.05 s", {"command": WALK, **PACE_PHASE}, 0.81873075, {"max_error": 0.05}),
+    # Standing under a command: each of eight differences is cut at 0.2^2; exp(-0.32 / 0.1).
+    Case("gait", "standing when told to walk", {"command": WALK}, 0.04076220),
+    Case("gait", "all twelve differences at their cut", {"command": WALK, **APART}, 0.00822975),  # exp(-4.8)
+    Case("gait", "a trot without a command", TROT_PHASE, 0.0),
+    Case("gait", "a trot that drifts fast without a command", {**TROT_PHASE, "base_lin_vel_b": [0, 0.51, 0]}, 1.0),
+    Case("foot_clearance", "standing", {}, 1.0),
+    Case(
+        "foot_clearance",
+        "a foot that slides at 1 m/s",  # exp(-0.057^2 tanh(2) / 0.05)
+        {"foot_vel_w": feet(RR=[0.6, -0.8, 0.0])},
+        0.93927919,
+    ),
+    Case("foot_clearance", "a foot that is lifted straight up", {"foot_vel_w": feet(RR=[0.0, 0.0, 1.0])}, 1.0),
+    Case(
+        "foot_clearance",
+        "feet that swing at the right height",
+        {"foot_vel_w": [[2.0, 0.0, 0.0]] * 4, "foot_height": [0.08] * 4},
+        1.0,
+    ),
+    Case(
+        "foot_clearance",
+        "two feet 0.1 m too high at full speed, other parameters",  # exp(-2 x 0.01 / 0.1)
+        {"foot_vel_w": feet(FR=[20.0, 0, 0], RL=[0, 20.0, 0]), "foot_height": [0.2] * 4},
+        0.81873075,
+        {"target_height": 0.1, "scale": 0.1, "speed_scale": 1.0},
+    ),
+    Case("action_smoothness", "no change", {"action": [0.7] * 12, "previous_action": [0.7] * 12}, 0.0),
+    Case("action_smoothness", "all by 0.25", {"action": [0.5] * 12, "previous_action": [0.25] * 12}, 0.86602540),
+    # Mean 0.25, squared deviations 0.0225 + 0.0025 + 0.0025 + 0.0225, over 3.
+    Case("air_time_variance", "unequal swings", {"foot_last_air_time": [0.1, 0.2, 0.3, 0.4]}, 0.05 / 3),
+    Case("air_time_variance", "unequal stances", {"foot_last_contact_time": [0.4, 0.1, 0.3, 0.2]}, 0.05 / 3),
+    Case(
+        "air_time_variance",
+        "one swing cut at 0.5 s, and unequal stances",  # of 0.1 0.2 0.3 0.5: 0.0875 / 3
+        {"foot_last_air_time": [0.1, 0.2, 0.3, 0.9], "foot_last_contact_time": [0.1, 0.2, 0.3, 0.4]},
+        0.1375 / 3,
+    ),
+    Case("air_time_variance", "equal legs", {"foot_last_air_time": [0.2] * 4, "foot_last_contact_time": [0.3] * 4}, 0),
+    Case(
+        "base_motion",
+        "heaving and tilting",  # 0.8 x 0.25 + 0.2 x (1 + 2)
+        {"base_lin_vel_b": [3.0, 3.0, -0.5], "base_ang_vel_b": [1.0, -2.0, 5.0]},
+        0.8,
+    ),
+    Case(
+        "base_motion",
+        "heaving and tilting, another weight",  # 0.5 x 0.25 + 0.5 x 3
+        {"base_lin_vel_b": [0.0, 0.0, -0.5], "base_ang_vel_b": [1.0, -2.0, 0.0]},
+        1.625,
+        {"heave_weight": 0.5},
+    ),
+    Case("base_orientation", "level", {}, 0.0),
+    Case("base_orientation", "rolled by 30 degrees", {"projected_gravity_b": [0.0, -0.5, -math.sqrt(0.75)]}, 0.5),
+    Case("base_orientation", "on its back is level", {"projected_gravity_b": [0.0, 0.0, 1.0]}, 0.0),
+    Case("foot_slip", "two sliding feet bear force", SLIDING, 5.5),
+    Case("foot_force", "four forces", {"foot_force": [3.0, 4.0, 0.0, 10.0]}, 125.0),
+    Case("joint_torque", "2 N m everywhere", {"joint_torque": [2.0, -2.0] * 6}, math.sqrt(48)),
+    Case("joint_acceleration", "3 and 4", {"joint_acc": [3.0] + [0.0] * 10 + [-4.0]}, 5.0),
+    Case("joint_velocity", "5 and 12", {"joint_vel": [0.0, 5.0] + [0.0] * 9 + [-12.0]}, 13.0),
+    Case("joint_deviation", "standing at the nominal stance", {}, 0.0),
+    Case("joint_deviation", "moving with all joints 0.1 off", {"command": WALK, "joint_pos": TENTH_OFF}, 0.34641016),
+    Case("joint_deviation", "standing with all joints 0.1 off", {"joint_pos": TENTH_OFF}, 1.73205081),
+    Case(
+        "joint_deviation",
+        "standing with all joints 0.1 off, other parameters",
+        {"joint_pos": TENTH_OFF, "base_lin_vel_b": [0.9, 0.0, 0.0]},
+        0.69282032,
+        {"standing_scale": 2.0, "speed_threshold": 1.0},
+    ),
+    Case("joint_position_limit", "the nominal stance", {}, 0.0),
+    # 95 % of the ranges: hip +-0.81985, thigh -0.556325..4.371325, calf -2.76975..-0.93625.
+    Case(
+        "joint_position_limit",
+        "six joints just outside the soft range",
+        {
+            "joint_pos": with_joints(
+                FR_hip=0.8199, RL_hip=-0.8199, FL_thigh=-0.5564, RR_thigh=4.3714, RR_calf=-2.7698, RL_calf=-0.9362
+            )
+        },
+        6.0,
+    ),
+    Case(
+        "joint_position_limit",
+        "six joints just inside the soft range",
+        {
+            "joint_pos": with_joints(
+                FR_hip=0.8198, RL_hip=-0.8198, FL_thigh=-0.5563, RR_thigh=4.3713, RR_calf=-2.7697, RL_calf=-0.9363
+            )
+        },
+        0.0,
+    ),
+    Case(
+        "joint_position_limit",
+        "the whole range",
+        {"joint_pos": with_joints(FR_hip=0.862, RL_hip=-0.864, FL_calf=-2.819)},
+        2.0,
+        {"soft_factor": 1.0},
+    ),
+    Case("joint_velocity_limit", "six fast joints", FAST, 6.0),
+    Case("joint_velocity_limit", "a lower limit for the hips", FAST, 7.0, {"limit": (30.0, 30.1, 20.06)}),
+    Case("thigh_contact", "two thighs", {"thigh_contact": [True, False, True, False]}, 2.0),
+    Case("thigh_contact", "calves do not count", {"calf_contact": [True] * 4, "trunk_contact": True}, 0.0),
+    Case("calf_contact", "three calves", {"calf_contact": [True, True, True, False]}, 3.0),
+    Case("calf_contact", "feet do not count", {"foot_contact": [True] * 4, "thigh_contact": [True] * 4}, 0.0),
+    # Table III to the letter
+    Case("feet_air_time_literal", "feet on the ground", {}, -0.7),
+    Case("feet_air_time_literal", "never landing pays", {"foot_air_time": [10.0] * 4}, 39.3),
+    Case("feet_air_time_literal", "another threshold", {"foot_air_time": [0.3, 0.1, 0, 0]}, 0.0, {"threshold": 0.1}),
+    Case("foot_clearance_literal", "feet on the ground", {}, 1.25608533),  # exp(4 x 0.057)
+    Case("foot_clearance_literal", "feet at the target", {"foot_height": [0.08] * 4}, 1.0),
+    Case(
+        "foot_clearance_literal",
+        "another target",  # exp(4 x 0.077)
+        {},
+        1.36070099,
+        {"target_height": 0.1},
+    ),
+    Case("air_time_variance_literal", "unequal swings", {"foot_last_air_time": [0.125, 0.25, 0.5, 1.0]}, 0.0),
+    Case("base_motion_literal", "roll and pitch add", {"base_ang_vel_b": [-1.0, -2.0, 7.0]}, 3.0),
+    Case("base_motion_literal", "roll and opposite pitch cancel", {"base_ang_vel_b": [1.5, -1.5, 7.0]}, 0.0),
+    Case("foot_slip_literal", "two sliding feet bear force", SLIDING, 5.02493781),  # sqrt(5^2 + 0.5^2)
+    Case("joint_deviation_literal", "all joints 0.1 off", {"joint_pos": TENTH_OFF}, 1.2),
+    Case(
+        "joint_deviation_literal",
+        "left and right cancel",
+        {"joint_pos": with_joints(FR_thigh=1.8, FL_thigh=-0.2)},
+        0.0,
+    ),
+    Case(
+        "joint_position_limit_literal",
+        "one of four joints beyond a hard stop is above it",
+        {"joint_pos": with_joints(FR_hip=0.8631, FL_hip=-0.8631, RR_hip=0.8629, RL_calf=-2.82)},
+        1.0,
+    ),
+    Case("joint_velocity_limit_literal", "three joints fast forwards", FAST, 3.0),
+    Case("joint_velocity_limit_literal", "a lower limit for the hips", FAST, 4.0, {"limit": (30.0, 30.1, 20.06)}),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=[f"{c.term}: {c.says}" for c in CASES])
+def test_a_term_has_the_value_worked_out_by_hand(case: Case) -> None:
+    value = evaluate(case.term, snapshot(**case.changes), **case.parameters)
+    assert value.shape == (1,)
+    assert value.item() == pytest.approx(case.expected, rel=1e-6, abs=1e-6)
+
+
+def test_every_registered_term_has_a_value_worked_out_by_hand() -> None:
+    assert {case.term for case in CASES} == set(members("reward"))
+
+
+TABLE_III = {
+    "feet_air_time": 5.0,
+    "linear_velocity_error": 5.0,
+    "angular_velocity_error": 5.0,
+    "gait": 10.0,
+    "foot_clearance": 5.0,
+    "action_smoothness": -1.5,
+    "air_time_variance": -1.0,
+    "base_motion": -2.0,
+    "base_orientation": -5.0,
+    "foot_slip": -1.0,
+    "foot_force": -0.00002,
+    "joint_torque": -0.0005,
+    "joint_acceleration": -0.0002,
+    "joint_velocity": -0.015,
+    "joint_deviation": -0.75,
+    "joint_position_limit": -100.0,
+    "joint_velocity_limit": -10.0,
+    "thigh_contact": -10.0,
+    "calf_contact": -1.0,
+}
+
+
+@pytest.mark.parametrize("reward", ["paper", "paper_literal"])
+def test_the_weights_are_those_of_table_iii(make_task: Callable[..., TaskConfig], reward: str) -> None:
+    task = make_task(f"reward={reward}")
+    assert {term.key: term.slots["weight"] for term in task.reward} == TABLE_III
+
+
+@pytest.mark.parametrize("reward", ["paper", "paper_literal"])
+def test_the_configured_terms_are_finite_at_rest_and_penalise_nothing_but_the_literal_ones(
+    make_task: Callable[..., TaskConfig], reward: str
+) -> None:
+    values = {term.key: term(snapshot()).item() for term in make_task(f"reward={reward}").reward}
+    assert all(math.isfinite(v) for v in values.values())
+    penalties = {k: v for k, v in values.items() if TABLE_III[k] < 0 and k != "foot_force"}
+    assert penalties == dict.fromkeys(penalties, 0.0)
+    assert values["foot_force"] == pytest.approx(4 * 31.25**2)
+
+
+# Claims that hold for more than one situation
+
+
+def test_no_timers_take_the_gait_term_out_of_its_bounds() -> None:
+    rng = np.random.default_rng(0)
+    air, contact = rng.uniform(0.0, 1.0, (2, 5000, 4))
+    value = evaluate("gait", snapshot(5000, command=WALK, foot_air_time=air, foot_contact_time=contact))
+    assert value.min() >= math.exp(-4.8) * (1 - 1e-5)
+    assert value.max() <= 1.0
+
+
+def test_a_trot_of_any_phase_is_perfect_and_any_other_pairing_is_not() -> None:
+    """Sweep through a stride in which legs of a pair share a phase and the pairs alternate."""
+    t = torch.arange(1, 10) * 0.02
+    zero = torch.zeros_like(t)
+    for pair in [(FR, RL), (FR, RR), (FR, FL)]:
+        air = torch.stack([t if leg in pair else zero for leg in range(4)], dim=-1)
+        contact = torch.stack([zero if leg in pair else t for leg in range(4)], dim=-1)
+        for a, c in [(air, contact), (contact, air)]:
+            value = evaluate("gait", snapshot(9, command=WALK, foot_air_time=a, foot_contact_time=c))
+            assert torch.equal(value, torch.ones(9)) if pair == (FR, RL) else (value < 1.0).all()
+
+
+def test_feet_air_time_pays_most_when_the_phase_changes_every_mode_time() -> None:
+    """Averaged over phases of length P, in small ticks, the pay per foot is largest at P = mode_time = 0.175 s."""
+    pay = {}
+    for length in (0.1, 0.15, 0.17, 0.175, 0.18, 0.2, 0.35):
+        t = (torch.arange(2000) + 0.5) / 2000 * length
+        swing, rest = t.unsqueeze(1) * torch.tensor([1.0, 0, 0, 1]), t.unsqueeze(1) * torch.tensor([0.0, 1, 1, 0])
+        s = snapshot(2000, command=WALK, foot_air_time=swing, foot_contact_time=rest)
+        pay[length] = evaluate("feet_air_time", s).mean().item() / 4
+    assert max(pay, key=pay.__getitem__) == 0.175
+    assert pay[0.175] == pytest.approx(0.175 / 2, rel=1e-3)
+    assert pay[0.35] == pytest.approx(0.175 / 4, rel=1e-3)
+
+
+def test_the_printed_air_time_variance_is_zero_for_every_gait() -> None:
+    air = np.random.default_rng(0).uniform(0.0, 0.5, (1000, 4))
+    value = evaluate("air_time_variance_literal", snapshot(1000, foot_last_air_time=air))
+    assert value.abs().max() < 2e-6  # rounding of sixteen float32 differences
+    assert evaluate("air_time_variance", snapshot(1000, foot_last_air_time=air)).min() > 0.0
+
+
+def test_air_time_variance_is_numpys_unbiased_variance() -> None:
+    air, contact = np.random.default_rng(1).uniform(0.0, 0.8, (2, 200, 4))
+    value = evaluate("air_time_variance", snapshot(200, foot_last_air_time=air, foot_last_contact_time=contact))
+    expected = sum(np.var(np.minimum(x, 0.5), axis=1, ddof=1) for x in (air, contact))
+    np.testing.assert_allclose(value.numpy(), expected, rtol=1e-5)
+
+
+def test_rows_of_a_snapshot_do_not_touch_each_other() -> None:
+    commands = torch.tensor([[0.0, 0.0, 0.0], WALK, [0.0, 0.0, 0.0]])
+    value = evaluate("feet_air_time", snapshot(3, command=commands))
+    assert value.tolist() == pytest.approx([0.7, 0.0, 0.7])
