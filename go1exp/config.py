@@ -119,6 +119,7 @@ class PPOConfig:
         max_grad_norm: gradient clip, norm over actor and critic together.
         normalize_advantage: over each minibatch, as SB3 does.
         init_std: initial standard deviation of the actions.
+        orthogonal_init: SB3's initial weights (gain sqrt(2), last layer of the actor 0.01); else PyTorch's, as rsl_rl.
         hidden: layers of actor and critic each.
         activation: between them.
         matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16.
@@ -144,6 +145,7 @@ class PPOConfig:
     max_grad_norm: Positive
     normalize_advantage: bool
     init_std: Positive
+    orthogonal_init: bool
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
     activation: Literal["elu", "relu", "tanh"]
     matmul_precision: Literal["highest", "bf16"]

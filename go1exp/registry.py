@@ -32,16 +32,16 @@ NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-def _ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+def ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+    """Refuse a range whose low exceeds its high."""
     if bounds[0] > bounds[1]:
         raise ValueError("low must not exceed high")
     return bounds
 
 
-Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Range = Annotated[tuple[float, float], AfterValidator(ordered)]
 """``[low, high]`` of a uniform distribution."""
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
-FractionRange = Annotated[tuple[Fraction, Fraction], AfterValidator(_ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
 
 
 class Expected(RuntimeError):

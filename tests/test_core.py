@@ -227,6 +227,7 @@ def test_a_robot_on_its_back_is_terminated_and_starts_again_while_the_others_go_
             assert a["observation"][fallen, 8] < -0.9
             assert not a["observation"][fallen, 36:].any()
             assert core.steps[fallen] == 0
+            np.testing.assert_allclose(core.snapshot().joint_target[fallen], robot.NOMINAL_STANCE, atol=1e-6)
             assert core.backend.qpos[fallen, 2] == pytest.approx(robot.NOMINAL_HEIGHT)
     assert ended
 
@@ -417,31 +418,59 @@ def test_a_policy_step_is_that_many_physics_steps_under_the_actuators_law(
     data.qpos[:], data.qvel[:] = core.backend.qpos[0], core.backend.qvel[0]
     mujoco.mj_forward(model, data)
     limit = np.tile([23.7, 23.7, 35.55], 4)
-    for action in actions(2, 10, 1.0):
+    phase, touching, landings = np.zeros(4, int), np.zeros(4, bool), 0
+    for action in actions(2, 25, 3.0):
         core.step(action)
         target = robot.NOMINAL_STANCE + 0.2 * action[0].double().numpy()
+        landed = np.zeros(4, bool)
         for _ in range(substeps):
             speed = data.qvel[6:].copy()
             data.ctrl[:] = np.clip(20.0 * (target - data.qpos[7:]) - 0.5 * speed, -limit, limit)
             mujoco.mj_step(model, data)
+            force, now = foot_forces(model, data)
+            landed |= now & ~touching & (phase > 0)
+            phase = np.where(now == touching, phase + 1, 1)
+            touching = now
         s = core.snapshot()
         assert s.joint_acc is not None
-        np.testing.assert_allclose(core.backend.qpos[0], data.qpos, atol=2e-6)  # targets are float32 in the core
+        # Targets are float32 in the core, and contacts amplify the difference with time.
+        np.testing.assert_allclose(core.backend.qpos[0], data.qpos, atol=1e-5)
         np.testing.assert_allclose(s.joint_torque[0], data.ctrl, atol=1e-3)
         np.testing.assert_allclose(s.joint_acc[0], (data.qvel[6:] - speed) / physics_dt, atol=0.3, rtol=1e-3)
-        np.testing.assert_allclose(s.foot_force[0], foot_forces(model, data), atol=0.05, rtol=1e-3)
-    assert data.time == pytest.approx(0.2)
+        np.testing.assert_allclose(s.foot_force[0], force, atol=0.05, rtol=1e-3)
+        np.testing.assert_array_equal(s.foot_contact[0], touching)
+        np.testing.assert_array_equal(s.foot_touchdown[0], landed)
+        np.testing.assert_allclose(s.foot_contact_time[0], touching * phase * physics_dt, atol=1e-5)
+        np.testing.assert_allclose(s.foot_air_time[0], ~touching * phase * physics_dt, atol=1e-5)
+        landings += landed.sum()
+    assert landings >= 6
+    assert data.time == pytest.approx(0.5)
 
 
-def foot_forces(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Magnitude of the force on each foot in the last step, from MuJoCo's contact list."""
-    force, one = np.zeros((4, 3)), np.zeros(6)
+def foot_forces(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+    """Force on each foot in the last step, N, and whether it touched at all, from MuJoCo's contact list."""
+    force, touching, one = np.zeros((4, 3)), np.zeros(4, dtype=bool), np.zeros(6)
     for k, contact in enumerate(data.contact):
         for leg, name in enumerate(robot.LEGS):
             if model.geom(f"{name}_foot").id in contact.geom:
                 mujoco.mj_contactForce(model, data, k, one)
                 force[leg] += one[:3] @ contact.frame.reshape(3, 3)
-    return np.linalg.norm(force, axis=1)
+                touching[leg] = True
+    return np.linalg.norm(force, axis=1), touching
+
+
+def test_a_foot_in_contact_bears_force(make_core: Make) -> None:
+    """`Snapshot.foot_contact`: "the foot bears force now"."""
+    core = make_core(*QUIET, num_envs=8, noise=False)
+    core.reset()
+    seen = 0
+    for action in actions(8, 60, 2.0):
+        core.step(action)
+        s = core.snapshot()
+        assert (s.foot_force[s.foot_contact] > 0.0).all()
+        assert not s.foot_force[~s.foot_contact].any()
+        seen += int(s.foot_contact.sum())
+    assert seen > 100
 
 
 def test_the_snapshot_describes_the_state(make_core: Make) -> None:

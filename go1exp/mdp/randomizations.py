@@ -7,16 +7,18 @@ write the state of a reset. All draws are independent per element. Table I of th
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Literal, Protocol
+import functools
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
+import numpy as np
 import torch
+from pydantic import AfterValidator, Field
 
 from go1exp import robot
 from go1exp.mdp.derived import quat_from_rotvec, quat_multiply
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.randomness import Stream
-from go1exp.registry import FractionRange, PositiveRange, Range, randomization
+from go1exp.registry import PositiveRange, Range, ordered, randomization
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -60,18 +62,54 @@ def foot_friction(
     _vary(model, "geom_friction", (model.ids("geom", FEET), 0), mask, operation, draw)
 
 
-@randomization("foot_restitution", kind="model", fields=("geom_solref",))
-def foot_restitution(model: ModelFields, stream: Stream, mask: Tensor, *, range: FractionRange = (0.0, 0.2)) -> None:
-    """Coefficient of restitution of each foot, by the damping ratio of its contact.
+def restitution(damping_ratio: np.ndarray) -> np.ndarray:
+    """Return the share of its speed that a mass keeps when it meets a spring-damper which can push but not pull.
 
-    MuJoCo has no restitution; its contact is a spring-damper of damping ratio z, which returns the fraction
-    e = exp(-pi z / sqrt(1 - z^2)) of a free mass's speed, so z = -ln e / sqrt(pi^2 + ln^2 e), and 1 for e = 0.
-    Text of the paper, section II-B.1 (no range is printed; 0 to 0.2 is chosen).
+    With z the damping ratio and w = sqrt(|1 - z^2|): e = exp(-z/w (pi - atan(2 z w / (1 - 2 z^2)))) below z = 1/sqrt(2),
+    e = exp(-z/w atan(2 z w / (2 z^2 - 1))) up to 1, e = exp(-z/w ln((z + w) / (z - w))) above; exp(-2) at 1.
+    Schwager and Poeschel, "Coefficient of restitution and linear-dashpot model revisited", Granular Matter 9 (2007).
     """
-    e = stream.uniform(len(FEET), low=range[0], high=range[1]).clamp(min=1e-6, max=0.999)
-    log_e = torch.log(e)
-    ratio = -log_e / torch.sqrt(math.pi**2 + log_e.square())
-    _vary(model, "geom_solref", (model.ids("geom", FEET), 1), mask, "set", ratio)
+    z = np.asarray(damping_ratio, dtype=float)
+    w = np.sqrt(np.maximum(np.abs(1.0 - z**2), 1e-18))
+    under = np.where(z < 1.0, np.arctan2(2.0 * z * w, 2.0 * z**2 - 1.0), 0.0)
+    over = np.log((z + w) / np.maximum(z - w, 1e-18))
+    return np.exp(-z / w * np.where(z < 1.0, under, over))
+
+
+@functools.cache
+def _restitution_table(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Damping ratios and their restitution on a grid, restitution rising."""
+    ratio = np.geomspace(4.0, 0.1, 400)
+    return torch.tensor(restitution(ratio), device=device), torch.tensor(ratio, device=device)
+
+
+def damping_ratio(e: Tensor) -> Tensor:
+    """Invert ``restitution`` by linear interpolation; any shape, values within ``Restitution``."""
+    known, ratio = _restitution_table(e.device)
+    right = torch.searchsorted(known, e.to(known.dtype).contiguous()).clamp(1, len(known) - 1)
+    share = (e - known[right - 1]) / (known[right] - known[right - 1])
+    return ratio[right - 1] + share * (ratio[right] - ratio[right - 1])
+
+
+Restitution = Annotated[float, Field(ge=0.02, le=0.7)]
+"""Below, a contact of MuJoCo would have to be far too soft; above, a physics step of 2 ms cannot resolve it."""
+
+
+@randomization("foot_restitution", kind="model", fields=("geom_solref",))
+def foot_restitution(
+    model: ModelFields,
+    stream: Stream,
+    mask: Tensor,
+    *,
+    range: Annotated[tuple[Restitution, Restitution], AfterValidator(ordered)] = (0.05, 0.3),
+) -> None:
+    """Coefficient of restitution of each foot, 0.02 to 0.7, by the damping ratio of its contact.
+
+    MuJoCo's contact is a spring-damper; its default ratio of 1 returns exp(-2) = 0.135 of the speed. Text of the
+    paper, section II-B.1, which prints no range: 0.05 to 0.3 is chosen.
+    """
+    e = stream.uniform(len(FEET), low=range[0], high=range[1])
+    _vary(model, "geom_solref", (model.ids("geom", FEET), 1), mask, "set", damping_ratio(e))
 
 
 @randomization("center_of_mass", kind="model", fields=("body_ipos",), derived=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import random
 import warnings
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +76,9 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     ppo.iteration = state["iteration"]
     ppo.num_timesteps = state["num_timesteps"]
     ppo._n_updates = state["n_updates"]
-    assert ppo.ep_info_buffer is not None
-    ppo.ep_info_buffer.extend(state["episodes"])
+    # SB3 makes these two when learning starts, unless the first is there already.
+    ppo.ep_info_buffer = deque(state["episodes"], maxlen=ppo._stats_window_size)
+    ppo.ep_success_buffer = deque(maxlen=ppo._stats_window_size)
     _core(ppo).load_state_dict(state["env"])
     ppo._last_obs = state["last_obs"].numpy()
     ppo._last_episode_starts = state["last_episode_starts"].numpy()

@@ -56,6 +56,7 @@ def policy_settings(config: PPOConfig) -> dict[str, Any]:
     return {
         "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
         "activation_fn": ACTIVATIONS[config.activation],
+        "ortho_init": config.orthogonal_init,
         "log_std_init": float(np.log(config.init_std)),
         "bf16": config.matmul_precision == "bf16",
     }
