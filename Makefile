@@ -38,9 +38,13 @@ $(OK): pyproject.toml requirements/lock.txt
 	@$(PIP) check
 	@touch $@
 
-demo: setup ## run the demonstration
-	@echo "demo: go1exp demo"
-	@$(BIN)/go1exp demo
+demo: setup ## train for some minutes, judge the policy and film it, all in runs/demo
+	@echo "demo 1/3: go1exp train experiment=demo"
+	@$(BIN)/go1exp train experiment=demo hydra.run.dir=runs/demo
+	@echo "demo 2/3: go1exp eval"
+	@$(BIN)/go1exp eval run=runs/demo 'grid.x=[0.5]' grid.y=[] grid.yaw=[] duration_s=10
+	@echo "demo 3/3: go1exp play"
+	@$(BIN)/go1exp play run=runs/demo viewer=clip
 
 test: setup ## run the tests
 	@echo "test: pytest"

@@ -70,7 +70,7 @@ def unknown_name(path: str, name: str, known: Iterable[str], what: str) -> str:
 
 
 def as_json(settings: Any) -> str:
-    """Dump settings for a strict schema: pydantic takes lists for tuples and mappings for dataclasses only from JSON."""
+    """Dump settings for a strict schema, which takes lists for tuples and mappings for dataclasses only from JSON."""
     return json.dumps(settings)
 
 

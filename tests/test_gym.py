@@ -14,9 +14,10 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from go1exp.config import TaskConfig
+from go1exp.env import register
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
-from go1exp.env.gym_env import Go1Env, register
+from go1exp.env.gym_env import Go1Env
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.registry import ConfigError
 

@@ -18,8 +18,10 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.config import parse_train
     from go1exp.env.core import Go1Core
     from go1exp.evaluate import video
+    from go1exp.evaluate.camera import RenderingUnavailable
     from go1exp.evaluate.policy import load_policy
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
+    from go1exp.evaluate.stick import picture
     from go1exp.train import run_folder
 
     trained = parse_train(run_folder.read_config(run))
@@ -43,7 +45,12 @@ def _task(container: dict[str, Any]) -> None:
     core.command.value[:] = core.command.value.new_tensor(settings.command)
     out = Path(settings.out) if settings.out else run / "play.mp4"
     progress = spinner(1, "filming")
-    frames = list(video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress))
+    try:
+        frames = list(video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress))
+    except RenderingUnavailable as error:
+        picture(core, policy, settings.seconds, out.with_suffix(".png"))
+        print(f"{error}\nA stick figure instead: {out.with_suffix('.png')}")
+        return
     video.write_mp4(out, frames, settings.fps)
     video.write_strip(out.with_suffix(".png"), frames)
     print(f"written to {out} and {out.with_suffix('.png')}")

@@ -47,6 +47,7 @@ def _task(container: dict[str, Any]) -> int | None:
         discard(run)
         raise
     if config.process.resume:
+        discard(run)
         run = Path(config.process.resume)
         container = _resumed(run, list(HydraConfig.get().overrides.task))
         config = parse_train(container)

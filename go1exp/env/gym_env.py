@@ -82,8 +82,3 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         if self._camera is not None:
             self._camera.close()
             self._camera = None
-
-
-def register() -> None:
-    """Make ``Go1-v0`` known to Gymnasium; the time limit is the configuration's own."""
-    gym.register(id="Go1-v0", entry_point="go1exp.env.gym_env:Go1Env")

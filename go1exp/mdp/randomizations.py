@@ -65,8 +65,8 @@ def foot_friction(
 def restitution(damping_ratio: np.ndarray) -> np.ndarray:
     """Return the share of its speed that a mass keeps when it meets a spring-damper which can push but not pull.
 
-    With z the damping ratio and w = sqrt(|1 - z^2|): e = exp(-z/w (pi - atan(2 z w / (1 - 2 z^2)))) below z = 1/sqrt(2),
-    e = exp(-z/w atan(2 z w / (2 z^2 - 1))) up to 1, e = exp(-z/w ln((z + w) / (z - w))) above; exp(-2) at 1.
+    With z the damping ratio and w = sqrt(|1 - z^2|): e = exp(-z/w atan2(2 z w, 2 z^2 - 1)) below z = 1, exp(-2) at 1,
+    and exp(-z/w ln((z + w) / (z - w))) above.
     Schwager and Poeschel, "Coefficient of restitution and linear-dashpot model revisited", Granular Matter 9 (2007).
     """
     z = np.asarray(damping_ratio, dtype=float)
