@@ -98,11 +98,14 @@ class Go1Core:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
         self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
+        self._last_action = zeros(robot.NUM_JOINTS)
         self.target, self.torque = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self.joint_acc = zeros(robot.NUM_JOINTS)
         self.spawn = zeros(3)
         self.steps = zeros(dtype=torch.int64)
+        self._first_step = zeros(dtype=torch.int64)
         self.episode_return = zeros()
+        self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
         self.reward_sums = torch.zeros(len(self._rewards), dtype=torch.float64, device=self.device)
         self.term_values = zeros(len(self._rewards))
         self.feet = FootTimers(num_envs, task.sim.physics_dt, self.device)
@@ -176,7 +179,8 @@ class Go1Core:
             self._randomize_model("startup", everyone)
         self._restart(everyone)
         if self._spread_starts and not self._started:
-            self.steps.copy_(self.random.stream("spread").integers(self.task.sim.episode_steps, 1).squeeze(1))
+            self._first_step.copy_(self.random.stream("spread").integers(self.task.sim.episode_steps, 1).squeeze(1))
+            self.steps.copy_(self._first_step)
         self._started = True
         self._advance_world(everyone)
         return self._observe(self.snapshot())
@@ -214,10 +218,11 @@ class Go1Core:
         self.actuator.reset(mask)
         self.feet.reset(mask)
         for tensor in (self.action, self.previous_action, self.torque, self.joint_acc):
-            tensor.mul_(~rows)
+            tensor.masked_fill_(rows, 0.0)  # and not a product: zero times NaN is NaN
         self.target.copy_(torch.where(rows, self._nominal, self.target))
-        self.steps.mul_(~mask)
-        self.episode_return.mul_(~mask)
+        self.steps.masked_fill_(mask, 0)
+        self._first_step.masked_fill_(mask, 0)
+        self.episode_return.masked_fill_(mask, 0.0)
 
     # ------------------------------------------------------------------ step
 
@@ -235,7 +240,9 @@ class Go1Core:
         reward = self._reward(s)
         self.episode_return += reward
         final_observation = self._observe(s)
-        episode_return, episode_length = self.episode_return.clone(), self.steps.clone()
+        episode_return, episode_length = self.episode_return.clone(), self.steps - self._first_step
+        self._last_qpos.copy_(self.backend.qpos)
+        self._last_qvel.copy_(self.backend.qvel)
 
         ended = terminated | truncated
         self._move_levels(ended)
@@ -249,6 +256,7 @@ class Go1Core:
         clip = self.task.action.clip
         self.previous_action.copy_(self.action)
         self.action.copy_(action.clamp(-clip, clip))
+        self._last_action.copy_(self.action)
         self.target.copy_(self._nominal + self.task.action.scale * self.action)
         target = self.target.to(self.backend.qpos.dtype)
         q, qd = self._state.joint_pos, self._state.joint_vel
@@ -260,7 +268,7 @@ class Go1Core:
             speed = qd.clone()
             self.backend.step(torque)
             feet = self._foot_contact[..., 0]
-            self.feet.update(feet > 0)
+            self.feet.update(self._foot_contact[..., 1:].square().sum(-1) > 0)
             # Counts, largest over the substeps; a calf's contacts without those of its foot.
             torch.maximum(self._touched, self._link_contacts, out=self._touched)
             torch.maximum(self._calf_touched, self._link_contacts[:, CALVES] - feet, out=self._calf_touched)
@@ -356,7 +364,7 @@ class Go1Core:
         """Raise NumericalFault if anything in the step is not finite. Waits for the device."""
         if torch.isfinite(result.reward.sum() + result.final_observation.sum()):
             return
-        named = {"action": self.action, "torque": self.torque, "qpos": self.backend.qpos, "qvel": self.backend.qvel}
+        named = {"action": self._last_action, "qpos": self._last_qpos, "qvel": self._last_qvel}
         named |= {f"reward.{t.key}": self.term_values[:, k] for k, t in enumerate(self._rewards)}
         named |= {"observation": result.final_observation}
         for name, values in named.items():
@@ -383,6 +391,7 @@ class Go1Core:
         "joint_acc",
         "spawn",
         "steps",
+        "_first_step",
         "episode_return",
         "reward_sums",
         "level",

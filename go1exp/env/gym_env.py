@@ -23,7 +23,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         overrides: as after ``go1exp train``; the run-time settings among them are ignored.
         task: a parsed configuration instead.
         noise: add the configured observation noise.
-        env_index: behave like this environment of a batch with the same seed.
+        env_index: behave like this environment of a batch with the same seed, in the first episode.
         render_mode: ``rgb_array`` or None.
 
     Raises:
@@ -64,8 +64,9 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         """Apply an action (12,) for one policy period."""
         result = self.core.step(torch.as_tensor(action, dtype=torch.float32).unsqueeze(0))
         self.core.check(result)
-        observation = result.final_observation[0].numpy().copy()
-        return observation, float(result.reward[0]), bool(result.terminated[0]), bool(result.truncated[0]), {}
+        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
+        last = result.final_observation if terminated or truncated else result.observation
+        return last[0].numpy().copy(), float(result.reward[0]), terminated, truncated, {}
 
     def render(self) -> np.ndarray | None:
         """Return a picture (480, 640, 3) uint8 if the render mode is ``rgb_array``."""

@@ -35,8 +35,8 @@ class Go1VecEnv(VecEnv):
     """
 
     def __init__(self, core: Go1Core) -> None:
-        super().__init__(core.num_envs, *spaces(core))
         self.core = core
+        super().__init__(core.num_envs, *spaces(core))
         self._actions = torch.zeros_like(core.action)
 
     def reset(self) -> VecEnvObs:
@@ -76,8 +76,9 @@ class Go1VecEnv(VecEnv):
         """Nothing to release: threads end with the object."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the core, once per environment asked for."""
-        return [getattr(self.core, attr_name, None)] * self._count(indices)
+        """Return an attribute of the core, once per environment asked for; raise AttributeError if it has none."""
+        value = None if attr_name == "render_mode" else getattr(self.core, attr_name)
+        return [value] * self._count(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Refuse: the environments share one core."""
@@ -93,5 +94,5 @@ class Go1VecEnv(VecEnv):
 
     def _count(self, indices: VecEnvIndices) -> int:
         if indices is None:
-            return self.num_envs
+            return self.core.num_envs
         return len(indices) if isinstance(indices, Sequence | Iterable) else 1  # type: ignore[arg-type]

@@ -242,7 +242,8 @@ class Camera:
             mujoco.mjr_uploadHField(model, self._context, 0)
         self._follow(env)
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(model, data, self._option, None, self._view, everything, self._scene)
+        for _ in range(2):  # the second time, an endless plane is laid about this camera and not about the last one
+            mujoco.mjv_updateScene(model, data, self._option, None, self._view, everything, self._scene)
         draw_velocities(self._scene, self.stage, self.stage.core.command.value[env], self._velocity)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         picture = np.empty((self._rect.height, self._rect.width, 3), np.uint8)

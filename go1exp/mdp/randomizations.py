@@ -55,7 +55,12 @@ def _vary(
 
 @randomization("foot_friction", kind="model", fields=("geom_friction",))
 def foot_friction(
-    model: ModelFields, stream: Stream, mask: Tensor, *, range: PositiveRange = (0.4, 1.1), operation: Operation = "set"
+    model: ModelFields,
+    stream: Stream,
+    mask: Tensor,
+    *,
+    range: PositiveRange = (0.4, 1.1),
+    operation: Literal["set", "scale"] = "set",
 ) -> None:
     """Sliding friction coefficient of each foot; the foot's value is the contact's. Table I: new, (0.4, 1.1)."""
     draw = stream.uniform(len(FEET), low=range[0], high=range[1])

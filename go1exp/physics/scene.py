@@ -11,7 +11,7 @@ import mujoco
 
 from go1exp import robot
 from go1exp.physics.model import load_robot
-from go1exp.physics.terrain_geom import add_to_spec
+from go1exp.physics.terrain_geom import FLOOR, add_to_spec
 from go1exp.robot import RobotConfig
 from go1exp.terrain import Terrain
 
@@ -35,7 +35,7 @@ class Sensors:
     foot_vel_w: slice
     """4 x 3: their velocity, m/s."""
     foot_contact: slice
-    """4 x 4: number of contacts of the foot sphere, then the net contact force on it, N."""
+    """4 x 4: number of contacts of the foot sphere with the ground, then the ground's net force on it, world frame, N."""
     link_contacts: slice
     """13: number of contacts of thighs (4), calves with their feet (4), trunk with head (1), hips (4)."""
 
@@ -89,7 +89,11 @@ def _add_sensors(spec: mujoco.MjSpec) -> Sensors:
         start = end
         for target in targets:
             name = f"{target}_{kind.name.removeprefix('mjSENS_').lower()}"
-            spec.add_sensor(name=name, type=kind, objtype=objtype, objname=target, intprm=[*intprm, 0, 0, 0][:3])
+            sensor = spec.add_sensor(
+                name=name, type=kind, objtype=objtype, objname=target, intprm=[*intprm, 0, 0, 0][:3]
+            )
+            if objtype == geom:  # the force is the first's on the second
+                sensor.objname, sensor.reftype, sensor.refname = FLOOR, geom, target
             end += size
         return slice(start, end)
 

@@ -1,0 +1,711 @@
+"""Every leaf of every file in conf/ does something: no number there is only decoration.
+
+One leaf at a time gets another valid value, and something observable has to come out differently: a state, a reward,
+an observation, a weight of the network, a file, what an outside library is told. What a program observably does is
+its *trace*; a trace never holds a copy of the configuration, which would make every key look alive.
+
+Leaves are found in the files and other values by trial against the schemas, so a new key needs nothing here unless
+it has no effect within a few robots and steps; ``EXEMPT`` has those that cannot be shown, and why.
+"""
+
+from __future__ import annotations
+
+import copy
+import csv
+import io
+import itertools
+import json
+import re
+import sys
+import types
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import closing, redirect_stdout
+from dataclasses import dataclass, fields
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from mujoco.batch import Batch
+from omegaconf import OmegaConf
+
+from go1exp import data_root, registry
+from go1exp.cli import settings
+from go1exp.cli.app import App
+from go1exp.compose import config_folder, register_groups
+from go1exp.config import MANY_TERMS, ONE_TERM, parse_train
+from go1exp.env.core import Go1Core
+from go1exp.registry import ConfigError, Range
+from go1exp.train import run_folder, trainer
+from go1exp.types import Snapshot
+
+pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
+
+CONF = data_root() / "conf"
+
+Trace = Generator[tuple[str, Any], None, None]
+"""What can be observed, in order, each with a name; lazy, so that a comparison stops at the first difference."""
+
+EXEMPT = {
+    "actuator/pd.yaml:actuator.term": "there is no other actuator to choose",
+    "backend/cpu.yaml:backend.name": "there is no other engine to choose",
+    "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
+    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
+}
+"""Leaf, or mapping of leaves, that need not be shown to act, and the reason."""
+
+NEEDS = {"curriculum/terrain_level": ["terrain=rough"]}
+"""Choices that other choices must go with."""
+
+SMALL: dict[str, dict[str, Any]] = {
+    "train": {
+        "sim.physics_dt": 0.005,
+        "sim.episode_s": 0.4,
+        "terrain.rows": 3,
+        "terrain.cols": 10,
+        "terrain.tile_size": 4.0,
+        "terrain.border": 2.0,
+        "curriculum.terrain_level.start_level_max": 1,
+        "backend.threads": 1,
+        "torch_threads": 1,
+        "ppo.num_envs": 8,
+        "ppo.iterations": 4,
+        "ppo.steps": 6,
+        "ppo.epochs": 2,
+        "ppo.minibatches": 4,
+        "ppo.learning_rate": 0.005,
+        "ppo.learning_rate_range": [0.003, 0.01],
+        "ppo.hidden": [8, 7, 6],
+        "logger.tensorboard": False,
+        "checkpoint.every": 1,
+    },
+    "eval": {
+        "grid": {"x": [0.5, 1.0], "y": [0.5], "yaw": [1.0], "cross": False},
+        "episodes": 2,
+        "duration_s": 0.2,
+        "settle_s": 0.1,
+        "noise": True,
+        "rand": True,
+        "push": True,
+        "terrain": True,
+    },
+    "play": {"seconds": 0.4, "noise": True, "rand": True, "push": True, "terrain": True, "viewer": "clip"},
+    "list": {},
+    "bench": {"num_envs": 4, "rounds": 1, "seconds": 0.1, "threads": 1},
+}
+"""Values that the traces use instead of those in conf/: fewer and shorter, or switched on so that others can act."""
+
+OTHER: dict[str, Callable[[Walk], list[Any]]] = {
+    "train:backend.threads": lambda walk: [2],
+    "train:torch_threads": lambda walk: [2],
+    "train:device": lambda walk: ["cuda"],
+    "train:logger.wandb": lambda walk: [{"project": "p", "mode": "offline", "group": None, "entity": None}],
+    "train:resume": lambda walk: [str(walk.trained("resumed"))],
+    "eval:run": lambda walk: [str(walk.trained("other", "seed=5"))],
+    "play:run": lambda walk: [str(walk.trained("other", "seed=5"))],
+    "eval:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
+    "play:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
+    "list:group": lambda walk: ["reward"],
+    "bench:overrides": lambda walk: [["sim.physics_dt=0.004"]],
+}
+"""Other values of leaves where ``other_values`` could not guess one."""
+
+
+# ---------------------------------------------------------------------- the leaves
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One value in one file: ``key`` is its path in the composed configuration."""
+
+    file: str
+    key: str
+    value: Any
+
+    @property
+    def name(self) -> str:
+        return f"{self.file}.yaml:{self.key}"
+
+    @property
+    def program(self) -> str:
+        return self.file if "/" not in self.file else "train"
+
+    @property
+    def overlay(self) -> bool:
+        """Part of an experiment, which changes keys that other files have."""
+        return self.file.startswith("experiment/")
+
+    @property
+    def choice(self) -> list[str]:
+        """Overrides that bring the file into the configuration."""
+        group, _, choice = self.file.partition("/")
+        group = group.replace("randomization", "rand")
+        chosen = [f"{group}={choice}"] if choice and not self.overlay else []
+        return [*chosen, *NEEDS.get(self.file, [])]
+
+
+def flat(node: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Leaves of nested mappings; a term without parameters, ``{}``, is one."""
+    if isinstance(node, Mapping) and node:
+        for key, value in node.items():
+            yield from flat(value, f"{path}.{key}".strip("."))
+    else:
+        yield path, node
+
+
+def read_leaves(conf: Path = CONF) -> list[Leaf]:
+    found = []
+    for file in sorted(conf.rglob("*.yaml")):
+        name = file.relative_to(conf).with_suffix("").as_posix()
+        content = OmegaConf.to_container(OmegaConf.load(file))
+        assert isinstance(content, dict)
+        content.pop("defaults", None)
+        group = name.split("/")[0].replace("randomization", "rand") if "/" in name else ""
+        prefix = "" if group == "experiment" else group
+        found += [Leaf(name, key, value) for key, value in flat(content, prefix) if content]
+    return found
+
+
+def exemption(name: str) -> str | None:
+    """The entry of ``EXEMPT`` that covers a leaf."""
+    return next((e for e in EXEMPT if name == e or name.startswith(f"{e}.")), None)
+
+
+def stale(exempt: Iterable[str], names: Iterable[str]) -> list[str]:
+    """Exemptions that no leaf needs any more."""
+    names = list(names)
+    return [e for e in exempt if not any(n == e or n.startswith(f"{e}.") for n in names)]
+
+
+LEAVES = read_leaves()
+WALKED = [leaf for leaf in LEAVES if not exemption(leaf.name)]
+
+
+# ---------------------------------------------------------------------- other values
+
+
+def get(container: Mapping[str, Any], key: str) -> Any:
+    for part in key.split("."):
+        container = container[part]
+    return container
+
+
+def put(container: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """A copy with another value."""
+    changed = copy.deepcopy(container)
+    *parents, last = key.split(".")
+    node = changed
+    for part in parents:
+        node = node[part]
+    node[last] = value
+    return changed
+
+
+def drop(container: dict[str, Any], key: str) -> dict[str, Any]:
+    """A copy without the key."""
+    changed = copy.deepcopy(container)
+    parent, _, last = key.rpartition(".")
+    del get(changed, parent)[last]
+    return changed
+
+
+@lru_cache(4)
+def _resolved(container: str) -> str:
+    return json.dumps(OmegaConf.to_container(OmegaConf.create(json.loads(container)), resolve=True))
+
+
+def resolved(container: dict[str, Any]) -> dict[str, Any]:
+    plain: dict[str, Any] = json.loads(_resolved(json.dumps(container)))
+    return plain
+
+
+def parse(program: str, container: dict[str, Any]) -> Any:
+    """What the program makes of its configuration; ConfigError if that is not valid."""
+    if program == "train":
+        return parse_train(container)
+    return settings.parse(getattr(settings, f"{program.capitalize()}Settings"), container)
+
+
+def complaints(program: str, container: dict[str, Any]) -> list[str]:
+    try:
+        parse(program, resolved(container))
+    except ConfigError as error:
+        return error.problems
+    return []
+
+
+def other_values(value: Any) -> list[Any]:
+    """Guesses at other valid values of a leaf, the most telling first."""
+    if isinstance(value, bool):
+        return [not value]
+    if isinstance(value, int):
+        return [value + 1, value + 2, 2 * value, value - 1, 4 * value]
+    if isinstance(value, float):
+        if value == 0.0:
+            return [0.1, 0.01, -0.1, 1.0]
+        return [*(f * value for f in (0.5, 1.5)), value + 0.1, value - 0.1, *(f * value for f in (10.0, 0.1, 0.01))]
+    if value is None:
+        return [0.1, 1, "other"]
+    return []
+
+
+def with_other_term(container: dict[str, Any], key: str) -> Iterator[dict[str, Any]]:
+    """Configurations in which ``term`` names another term, with its own defaults for parameters."""
+    group, path = key.split(".")[0], key.rpartition(".")[0]
+    now, slots = get(container, path), MANY_TERMS.get(group)
+    kept = {k: v for k, v in now.items() if slots and k in slots.model_fields}
+    for name in registry.members(group):
+        if name != now["term"]:
+            yield put(container, path, {"term": name, **kept})
+
+
+def variants(program: str, container: dict[str, Any], key: str, walk: Walk) -> dict[str, list[dict[str, Any]]]:
+    """Changed configurations by what is changed: the leaf, or one element of it. One of each must make a difference."""
+    value = get(resolved(container), key)
+    if special := OTHER.get(f"{program}:{key}"):
+        return {key: [put(container, key, v) for v in special(walk)]}
+    if value == {}:
+        return {key: [drop(container, key)]}
+    if key.endswith(".term") and key.split(".")[0] in (*MANY_TERMS, *ONE_TERM):
+        return {key: list(with_other_term(container, key))}
+    if isinstance(value, list):
+        elements = {f"{key}[{k}]": (k, v) for k, v in enumerate(value)}
+        return {
+            name: [put(container, key, [*value[:k], other, *value[k + 1 :]]) for other in other_values(v)]
+            for name, (k, v) in elements.items()
+        }
+    if isinstance(value, str):  # the schema's complaint lists what may stand there
+        allowed = [m for line in complaints(program, put(container, key, "?")) for m in re.findall(r"'(\w+)'", line)]
+        return {key: [put(container, key, v) for v in [*allowed, f"{value}_other"] if v != value]}
+    return {key: [put(container, key, v) for v in other_values(value)]}
+
+
+# ---------------------------------------------------------------------- comparison
+
+
+def same(a: Any, b: Any) -> bool:
+    """Equal; numbers up to rounding, so that a term that is zero but for rounding does not count as acting."""
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, torch.Tensor | np.ndarray | float) and isinstance(b, torch.Tensor | np.ndarray | float):
+        x, y = np.asarray(a), np.asarray(b)
+        return x.shape == y.shape and bool(np.allclose(x, y, rtol=1e-6, atol=1e-7, equal_nan=True))
+    return bool(a == b)
+
+
+def difference(base: list[tuple[str, Any]], other: Iterable[tuple[str, Any]]) -> str | None:
+    """Name of the first thing that is not the same, or None."""
+    for (name, a), found in itertools.zip_longest(base, other, fillvalue=("end", None)):
+        if name != found[0] or not same(a, found[1]):
+            return name
+    return None
+
+
+class Walk:
+    """Composes, traces and compares; keeps what several leaves need."""
+
+    def __init__(self, scratch: Path) -> None:
+        self._scratch = scratch
+        self._count = itertools.count()
+        self._bases: dict[str, list[tuple[str, Any]]] = {}
+        self._runs: dict[str, Path] = {}
+
+    def folder(self) -> Path:
+        folder = self._scratch / str(next(self._count))
+        folder.mkdir()
+        return folder
+
+    def trained(self, name: str, *overrides: str) -> Path:
+        """A finished run on rough ground that makes big movements, whose pushes are frequent."""
+        if name not in self._runs:
+            container = resolved(small("train", composed("train", ("terrain=rough", *overrides))))
+            container["terrain"]["platform"] = 0.2
+            container["event"]["push"]["interval"] = [0.04, 0.06]
+            container["action"]["scale"] = 20.0
+            run = self._scratch / name
+            run_folder.write(run, container)
+            trainer.train(parse_train(container), container, run)
+            self._runs[name] = run
+        return self._runs[name]
+
+    def setup(self, leaf: Leaf) -> dict[str, Any]:
+        """The configuration, interpolations unresolved, in which a leaf is tried."""
+        run = [f"run={self.trained('run')}"] if leaf.program in ("eval", "play") else []
+        return small(leaf.program, composed(leaf.program, (*leaf.choice, *run)))
+
+    def trace(self, program: str, container: dict[str, Any], key: str) -> Trace:
+        how = resume_trace if key == "resume" else TRACES[program]
+        return how(resolved(container), self)
+
+    def base(self, program: str, container: dict[str, Any], key: str) -> list[tuple[str, Any]]:
+        identity = f"{program} {key == 'resume'} {json.dumps(container, sort_keys=True)}"
+        if identity not in self._bases:
+            self._bases[identity] = list(self.trace(program, container, key))
+        return self._bases[identity]
+
+    def effect(self, program: str, before: dict[str, Any], after: dict[str, Any], key: str) -> str | None:
+        with closing(self.trace(program, after, key)) as other:
+            return difference(self.base(program, before, key), other)
+
+    def dead(self, leaf: Leaf) -> list[str]:
+        """The leaf, or the elements of it, that make no difference."""
+        before = self.setup(leaf)
+        if leaf.overlay and leaf.key not in SMALL["train"]:  # what an experiment sets is itself the other value
+            return self.idle("train", before, leaf.key, {leaf.key: [put(before, leaf.key, leaf.value)]})
+        return self.idle(leaf.program, before, leaf.key, variants(leaf.program, before, leaf.key, self))
+
+    def idle(
+        self, program: str, before: dict[str, Any], key: str, changes: dict[str, list[dict[str, Any]]]
+    ) -> list[str]:
+        """The changes by name none of whose valid configurations makes a difference."""
+        assert changes, f"{key}: no way to vary it; OTHER needs a value"
+        found = []
+        for name, changed in changes.items():
+            valid = (c for c in changed if not complaints(program, c))
+            if not any(self.effect(program, before, c, key) for c in valid):
+                found.append(name)
+        return found
+
+
+@cache
+def _composed(program: str, overrides: tuple[str, ...]) -> str:
+    register_groups()
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(config_folder(), version_base="1.3"):
+        return json.dumps(OmegaConf.to_container(hydra_compose(program, list(overrides))))
+
+
+def composed(program: str, overrides: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Compose without resolving interpolations, so that a change goes where they lead."""
+    container: dict[str, Any] = json.loads(_composed(program, overrides))
+    return container
+
+
+def small(program: str, container: dict[str, Any]) -> dict[str, Any]:
+    for key, value in SMALL[program].items():
+        try:
+            container = put(container, key, value)
+        except KeyError:  # of a choice that is not made here
+            assert key.startswith("curriculum."), f"SMALL: no such key {key}"
+    return container
+
+
+# ---------------------------------------------------------------------- traces
+
+
+def provoked(core: Go1Core, steps: int = 12) -> Trace:
+    """Throw the robots about, so that whatever can happen to one happens to some, and look at everything.
+
+    Every other robot is put into a random state: at any height and tilt, joints anywhere and fast, feet long in the
+    air or on the ground, told to stand, commands and pushes running out. The others go on from where they are.
+    """
+    rng = np.random.default_rng(0)
+    yield "first observation", core.reset().clone()
+    yield from everything(core)
+    n = core.num_envs
+    for step in range(steps):
+        here = torch.arange(n) % 2 == step % 2
+        qpos, qvel = core.backend.qpos.clone(), core.backend.qvel.clone()
+        qpos[:, 2] = core.spawn[:, 2] + torch.tensor(rng.uniform(0.1, 0.4, n))
+        tilt = rng.normal(size=(n, 3)) * rng.choice([0.1, 0.5, 1.0], (n, 1))
+        quat = np.concatenate([np.ones((n, 1)), tilt], 1)
+        qpos[:, 3:7] = torch.tensor(quat / np.linalg.norm(quat, axis=1, keepdims=True))
+        low, high = np.tile([[-0.863, 0.863], [-0.686, 4.501], [-2.818, -0.888]], (4, 1)).T
+        qpos[:, 7:] = torch.tensor(rng.uniform(low, high, (n, 12)))
+        qvel[:, :6] = torch.tensor(rng.uniform(-1, 1, (n, 6)) * rng.choice([0.3, 2.0], (n, 1)))
+        qvel[:, 6:] = torch.tensor(rng.uniform(-40, 40, (n, 12)))
+        core.backend.reset(here, qpos, qvel)
+        for name in ("air", "contact", "last_air", "last_contact"):
+            getattr(core.feet, name)[here] = torch.tensor(rng.uniform(0, 1, (n, 4)), dtype=torch.float32)[here]
+        core.command.value[here & (torch.arange(n) % 4 < 2)] = 0.0
+        for part in (core.command, *core.events.values()):
+            if hasattr(part, "time_left"):
+                part.time_left[here] = 0.0
+        size = rng.choice([0.3, 3.0, 300.0], (n, 1))
+        result = core.step(torch.tensor(rng.normal(size=(n, 12)) * size, dtype=torch.float32))
+        for field in fields(result):
+            yield f"step {step}: {field.name}", getattr(result, field.name).clone()
+        if step % 4 == 3:
+            yield from everything(core)
+
+
+def everything(core: Go1Core) -> Trace:
+    for part, state in core.state_dict().items():
+        if part != "random":  # holds the seed as it was given
+            yield part, state
+
+
+def train_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """Build learner and environment, provoke the environment; then a short training run."""
+    config, run = parse_train(container), walk.folder()
+    with pytest.MonkeyPatch.context() as patch:
+        asked: list[str] = []  # a machine without a GPU has no other device to go to
+
+        def get_device(device: Any) -> torch.device:
+            asked.append(str(device))
+            return torch.device("cpu")
+
+        patch.setattr("stable_baselines3.common.base_class.get_device", get_device)
+        told: list[Any] = []
+        patch.setitem(sys.modules, "wandb", wandb_stub(told))
+        torch.set_num_threads(1)
+        try:
+            ppo = trainer.build(config)
+            core = ppo.get_env().core  # type: ignore[union-attr]
+            yield "first weights", dict(ppo.policy.state_dict())
+            yield "threads of torch", torch.get_num_threads()
+            yield "threads of MuJoCo", core.backend._batch.nthread
+            yield "device", asked[0]
+            yield "ground", {"heights": core.terrain.heights, "origins": core.terrain.tile_origins}
+            yield from provoked(core)
+            ppo = trainer.train(config, container, run)
+            yield "weights", dict(ppo.policy.state_dict())
+            yield "learning rate", ppo.policy.optimizer.param_groups[0]["lr"]
+        finally:
+            torch.set_num_threads(1)
+    yield "steps", ppo.num_timesteps
+    yield "files", sorted(str(p.relative_to(run)) for p in run.rglob("*") if "tfevents" not in p.name)
+    if (run / "metrics.csv").exists():
+        with (run / "metrics.csv").open(newline="") as file:
+            yield "metrics", [{k: float(v) if v else None for k, v in row.items()} for row in csv.DictReader(file)]
+    yield "Weights & Biases", told
+
+
+def wandb_stub(told: list[Any]) -> types.ModuleType:
+    """A module that writes down what it is told, but for the copy of the configuration and the identity of the run."""
+
+    def init(**arguments: Any) -> Any:
+        told.append({k: v for k, v in arguments.items() if k not in ("config", "id", "dir", "settings")})
+        return types.SimpleNamespace(log=lambda values, step: told.append(sorted(values)), finish=lambda: None)
+
+    module = types.ModuleType("wandb")
+    module.init, module.Settings = init, dict  # type: ignore[attr-defined]
+    return module
+
+
+def resume_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """Run the verb itself, with a stub for the training: in which folder it would train."""
+    from go1exp.cli.train import APP
+
+    folders: list[str] = []
+    chosen = json.dumps(container["resume"])
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()):
+        patch.setattr(sys, "argv", sys.argv)
+        patch.setenv("HYDRA_FULL_ERROR", "0")  # the verb changes both
+        patch.setattr(trainer, "train", lambda config, container, run: folders.append(run.name))
+        assert APP.run([f"hydra.run.dir={walk.folder() / 'new'}", f"resume={chosen}"]) == 0
+    yield "folder", folders
+
+
+def outcome(app: App, container: dict[str, Any], walk: Walk) -> tuple[str, dict[str, bytes]]:
+    """Run a verb without its Hydra application; return what it printed and the files it wrote."""
+    said, here = io.StringIO(), walk.folder()
+    places = [here, *(Path(run) for run in [container.get("run")] if run)]
+    before = {p for place in places for p in place.rglob("*")}
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+        patch.chdir(here)
+        assert not app.task(container)
+    files = [p for place in places for p in place.rglob("*") if p not in before and p.is_file()]
+    written = {p.name: p.read_bytes() for p in files}
+    for file in files:
+        file.unlink()
+    return said.getvalue(), written
+
+
+def eval_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """The report without the settings that it repeats, and where it lies."""
+    from go1exp.cli.evaluate import APP
+
+    _, files = outcome(APP, container, walk)
+    yield "files", sorted(files)
+    for content in files.values():
+        report = json.loads(content)
+        yield "report", {k: report[k] for k in ("commands", "rmse", "falls", "episodes")}
+
+
+def play_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """The frames of the film, or that the live viewer was opened; a stub draws the state as numbers."""
+    from go1exp.cli.play import APP
+    from go1exp.evaluate import video
+
+    seen: list[Any] = []
+
+    class Camera:
+        def __init__(self, core: Go1Core, width: int, height: int) -> None:
+            self.stage = types.SimpleNamespace(core=core)
+
+        def frame(self, env: int) -> Any:
+            seen.append(self.stage.core.backend.qpos[env].clone())
+            return np.zeros((64, 64, 3), np.uint8)
+
+        def close(self) -> None:
+            pass
+
+    def write_mp4(path: Path, frames: Any, fps: float) -> None:
+        path.write_text(f"{len(frames)} frames at {fps}")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("DISPLAY", raising=False)
+        patch.delenv("WAYLAND_DISPLAY", raising=False)
+        patch.setattr(video, "Camera", Camera)
+        patch.setattr(video, "write_mp4", write_mp4)
+        patch.setattr(video, "write_strip", lambda path, frames: path.write_text("strip"))
+        patch.setattr(video, "live", lambda core, policy: seen.append("live"))
+        _, files = outcome(APP, container, walk)
+    yield "frames", seen
+    yield "files", files
+
+
+def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    from go1exp.cli.listing import APP
+
+    yield "output", outcome(APP, container, walk)[0]
+
+
+def bench_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """What is built and for how long it runs, by a clock of its own and without other processes."""
+    from go1exp.bench import env, measure
+    from go1exp.cli.bench import APP
+    from go1exp.physics import mujoco_cpu
+
+    built: list[Any] = []
+    ticks = itertools.count()
+
+    def batch(model: Any, *arguments: Any, **options: Any) -> Any:
+        made = Batch(model, *arguments, **options)
+        built.append([made.nsim, made.nthread, model.opt.timestep])
+        return made
+
+    def memory(overrides: list[str]) -> float:
+        built.append(overrides)
+        return 0.0
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measure, "time", types.SimpleNamespace(perf_counter=lambda: 0.04 * next(ticks)))
+        patch.setattr(mujoco_cpu, "Batch", batch)
+        patch.setattr(env, "Batch", batch)
+        patch.setattr(env, "subproc_subject", lambda task: (measure.Subject("processes", lambda: 1), lambda: None))
+        patch.setattr(env, "memory_per_env_kb", memory)
+        said, files = outcome(APP, container, walk)
+    yield "built", built
+    yield "time", next(ticks)
+    yield "figures", re.findall(r"^ *[\d,.]+  .*", said, re.MULTILINE)
+    yield "files", files
+
+
+TRACES: dict[str, Callable[[dict[str, Any], Walk], Trace]] = {
+    "train": train_trace,
+    "eval": eval_trace,
+    "play": play_trace,
+    "list": list_trace,
+    "bench": bench_trace,
+}
+"""Program (a file at the root of conf/) -> its trace."""
+
+
+# ---------------------------------------------------------------------- the tests
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
+    return Walk(tmp_path_factory.mktemp("keys"))
+
+
+@pytest.mark.parametrize("leaf", WALKED, ids=[leaf.name for leaf in WALKED])
+def test_every_key_acts(leaf: Leaf, walk: Walk) -> None:
+    assert not (dead := walk.dead(leaf)), f"{leaf.file}.yaml: nothing changes with {', '.join(dead)}"
+
+
+def test_exemptions_are_needed() -> None:
+    assert not stale(EXEMPT, (leaf.name for leaf in LEAVES))
+    only_choices = [leaf for leaf in LEAVES if EXEMPT.get(leaf.name, "").startswith("there is no other")]
+    assert len(only_choices) == 2
+
+
+@pytest.mark.parametrize("name", [name for name, why in EXEMPT.items() if why.startswith("there is no other")])
+def test_an_only_choice_is_still_the_only_one(name: str, walk: Walk) -> None:
+    leaf = next(leaf for leaf in LEAVES if leaf.name == name)
+    before = walk.setup(leaf)
+    (others,) = variants(leaf.program, before, leaf.key, walk).values()
+    assert not [other for other in others if not complaints(leaf.program, other)]
+
+
+def test_the_tables_hold_no_keys_that_are_gone() -> None:
+    known = {f"{leaf.program}:{leaf.key}" for leaf in LEAVES}
+    mentioned = {f"{program}:{key}" for program, values in SMALL.items() for key in values} | set(OTHER)
+    assert not stale(mentioned, known)
+
+
+# ---------------------------------------------------------------------- the test of the test
+
+
+@pytest.mark.parametrize("program", TRACES)
+def test_a_trace_repeats(program: str, walk: Walk) -> None:
+    container = walk.setup(Leaf(program, "", None))
+    assert walk.base(program, container, "")
+    assert difference(walk.base(program, container, ""), walk.trace(program, container, "")) is None
+
+
+def test_dead_keys_are_found(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    def ghost(s: Snapshot, *, used: float = 1.0, unused: float = 1.0, half: Range = (0.0, 1.0)) -> torch.Tensor:
+        return used * half[1] * s.joint_vel.square().sum(-1)
+
+    monkeypatch.setitem(registry._REGISTRY["reward"], "ghost", registry.Entry("reward", "ghost", ghost))
+    before = walk.setup(Leaf("train", "", None))
+    before["reward"] = {"ghost": {"weight": 1.0, "used": 1.0, "unused": 1.0, "half": [0.0, 1.0]}}
+    for key, dead in {"weight": [], "used": [], "unused": ["unused"], "half": ["half[0]"]}.items():
+        path = f"reward.ghost.{key}"
+        found = walk.idle("train", before, path, variants("train", before, path, walk))
+        assert found == [f"reward.ghost.{name}" for name in dead]
+
+
+def test_new_keys_are_found_and_old_exemptions_too(tmp_path: Path) -> None:
+    (tmp_path / "reward").mkdir()
+    (tmp_path / "train.yaml").write_text("defaults: [{reward: some}]\nsim: {new: 1.0}\nhydra: {job: {name: x}}\n")
+    (tmp_path / "reward/some.yaml").write_text("gait: {weight: 1.0, list: [1, 2]}\nempty: {}\n")
+    (tmp_path / "reward/none.yaml").write_text("{}\n")
+    names = [leaf.name for leaf in read_leaves(tmp_path)]
+    assert names == [
+        "reward/some.yaml:reward.gait.weight",
+        "reward/some.yaml:reward.gait.list",
+        "reward/some.yaml:reward.empty",
+        "train.yaml:sim.new",
+        "train.yaml:hydra.job.name",
+    ]
+    assert [name for name in names if exemption(name)] == ["train.yaml:hydra.job.name"]
+    assert stale(["train.yaml:hydra", "train.yaml:sim.old", "reward/some.yaml:reward.gait"], names) == [
+        "train.yaml:sim.old"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "equal"),
+    [
+        (1.0, 1.0 + 1e-8, True),
+        (1.0, 1.001, False),
+        (float("nan"), float("nan"), True),
+        (torch.zeros(3), torch.zeros(3), True),
+        (torch.zeros(3), torch.zeros(4), False),
+        ({"x": [1.0]}, {"x": [1.0]}, True),
+        ({"x": [1.0]}, {"x": [2.0]}, False),
+        ({"x": 1}, {"y": 1}, False),
+        ([1.0], [1.0, 1.0], False),
+        (None, 1.0, False),
+        ("a", "b", False),
+    ],
+)
+def test_same(a: Any, b: Any, equal: bool) -> None:
+    assert same(a, b) == equal
+
+
+def test_a_trace_that_ends_early_is_different() -> None:
+    assert difference([("x", 1)], [("x", 1)]) is None
+    assert difference([("x", 1), ("y", 2)], [("x", 1)]) == "y"
+    assert difference([("x", 1)], [("x", 1), ("y", 2)]) == "end"

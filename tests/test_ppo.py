@@ -1,0 +1,456 @@
+"""The learner: the divergence and the rate rule against references, SB3's object as configured, and that it learns."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor, nn
+from torch.distributions import Independent, Normal, kl_divergence
+
+from go1exp.compose import compose
+from go1exp.config import PPOConfig, parse_train
+from go1exp.env.core import Go1Core
+from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, policy_settings
+
+pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
+
+TINY = (
+    "ppo=paper",
+    "ppo.num_envs=8",
+    "ppo.steps=8",
+    "ppo.minibatches=2",
+    "ppo.epochs=2",
+    "ppo.hidden=[16]",
+    "ppo.matmul_precision=highest",
+)
+
+
+def settings(*overrides: str) -> PPOConfig:
+    return parse_train(compose("train", [*TINY, *overrides])).ppo
+
+
+class Slider(VecEnv):
+    """A point on a line that is paid for being at 0: obs (N, 1) its place, action (N, 1) its step; 16 steps long."""
+
+    LENGTH = 16
+
+    def __init__(self, num_envs: int = 8) -> None:
+        box = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        super().__init__(num_envs, gym.spaces.Box(-np.inf, np.inf, (1,), np.float32), box)
+        self.random = np.random.default_rng(0)
+        self.returns: list[float] = []
+
+    def _start(self) -> np.ndarray:
+        return self.random.uniform(-1.0, 1.0, (self.num_envs, 1)).astype(np.float32)
+
+    def reset(self) -> np.ndarray:
+        self.place, self.time, self.total = self._start(), 0, np.zeros(self.num_envs)
+        return self.place.copy()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.place = self.place + 0.5 * actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        reward = -np.abs(self.place[:, 0]).astype(np.float32)
+        self.time += 1
+        self.total += reward
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        over = self.time == self.LENGTH
+        if over:
+            self.returns.append(float(self.total.mean()))
+            for i, info in enumerate(infos):
+                info["terminal_observation"] = self.place[i].copy()
+                info["TimeLimit.truncated"] = True
+                info["episode"] = {"r": float(self.total[i]), "l": self.LENGTH}
+            self.place, self.time, self.total = self._start(), 0, np.zeros(self.num_envs)
+        return self.place.copy(), reward, np.full(self.num_envs, over), infos
+
+    def close(self) -> None: ...
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None: ...
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        return [None] * self.num_envs
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+
+def slider_ppo(*overrides: str) -> AdaptivePPO:
+    config = settings(*overrides)
+    return AdaptivePPO(config, Slider(config.num_envs), seed=3, device="cpu")
+
+
+def learn(ppo: AdaptivePPO, iterations: int) -> None:
+    ppo.learn(iterations * ppo.n_steps * ppo.n_envs)
+
+
+def gaussian(policy: GaussianPolicy, observations: Tensor) -> Normal:
+    distribution = policy.get_distribution(observations).distribution
+    assert isinstance(distribution, Normal)
+    return distribution
+
+
+def collect(ppo: AdaptivePPO) -> None:
+    """Fill the rollout buffer once, without an update."""
+    _, callback = ppo._setup_learn(ppo.n_steps * ppo.n_envs, None)
+    callback.on_training_start({}, {})
+    assert ppo.env is not None
+    ppo.collect_rollouts(ppo.env, callback, ppo.rollout_buffer, ppo.n_steps)
+
+
+# ---------------------------------------------------------------------- divergence
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_divergence_is_that_of_torch_distributions(seed: int) -> None:
+    torch.manual_seed(seed)
+    old_mean, mean = torch.randn(32, 12, dtype=torch.float64), torch.randn(32, 12, dtype=torch.float64)
+    old_log_std, log_std = torch.randn(12, dtype=torch.float64), torch.randn(12, dtype=torch.float64)
+    old = Independent(Normal(old_mean, old_log_std.exp()), 1)
+    new = Independent(Normal(mean, log_std.exp()), 1)
+    torch.testing.assert_close(gaussian_kl(old_mean, old_log_std, mean, log_std), kl_divergence(old, new))
+
+
+def test_the_divergence_of_two_gaussians_on_paper() -> None:
+    """From N(0, 1) to N(1, 2^2): ln 2 + (1 + 1) / 8 - 1/2; two axes: twice; backwards: another number."""
+    zero, one, two = torch.zeros(1, 2), torch.ones(1, 2), torch.full((2,), math.log(2.0))
+    forth = math.log(2.0) + 2.0 / 8.0 - 0.5
+    back = -math.log(2.0) + (4.0 + 1.0) / 2.0 - 0.5
+    assert gaussian_kl(zero, torch.zeros(2), one, two).item() == pytest.approx(2 * forth, rel=1e-6)
+    assert gaussian_kl(one, two, zero, torch.zeros(2)).item() == pytest.approx(2 * back, rel=1e-6)
+
+
+def test_the_divergence_of_a_distribution_from_itself_is_zero_to_the_last_bit() -> None:
+    torch.manual_seed(0)
+    mean, log_std = 10.0 * torch.randn(1000, 12), torch.randn(12)
+    assert (gaussian_kl(mean, log_std, mean, log_std) == 0).all()
+
+
+# ---------------------------------------------------------------------- rate rule
+
+
+@pytest.mark.parametrize(
+    ("rate", "kl", "expected"),
+    [
+        (1e-3, 0.0201, 1e-3 / 1.5),  # too far: slower
+        (1e-3, 1e9, 1e-3 / 1.5),
+        (1e-3, math.inf, 1e-3 / 1.5),
+        (1e-3, 0.02, 1e-3),  # on the edge: unchanged
+        (1e-3, 0.01, 1e-3),
+        (1e-3, 0.005, 1e-3),  # on the edge: unchanged
+        (1e-3, 0.0049, 1.5e-3),  # too near: faster
+        (1e-3, 1e-12, 1.5e-3),
+        (1e-3, 0.0, 1e-3),  # the same policy says nothing about the rate
+        (1e-3, -1e-9, 1e-3),  # nor does rounding
+        (1.2e-5, 1.0, 1e-5),  # bounds
+        (1e-5, 1.0, 1e-5),
+        (0.008, 1e-4, 0.01),
+        (0.01, 1e-4, 0.01),
+        (0.01, 1.0, 0.01 / 1.5),  # off a bound again
+        (1e-5, 1e-4, 1.5e-5),
+    ],
+)
+def test_the_rate_rule_is_rsl_rls(rate: float, kl: float, expected: float) -> None:
+    assert adapted_rate(rate, kl, 0.01, (1e-5, 1e-2)) == pytest.approx(expected, rel=1e-12)
+
+
+class Watched:
+    """What happened in every minibatch of a training, with divergences computed anew by torch.distributions."""
+
+    def __init__(self, ppo: AdaptivePPO) -> None:
+        self.rates: list[list[float]] = []
+        self.own_kl: list[list[float]] = []
+        self.kl: list[list[float]] = []
+        self._seen = torch.empty(0)
+        train, evaluate_actions = ppo.train, ppo.policy.evaluate_actions
+
+        def watched_train() -> None:
+            self.rates.append([])
+            self.own_kl.append([])
+            self._old = copy.deepcopy(ppo.policy)
+            train()
+            self.kl.append(list(ppo._kl))
+
+        def watched_evaluate(obs: Tensor, actions: Tensor) -> Any:
+            self._seen = obs.clone()
+            return evaluate_actions(obs, actions)
+
+        def before_step(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+            """Runs after the learner's own hook, because it was registered after it."""
+            self.rates[-1].append(optimizer.param_groups[0]["lr"])
+            with torch.no_grad():
+                old, new = gaussian(self._old, self._seen), gaussian(ppo.policy, self._seen)
+                self.own_kl[-1].append(float(kl_divergence(old, new).sum(-1).mean()))
+
+        ppo.train = watched_train  # type: ignore[method-assign]
+        ppo.policy.evaluate_actions = watched_evaluate  # type: ignore[method-assign, assignment]
+        ppo.policy.optimizer.register_step_pre_hook(before_step)
+
+
+@pytest.fixture(scope="module")
+def adaptive() -> tuple[AdaptivePPO, Watched]:
+    """Twelve iterations with a goal that the rate has to look for in both directions."""
+    ppo = slider_ppo("ppo.epochs=3", "ppo.minibatches=4", "ppo.desired_kl=0.003")
+    watched = Watched(ppo)
+    learn(ppo, 12)
+    return ppo, watched
+
+
+def test_divergences_of_all_minibatches_are_from_the_policy_that_collected_their_samples(
+    adaptive: tuple[AdaptivePPO, Watched],
+) -> None:
+    _, watched = adaptive
+    assert [len(k) for k in watched.kl] == [12] * 12  # 3 epochs of 4 minibatches
+    np.testing.assert_allclose(watched.kl, watched.own_kl, atol=2e-6, rtol=1e-3)
+    assert np.mean(watched.kl) > 1e-4  # so that the tolerance means something
+
+
+def test_the_first_minibatch_of_every_update_has_diverged_by_exactly_nothing(
+    adaptive: tuple[AdaptivePPO, Watched],
+) -> None:
+    _, watched = adaptive
+    assert [k[0] for k in watched.kl] == [0.0] * 12
+    assert all(k[-1] > 0.0 for k in watched.kl)
+
+
+def test_the_rate_of_every_gradient_step_follows_from_the_divergences(adaptive: tuple[AdaptivePPO, Watched]) -> None:
+    ppo, watched = adaptive
+    low, high = ppo.config.learning_rate_range
+    rate = ppo.config.learning_rate
+    expected = []
+    for kl in np.concatenate(watched.kl):
+        if kl > 0.006:
+            rate = rate / 1.5 if rate / 1.5 > low else low
+        elif kl > 0.0 and kl < 0.0015:
+            rate = rate * 1.5 if rate * 1.5 < high else high
+        expected.append(rate)
+    got = np.concatenate(watched.rates)
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    assert (np.diff(got) > 0).any()
+    assert (np.diff(got) < 0).any()
+    assert ppo.logger.name_to_value["train/learning_rate"] == got[-1]
+    assert ppo.logger.name_to_value["train/kl"] == pytest.approx(np.mean(watched.kl[-1]))
+
+
+def test_a_fixed_schedule_keeps_the_rate_whatever_the_divergence() -> None:
+    ppo = slider_ppo("ppo.schedule=fixed", "ppo.desired_kl=1e-6", "ppo.learning_rate=0.002")
+    watched = Watched(ppo)
+    learn(ppo, 3)
+    assert set(np.concatenate(watched.rates)) == {0.002}
+    assert max(np.concatenate(watched.kl)) > 2e-6  # adaptive would have answered
+
+
+def test_an_iteration_reports_once_when_its_update_is_complete() -> None:
+    ppo = slider_ppo()
+    seen = []
+    ppo.after_iteration = lambda p: seen.append((p.iteration, p.num_timesteps, p._n_updates))
+    learn(ppo, 3)
+    assert seen == [(1, 64, 2), (2, 128, 4), (3, 192, 6)]
+
+
+# ---------------------------------------------------------------------- SB3's object
+
+
+def test_every_setting_arrives_in_sb3() -> None:
+    ppo = slider_ppo(
+        "ppo.steps=16",
+        "ppo.minibatches=4",
+        "ppo.epochs=3",
+        "ppo.learning_rate=0.002",
+        "ppo.gamma=0.9",
+        "ppo.gae_lambda=0.8",
+        "ppo.clip_range=0.15",
+        "ppo.value_clip=0.3",
+        "ppo.entropy=0.01",
+        "ppo.value_coef=0.7",
+        "ppo.max_grad_norm=0.4",
+        "ppo.normalize_advantage=false",
+        "ppo.init_std=0.3",
+    )
+    assert (ppo.n_steps, ppo.batch_size, ppo.n_epochs, ppo.n_envs) == (16, 8 * 16 // 4, 3, 8)
+    assert (ppo.gamma, ppo.gae_lambda) == (0.9, 0.8)
+    assert (ppo.rollout_buffer.gamma, ppo.rollout_buffer.gae_lambda) == (0.9, 0.8)
+    assert (ppo.ent_coef, ppo.vf_coef, ppo.max_grad_norm) == (0.01, 0.7, 0.4)
+    assert ppo.normalize_advantage is False
+    assert ppo.target_kl is None  # SB3 would stop an update early
+    assert callable(ppo.clip_range)
+    assert callable(ppo.clip_range_vf)
+    assert [ppo.clip_range(p) for p in (1.0, 0.5, 0.0)] == [0.15] * 3
+    assert [ppo.clip_range_vf(p) for p in (1.0, 0.5, 0.0)] == [0.3] * 3
+    assert ppo.policy.optimizer.param_groups[0]["lr"] == 0.002
+    torch.testing.assert_close(ppo.policy.log_std.exp(), torch.tensor([0.3]))
+    assert slider_ppo("ppo.value_clip=null").clip_range_vf is None
+    assert slider_ppo().normalize_advantage is True
+
+
+@pytest.mark.parametrize(("name", "kind"), [("elu", nn.ELU), ("relu", nn.ReLU), ("tanh", nn.Tanh)])
+def test_actor_and_critic_are_networks_of_their_own_with_the_configured_layers(name: str, kind: type) -> None:
+    policy = slider_ppo("ppo.hidden=[32,16,8]", f"ppo.activation={name}").policy
+    actor, critic = policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net
+    for net in (actor, critic):
+        linear = [(m.in_features, m.out_features) for m in net if isinstance(m, nn.Linear)]
+        assert linear == [(1, 32), (32, 16), (16, 8)]
+        assert [type(m) for m in net] == [nn.Linear, kind] * 3
+    assert (policy.action_net.in_features, policy.action_net.out_features) == (8, 1)
+    assert (policy.value_net.in_features, policy.value_net.out_features) == (8, 1)
+    observation = torch.linspace(-1, 1, 5).unsqueeze(1)
+    value = policy.predict_values(observation).detach()
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.zero_()
+    torch.testing.assert_close(policy.predict_values(observation).detach(), value, rtol=0, atol=0)
+
+
+def test_orthogonal_weights_are_a_choice() -> None:
+    def first_layer(choice: str) -> Tensor:
+        policy = slider_ppo("ppo.hidden=[16,8]", f"ppo.orthogonal_init={choice}").policy
+        weight = policy.state_dict()["mlp_extractor.policy_net.2.weight"]
+        return weight @ weight.T
+
+    torch.testing.assert_close(first_layer("true"), 2.0 * torch.eye(8), atol=1e-5, rtol=0)  # gain sqrt(2)
+    assert not torch.allclose(first_layer("false"), 2.0 * torch.eye(8), atol=0.1)
+
+
+# ---------------------------------------------------------------------- precision
+
+
+def network(precision: str) -> GaussianPolicy:
+    torch.manual_seed(0)
+    box = gym.spaces.Box(-1.0, 1.0, (12,), np.float32)
+    config = settings(f"ppo.matmul_precision={precision}", "ppo.hidden=[64,32]")
+    return GaussianPolicy(
+        gym.spaces.Box(-np.inf, np.inf, (48,), np.float32), box, lambda _: 1e-3, **policy_settings(config)
+    )
+
+
+def outputs(policy: GaussianPolicy, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    actions = torch.zeros(len(observation), 12)
+    values, log_prob, _ = policy.evaluate_actions(observation, actions)
+    return policy.last_distribution.distribution.mean.detach(), values.detach(), log_prob.detach()
+
+
+def test_bf16_changes_the_forward_pass_of_training_only_and_not_by_much() -> None:
+    exact, rough = network("highest"), network("bf16")
+    rough.load_state_dict(exact.state_dict())
+    observation = torch.randn(256, 48)
+    for policy in (exact, rough):
+        policy.set_training_mode(False)
+    reference = outputs(exact, observation)
+    for one, other in zip(reference, outputs(rough, observation), strict=True):
+        assert torch.equal(one, other)
+    for policy in (exact, rough):
+        policy.set_training_mode(True)
+    for one, other in zip(reference, outputs(exact, observation), strict=True):
+        assert torch.equal(one, other)
+    for one, other in zip(reference, outputs(rough, observation), strict=True):
+        assert other.dtype == torch.float32
+        assert not torch.equal(one, other)
+        assert (one - other).abs().max() < 0.02 * one.abs().max()
+
+
+def test_bf16_keeps_weights_and_their_gradients_in_float32() -> None:
+    ppo = slider_ppo("ppo.matmul_precision=bf16")
+    before = copy.deepcopy(ppo.policy.state_dict())
+    learn(ppo, 2)
+    for name, parameter in ppo.policy.named_parameters():
+        assert parameter.dtype == torch.float32
+        assert parameter.grad is not None
+        assert parameter.grad.dtype == torch.float32
+        assert not torch.equal(parameter, before[name])
+
+
+@pytest.mark.parametrize("precision", ["highest", "bf16"])
+def test_the_means_kept_with_a_rollout_are_float32_and_those_of_its_observations(precision: str) -> None:
+    ppo = slider_ppo(f"ppo.matmul_precision={precision}")
+    reference = slider_ppo().policy
+    reference.load_state_dict(ppo.policy.state_dict())
+    collect(ppo)
+    observations = torch.as_tensor(ppo.rollout_buffer.observations).reshape(-1, 1)
+    with torch.no_grad():
+        expected = gaussian(reference, observations).mean
+    got = torch.as_tensor(ppo.rollout_buffer.means).reshape(-1, 1)
+    torch.testing.assert_close(got, expected, atol=1e-6, rtol=1e-6)
+    assert got.std() > 1e-3
+
+
+# ---------------------------------------------------------------------- the environment's border
+
+
+def test_wrapping_the_environment_for_sb3_warns_of_nothing(make_core: Callable[..., Go1Core]) -> None:
+    core = make_core()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Go1VecEnv(core)
+
+
+def test_a_time_limit_is_bootstrapped_with_the_value_of_the_last_observation_and_a_fall_is_not(
+    make_core: Callable[..., Go1Core],
+) -> None:
+    """Rewards in the rollout against the environment's own, computed by hand for the episodes that ended."""
+    core = make_core("sim.episode_s=0.12", "termination={tilt: {max_angle: 0.15}}", num_envs=16)
+    env = Go1VecEnv(core)
+    config = settings("ppo.num_envs=16", "ppo.gamma=0.9")
+    ppo = AdaptivePPO(config, env, seed=0, device="cpu")
+    steps: list[tuple[np.ndarray, list[dict[str, Any]]]] = []
+    step_wait = env.step_wait
+
+    def recorded() -> Any:
+        observation, reward, done, infos = step_wait()
+        steps.append((reward.copy(), infos))
+        return observation, reward, done, infos
+
+    env.step_wait = recorded  # type: ignore[method-assign]
+    collect(ppo)
+    kinds = {"running": 0, "fell": 0, "time": 0}
+    for k, (reward, infos) in enumerate(steps):
+        for i, info in enumerate(infos):
+            got, expected = ppo.rollout_buffer.rewards[k, i], reward[i]
+            if not info:
+                kinds["running"] += 1
+            elif not info["TimeLimit.truncated"]:
+                kinds["fell"] += 1
+                assert info["episode"]["l"] <= 6
+            else:
+                kinds["time"] += 1
+                assert info["episode"]["l"] == 6
+                with torch.no_grad():
+                    last = torch.as_tensor(info["terminal_observation"]).unsqueeze(0)
+                    value = float(ppo.policy.predict_values(last))
+                assert abs(value) > 1e-3  # so that leaving it out would show
+                expected = reward[i] + 0.9 * value
+            assert got == pytest.approx(expected, rel=1e-5, abs=1e-6)
+            if k + 1 < len(steps):
+                assert bool(ppo.rollout_buffer.episode_starts[k + 1, i]) == bool(info)
+    assert min(kinds.values()) > 0, kinds
+
+
+# ---------------------------------------------------------------------- learning
+
+
+def test_it_learns_to_walk_to_a_point_on_a_line() -> None:
+    ppo = slider_ppo("ppo.num_envs=32", "ppo.steps=16", "ppo.epochs=4", "ppo.minibatches=4", "ppo.init_std=0.5")
+    learn(ppo, 40)
+    env = ppo.env
+    assert isinstance(env, Slider)
+    first, last = np.mean(env.returns[:3]), np.mean(env.returns[-3:])
+    assert first < -6.0  # a random walk
+    assert last > 0.5 * first
+    observation = torch.tensor([[-0.4], [0.4]])
+    with torch.no_grad():
+        left, right = ppo.policy._predict(observation, deterministic=True)[:, 0]
+    assert left > 0.2
+    assert right < -0.2
