@@ -305,7 +305,9 @@ class Go1Core:
         """Apply the curriculum to the episodes that ended."""
         for rule in self._curriculum:
             travelled = (self._state.base_pos_w[:, :2] - self.spawn[:, :2]).norm(dim=-1).float()
-            commanded = self.command.value[:, :2].norm(dim=-1) * self.task.sim.episode_s
+            # A first episode may have begun part-way through its time.
+            time = (self.task.sim.episode_steps - self._first_step) * self.task.sim.policy_dt
+            commanded = self.command.value[:, :2].norm(dim=-1) * time
             anywhere = self.random.stream("relevel").integers(self._max_level + 1, 1).squeeze(1)
             tile = self.task.terrain.tile_size
             after = rule(self.level, travelled, commanded, tile, self._max_level, anywhere)

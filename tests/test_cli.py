@@ -1,0 +1,324 @@
+"""The command line: refusals that say what is meant, before anything is loaded; help, completion, and every verb."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import pytest
+import yaml
+
+from go1exp import data_root, registry
+from go1exp.cli import VERBS
+from go1exp.compose import compose
+from go1exp.config import parse_train
+from go1exp.evaluate.camera import RenderingUnavailable, choose_gl
+from go1exp.train import run_folder, trainer
+
+COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
+WITH_MODULES = """
+import json, os, sys
+from go1exp.cli import main
+try:
+    sys.exit(main())
+finally:
+    with open(os.environ["MODULES"], "w") as file:
+        json.dump(list(sys.modules), file)
+"""
+SMALL = (
+    "ppo=paper",
+    "ppo.num_envs=4",
+    "ppo.steps=4",
+    "ppo.minibatches=2",
+    "ppo.epochs=1",
+    "ppo.hidden=[16]",
+    "ppo.iterations=2",
+    "backend.threads=1",
+    "torch_threads=1",
+    "logger.tensorboard=false",
+)
+HEAVY = {"mujoco", "stable_baselines3", "gymnasium", "torch.nn", "wandb", "tensorboard", "matplotlib", "scipy"}
+
+
+def cli(cwd: Path, *arguments: str, code: str = COMMAND_LINE, **environment: str) -> subprocess.CompletedProcess[str]:
+    inherited = {k: v for k, v in os.environ.items() if k not in ("HYDRA_FULL_ERROR", "DISPLAY", "WAYLAND_DISPLAY")}
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=cwd,
+        env={**inherited, "PYTHONPATH": str(data_root()), **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def assert_refused(tmp_path: Path, arguments: list[str], *said: str) -> None:
+    """Status 2, one message with everything of ``said``, nothing heavy loaded, nothing left behind."""
+    here, modules = tmp_path / "here", tmp_path / "modules.json"
+    here.mkdir()
+    done = cli(here, *arguments, code=WITH_MODULES, MODULES=str(modules))
+    first, *others = done.stderr.splitlines()
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert re.match(r"go1exp( \w+)?: ", first)
+    assert all(line.startswith("  ") for line in others), done.stderr
+    assert not [text for text in said if text not in done.stderr], done.stderr
+    assert not HEAVY & set(json.loads(modules.read_text()))
+    assert done.stdout == ""
+    assert [p for p in here.rglob("*") if p != here / "runs"] == []
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two tiny iterations."""
+    run = tmp_path_factory.mktemp("cli") / "run"
+    container = compose("train", SMALL)
+    run_folder.write(run, container)
+    trainer.train(parse_train(container), container, run)
+    return run
+
+
+# ---------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        # a misspelt key
+        ("train ppo.iteratons=7", ("ppo.iteratons=7", "did you mean 'ppo.iterations'")),
+        ("train reward.gait.weigth=-1", ("reward.gait.weigth=-1", "did you mean 'reward.gait.weight'")),
+        ("train ~reward.gat", ("reward.gat", "did you mean 'reward.gait'")),
+        ("eval run=x duration=3", ("duration=3", "did you mean 'duration_s'")),
+        # a new one
+        ("train +sead=3", ("sead: unknown key", "did you mean 'seed'?", "3")),
+        ("train +ppo.gama=3", ("ppo.gama: unknown key", "did you mean 'gamma'", "3")),
+        ("train +reward.gait.weigth=3", ("reward.gait.weigth: unknown key", "did you mean 'weight'", "3")),
+        ("play run=x +grid.x=[1]", ("grid: unknown key", "{'x': [1]}")),
+        # a misspelt term
+        ("train +reward.foot_slp={weight:1}", ("reward.foot_slp: unknown reward term", "did you mean 'foot_slip'")),
+        ("train actuator.term=dp", ("actuator", "unknown actuator term 'dp'", "did you mean 'pd'")),
+        # a wrong type
+        ("train ppo.iterations=many", ("ppo.iterations = 'many'", "integer")),
+        ("train ppo.hidden=[64,x]", ("ppo.hidden.1 = 'x'", "integer")),
+        ("train reward.gait=5", ("reward.gait = 5", "mapping")),
+        ("eval run=x grid.x=3", ("grid.x = 3", "array")),
+        # out of range
+        ("train ppo.gamma=1.5", ("ppo.gamma = 1.5", "less than or equal to 1")),
+        ("train event.push.interval=[3,1]", ("event.push.interval = [3, 1]", "low must not exceed high")),
+        ("eval run=x episodes=0", ("episodes = 0", "greater than or equal to 1")),
+        ("bench suite=fast", ("suite = 'fast'", "'env' or 'train'")),
+        # a misspelt choice
+        ("train rand=tabel1", ("rand=tabel1", "did you mean 'table1'?")),
+        ("train experiment=ablation/no_gat", ("experiment=ablation/no_gat", "did you mean 'ablation/no_gait'")),
+        ("list group=rewrd", ("'rewrd'", "did you mean 'reward'?")),
+        # others
+        ("trian seed=1", ("unknown verb 'trian'", "did you mean 'train'?")),
+        ("eval", ("run: required",)),
+        ("play seconds=3", ("run: required",)),
+        ("train ppo.gamma=1.5 sim.policy_dt=0.003", ("2 problems", "ppo.gamma = 1.5", "sim.policy_dt = 0.003")),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_wrong_setting_is_refused_at_once_in_words(arguments: str, said: tuple[str, ...], tmp_path: Path) -> None:
+    assert_refused(tmp_path, arguments.split(), *said)
+
+
+@pytest.mark.parametrize("argument", ["eval run=nowhere", "play run=nowhere", "train resume=nowhere"])
+def test_a_run_folder_that_does_not_exist_is_refused_at_once(argument: str, tmp_path: Path) -> None:
+    assert_refused(tmp_path, argument.split(), "nowhere", "not a run folder")
+
+
+def test_a_sweep_with_a_wrong_value_is_refused_in_the_same_words(tmp_path: Path) -> None:
+    done = cli(tmp_path, "train", "-m", "ppo.gamma=1.5,2.5")
+    assert done.returncode == 2
+    assert "go1exp train: ppo.gamma = 1.5: input should be less than or equal to 1" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.rglob("config.yaml"))
+
+
+def test_a_traceback_is_there_for_who_asks_for_it(tmp_path: Path) -> None:
+    done = cli(tmp_path, "train", "ppo.gamma=1.5", HYDRA_FULL_ERROR="1")
+    assert done.returncode not in (0, 2)
+    assert "Traceback" in done.stderr
+    assert "ConfigError" in done.stderr
+
+
+# ---------------------------------------------------------------------- help
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]])
+def test_the_general_help_names_every_verb_and_loads_nothing(arguments: list[str], tmp_path: Path) -> None:
+    done = cli(tmp_path, *arguments, code=WITH_MODULES, MODULES=str(tmp_path / "modules.json"))
+    assert done.returncode == 0
+    for verb, text in VERBS.items():
+        assert re.search(rf"^  {verb} +{re.escape(text)}$", done.stdout, re.MULTILINE)
+    loaded = set(json.loads((tmp_path / "modules.json").read_text()))
+    assert not (HEAVY | {"hydra", "numpy", "pydantic", "torch"}) & loaded
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_help_of_every_verb_says_what_it_does_its_settings_and_examples(verb: str, tmp_path: Path) -> None:
+    done = cli(tmp_path, verb, "--help")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert done.stdout.startswith(f"go1exp {verb}: ")
+    settings, examples = done.stdout.split("Examples:")
+    assert len(re.findall(rf"^  go1exp {verb}\b", examples, re.MULTILINE)) >= 2
+    for key in yaml.safe_load((data_root() / f"conf/{verb}.yaml").read_text()):
+        if key not in ("defaults", "hydra"):
+            assert re.search(rf"^{key}:", settings, re.MULTILINE), key
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cfg_job_prints_the_configuration_and_runs_nothing(tmp_path: Path) -> None:
+    done = cli(tmp_path, "train", "--cfg", "job", "rand=none", "ppo.iterations=7")
+    assert done.returncode == 0, done.stderr
+    printed = yaml.safe_load(done.stdout)
+    assert printed == compose("train", ["rand=none", "ppo.iterations=7"])
+    assert printed["ppo"]["iterations"] == 7
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
+    pyproject = (data_root() / "pyproject.toml").read_text()
+    version = re.search(r'^version = "(.+)"$', pyproject, re.MULTILINE)
+    assert version
+    assert cli(tmp_path, "--version").stdout == f"go1exp {version.group(1)}\n"
+
+
+# ---------------------------------------------------------------------- tab completion
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("go1exp ", set(VERBS)),
+        ("go1exp tr", {"train"}),
+        ("go1exp train rand=ta", {"rand=table1"}),
+        ("go1exp train rand=table1 ppo.iterat", {"ppo.iterations="}),
+        ("go1exp eval epis", {"episodes="}),
+        ("go1exp trian rand=ta", set()),
+    ],
+)
+def test_tab_completes(line: str, offered: set[str], tmp_path: Path) -> None:
+    done = cli(tmp_path, "-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
+    assert done.returncode == 0
+    assert set(done.stdout.split()) == offered
+    assert done.stderr == ""
+
+
+def test_tab_completes_in_a_real_bash(tmp_path: Path) -> None:
+    program = tmp_path / "bin/go1exp"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\nexec '{sys.executable}' -c '{COMMAND_LINE}' \"$@\"\n")
+    program.chmod(0o755)
+    script = """
+eval "$(go1exp -sc install=bash)"
+complete -p go1exp
+COMP_LINE="go1exp train rand=ta"; COMP_POINT=${#COMP_LINE}; COMP_WORDS=($COMP_LINE); COMP_CWORD=2
+$(complete -p go1exp | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+echo "offered: ${COMPREPLY[@]}"
+"""
+    path = f"{program.parent}:{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path, "PYTHONPATH": str(data_root())}
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert "offered: rand=table1" in done.stdout, done.stderr
+
+
+# ---------------------------------------------------------------------- verbs
+
+
+def test_list_prints_every_registered_term_with_its_first_line_and_every_choice(tmp_path: Path) -> None:
+    done = cli(tmp_path, "list")
+    assert done.returncode == 0, done.stderr
+    sections: dict[str, list[str]] = {}
+    for line in done.stdout.splitlines():
+        if line and not line.startswith(" "):
+            sections[line] = []
+        elif line:
+            sections[line and list(sections)[-1]].append(line)
+    for group in registry.groups():
+        for name, entry in registry.members(group).items():
+            assert entry.doc
+            assert [line for line in sections[group] if line.split() == [name, *entry.doc.split()]], (group, name)
+    assert any(line.startswith("  rand=table1 ") for line in sections["rand"])
+    assert any(line.startswith("  experiment=ablation/no_gait ") for line in sections["experiment"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sweep_writes_one_run_folder_for_each_job(tmp_path: Path) -> None:
+    done = cli(tmp_path, "train", "-m", "seed=3,5", *SMALL, f"hydra.sweep.dir={tmp_path / 'sweep'}")
+    assert done.returncode == 0, done.stderr
+    runs = sorted(p.parent for p in (tmp_path / "sweep").glob("*/config.yaml"))
+    assert [run_folder.read_config(r)["seed"] for r in runs] == [3, 5]
+    for run in runs:
+        assert (run / "checkpoints/000002.pt").exists()
+        assert json.loads((run / "meta.json").read_text())["seed"] == run_folder.read_config(run)["seed"]
+    tables = [(run / "metrics.csv").read_text() for run in runs]
+    assert [len(t.splitlines()) for t in tables] == [3, 3]
+    assert tables[0] != tables[1]
+    assert [p.name for p in tmp_path.iterdir()] == ["sweep"]
+
+
+GRID = ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=2", "duration_s=0.4", "settle_s=0.1")
+
+
+def test_eval_prints_a_table_and_writes_the_same_as_json(run: Path, tmp_path: Path) -> None:
+    done = cli(tmp_path, "eval", f"run={run}", *GRID, "out=sub/report.json")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    report: dict[str, Any] = json.loads((tmp_path / "sub/report.json").read_text())
+    assert set(report) >= {"policy", "commands", "rmse", "falls", "episodes", "settings"}
+    assert report["policy"]["iteration"] == 2
+    assert report["policy"]["num_timesteps"] == 2 * 4 * 4
+    assert [c["command"] for c in report["commands"]] == [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
+    for command in report["commands"]:
+        assert set(command) == {"command", "mean", "rmse", "falls", "episodes", "mean_time_s"}
+        assert set(command["rmse"]) == set(command["mean"]) == {"x", "y", "yaw"}
+        assert command["episodes"] == 2
+    assert report["episodes"] == 4
+    assert report["settings"]["duration_s"] == 0.4
+    header, *lines = done.stdout.splitlines()
+    assert "command" in header
+    assert "RMSE" in header
+    mean = report["commands"][1]["mean"]
+    assert "+0.50, +0.00, +0.00" in lines[1]
+    assert f"{mean['x']:+.2f}, {mean['y']:+.2f}, {mean['yaw']:+.2f}" in lines[1]
+    assert "sub/report.json" in done.stdout
+    assert [p.name for p in tmp_path.iterdir()] == ["sub"]
+
+
+def test_a_checkpoint_is_named_as_a_file_in_the_run_folder(run: Path, tmp_path: Path) -> None:
+    """``checkpoint: null  # file in it``, says conf/eval.yaml of the run folder."""
+    done = cli(tmp_path, "eval", f"run={run}", *GRID, "out=report.json", "checkpoint=checkpoints/000002.pt")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["policy"]["file"].endswith("checkpoints/000002.pt")
+
+
+def test_an_empty_grid_is_refused(run: Path, tmp_path: Path) -> None:
+    done = cli(tmp_path, "eval", f"run={run}", "grid.cross=true", "grid.x=[]", "out=report.json")
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "grid" in done.stderr
+
+
+def test_play_writes_a_clip_and_a_picture(run: Path, tmp_path: Path) -> None:
+    try:
+        choose_gl()
+    except RenderingUnavailable as error:
+        pytest.skip(str(error))
+    done = cli(tmp_path, "play", f"run={run}", "seconds=0.4", "fps=10", "viewer=clip", "out=clip.mp4")
+    assert done.returncode == 0, done.stderr
+    frames = iio.imread(tmp_path / "clip.mp4")
+    assert 4 <= len(frames) <= 5
+    assert iio.imread(tmp_path / "clip.png").std() > 1.0
+    assert {p.name for p in tmp_path.iterdir()} == {"clip.mp4", "clip.png"}
