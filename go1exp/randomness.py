@@ -49,7 +49,7 @@ class Stream:
         self.counter = torch.zeros(1, dtype=torch.int64, device=key.device)
 
     def uniform(self, *shape: int, low: float | Tensor = 0.0, high: float | Tensor = 1.0) -> Tensor:
-        """Draw ``(N, *shape)`` float32 from U[low, high] (high only by rounding); bounds broadcast against the result."""
+        """Draw ``(N, *shape)`` float32, uniform from low to high (reached by rounding only); the bounds broadcast."""
         count = math.prod(shape)
         index = self.counter + torch.arange(1, count + 1, device=self.key.device)
         self.counter += count

@@ -12,7 +12,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import pytest
-import yaml
+from omegaconf import OmegaConf
 
 from go1exp import data_root, registry
 from go1exp.cli import VERBS
@@ -96,7 +96,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train ~reward.gat", ("reward.gat", "did you mean 'reward.gait'")),
         ("eval run=x duration=3", ("duration=3", "did you mean 'duration_s'")),
         # a new one
-        ("train +sead=3", ("sead: unknown key", "did you mean 'seed'?", "3")),
+        ("train +sead=3", ("sead: unknown key", "did you mean 'seed'", "3")),
         ("train +ppo.gama=3", ("ppo.gama: unknown key", "did you mean 'gamma'", "3")),
         ("train +reward.gait.weigth=3", ("reward.gait.weigth: unknown key", "did you mean 'weight'", "3")),
         ("play run=x +grid.x=[1]", ("grid: unknown key", "{'x': [1]}")),
@@ -112,6 +112,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train ppo.gamma=1.5", ("ppo.gamma = 1.5", "less than or equal to 1")),
         ("train event.push.interval=[3,1]", ("event.push.interval = [3, 1]", "low must not exceed high")),
         ("eval run=x episodes=0", ("episodes = 0", "greater than or equal to 1")),
+        ("eval run=x settle_s=30", ("settle_s = 30.0", "duration_s = 20.0")),
+        ("play run=x command=[1.0,2.0]", ("command.2: required",)),
         ("bench suite=fast", ("suite = 'fast'", "'env' or 'train'")),
         # a misspelt choice
         ("train rand=tabel1", ("rand=tabel1", "did you mean 'table1'?")),
@@ -121,7 +123,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("trian seed=1", ("unknown verb 'trian'", "did you mean 'train'?")),
         ("eval", ("run: required",)),
         ("play seconds=3", ("run: required",)),
-        ("train ppo.gamma=1.5 sim.policy_dt=0.003", ("2 problems", "ppo.gamma = 1.5", "sim.policy_dt = 0.003")),
+        ("train ppo.gamma=1.5 sim.policy_dt=0.003", ("problems", "ppo.gamma = 1.5", "sim.policy_dt = 0.003")),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -170,7 +172,7 @@ def test_the_help_of_every_verb_says_what_it_does_its_settings_and_examples(verb
     assert done.stdout.startswith(f"go1exp {verb}: ")
     settings, examples = done.stdout.split("Examples:")
     assert len(re.findall(rf"^  go1exp {verb}\b", examples, re.MULTILINE)) >= 2
-    for key in yaml.safe_load((data_root() / f"conf/{verb}.yaml").read_text()):
+    for key in OmegaConf.load(data_root() / f"conf/{verb}.yaml"):
         if key not in ("defaults", "hydra"):
             assert re.search(rf"^{key}:", settings, re.MULTILINE), key
     assert list(tmp_path.iterdir()) == []
@@ -179,7 +181,7 @@ def test_the_help_of_every_verb_says_what_it_does_its_settings_and_examples(verb
 def test_cfg_job_prints_the_configuration_and_runs_nothing(tmp_path: Path) -> None:
     done = cli(tmp_path, "train", "--cfg", "job", "rand=none", "ppo.iterations=7")
     assert done.returncode == 0, done.stderr
-    printed = yaml.safe_load(done.stdout)
+    printed = OmegaConf.create(done.stdout)
     assert printed == compose("train", ["rand=none", "ppo.iterations=7"])
     assert printed["ppo"]["iterations"] == 7
     assert list(tmp_path.iterdir()) == []
@@ -309,6 +311,13 @@ def test_an_empty_grid_is_refused(run: Path, tmp_path: Path) -> None:
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     assert "grid" in done.stderr
+
+
+def test_a_policy_period_that_physics_cannot_keep_is_refused(run: Path, tmp_path: Path) -> None:
+    """2.5 physics steps would become 2, and every time and speed in the report would be of another clock."""
+    done = cli(tmp_path, "eval", f"run={run}", *GRID, "out=report.json", "policy_dt=0.005")
+    assert done.returncode == 2, done.stdout
+    assert "policy_dt = 0.005" in done.stderr
 
 
 def test_play_writes_a_clip_and_a_picture(run: Path, tmp_path: Path) -> None:

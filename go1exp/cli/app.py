@@ -59,7 +59,8 @@ class App:
                 failure.append(error)  # Hydra would print a report of its own
 
         version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
-        sys.argv = [f"go1exp {self.name}", *arguments]
+        # Tab completion is installed for the program, whichever verb serves it.
+        sys.argv = ["go1exp" if "-sc" in arguments else f"go1exp {self.name}", *arguments]
         try:
             hydra.main(**version, config_path=config_folder(), config_name=self.name)(task)()
             if failure:

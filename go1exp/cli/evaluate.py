@@ -15,26 +15,13 @@ def _task(container: dict[str, Any]) -> None:
     settings = parse(EvalSettings, container)
     run = Path(settings.run)
 
-    from go1exp.config import parse_train
     from go1exp.evaluate import table
-    from go1exp.evaluate.policy import load_policy
+    from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
-    from go1exp.train import run_folder
 
-    trained = parse_train(run_folder.read_config(run))
-    policy, about = load_policy(run, trained.ppo, Path(settings.checkpoint) if settings.checkpoint else None)
-    config = EvalConfig(
-        commands=grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross),
-        episodes=settings.episodes,
-        duration_s=settings.duration_s,
-        settle_s=settings.settle_s,
-        noise=settings.noise,
-        rand=settings.rand,
-        push=settings.push,
-        terrain=settings.terrain,
-        policy_dt=settings.policy_dt,
-        seed=settings.seed,
-    )
+    trained, policy, about = load_run(run, Path(settings.checkpoint) if settings.checkpoint else None)
+    commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
+    config = EvalConfig.of(settings, commands=commands)
     report = {"policy": about, **evaluate(trained.task, policy, config, spinner(1, "evaluating"))}
     out = Path(settings.out) if settings.out else run / "eval.json"
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -45,7 +45,7 @@ def _parameter(p: inspect.Parameter) -> str:
 
 
 def _choices() -> dict[str, list[tuple[str, str]]]:
-    """Return the files of each group with the first line of their comment."""
+    """Return the files of each group with the first sentence of their comment."""
     from go1exp import data_root
 
     found: dict[str, list[tuple[str, str]]] = {}
@@ -53,8 +53,9 @@ def _choices() -> dict[str, list[tuple[str, str]]]:
         parts = file.relative_to(data_root() / "conf").with_suffix("").parts
         if len(parts) > 1:
             group = "rand" if parts[0] == "randomization" else parts[0]
-            comments = [line[1:].strip() for line in file.read_text().splitlines() if line.startswith("#")]
-            about = next((c for c in comments if not c.startswith("@package")), "")
+            lines = file.read_text().splitlines()
+            comments = [line[1:].strip() for line in lines if line.startswith("#") and "@package" not in line]
+            about = " ".join(comments).split(". ")[0].rstrip(".")
             found.setdefault(group, []).append(("/".join(parts[1:]), about))
     return found
 

@@ -15,29 +15,16 @@ def _task(container: dict[str, Any]) -> None:
     settings = parse(PlaySettings, container)
     run = Path(settings.run)
 
-    from go1exp.config import parse_train
     from go1exp.env.core import Go1Core
     from go1exp.evaluate import video
     from go1exp.evaluate.camera import RenderingUnavailable
-    from go1exp.evaluate.policy import load_policy
+    from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
     from go1exp.evaluate.stick import picture
-    from go1exp.train import run_folder
 
-    trained = parse_train(run_folder.read_config(run))
-    policy, _ = load_policy(run, trained.ppo, Path(settings.checkpoint) if settings.checkpoint else None)
-    shown = EvalConfig(
-        commands=(settings.command,),
-        episodes=1,
-        duration_s=settings.seconds,
-        settle_s=0.0,
-        noise=settings.noise,
-        rand=settings.rand,
-        push=settings.push,
-        terrain=settings.terrain,
-        policy_dt=None,
-        seed=settings.seed,
-    )
+    trained, policy, _ = load_run(run, Path(settings.checkpoint) if settings.checkpoint else None)
+    whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
+    shown = EvalConfig.of(settings, commands=(settings.command,), **whole)
     core = Go1Core(evaluation_task(trained.task, shown), 1, settings.seed, noise=settings.noise)
     if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
         video.live(core, policy)

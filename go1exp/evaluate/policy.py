@@ -12,12 +12,24 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.config import PPOConfig
-from go1exp.train import checkpoint
+from go1exp.config import PPOConfig, TrainConfig, parse_train
+from go1exp.train import checkpoint, run_folder
 from go1exp.train.ppo import GaussianPolicy, policy_settings
 
 Policy = Callable[[Tensor], Tensor]
 """Observations (N, O) float32 -> actions (N, 12), deterministic."""
+
+
+def load_run(run: Path, which: Path | None = None) -> tuple[TrainConfig, Policy, dict[str, Any]]:
+    """Load a run by its own configuration: that, its policy, and what ``load_policy`` tells of it.
+
+    Raises:
+        FileNotFoundError: if ``run`` is no run folder or holds no checkpoint.
+        go1exp.registry.ConfigError: if its configuration is not one that this version knows.
+    """
+    config = parse_train(run_folder.read_config(run))
+    policy, about = load_policy(run, config.ppo, which)
+    return config, policy, about
 
 
 def load_policy(run: Path, config: PPOConfig, which: Path | None = None) -> tuple[Policy, dict[str, Any]]:

@@ -50,6 +50,12 @@ class EvalConfig:
     policy_dt: float | None
     seed: int
 
+    @classmethod
+    def of(cls, settings: Any, **changes: Any) -> EvalConfig:
+        """Take what ``settings`` (of a verb) has of these attributes; ``changes`` give the rest."""
+        shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(cls) if hasattr(settings, f.name)}
+        return cls(**{**shared, **changes})
+
 
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     """Return the task in which a policy trained on ``task`` is judged."""

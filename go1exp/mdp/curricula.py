@@ -33,7 +33,7 @@ def terrain_levels_after(
     Args:
         level: Level of the episode that ended, (N,) int64.
         distance: Horizontal distance from the tile's origin at its end, (N,), m.
-        commanded_distance: |v*_xy| of the command at its end times the time that the episode could have lasted, (N,), m.
+        commanded_distance: |v*_xy| of the command at its end times the time the episode could have lasted, (N,), m.
         tile_size: Edge of a tile, m.
         max_level: The top level, rows - 1.
         random_level: Uniform draws from 0..max_level, (N,) int64.

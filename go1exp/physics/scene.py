@@ -35,7 +35,7 @@ class Sensors:
     foot_vel_w: slice
     """4 x 3: their velocity, m/s."""
     foot_contact: slice
-    """4 x 4: number of contacts of the foot sphere with the ground, then the ground's net force on it, world frame, N."""
+    """4 x 4: number of contacts of the foot sphere with the ground, then the ground's net force on it (world), N."""
     link_contacts: slice
     """13: number of contacts of thighs (4), calves with their feet (4), trunk with head (1), hips (4)."""
 
