@@ -304,18 +304,24 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
     return parts, problems
 
 
+def time_rules(sim: SimConfig) -> list[str]:
+    """Return what is wrong with the periods of a simulation: each must be a whole multiple of the next shorter one."""
+    problems = []
+    for name, longer, unit, shorter in (
+        ("policy_dt", sim.policy_dt, "physics_dt", sim.physics_dt),
+        ("episode_s", sim.episode_s, "policy_dt", sim.policy_dt),
+    ):
+        ratio = longer / shorter
+        if ratio < 1 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
+            problems.append(f"sim.{name} = {longer}: must be a whole multiple of sim.{unit} = {shorter}")
+    return problems
+
+
 def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
     """Rules between sections."""
     problems = []
     if sim := parts.get("sim"):
-        for name, longer, shorter in (
-            ("policy_dt", sim.policy_dt, sim.physics_dt),
-            ("episode_s", sim.episode_s, sim.policy_dt),
-        ):
-            ratio = longer / shorter
-            if ratio < 1 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
-                unit = "sim.physics_dt" if name == "policy_dt" else "sim.policy_dt"
-                problems.append(f"sim.{name} = {longer}: must be a whole multiple of {unit} = {shorter}")
+        problems += time_rules(sim)
     if (ppo := parts.get("ppo")) and ppo.num_envs * ppo.steps % ppo.minibatches:
         problems.append(
             f"ppo.minibatches = {ppo.minibatches}: must divide ppo.num_envs x ppo.steps = {ppo.num_envs * ppo.steps}"

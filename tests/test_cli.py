@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import pytest
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from go1exp import data_root, registry
@@ -172,10 +174,48 @@ def test_the_help_of_every_verb_says_what_it_does_its_settings_and_examples(verb
     assert done.stdout.startswith(f"go1exp {verb}: ")
     settings, examples = done.stdout.split("Examples:")
     assert len(re.findall(rf"^  go1exp {verb}\b", examples, re.MULTILINE)) >= 2
-    for key in OmegaConf.load(data_root() / f"conf/{verb}.yaml"):
+    for key in map(str, OmegaConf.load(data_root() / f"conf/{verb}.yaml")):
         if key not in ("defaults", "hydra"):
             assert re.search(rf"^{key}:", settings, re.MULTILINE), key
     assert list(tmp_path.iterdir()) == []
+
+
+EXAMPLES = [
+    line.strip()
+    for verb in VERBS
+    for line in (data_root() / f"conf/{verb}.yaml").read_text().split("Examples:")[-1].splitlines()
+    if line.strip().startswith("go1exp ")
+]
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_the_examples_of_the_help_are_commands_that_exist(example: str) -> None:
+    _, verb, *overrides = shlex.split(example)
+    assert verb in VERBS
+    for override in overrides:
+        if override != "-m":
+            first_of_a_sweep = override if "-m" not in overrides else override.split(",")[0]
+            compose(verb, [first_of_a_sweep])
+
+
+def leaves(settings: dict[str, Any], path: str = "") -> list[tuple[str, Any]]:
+    found = []
+    for key, value in settings.items():
+        found += leaves(value, f"{path}{key}.") if isinstance(value, dict) else [(path + key, value)]
+    return found
+
+
+@pytest.mark.parametrize("verb", [v for v in VERBS if v != "train"])
+def test_every_setting_of_a_verb_can_be_given_on_the_command_line(verb: str) -> None:
+    """A folder of conf/ with the name of a key would make Hydra take the key for a choice of files."""
+    refused = []
+    for key, value in leaves(compose(verb)):
+        given = "x" if value == "???" else value
+        try:
+            assert dict(leaves(compose(verb, [f"{key}={json.dumps(given)}"])))[key] == given
+        except (HydraException, ValueError) as error:
+            refused.append(f"{key}: {error}")
+    assert refused == []
 
 
 def test_cfg_job_prints_the_configuration_and_runs_nothing(tmp_path: Path) -> None:
@@ -183,7 +223,7 @@ def test_cfg_job_prints_the_configuration_and_runs_nothing(tmp_path: Path) -> No
     assert done.returncode == 0, done.stderr
     printed = OmegaConf.create(done.stdout)
     assert printed == compose("train", ["rand=none", "ppo.iterations=7"])
-    assert printed["ppo"]["iterations"] == 7
+    assert printed.ppo.iterations == 7
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
-from go1exp.config import TaskConfig
+from go1exp.config import TaskConfig, time_rules
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.policy import Policy
 from go1exp.mdp.commands import FixedVelocity
-from go1exp.registry import Term, members
+from go1exp.registry import ConfigError, Term, members
 from go1exp.terrain import TerrainConfig
 
 Command = tuple[float, float, float]
@@ -58,13 +58,19 @@ class EvalConfig:
 
 
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
-    """Return the task in which a policy trained on ``task`` is judged."""
+    """Return the task in which a policy trained on ``task`` is judged.
+
+    Raises:
+        ConfigError: if the times do not divide each other.
+    """
     sim = dataclasses.replace(
         task.sim,
         policy_dt=config.policy_dt or task.sim.policy_dt,
         episode_s=config.duration_s + 1.0,  # no time limit within the evaluation
         spread_starts=False,
     )
+    if problems := time_rules(sim):
+        raise ConfigError(problems)
     fixed = Term("command", members("command")["fixed_velocity"], {})
     changes: dict[str, Any] = {"sim": sim, "command": fixed, "curriculum": ()}
     if not config.rand:

@@ -18,6 +18,7 @@ from go1exp.config import TrainConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.registry import ConfigError
 from go1exp.train import checkpoint, metrics
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
@@ -28,7 +29,13 @@ class Stopped(Exception):
 
 
 def build(config: TrainConfig) -> AdaptivePPO:
-    """Build learner and environment."""
+    """Build learner and environment.
+
+    Raises:
+        ConfigError: if the device is not there (SB3 would quietly take another).
+    """
+    if config.process.device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError([f"device = {config.process.device!r}: torch finds no CUDA device; use device=cpu"])
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)
     core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=config.task.sim.spread_starts)
