@@ -28,8 +28,6 @@ from go1exp.train.metrics import CsvWriter
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.types import Snapshot
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
-
 SMALL = (
     "ppo=paper",
     "ppo.num_envs=8",

@@ -22,8 +22,6 @@ from go1exp.env.core import Go1Core
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, policy_settings
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
-
 TINY = (
     "ppo=paper",
     "ppo.num_envs=8",

@@ -21,8 +21,6 @@ from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.train import checkpoint, metrics, run_folder, trainer
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
-
 SMALL = (
     "ppo.num_envs=8",
     "ppo.steps=8",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -63,12 +64,9 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     Raises:
         ConfigError: if the times do not divide each other.
     """
-    sim = dataclasses.replace(
-        task.sim,
-        policy_dt=config.policy_dt or task.sim.policy_dt,
-        episode_s=config.duration_s + 1.0,  # no time limit within the evaluation
-        spread_starts=False,
-    )
+    period = config.policy_dt or task.sim.policy_dt
+    beyond = (math.ceil(config.duration_s / period) + 1) * period  # no time limit within the evaluation
+    sim = dataclasses.replace(task.sim, policy_dt=period, episode_s=beyond, spread_starts=False)
     if problems := time_rules(sim):
         raise ConfigError(problems)
     fixed = Term("command", members("command")["fixed_velocity"], {})

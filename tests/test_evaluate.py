@@ -1,0 +1,380 @@
+"""The evaluation: its statistics against a count by hand, what it switches off, its grid, its tables, its policies."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from go1exp.compose import compose
+from go1exp.config import TaskConfig, TrainConfig, parse_train
+from go1exp.env.core import Go1Core
+from go1exp.evaluate import table
+from go1exp.evaluate.policy import Policy, load_policy
+from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
+from go1exp.train import checkpoint, run_folder, trainer
+
+MakeTask = Callable[..., TaskConfig]
+
+
+def settings(*commands: tuple[float, float, float], **changes: Any) -> EvalConfig:
+    plain = EvalConfig(
+        commands=commands or ((0.5, 0.0, 0.0),),
+        episodes=2,
+        duration_s=1.0,
+        settle_s=0.2,
+        noise=False,
+        rand=False,
+        push=False,
+        terrain=False,
+        policy_dt=None,
+        seed=1,
+    )
+    return dataclasses.replace(plain, **changes)
+
+
+def stand(observation: Tensor) -> Tensor:
+    return torch.zeros(len(observation), 12)
+
+
+def topple(rows: Sequence[int], after: int = 0) -> Policy:
+    """A policy that throws the robots of ``rows`` over from its step ``after`` on, and lets the others stand."""
+    step = [0]
+
+    def policy(observation: Tensor) -> Tensor:
+        action = torch.zeros(len(observation), 12)
+        if step[0] >= after:
+            action[list(rows)] = torch.tensor([5.0, 0.0, -6.0] * 2 + [-5.0, 0.0, 6.0] * 2)
+        step[0] += 1
+        return action
+
+    return policy
+
+
+@pytest.fixture
+def task(make_task: MakeTask) -> TaskConfig:
+    return make_task("backend.threads=1")
+
+
+# ---------------------------------------------------------------------- statistics
+
+
+def by_hand(task: TaskConfig, policy: Policy, config: EvalConfig) -> list[dict[str, Any]]:
+    """The report's rows from the physics state: lists, numpy, scipy's rotations, one robot at a time."""
+    robots = len(config.commands) * config.episodes
+    core = Go1Core(evaluation_task(task, config), robots, config.seed, noise=config.noise)
+    each = [command for command in config.commands for _ in range(config.episodes)]
+    core.command.value[:] = torch.tensor(each)
+    observation = core.reset()
+    running, times = [True] * robots, [0] * robots
+    fell = [False] * robots
+    seen: list[list[np.ndarray]] = [[] for _ in range(robots)]
+    dt = core.task.sim.policy_dt
+    for step in range(round(config.duration_s / dt)):
+        result = core.step(policy(observation))
+        observation = result.observation
+        for i in range(robots):
+            if running[i] and (result.terminated[i] or result.truncated[i]):
+                running[i], fell[i] = False, bool(result.terminated[i])
+            if running[i]:
+                times[i] += 1
+                qpos, qvel = core.backend.qpos[i].numpy(), core.backend.qvel[i].numpy()
+                to_body = Rotation.from_quat(qpos[3:7], scalar_first=True).inv()
+                if step * dt >= config.settle_s - 1e-9:
+                    seen[i].append(np.array([*to_body.apply(qvel[:3])[:2], qvel[5]]))
+    rows = []
+    for k, command in enumerate(config.commands):
+        mine = range(k * config.episodes, (k + 1) * config.episodes)
+        samples = np.array([v for i in mine for v in seen[i]])
+        rows.append(
+            {
+                "command": list(command),
+                "mean": samples.mean(0) if len(samples) else None,
+                "rmse": np.sqrt(((samples - command) ** 2).mean(0)) if len(samples) else None,
+                "falls": sum(fell[i] for i in mine),
+                "mean_time_s": float(np.mean([times[i] * dt for i in mine])),
+                "samples": samples,
+            }
+        )
+    return rows
+
+
+@pytest.mark.parametrize("after", [0, 25], ids=["falls while settling", "falls later"])
+def test_the_statistics_are_those_of_a_count_by_hand(after: int, task: TaskConfig) -> None:
+    """Three commands; of the second one robot falls, of the third both."""
+    config = settings((0.5, 0.0, 0.0), (0.0, -0.3, 1.0), (1.0, 0.0, 0.0), duration_s=1.2, settle_s=0.3)
+    falling = [2, 4, 5]
+    report = evaluate(task, topple(falling, after), config)
+    expected = by_hand(task, topple(falling, after), config)
+    assert [row["falls"] for row in expected] == [0, 1, 2]  # else the policy does not do what the test needs
+    for row, other in zip(report["commands"], expected, strict=True):
+        assert row["command"] == other["command"]
+        assert row["falls"] == other["falls"]
+        assert row["episodes"] == 2
+        assert row["mean_time_s"] == pytest.approx(other["mean_time_s"], abs=1e-4)
+        for figure in ("mean", "rmse"):
+            if other[figure] is None:
+                assert row[figure] is None
+            else:
+                np.testing.assert_allclose([row[figure][a] for a in ("x", "y", "yaw")], other[figure], atol=2e-5)
+    errors = [row["samples"] - row["command"] for row in expected if len(row["samples"])]
+    overall = np.sqrt((np.concatenate(errors) ** 2).mean(0))
+    np.testing.assert_allclose(list(report["rmse"].values()), overall, atol=2e-5)
+    assert (report["falls"], report["episodes"]) == (3, 6)
+
+
+def test_a_standing_robot_is_half_a_metre_per_second_off_and_does_not_fall(task: TaskConfig) -> None:
+    report = evaluate(task, stand, settings((0.5, 0.0, 0.0), duration_s=5.0, settle_s=1.0))
+    (row,) = report["commands"]
+    assert all(abs(v) < 0.01 for v in row["mean"].values())
+    assert row["rmse"]["x"] == pytest.approx(0.5, abs=0.01)
+    assert row["rmse"]["y"] < 0.01
+    assert row["rmse"]["yaw"] < 0.01
+    assert row["falls"] == 0
+    assert row["mean_time_s"] == pytest.approx(5.0, abs=1e-3)
+
+
+def test_a_fall_ends_the_counting(task: TaskConfig) -> None:
+    """Put back on its feet, the robot stands still for the rest of the time: none of that may count."""
+    throw, steps = topple([0, 1]), [0]
+
+    def policy(observation: Tensor) -> Tensor:
+        steps[0] += 1
+        return throw(observation) if steps[0] <= 60 else stand(observation)
+
+    report = evaluate(task, policy, settings((0.0, 0.0, 0.0), duration_s=3.0, settle_s=1.5))
+    (row,) = report["commands"]
+    assert row["falls"] == 2  # not more, however often it falls and is put back
+    assert row["mean_time_s"] < 1.2
+    assert (row["mean"], row["rmse"], report["rmse"]) == (None, None, None)
+
+
+def test_leaving_the_map_ends_the_counting_and_is_no_fall(task: TaskConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def off_map(core: Go1Core) -> Tensor:
+        return torch.tensor([True, False]) & (core.steps == 10)
+
+    monkeypatch.setattr(Go1Core, "_off_map", off_map)
+    (row,) = evaluate(task, stand, settings(duration_s=1.0))["commands"]
+    assert row["falls"] == 0
+    assert row["mean_time_s"] == pytest.approx((9 * 0.02 + 1.0) / 2, abs=1e-4)
+
+
+def test_each_robot_gets_the_command_of_its_row_and_its_policy_sees_it(task: TaskConfig) -> None:
+    commands = ((1.5, 0.0, 0.0), (0.0, -0.25, 0.75))
+    seen: list[Tensor] = []
+
+    def policy(observation: Tensor) -> Tensor:
+        seen.append(observation.clone())
+        return stand(observation)
+
+    evaluate(task, policy, settings(*commands, duration_s=0.1, settle_s=0.0))
+    start = 0
+    for term in task.observation:
+        if "command" in term.key:
+            break
+        start += term.entry.traits["size"]
+    for observation in seen:
+        for row, command in zip(observation, [commands[0]] * 2 + [commands[1]] * 2, strict=True):
+            np.testing.assert_allclose(row[start : start + 3], command, rtol=1e-6)
+
+
+def test_progress_is_told_in_steps(task: TaskConfig) -> None:
+    told: list[tuple[int, int]] = []
+    evaluate(task, stand, settings(duration_s=0.2, settle_s=0.0), lambda done, total: told.append((done, total)))
+    assert told == [(k, 10) for k in range(1, 11)]
+    told.clear()
+    faster = settings(duration_s=0.2, settle_s=0.0, policy_dt=0.01)
+    evaluate(task, stand, faster, lambda done, total: told.append((done, total)))
+    assert told[-1] == (20, 20)
+
+
+def test_the_same_seed_gives_the_same_report(task: TaskConfig) -> None:
+    config = settings(rand=True, push=True, noise=True, duration_s=0.4, settle_s=0.0)
+    policy: Policy = lambda observation: 0.3 * observation[:, :12]  # noqa: E731
+    one = evaluate(task, policy, config)
+    assert evaluate(task, policy, config) == one
+    assert evaluate(task, policy, dataclasses.replace(config, seed=2)) != one
+
+
+# ---------------------------------------------------------------------- what is judged
+
+
+def test_nothing_of_the_training_but_the_robot_stays_unless_asked_for(make_task: MakeTask) -> None:
+    task = make_task("backend.threads=1", "terrain=rough", "curriculum=terrain_level", "sim.episode_s=5")
+    plain = evaluation_task(task, settings())
+    assert (plain.rand, plain.event, plain.curriculum) == ((), (), ())
+    assert plain.terrain.kind == "flat"
+    assert plain.command.entry.name == "fixed_velocity"
+    assert not plain.sim.spread_starts
+    assert plain.sim.policy_dt == task.sim.policy_dt
+    for kept in ("robot", "actuator", "action", "observation", "termination", "reward", "backend"):
+        assert getattr(plain, kept) == getattr(task, kept)
+    assert evaluation_task(task, settings(rand=True)).rand == task.rand != ()
+    assert evaluation_task(task, settings(push=True)).event == task.event != ()
+    assert evaluation_task(task, settings(terrain=True)).terrain == task.terrain
+    full = evaluation_task(task, settings(rand=True, push=True, terrain=True))
+    assert full.curriculum == ()  # levels are drawn, not earned
+    assert evaluation_task(task, settings(policy_dt=0.01)).sim.decimation == 5
+
+
+def test_no_time_limit_falls_into_the_evaluation(make_task: MakeTask) -> None:
+    task = make_task("backend.threads=1", "sim.episode_s=0.2")
+    report = evaluate(task, stand, settings(duration_s=0.6))
+    assert report["commands"][0]["mean_time_s"] == pytest.approx(0.6, abs=1e-4)
+
+
+def test_the_report_says_under_what_it_was_made(task: TaskConfig) -> None:
+    config = settings(duration_s=0.1, settle_s=0.0, seed=7)
+    said = evaluate(task, stand, config)["settings"]
+    assert said == {k: v for k, v in dataclasses.asdict(config).items() if k != "commands"}
+
+
+# ---------------------------------------------------------------------- grid
+
+
+def test_a_crossed_grid_is_every_combination() -> None:
+    assert grid([1.0, 2.0], [0.0], [-1.0, 0.5], cross=True) == (
+        (1.0, 0.0, -1.0),
+        (1.0, 0.0, 0.5),
+        (2.0, 0.0, -1.0),
+        (2.0, 0.0, 0.5),
+    )
+
+
+def test_a_plain_grid_is_standing_and_one_axis_at_a_time_each_once() -> None:
+    assert grid([1.0, 0.0, 1.0], [-0.5], [0.25], cross=False) == (
+        (0.0, 0.0, 0.0),
+        (1.0, 0.0, 0.0),
+        (0.0, -0.5, 0.0),
+        (0.0, 0.0, 0.25),
+    )
+    assert grid([], [], [], cross=False) == ((0.0, 0.0, 0.0),)
+
+
+# ---------------------------------------------------------------------- tables
+
+REPORT: dict[str, Any] = {
+    "policy": {"iteration": 5, "num_timesteps": 2_500_000, "file": "x"},
+    "commands": [
+        {
+            "command": [0.5, 0.0, -1.0],
+            "mean": {"x": 0.456, "y": -0.001, "yaw": -0.9},
+            "rmse": {"x": 0.05, "y": 0.123, "yaw": 1.0},
+            "falls": 1,
+            "episodes": 16,
+            "mean_time_s": 19.96,
+        },
+        {"command": [2, 0, 0], "mean": None, "rmse": None, "falls": 16, "episodes": 16, "mean_time_s": 0.5},
+    ],
+    "rmse": {"x": 0.05, "y": 0.1234, "yaw": 1.0},
+    "falls": 17,
+    "episodes": 32,
+    "settings": {"noise": True, "rand": False, "push": True, "terrain": False, "duration_s": 20.0},
+}
+CELLS = [
+    ("+0.50, +0.00, -1.00", "+0.46, -0.00, -0.90", "0.05, 0.12, 1.00", "1/16", "20.0"),
+    ("+2.00, +0.00, +0.00", "-", "-", "16/16", "0.5"),
+]
+
+
+def test_the_rows_of_a_table_hold_the_reports_figures() -> None:
+    assert table.rows(REPORT) == CELLS
+
+
+def test_the_table_for_a_terminal_stands_in_columns() -> None:
+    header, *lines = table.text(REPORT).split("\n")[:3]
+    assert len({len(header), *map(len, lines)}) == 1
+    for line, cells in zip([header, *lines], [table.HEADER, *CELLS], strict=True):
+        ends = [line.index(cell) + len(cell) for cell in cells if cell != "-"]
+        assert ends == sorted(ends)
+        assert [c.strip() for c in line.split("  ") if c.strip()] == list(cells)
+    whole = lines[0]
+    for name, cell in zip(table.HEADER, CELLS[0], strict=True):  # right-aligned under its heading
+        assert header.rindex(name) + len(name) == whole.index(cell) + len(cell)
+
+
+def test_the_table_for_a_document_is_markdown() -> None:
+    lines = table.markdown(REPORT).split("\n")
+    assert [line.count("|") for line in lines[:4]] == [6, 6, 6, 6]
+    cells = [tuple(c.strip() for c in line.strip("|").split("|")) for line in lines[:4]]
+    assert cells == [table.HEADER, ("---",) * 5, *CELLS]
+    assert lines[4] == ""
+
+
+@pytest.mark.parametrize("lay_out", [table.text, table.markdown])
+def test_a_table_ends_with_what_it_is_of(lay_out: Callable[[dict[str, Any]], str]) -> None:
+    last = lay_out(REPORT).split("\n")[-1]
+    for part in ("2.50 M steps", "x 0.050, y 0.123, yaw 1.000", "falls 17 in 32 episodes of 20 s", "noise, push"):
+        assert part in last
+    quiet = {**REPORT, "rmse": None, "settings": {**REPORT["settings"], "noise": False, "push": False}}
+    assert "no noise, randomisation or pushes, on flat ground" in lay_out(quiet)
+
+
+def test_a_real_report_can_be_laid_out(task: TaskConfig) -> None:
+    report = evaluate(task, stand, settings(duration_s=0.1, settle_s=0.0))
+    report["policy"] = {"iteration": 0, "num_timesteps": 0, "file": ""}
+    assert len(table.text(report).split("\n")) == 4
+    assert "+0.50, +0.00, +0.00" in table.markdown(report)
+
+
+# ---------------------------------------------------------------------- policies from run folders
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainConfig]:
+    run = tmp_path_factory.mktemp("evaluate") / "run"
+    container = compose(
+        "train",
+        [
+            "ppo=cpu",
+            "ppo.num_envs=4",
+            "ppo.steps=4",
+            "ppo.minibatches=2",
+            "ppo.epochs=2",
+            "ppo.hidden=[16,8]",
+            "ppo.iterations=2",
+            "backend.threads=1",
+            "torch_threads=1",
+            "checkpoint.every=1",
+            "logger.tensorboard=false",
+        ],
+    )
+    config = parse_train(container)
+    run_folder.write(run, container)
+    trainer.train(config, container, run)
+    return run, config
+
+
+def by_hand_network(path: Path, observation: np.ndarray) -> np.ndarray:
+    """The actor of a checkpoint in numpy, float64: two layers with ELU, one without."""
+    weights = {k: v.double().numpy() for k, v in checkpoint.read(path)["policy"].items()}
+    for layer in ("mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2"):
+        observation = observation @ weights[f"{layer}.weight"].T + weights[f"{layer}.bias"]
+        observation = np.where(observation > 0, observation, np.expm1(observation))
+    return observation @ weights["action_net.weight"].T + weights["action_net.bias"]
+
+
+@pytest.mark.parametrize("which", [None, 1])
+def test_a_loaded_policy_is_the_mean_of_the_trained_one(which: int | None, trained: tuple[Path, TrainConfig]) -> None:
+    run, config = trained
+    path = run / f"checkpoints/{which or 2:06d}.pt"
+    policy, about = load_policy(run, config.ppo, path if which else None)
+    size = checkpoint.read(path)["policy"]["mlp_extractor.policy_net.0.weight"].shape[1]
+    observation = np.random.default_rng(0).normal(size=(5, size))
+    got = policy(torch.as_tensor(observation, dtype=torch.float32))
+    np.testing.assert_allclose(got.numpy(), by_hand_network(path, observation), atol=1e-5)
+    assert not got.requires_grad
+    assert about == {"iteration": which or 2, "num_timesteps": 16 * (which or 2), "file": str(path)}
+
+
+def test_a_folder_without_checkpoints_is_named(trained: tuple[Path, TrainConfig], tmp_path: Path) -> None:
+    _, config = trained
+    with pytest.raises(FileNotFoundError, match=str(tmp_path)):
+        load_policy(tmp_path, config.ppo)

@@ -1,0 +1,264 @@
+"""The layers of the package, read from its source: who imports whom, and what every file owes its reader.
+
+Data flows from the robot's description to the command line, imports point the other way. Imports inside functions
+and for type checking count too.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from go1exp import data_root, registry
+from go1exp.cli import MODULES, VERBS
+
+PACKAGE = data_root() / "go1exp"
+FILES = sorted(PACKAGE.rglob("*.py"))
+RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
+
+FOREIGN = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra")
+OWN = ("physics", "env", "train", "evaluate", "bench", "cli")
+
+FORBIDDEN: dict[str, tuple[str, ...]] = {
+    # plain descriptions
+    "__init__.py": (*FOREIGN, "torch", "numpy", "go1exp"),
+    "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *(f"go1exp.{m}" for m in OWN)),
+    "types.py": (*FOREIGN, "go1exp.mdp", *(f"go1exp.{m}" for m in OWN)),
+    "registry.py": (*FOREIGN, "torch", "go1exp"),
+    "randomness.py": (*FOREIGN, "go1exp"),
+    "memory.py": (*FOREIGN, "go1exp"),
+    "terrain.py": (*FOREIGN, "torch", "go1exp.mdp", *(f"go1exp.{m}" for m in OWN)),
+    "config.py": (*FOREIGN, "omegaconf", "go1exp.compose", *(f"go1exp.{m}" for m in OWN)),
+    "compose.py": ("mujoco", "gymnasium", "stable_baselines3", "torch", "go1exp.config", *(f"go1exp.{m}" for m in OWN)),
+    # the MDP knows no engine, the engine no MDP
+    "mdp/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.actuator", *(f"go1exp.{m}" for m in OWN)),
+    "actuator/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *(f"go1exp.{m}" for m in OWN)),
+    "physics/": (
+        *("gymnasium", "stable_baselines3", "hydra", "omegaconf", "go1exp.mdp", "go1exp.actuator", "go1exp.config"),
+        *("go1exp.env", "go1exp.train", "go1exp.evaluate", "go1exp.bench", "go1exp.cli"),
+    ),
+    # the environment joins them
+    "env/": ("mujoco", "hydra", "omegaconf", "go1exp.train", "go1exp.bench", "go1exp.cli"),
+    "env/core.py": ("gymnasium", "stable_baselines3", "go1exp.compose", "go1exp.evaluate"),
+    "env/faults.py": (*FOREIGN, "torch"),
+    "env/gym_env.py": ("stable_baselines3",),
+    "env/sb3_env.py": ("go1exp.compose", "go1exp.evaluate"),
+    # users of the environment
+    "train/": ("mujoco", "hydra", "go1exp.compose", "go1exp.physics", "go1exp.evaluate", "go1exp.bench", "go1exp.cli"),
+    "evaluate/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
+    "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
+}
+"""File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""
+
+SETTLED = {"compose.py", "cli/app.py", "cli/train.py"}
+"""The only files that may import hydra."""
+
+
+@cache
+def tree(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(), str(file))
+
+
+def imports(file: Path) -> Iterator[str]:
+    """Full names of what a file imports; ``from go1exp import robot`` gives ``go1exp`` and ``go1exp.robot``."""
+    for node in ast.walk(tree(file)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import in line {node.lineno}"
+            assert node.module is not None
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def within(name: str, module: str) -> bool:
+    return name == module or name.startswith(f"{module}.")
+
+
+def own_imports(file: Path) -> set[str]:
+    """Modules of the package that a file imports, as files relative to it."""
+    found = set()
+    for name in imports(file):
+        parts = name.split(".")
+        if parts[0] == "go1exp" and len(parts) > 1:
+            path = "/".join(parts[1:])
+            found |= {candidate for candidate in (f"{path}.py", f"{path}/__init__.py") if candidate in RELATIVE}
+    return found
+
+
+# ---------------------------------------------------------------------- who imports whom
+
+
+def test_the_reader_of_imports_sees_every_form(tmp_path: Path) -> None:
+    source = tmp_path / "m.py"
+    source.write_text("import a.b as c, d\nfrom e import f\ndef g():\n    from h.i import j\nif X:\n    import k\n")
+    assert set(imports(source)) == {"a.b", "d", "e", "e.f", "h.i", "h.i.j", "k"}
+
+
+@pytest.mark.parametrize("place", FORBIDDEN)
+def test_a_layer_imports_nothing_from_above_it(place: str) -> None:
+    mine = [name for name in RELATIVE if name == place or (place.endswith("/") and name.startswith(place))]
+    assert mine, f"{place} is gone: the rules need a word about what came instead"
+    broken = {
+        f"{name} imports {imported}"
+        for name in mine
+        for imported in imports(RELATIVE[name])
+        for module in FORBIDDEN[place]
+        if within(imported, module) and not (module == "go1exp" and within(imported, "go1exp.__version__"))
+    }
+    assert broken == set()
+
+
+def test_every_file_belongs_to_a_layer() -> None:
+    placed = [n for n in RELATIVE if n in FORBIDDEN or any(n.startswith(p) for p in FORBIDDEN if p.endswith("/"))]
+    assert set(RELATIVE) - set(placed) == {n for n in RELATIVE if n.startswith("cli/")}
+
+
+def importers(module: str) -> set[str]:
+    return {name for name, file in RELATIVE.items() if any(within(i, module) for i in imports(file))}
+
+
+def test_hydra_stays_in_compose_and_on_the_command_line() -> None:
+    assert importers("hydra") <= SETTLED
+    assert importers("omegaconf") <= SETTLED | {"train/run_folder.py"}
+
+
+def test_sb3_stays_at_its_border_and_in_the_learner() -> None:
+    allowed = {"env/sb3_env.py", "bench/env.py"}
+    assert {n for n in importers("stable_baselines3") if not n.startswith("train/")} <= allowed
+
+
+def test_mujoco_stays_in_the_physics_and_where_pictures_are_made() -> None:
+    outside = {name for name in importers("mujoco") if not name.startswith("physics/")}
+    assert outside <= {"evaluate/camera.py", "evaluate/video.py", "evaluate/stick.py", "bench/env.py"}
+
+
+def test_wandb_and_tensorboard_stay_in_the_metrics() -> None:
+    assert importers("wandb") <= {"train/metrics.py"}
+    assert importers("tensorboard") <= {"train/metrics.py"}
+
+
+def test_no_module_imports_itself_in_a_circle() -> None:
+    graph = {name: own_imports(file) - {name} for name, file in RELATIVE.items()}
+    done: set[str] = set()
+    path: list[str] = []
+
+    def visit(name: str) -> None:
+        assert name not in path, " -> ".join([*path[path.index(name) :], name])
+        if name in done:
+            return
+        path.append(name)
+        for other in sorted(graph[name]):
+            visit(other)
+        path.pop()
+        done.add(name)
+
+    for name in sorted(graph):
+        visit(name)
+
+
+def test_importing_the_configuration_loads_no_engine_and_no_learner() -> None:
+    code = (
+        "import sys; sys.modules['torch'] = type(sys)('torch'); import go1exp.config; "
+        "print([m for m in ('mujoco', 'gymnasium', 'stable_baselines3', 'hydra', 'torch.nn') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=data_root(), capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+# ---------------------------------------------------------------------- the registry
+
+
+def decorated(file: Path) -> Iterator[tuple[str, str]]:
+    """(group, name) of the registrations in a file, from top to bottom."""
+    groups = {"randomization": "rand"}
+    for node in tree(file).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            for call in node.decorator_list:
+                if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.args:
+                    (name,) = (a.value for a in call.args[:1] if isinstance(a, ast.Constant))
+                    yield groups.get(call.func.id, call.func.id), str(name)
+
+
+def test_terms_are_registered_in_the_order_of_the_source() -> None:
+    import go1exp.config  # noqa: F401  (registers every term)
+
+    groups = registry.groups()
+    assert {"reward", "observation", "rand", "command", "event", "termination", "curriculum", "actuator"} <= set(groups)
+    for name, file in RELATIVE.items():
+        found = list(decorated(file))
+        for group in {g for g, _ in found}:
+            mine = [n for g, n in found if g == group]
+            assert [n for n in registry.members(group) if n in mine] == mine, name
+    everything = [d for file in FILES for d in decorated(file)]
+    registered = {(g, n) for g in groups for n, e in registry.members(g).items() if e.target.__module__[:6] == "go1exp"}
+    assert set(everything) == registered
+    assert len(everything) == len(set(everything))
+
+
+def test_a_term_and_its_function_have_one_name() -> None:
+    """But for an underscore where a name is taken; classes are in camel case and may say more than the term."""
+    for name, file in RELATIVE.items():
+        for node in tree(file).body:
+            if isinstance(node, ast.FunctionDef):
+                for call in node.decorator_list:
+                    if isinstance(call, ast.Call) and call.args and isinstance(call.args[0], ast.Constant):
+                        assert call.args[0].value == node.name.rstrip("_"), f"{name}: {node.name}"
+
+
+# ---------------------------------------------------------------------- what every file owes its reader
+
+
+@pytest.mark.parametrize("name", RELATIVE)
+def test_no_file_is_longer_than_400_lines(name: str) -> None:
+    assert len(RELATIVE[name].read_text().splitlines()) <= 400
+
+
+def undocumented(body: list[ast.stmt], path: str) -> Iterator[str]:
+    for node in body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            if not ast.get_docstring(node):
+                yield f"{path}{node.name}"
+            if isinstance(node, ast.ClassDef):
+                yield from undocumented(node.body, f"{path}{node.name}.")
+
+
+@pytest.mark.parametrize("name", RELATIVE)
+def test_every_public_name_is_documented(name: str) -> None:
+    module = tree(RELATIVE[name])
+    assert list(undocumented(module.body, "")) == []
+    assert ast.get_docstring(module) or not module.body
+
+
+def test_only_what_talks_to_people_prints() -> None:
+    talkers = ("cli/", "train/", "evaluate/")
+    printing = {
+        f"{name}:{node.lineno}"
+        for name, file in RELATIVE.items()
+        if not name.startswith(talkers)
+        for node in ast.walk(tree(file))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    }
+    assert printing == set()
+
+
+def test_nothing_is_evaluated_from_text() -> None:
+    dangerous = {
+        f"{name}:{node.lineno}"
+        for name, file in RELATIVE.items()
+        for node in ast.walk(tree(file))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("eval", "exec")
+    }
+    assert dangerous == set()
+
+
+def test_every_verb_has_a_module_and_a_configuration() -> None:
+    for verb in VERBS:
+        assert f"cli/{MODULES.get(verb, verb)}.py" in RELATIVE
+        assert (data_root() / f"conf/{verb}.yaml").is_file()
