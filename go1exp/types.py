@@ -1,4 +1,4 @@
-"""What the MDP sees of one moment: the ``Snapshot``."""
+"""What the MDP sees of one moment, ``Snapshot``, and what a step of the environment returns, ``StepResult``."""
 
 from __future__ import annotations
 
@@ -70,3 +70,23 @@ class Snapshot:
     """(N,) bool, trunk, head or a hip touched the ground during this policy step."""
     episode_time: Tensor
     """(N,) time since the last reset, s."""
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one policy step returns, all float32 or bool and valid until the next step."""
+
+    observation: Tensor
+    """(N, O) what the policy sees next; of a new episode where one ended."""
+    reward: Tensor
+    """(N,)"""
+    terminated: Tensor
+    """(N,) bool, the robot fell."""
+    truncated: Tensor
+    """(N,) bool, time is up or the robot left the map."""
+    final_observation: Tensor
+    """(N, O) the observation before any reset."""
+    episode_return: Tensor
+    """(N,) sum of rewards so far; of the whole episode where one ended."""
+    episode_length: Tensor
+    """(N,) int64 steps so far; of the whole episode where one ended."""

@@ -17,10 +17,11 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.actuator.setup import ActuatorSetup
 from go1exp.config import TaskConfig
-from go1exp.env.core import Go1Core, StepResult
+from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.registry import Entry, Term
+from go1exp.types import StepResult
 
 Make = Callable[..., Go1Core]
 

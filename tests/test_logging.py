@@ -84,12 +84,13 @@ def test_a_continued_file_is_byte_for_byte_that_of_one_run(resumed_after: int, t
 
 @pytest.mark.parametrize("bytes_left", [1, 2, 10])
 def test_a_row_that_was_cut_off_is_forgotten(bytes_left: int, tmp_path: Path) -> None:
-    write(tmp_path / "whole", 1, 4)
-    write(tmp_path / "cut", 1, 3)
+    """Even where what is left of iteration 12 reads as iteration 1."""
+    write(tmp_path / "whole", 1, 13)
+    write(tmp_path / "cut", 1, 12)
     file = tmp_path / "cut/metrics.csv"
     lines = file.read_bytes().splitlines(keepends=True)
     file.write_bytes(b"".join(lines[:-1]) + lines[-1][:bytes_left])
-    write(tmp_path / "cut", 3, 4)
+    write(tmp_path / "cut", 12, 13)
     assert file.read_bytes() == (tmp_path / "whole/metrics.csv").read_bytes()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 import warnings
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from go1exp.config import PPOConfig, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, policy_settings
+from go1exp.types import StepResult
 
 TINY = (
     "ppo=paper",
@@ -403,36 +405,30 @@ def test_a_time_limit_is_bootstrapped_with_the_value_of_the_last_observation_and
     env = Go1VecEnv(core)
     config = settings("ppo.num_envs=16", "ppo.gamma=0.9")
     ppo = AdaptivePPO(config, env, seed=0, device="cpu")
-    steps: list[tuple[np.ndarray, list[dict[str, Any]]]] = []
-    step_wait = env.step_wait
+    results: list[StepResult] = []
+    step = core.step
 
-    def recorded() -> Any:
-        observation, reward, done, infos = step_wait()
-        steps.append((reward.copy(), infos))
-        return observation, reward, done, infos
+    def recorded(action: Tensor) -> StepResult:
+        result = step(action)
+        results.append(dataclasses.replace(result, reward=result.reward.clone()))
+        return result
 
-    env.step_wait = recorded  # type: ignore[method-assign]
+    core.step = recorded  # type: ignore[method-assign]
     collect(ppo)
     kinds = {"running": 0, "fell": 0, "time": 0}
-    for k, (reward, infos) in enumerate(steps):
-        for i, info in enumerate(infos):
-            got, expected = ppo.rollout_buffer.rewards[k, i], reward[i]
-            if not info:
-                kinds["running"] += 1
-            elif not info["TimeLimit.truncated"]:
-                kinds["fell"] += 1
-                assert info["episode"]["l"] <= 6
-            else:
-                kinds["time"] += 1
-                assert info["episode"]["l"] == 6
-                with torch.no_grad():
-                    last = torch.as_tensor(info["terminal_observation"]).unsqueeze(0)
-                    value = float(ppo.policy.predict_values(last))
-                assert abs(value) > 1e-3  # so that leaving it out would show
-                expected = reward[i] + 0.9 * value
-            assert got == pytest.approx(expected, rel=1e-5, abs=1e-6)
-            if k + 1 < len(steps):
-                assert bool(ppo.rollout_buffer.episode_starts[k + 1, i]) == bool(info)
+    for k, result in enumerate(results):
+        with torch.no_grad():
+            values = ppo.policy.predict_values(result.final_observation)[:, 0]
+        for i in range(core.num_envs):
+            expected = float(result.reward[i])
+            kind = "fell" if result.terminated[i] else "time" if result.truncated[i] else "running"
+            kinds[kind] += 1
+            if kind == "time":
+                assert abs(values[i]) > 1e-3  # so that leaving it out would show
+                expected += 0.9 * float(values[i])
+            assert ppo.rollout_buffer.rewards[k, i] == pytest.approx(expected, rel=1e-5, abs=1e-6)
+            if k + 1 < len(results):
+                assert bool(ppo.rollout_buffer.episode_starts[k + 1, i]) == (kind != "running")
     assert min(kinds.values()) > 0, kinds
 
 

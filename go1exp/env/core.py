@@ -7,7 +7,6 @@ makes environment i of a batch compute exactly what it would compute alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
@@ -27,33 +26,13 @@ from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
 from go1exp.randomness import EnvRandom
 from go1exp.terrain import build_terrain
-from go1exp.types import Snapshot
+from go1exp.types import Snapshot, StepResult
 
 THIGHS, CALVES, TRUNK = slice(0, 4), slice(4, 8), slice(8, 13)
 """Columns of the link contact block (``physics/scene.py``); the trunk's are trunk with head, and the four hips."""
 
 MAP_MARGIN = 1.0
 """Distance from the edge of a height field at which an episode ends, m."""
-
-
-@dataclass(frozen=True)
-class StepResult:
-    """What one policy step returns, all float32 or bool and valid until the next step."""
-
-    observation: Tensor
-    """(N, O) what the policy sees next; of a new episode where one ended."""
-    reward: Tensor
-    """(N,)"""
-    terminated: Tensor
-    """(N,) bool, the robot fell."""
-    truncated: Tensor
-    """(N,) bool, time is up or the robot left the map."""
-    final_observation: Tensor
-    """(N, O) the observation before any reset."""
-    episode_return: Tensor
-    """(N,) sum of rewards so far; of the whole episode where one ended."""
-    episode_length: Tensor
-    """(N,) int64 steps so far; of the whole episode where one ended."""
 
 
 def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:

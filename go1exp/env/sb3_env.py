@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from go1exp import robot
-from go1exp.env.core import Go1Core, StepResult
+from go1exp.env.core import Go1Core
+from go1exp.types import StepResult
 
 
 def spaces(core: Go1Core) -> tuple[gym.spaces.Box, gym.spaces.Box]:

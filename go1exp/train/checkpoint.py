@@ -5,6 +5,8 @@ One file per checkpoint, written beside its final name and renamed when complete
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import random
 import warnings
@@ -28,16 +30,25 @@ def checkpoints(run: Path) -> list[Path]:
 
 
 def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
-    """Write the present state as the newest checkpoint and delete all but ``keep``; never leaves a partial file."""
-    folder = run / "checkpoints"
-    folder.mkdir(parents=True, exist_ok=True)
-    final = folder / f"{ppo.iteration:06d}{SUFFIX}"
+    """Write the present state as the newest checkpoint and delete all but ``keep``.
+
+    Raises:
+        OSError: if it cannot be written; the checkpoints that are there stay.
+    """
+    final = run / "checkpoints" / f"{ppo.iteration:06d}{SUFFIX}"
     partial = final.with_suffix(".partial")
-    with partial.open("wb") as file:
-        torch.save(_state(ppo), file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(final)
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as file:
+            torch.save(_state(ppo), file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(final)
+    except (OSError, RuntimeError) as error:  # torch's zip writer turns some of the system's errors into its own
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        number, reason = (error.errno, error.strerror) if isinstance(error, OSError) else (errno.EIO, str(error))
+        raise OSError(number, f"checkpoint cannot be written: {reason}", str(final)) from error
     for old in checkpoints(run)[:-keep]:
         old.unlink()
     return final

@@ -34,6 +34,8 @@ class CsvWriter(KVWriter):
     def _cut(self, name: str, path: Path, iteration: int) -> None:
         with path.open(newline="") as file:
             rows = list(csv.reader(file))
+        if not rows:
+            return
         self._columns[name] = rows[0]
         whole = [r for r in rows[1:] if len(r) == len(rows[0]) and int(float(r[0])) <= iteration]
         partial = path.with_suffix(".partial")
@@ -51,12 +53,15 @@ class CsvWriter(KVWriter):
         for name, values in parts.items():
             row = {"iteration": iteration, "steps": step, **values}
             path = self._files[name]
-            if name not in self._columns:
-                self._columns[name] = list(row)
-                with path.open("w", newline="") as file:
-                    csv.writer(file).writerow(self._columns[name])
-            with path.open("a", newline="") as file:
-                csv.writer(file).writerow([row.get(c, "") for c in self._columns[name]])
+            try:
+                if name not in self._columns:
+                    self._columns[name] = list(row)
+                    with path.open("w", newline="") as file:
+                        csv.writer(file).writerow(self._columns[name])
+                with path.open("a", newline="") as file:
+                    csv.writer(file).writerow([row.get(c, "") for c in self._columns[name]])
+            except OSError as error:
+                raise OSError(error.errno, f"metrics cannot be written: {error.strerror}", str(path)) from error
         key_values["iteration"] = iteration
 
     def close(self) -> None:

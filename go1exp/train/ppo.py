@@ -8,6 +8,7 @@ on the optimiser).
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -162,6 +163,9 @@ class AdaptivePPO(PPO):
         super()._setup_model()
         self.rollout_buffer.policy = self.policy
         self.policy.optimizer.register_step_pre_hook(self._before_gradient_step)
+        for name, parameter in self.policy.named_parameters():
+            # Before the gradients' norm is clipped, which would spread a NaN to all of them.
+            parameter.register_post_accumulate_grad_hook(partial(self._check_gradient, name))
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "ActorCriticPolicy") -> None:
         """Say nothing: the user chose the device."""
@@ -169,11 +173,13 @@ class AdaptivePPO(PPO):
     def _update_learning_rate(self, optimizers: Any) -> None:
         """Leave the rate where the last minibatch put it; SB3 would set it from a schedule over time."""
 
+    def _check_gradient(self, name: str, parameter: Tensor) -> None:
+        """Raise NumericalFault if the gradient that just arrived is not finite."""
+        if parameter.grad is not None and not torch.isfinite(parameter.grad.sum()):
+            raise NumericalFault(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}", {})
+
     def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
-        """Check the gradient and set the learning rate of the step about to be taken."""
-        for name, parameter in self.policy.named_parameters():
-            if parameter.grad is not None and not torch.isfinite(parameter.grad.sum()):
-                raise NumericalFault(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}", {})
+        """Set the learning rate of the step about to be taken."""
         with torch.no_grad():
             mean = self.policy.last_distribution.distribution.mean
             kl = gaussian_kl(self.rollout_buffer.current_means, self._old_log_std, mean, self.policy.log_std).mean()
@@ -192,10 +198,8 @@ class AdaptivePPO(PPO):
         self.iteration += 1
         self.logger.record("train/kl", float(np.mean(self._kl)))
         self.logger.record("train/learning_rate", self.policy.optimizer.param_groups[0]["lr"])
-        assert self.ep_info_buffer is not None
-        if self.ep_info_buffer:
-            self.logger.record("rollout/return", safe_mean([e["r"] for e in self.ep_info_buffer]))
-            self.logger.record("rollout/length", safe_mean([e["l"] for e in self.ep_info_buffer]))
+        for key, name in (("r", "return"), ("l", "length")):  # NaN until a first episode has ended
+            self.logger.record(f"rollout/{name}", safe_mean([e[key] for e in self.ep_info_buffer or ()]))
         self.after_iteration(self)
 
     def dump_logs(self, iteration: int = 0) -> None:
