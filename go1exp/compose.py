@@ -40,16 +40,16 @@ def compose(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
         return as_container(hydra_compose(name, list(overrides)))
 
 
-def flat_keys(name: str) -> list[str]:
-    """Return every key path of ``conf/<name>.yaml`` with its defaults, groups included."""
-    found: list[str] = []
-
-    def walk(node: Any, path: str) -> None:
-        found.append(path)
-        if isinstance(node, dict):
-            for key, value in node.items():
-                walk(value, f"{path}.{key}")
-
-    for key, value in compose(name).items():
-        walk(value, key)
+def key_values(container: Any, path: str = "") -> dict[str, Any]:
+    """Flatten nested mappings: every key path, with its value (a mapping's own path is there too, with None)."""
+    if not isinstance(container, dict):
+        return {path: container}
+    found: dict[str, Any] = {path: None} if path else {}
+    for key, value in container.items():
+        found |= key_values(value, f"{path}.{key}" if path else str(key))
     return found
+
+
+def flat_keys(name: str, overrides: Sequence[str] = ()) -> list[str]:
+    """Return every key path of ``conf/<name>.yaml`` composed with ``overrides``, groups included."""
+    return list(key_values(compose(name, overrides)))

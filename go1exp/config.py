@@ -197,7 +197,7 @@ class ProcessConfig:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    seed: CountOrZero
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
     device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
     torch_threads: CountOrZero
     resume: str | None

@@ -115,13 +115,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train event.push.interval=[3,1]", ("event.push.interval = [3, 1]", "low must not exceed high")),
         ("eval run=x episodes=0", ("episodes = 0", "greater than or equal to 1")),
         ("eval run=x settle_s=30", ("settle_s = 30.0", "duration_s = 20.0")),
-        ("play run=x command=[1.0,2.0]", ("command.2: required",)),
         ("bench suite=fast", ("suite = 'fast'", "'env' or 'train'")),
         # a misspelt choice
         ("train rand=tabel1", ("rand=tabel1", "did you mean 'table1'?")),
         ("train experiment=ablation/no_gat", ("experiment=ablation/no_gat", "did you mean 'ablation/no_gait'")),
         ("list group=rewrd", ("'rewrd'", "did you mean 'reward'?")),
+        ("train logger=null", ("logger=null",)),
+        ("train terrain=5", ("terrain=5",)),
         # others
+        ("train seed=4294967296", ("seed = 4294967296", "4294967295")),
         ("trian seed=1", ("unknown verb 'trian'", "did you mean 'train'?")),
         ("eval", ("run: required",)),
         ("play seconds=3", ("run: required",)),
@@ -131,6 +133,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_a_wrong_setting_is_refused_at_once_in_words(arguments: str, said: tuple[str, ...], tmp_path: Path) -> None:
     assert_refused(tmp_path, arguments.split(), *said)
+
+
+def test_a_key_that_the_chosen_group_does_not_have_is_not_proposed_for_itself(tmp_path: Path) -> None:
+    arguments = ["train", "rand=none", "rand.foot_friction.range=[0,1]"]
+    assert_refused(tmp_path, arguments, "rand.foot_friction.range=[0,1]: no such key")
+    done = cli(tmp_path, *arguments)
+    assert "did you mean 'rand.foot_friction" not in done.stderr
 
 
 @pytest.mark.parametrize("argument", ["eval run=nowhere", "play run=nowhere", "train resume=nowhere"])

@@ -31,9 +31,9 @@ def settings(*commands: tuple[float, float, float], **changes: Any) -> EvalConfi
         duration_s=1.0,
         settle_s=0.2,
         noise=False,
-        rand=False,
+        randomize=False,
         push=False,
-        terrain=False,
+        train_ground=False,
         policy_dt=None,
         seed=1,
     )
@@ -196,7 +196,7 @@ def test_progress_is_told_in_steps(task: TaskConfig) -> None:
 
 
 def test_the_same_seed_gives_the_same_report(task: TaskConfig) -> None:
-    config = settings(rand=True, push=True, noise=True, duration_s=0.4, settle_s=0.0)
+    config = settings(randomize=True, push=True, noise=True, duration_s=0.4, settle_s=0.0)
     policy: Policy = lambda observation: 0.3 * observation[:, :12]  # noqa: E731
     one = evaluate(task, policy, config)
     assert evaluate(task, policy, config) == one
@@ -216,10 +216,10 @@ def test_nothing_of_the_training_but_the_robot_stays_unless_asked_for(make_task:
     assert plain.sim.policy_dt == task.sim.policy_dt
     for kept in ("robot", "actuator", "action", "observation", "termination", "reward", "backend"):
         assert getattr(plain, kept) == getattr(task, kept)
-    assert evaluation_task(task, settings(rand=True)).rand == task.rand != ()
+    assert evaluation_task(task, settings(randomize=True)).rand == task.rand != ()
     assert evaluation_task(task, settings(push=True)).event == task.event != ()
-    assert evaluation_task(task, settings(terrain=True)).terrain == task.terrain
-    full = evaluation_task(task, settings(rand=True, push=True, terrain=True))
+    assert evaluation_task(task, settings(train_ground=True)).terrain == task.terrain
+    full = evaluation_task(task, settings(randomize=True, push=True, train_ground=True))
     assert full.curriculum == ()  # levels are drawn, not earned
     assert evaluation_task(task, settings(policy_dt=0.01)).sim.decimation == 5
 
@@ -276,7 +276,7 @@ REPORT: dict[str, Any] = {
     "rmse": {"x": 0.05, "y": 0.1234, "yaw": 1.0},
     "falls": 17,
     "episodes": 32,
-    "settings": {"noise": True, "rand": False, "push": True, "terrain": False, "duration_s": 20.0},
+    "settings": {"noise": True, "randomize": False, "push": True, "train_ground": False, "duration_s": 20.0},
 }
 CELLS = [
     ("+0.50, +0.00, -1.00", "+0.46, -0.00, -0.90", "0.05, 0.12, 1.00", "1/16", "20.0"),

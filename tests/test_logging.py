@@ -203,6 +203,8 @@ def wandb_records(file: Path) -> Iterator[Any]:
         checksum, length, kind = struct.unpack("<IHB", data[position : position + 7])
         payload = data[position + 7 : position + 7 + length]
         position += 7 + length
+        if len(payload) < length:
+            return  # still being written
         if (checksum, length, kind) == (0, 0, 0):
             continue
         assert zlib.crc32(bytes([kind]) + payload) == checksum
@@ -215,6 +217,11 @@ def wandb_records(file: Path) -> Iterator[Any]:
 
 
 def history(file: Path) -> list[dict[str, Any]]:
+    """Return what was logged; wandb's own process may still be writing when ``finish`` comes back."""
+    for _ in range(100):
+        if any(record.WhichOneof("record_type") == "exit" for record in wandb_records(file)):
+            break
+        time.sleep(0.1)
     found = []
     for record in wandb_records(file):
         if record.WhichOneof("record_type") == "history":

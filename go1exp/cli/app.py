@@ -42,7 +42,8 @@ class App:
     def run(self, arguments: Sequence[str]) -> int:
         """Run with command-line arguments; print errors; return the exit status."""
         # Hydra would print its own report and leave; this makes it raise to here instead.
-        own_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
+        before = os.environ.get("HYDRA_FULL_ERROR")
+        own_traceback = before == "1"
         os.environ["HYDRA_FULL_ERROR"] = "1"
         defer("torch")
         warnings.filterwarnings("ignore", message="The `render_mode` attribute is not defined")
@@ -71,6 +72,9 @@ class App:
             code, message = self._explain(error, arguments)
             print(f"go1exp {self.name}: {message}", file=sys.stderr)
             return code
+        finally:
+            if before is None:
+                os.environ.pop("HYDRA_FULL_ERROR", None)
         return next((s for s in status if s), 0) or 0
 
     def _explain(self, error: Exception, arguments: Sequence[str]) -> tuple[int, str]:
@@ -80,6 +84,9 @@ class App:
             return BAD_CONFIG, lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems", *lines])
         if isinstance(error, MissingConfigException):
             return BAD_CONFIG, _missing_choice(error)
+        if isinstance(error, ValueError) and "override must be a string" in str(error):
+            bad = next((a for a in arguments if _is_group(a.split("=")[0]) and not _is_choice(a)), "a group")
+            return BAD_CONFIG, f"{bad}: a group takes the name of one of its files, such as reward=paper"
         if isinstance(error, HydraException | OmegaConfBaseException):
             return BAD_CONFIG, self._bad_override(error, arguments)
         if isinstance(error, OSError):
@@ -97,19 +104,37 @@ class App:
             return " ".join(line.strip() for line in str(cause).splitlines() if line.strip())
         key = match.group(1)
         given = next((a for a in arguments if a.lstrip("+~").split("=")[0].split("@")[0] == key), key)
-        known = flat_keys(self.name)
+        groups = [a for a in arguments if re.match(r"[a-z_]+=[a-z]", a) and a != given]
+        try:
+            known = [k for k in flat_keys(self.name, groups) if k != key]
+        except Exception:  # one of the others is wrong too
+            known = [k for k in flat_keys(self.name) if k != key]
         close = nearest(key, known) or nearest(key.rsplit(".", 1)[-1], known)
         hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else "see go1exp list"
         return f"{given}: no such key {key!r}; {hint}"
 
 
+def _folder(group: str) -> Path:
+    return Path(config_folder()) / ("randomization" if group == "rand" else group)
+
+
+def _is_group(name: str) -> bool:
+    return bool(name) and _folder(name).is_dir()
+
+
+def _is_choice(argument: str) -> bool:
+    group, _, choice = argument.partition("=")
+    return (_folder(group) / f"{choice}.yaml").is_file()
+
+
 def _missing_choice(error: MissingConfigException) -> str:
-    options = list(error.options or [])
-    missing = error.missing_cfg_file or ""
-    group, _, choice = missing.rpartition("/")
-    if options and group:
-        return unknown_name(f"{group}={choice}", choice, options, f"choice of {group}")
-    return str(error).split("\n")[0]
+    """Name the group, the choice that it does not have, and the nearest that it has."""
+    group, _, choice = (error.missing_cfg_file or "").partition("/")
+    folder = _folder(group)
+    if not choice or not folder.is_dir():
+        return str(error).split("\n")[0]
+    known = [p.relative_to(folder).with_suffix("").as_posix() for p in folder.rglob("*.yaml")]
+    return unknown_name(f"{group}={choice}", choice, known, f"choice of {group}")
 
 
 class _Deferred(ModuleType):

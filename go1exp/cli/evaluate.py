@@ -7,19 +7,25 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.registry import ConfigError
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import EvalSettings, parse
+    from go1exp.cli.settings import EvalSettings, checkpoint_file, parse, run_folder
 
     settings = parse(EvalSettings, container)
-    run = Path(settings.run)
+    run = run_folder(settings.run)
+    checkpoint = checkpoint_file(run, settings.checkpoint)
+
+    grid_is_empty = not all((settings.grid.x, settings.grid.y, settings.grid.yaw))
+    if settings.grid.cross and grid_is_empty:
+        raise ConfigError(["grid: with cross=true every axis needs at least one value, such as grid.yaw=[0.0]"])
 
     from go1exp.evaluate import table
     from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
 
-    trained, policy, about = load_run(run, Path(settings.checkpoint) if settings.checkpoint else None)
+    trained, policy, about = load_run(run, checkpoint)
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
     config = EvalConfig.of(settings, commands=commands)
     report = {"policy": about, **evaluate(trained.task, policy, config, spinner(1, "evaluating"))}

@@ -10,10 +10,11 @@ from go1exp.cli.app import App, spinner
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import PlaySettings, parse
+    from go1exp.cli.settings import PlaySettings, checkpoint_file, parse, run_folder
 
     settings = parse(PlaySettings, container)
-    run = Path(settings.run)
+    run = run_folder(settings.run)
+    checkpoint = checkpoint_file(run, settings.checkpoint)
 
     from go1exp.env.core import Go1Core
     from go1exp.evaluate import video
@@ -22,14 +23,14 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
     from go1exp.evaluate.stick import picture
 
-    trained, policy, _ = load_run(run, Path(settings.checkpoint) if settings.checkpoint else None)
+    trained, policy, _ = load_run(run, checkpoint)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
-    shown = EvalConfig.of(settings, commands=(settings.command,), **whole)
+    shown = EvalConfig.of(settings, commands=(settings.velocity,), **whole)
     core = Go1Core(evaluation_task(trained.task, shown), 1, settings.seed, noise=settings.noise)
     if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
         video.live(core, policy)
         return
-    core.command.value[:] = core.command.value.new_tensor(settings.command)
+    core.command.value[:] = core.command.value.new_tensor(settings.velocity)
     out = Path(settings.out) if settings.out else run / "play.mp4"
     progress = spinner(1, "filming")
     try:

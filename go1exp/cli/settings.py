@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -40,9 +41,9 @@ class EvalSettings:
     duration_s: Positive
     settle_s: NonNegative
     noise: bool
-    rand: bool
+    randomize: bool
     push: bool
-    terrain: bool
+    train_ground: bool
     policy_dt: Annotated[float, Field(gt=0, le=0.1)] | None
     seed: Annotated[int, Field(ge=0)]
     out: str | None
@@ -61,14 +62,14 @@ class PlaySettings:
 
     run: RunFolder
     checkpoint: str | None
-    command: tuple[float, float, float]
+    velocity: tuple[float, float, float]
     seconds: Positive
     viewer: Literal["auto", "clip", "live"]
     fps: Annotated[int, Field(ge=1, le=50)]
     noise: bool
-    rand: bool
+    randomize: bool
     push: bool
-    terrain: bool
+    train_ground: bool
     seed: Annotated[int, Field(ge=0)]
     out: str | None
 
@@ -96,6 +97,26 @@ class BenchSettings:
     threads: Annotated[int, Field(ge=0)]
     overrides: tuple[str, ...]
     out: str | None
+
+
+def run_folder(path: str, key: str = "run") -> Path:
+    """Return the run folder ``path``; raise ConfigError if it is none, before anything heavy is imported."""
+    folder = Path(path)
+    if not (folder / "config.yaml").is_file():
+        raise ConfigError([f"{key} = {path!r}: not a run folder (it has no config.yaml)"])
+    return folder
+
+
+def checkpoint_file(run: Path, name: str | None) -> Path | None:
+    """Return the checkpoint ``name``, looked for in the run folder, its ``checkpoints/`` and as it stands."""
+    if name is None:
+        return None
+    places = [run / name, run / "checkpoints" / name, Path(name)]
+    found = next((p for p in places if p.is_file()), None)
+    if found is None:
+        there = ", ".join(p.name for p in sorted((run / "checkpoints").glob("*.pt"))) or "none"
+        raise ConfigError([f"checkpoint = {name!r}: no such file in {run}; it has {there}"])
+    return found
 
 
 def parse(kind: type[T], container: Mapping[str, Any]) -> T:

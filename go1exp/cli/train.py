@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from go1exp.cli.app import STOPPED, App, discard, run_dir
+from go1exp.cli.settings import run_folder as existing
+from go1exp.compose import key_values
 from go1exp.registry import ConfigError
 
 RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "backend.threads", "device")
@@ -37,6 +40,21 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
     return {str(k): v for k, v in container.items()}
 
 
+def _refuse_other(run: Path, container: dict[str, Any]) -> None:
+    """Raise ConfigError if ``run`` holds a run with another configuration: it would be neither one nor the other."""
+    from go1exp.train import run_folder
+
+    if not (run / "config.yaml").is_file():
+        return
+    old, new = OmegaConf.create(run_folder.read_config(run)), OmegaConf.create(container)
+    for key in RESUMABLE:
+        OmegaConf.update(old, key, OmegaConf.select(new, key))
+    before, after = (key_values(OmegaConf.to_container(c)) for c in (old, new))
+    differ = sorted(k for k in {*before, *after} if before.get(k) != after.get(k))
+    if differ:
+        raise ConfigError([f"{run}: holds a run with other settings of {', '.join(differ)}; use another folder"])
+
+
 def _task(container: dict[str, Any]) -> int | None:
     from go1exp.config import parse_train
 
@@ -48,9 +66,12 @@ def _task(container: dict[str, Any]) -> int | None:
         raise
     if config.process.resume:
         discard(run)
-        run = Path(config.process.resume)
+        run = existing(config.process.resume, "resume")
         container = _resumed(run, list(HydraConfig.get().overrides.task))
         config = parse_train(container)
+
+    else:
+        _refuse_other(run, container)
 
     from go1exp.train import run_folder, trainer
 
@@ -59,6 +80,8 @@ def _task(container: dict[str, Any]) -> int | None:
     try:
         trainer.train(config, container, run)
     except trainer.Stopped:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise  # so that the jobs after this one do not start
         print(f"stopped; go on with: go1exp train resume={run}")
         return STOPPED
     print(f"done; now: go1exp eval run={run}")

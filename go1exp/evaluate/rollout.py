@@ -33,9 +33,9 @@ class EvalConfig:
         duration_s: length of an episode, s.
         settle_s: time at its start that counts for falls but not for tracking, s.
         noise: add the observation noise of training.
-        rand: randomise robots and starts as in training; else the nominal robot.
+        randomize: randomise robots and starts as in training; else the nominal robot.
         push: push as in training.
-        terrain: the ground of training; else flat.
+        train_ground: the ground of training; else flat.
         policy_dt: another period of the policy, s, or None for that of training.
         seed: of everything random.
     """
@@ -45,9 +45,9 @@ class EvalConfig:
     duration_s: float
     settle_s: float
     noise: bool
-    rand: bool
+    randomize: bool
     push: bool
-    terrain: bool
+    train_ground: bool
     policy_dt: float | None
     seed: int
 
@@ -71,11 +71,11 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
         raise ConfigError(problems)
     fixed = Term("command", members("command")["fixed_velocity"], {})
     changes: dict[str, Any] = {"sim": sim, "command": fixed, "curriculum": ()}
-    if not config.rand:
+    if not config.randomize:
         changes["rand"] = ()
     if not config.push:
         changes["event"] = ()
-    if not config.terrain:
+    if not config.train_ground:
         changes["terrain"] = TerrainConfig(kind="flat")
     return dataclasses.replace(task, **changes)
 

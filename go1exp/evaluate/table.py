@@ -25,7 +25,7 @@ def rows(report: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def _summary(report: dict[str, Any]) -> str:
     policy, settings = report["policy"], report["settings"]
-    on = [name for name in ("noise", "rand", "push", "terrain") if settings[name]]
+    on = [name for name in ("noise", "randomize", "push", "train_ground") if settings[name]]
     rmse = ", ".join(f"{axis} {report['rmse'][axis]:.3f}" for axis in AXES) if report["rmse"] else "-"
     return (
         f"policy after {policy['num_timesteps'] / 1e6:.2f} M steps; RMSE over all: {rmse}; "

@@ -78,7 +78,7 @@ class MujocoCpu:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the simulations' states and every model field that differs between them, derived ones included."""
-        expanded = {name: self._batch.expanded(name) for name in MODEL_FIELDS}
+        expanded = {name: self._batch.expanded(name) for name in sorted(MODEL_FIELDS)}
         return {
             "state": {name: torch.from_numpy(np.array(self._batch.bind(name))) for name in STATE_FIELDS},
             "fields": {name: torch.from_numpy(np.array(v)) for name, v in expanded.items() if v is not None},

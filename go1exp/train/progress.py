@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from types import TracebackType
@@ -61,7 +62,7 @@ class Progress:
             ("train/learning_rate", "lr", "{:.1e}"),
             ("curriculum/terrain_level", "terrain", "{:.2f}"),
         ):
-            if key in metrics:
+            if key in metrics and not math.isnan(metrics[key]):
                 parts.append(f"{label} {form.format(metrics[key])}")
         text = "  ".join(parts)
         if self._bar:

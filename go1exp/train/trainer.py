@@ -18,13 +18,13 @@ from go1exp.config import TrainConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.registry import ConfigError
+from go1exp.registry import ConfigError, Expected
 from go1exp.train import checkpoint, metrics
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
 
 
-class Stopped(Exception):
+class Stopped(Expected):
     """A signal asked training to stop, and the iteration that was under way is complete and saved."""
 
 
@@ -84,7 +84,7 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path) -> Adaptive
             if last or asked_to_stop() or ppo.iteration % config.checkpoint.every == 0:
                 checkpoint.save(ppo, run, config.checkpoint.keep)
             if asked_to_stop() and not last:
-                raise Stopped
+                raise Stopped(f"stopped after iteration {ppo.iteration}")
 
         ppo.after_iteration = after_iteration
         left = config.ppo.iterations * size - ppo.num_timesteps
