@@ -325,7 +325,7 @@ class Walk:
     def trained(self, name: str, *overrides: str) -> Path:
         """A finished run on rough ground that makes big movements, whose pushes are frequent."""
         if name not in self._runs:
-            container = resolved(small("train", composed("train", ("terrain=rough", *overrides))))
+            container = resolved(small("train", compose("train", ("terrain=rough", *overrides))))
             container["terrain"]["platform"] = 0.2
             container["event"]["push"]["interval"] = [0.04, 0.06]
             container["action"]["scale"] = 20.0
@@ -338,7 +338,7 @@ class Walk:
     def setup(self, leaf: Leaf) -> dict[str, Any]:
         """The configuration, interpolations unresolved, in which a leaf is tried."""
         run = [f"run={self.trained('run')}"] if leaf.program in ("eval", "play") else []
-        return small(leaf.program, composed(leaf.program, (*leaf.choice, *run)))
+        return small(leaf.program, compose(leaf.program, (*leaf.choice, *run)))
 
     def trace(self, program: str, container: dict[str, Any], key: str) -> Trace:
         how = resume_trace if key == "resume" else TRACES[program]
@@ -375,16 +375,16 @@ class Walk:
 
 
 @cache
-def _composed(program: str, overrides: tuple[str, ...]) -> str:
+def _compose(program: str, overrides: tuple[str, ...]) -> str:
     register_groups()
     GlobalHydra.instance().clear()
     with initialize_config_dir(config_folder(), version_base="1.3"):
         return json.dumps(OmegaConf.to_container(hydra_compose(program, list(overrides))))
 
 
-def composed(program: str, overrides: tuple[str, ...] = ()) -> dict[str, Any]:
+def compose(program: str, overrides: tuple[str, ...] = ()) -> dict[str, Any]:
     """Compose without resolving interpolations, so that a change goes where they lead."""
-    container: dict[str, Any] = json.loads(_composed(program, overrides))
+    container: dict[str, Any] = json.loads(_compose(program, overrides))
     return container
 
 
@@ -457,7 +457,9 @@ def train_trace(container: dict[str, Any], walk: Walk) -> Trace:
         patch.setitem(sys.modules, "wandb", wandb_stub(told))
         torch.set_num_threads(1)
         try:
-            ppo = trainer.build(config)
+            with pytest.MonkeyPatch.context() as pretend:  # without it the other device is refused: a test of its own
+                pretend.setattr(torch.cuda, "is_available", lambda: True)
+                ppo = trainer.build(config)
             core = ppo.get_env().core  # type: ignore[union-attr]
             yield "first weights", dict(ppo.policy.state_dict())
             yield "threads of torch", torch.get_num_threads()
@@ -709,3 +711,9 @@ def test_a_trace_that_ends_early_is_different() -> None:
     assert difference([("x", 1)], [("x", 1)]) is None
     assert difference([("x", 1), ("y", 2)], [("x", 1)]) == "y"
     assert difference([("x", 1)], [("x", 1), ("y", 2)]) == "end"
+
+
+def test_a_device_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="device = 'cuda': torch finds no CUDA device"):
+        trainer.build(parse_train(compose("train", ("device=cuda", "ppo.num_envs=1"))))
