@@ -711,9 +711,3 @@ def test_a_trace_that_ends_early_is_different() -> None:
     assert difference([("x", 1)], [("x", 1)]) is None
     assert difference([("x", 1), ("y", 2)], [("x", 1)]) == "y"
     assert difference([("x", 1)], [("x", 1), ("y", 2)]) == "end"
-
-
-def test_a_device_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match="device = 'cuda': torch finds no CUDA device"):
-        trainer.build(parse_train(compose("train", ("device=cuda", "ppo.num_envs=1"))))

@@ -21,6 +21,8 @@ from go1exp.compose import compose
 from go1exp.config import PPOConfig, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.registry import ConfigError
+from go1exp.train import trainer
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, policy_settings
 from go1exp.types import StepResult
 
@@ -448,3 +450,10 @@ def test_it_learns_to_walk_to_a_point_on_a_line() -> None:
         left, right = ppo.policy._predict(observation, deterministic=True)[:, 0]
     assert left > 0.2
     assert right < -0.2
+
+
+def test_a_device_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SB3 would train on the CPU without a word."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="device = 'cuda': torch finds no CUDA device"):
+        trainer.build(parse_train(compose("train", ["device=cuda", "ppo.num_envs=1"])))
