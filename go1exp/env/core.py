@@ -88,6 +88,7 @@ class Go1Core:
         self.reward_sums = torch.zeros(len(self._rewards), dtype=torch.float64, device=self.device)
         self.term_values = zeros(len(self._rewards))
         self.feet = FootTimers(num_envs, task.sim.physics_dt, self.device)
+        self._speed = torch.zeros_like(self._state.joint_vel)
         self._touched = torch.zeros_like(self._link_contacts)
         self._calf_touched = torch.zeros_like(self._foot_contact[..., 0])
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
@@ -244,15 +245,15 @@ class Go1Core:
         self._calf_touched.zero_()
         for _ in range(self.task.sim.decimation):
             torque = self.actuator.torque(target, q, qd)
-            speed = qd.clone()
+            self._speed.copy_(qd)
             self.backend.step(torque)
             feet = self._foot_contact[..., 0]
-            self.feet.update(self._foot_contact[..., 1:].square().sum(-1) > 0)
+            self.feet.update(self._foot_contact[..., 3] != 0)  # the vertical force: exactly zero if there is none
             # Counts, largest over the substeps; a calf's contacts without those of its foot.
             torch.maximum(self._touched, self._link_contacts, out=self._touched)
             torch.maximum(self._calf_touched, self._link_contacts[:, CALVES] - feet, out=self._calf_touched)
         self.torque.copy_(torque)
-        self.joint_acc.copy_((qd - speed) / self.task.sim.physics_dt)
+        self.joint_acc.copy_((qd - self._speed) / self.task.sim.physics_dt)
 
     def _advance_world(self, restart: Tensor) -> None:
         """Let the policy period pass for commands and events; ``restart`` (N,) begins anew."""
