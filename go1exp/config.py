@@ -15,7 +15,10 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 import go1exp.actuator
+import go1exp.effects
 import go1exp.mdp  # noqa: F401  (registers every term)
+from go1exp import robot
+from go1exp.effects.rules import drive_problems
 from go1exp.registry import (
     STRICT,
     ConfigError,
@@ -87,6 +90,7 @@ class TaskConfig:
     terrain: TerrainConfig
     backend: BackendConfig
     actuator: Term
+    effect: tuple[Term, ...]
     command: Term
     reward: tuple[Term, ...]
     rand: tuple[Term, ...]
@@ -235,6 +239,13 @@ class RandomizationSlots(BaseModel):
     when: Literal["startup", "reset"] = "reset"
 
 
+class EffectSlots(BaseModel):
+    """Half-widths of the uniform distributions from which each environment's parameters are drawn, once."""
+
+    model_config = STRICT
+    spread: dict[str, NonNegative] = {}
+
+
 SECTIONS: dict[str, type] = {
     "sim": SimConfig,
     "action": ActionConfig,
@@ -254,6 +265,7 @@ MANY_TERMS: dict[str, type[BaseModel] | None] = {
     "reward": RewardSlots,
     "rand": RandomizationSlots,
     "observation": ObservationSlots,
+    "effect": EffectSlots,
     "event": None,
     "termination": None,
     "curriculum": None,
@@ -320,6 +332,8 @@ def time_rules(sim: SimConfig) -> list[str]:
 def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
     """Rules between sections."""
     problems = []
+    if actuator := parts.get("actuator"):
+        problems += drive_problems(actuator, parts.get("effect") or (), robot.JOINTS)
     if sim := parts.get("sim"):
         problems += time_rules(sim)
     if (ppo := parts.get("ppo")) and ppo.num_envs * ppo.steps % ppo.minibatches:

@@ -83,6 +83,8 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
             lines.append(unknown_name(key, str(e["loc"][-1]), known, "key") + f" (given: {e['input']!r})")
         elif e["type"] == "value_error" and not e["loc"]:  # a dataclass's own rules, one "key: rule" per line
             lines += [f"{path}.{line}".strip(".") for line in e["msg"].removeprefix("Value error, ").splitlines()]
+        elif e["type"] == "problems":  # a term inside this one: one line each, from that parameter's name on
+            lines += [".".join([path, *map(str, e["loc"][:-1]), line]).strip(".") for line in e["msg"].splitlines()]
         elif e["type"] in ("missing", "missing_argument"):
             lines.append(f"{key}: required, but not given")
         else:
@@ -113,12 +115,11 @@ class Entry:
     @cached_property
     def schema(self) -> type[BaseModel]:
         """Pydantic model of the parameters."""
-        function = self.target.__init__ if inspect.isclass(self.target) else self.target
         scope = vars(sys.modules[self.target.__module__])
         fields: dict[str, Any] = {}
         for name, p in self.parameters.items():
             # Only these annotations are evaluated: the positional ones name tensors, which need no import here.
-            stub = type(name, (), {"__annotations__": {name: function.__annotations__[name]}})
+            stub = type(name, (), {"__annotations__": {name: p.annotation}})
             kind = get_type_hints(stub, globalns=dict(scope), include_extras=True)[name]
             fields[name] = (kind, ... if p.default is p.empty else p.default)
         return create_model(self.name, __config__=STRICT, **fields)
@@ -156,6 +157,9 @@ event = partial(register, "event")
 termination = partial(register, "termination")
 curriculum = partial(register, "curriculum")
 actuator = partial(register, "actuator")
+importer = partial(register, "importer")
+effect = partial(register, "effect")
+excitation = partial(register, "excitation")
 
 
 def members(group: str) -> dict[str, Entry]:

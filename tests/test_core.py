@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.actuator.setup import ActuatorSetup
+from go1exp.drive import DriveSetup
 from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
@@ -420,13 +420,18 @@ def test_a_policy_step_is_that_many_physics_steps_under_the_actuators_law(
     mujoco.mj_forward(model, data)
     limit = np.tile([23.7, 23.7, 35.55], 4)
     phase, touching, landings = np.zeros(4, int), np.zeros(4, bool), 0
+    speed, last_target = data.qvel[6:].copy(), robot.NOMINAL_STANCE
     for action in actions(2, 25, 3.0):
         core.step(action)
         target = robot.NOMINAL_STANCE + 0.2 * action[0].double().numpy()
         landed = np.zeros(4, bool)
         for _ in range(substeps):
+            # Half a step ago and one and a half: the speed now. A new target has been in force for half of this step.
+            now_speed = 1.5 * data.qvel[6:] - 0.5 * speed
             speed = data.qvel[6:].copy()
-            data.ctrl[:] = np.clip(20.0 * (target - data.qpos[7:]) - 0.5 * speed, -limit, limit)
+            error = 0.5 * (target + last_target) - data.qpos[7:]
+            last_target = target
+            data.ctrl[:] = np.clip(20.0 * error - 0.5 * now_speed, -limit, limit)
             mujoco.mj_step(model, data)
             force, now = foot_forces(model, data)
             landed |= now & ~touching & (phase > 0)
@@ -582,7 +587,7 @@ def test_the_reward_is_the_sum_of_the_configured_terms_on_the_snapshot_of_the_st
 class Recorder:
     """An actuator that holds still and remembers what it is asked."""
 
-    def __init__(self, setup: ActuatorSetup) -> None:
+    def __init__(self, setup: DriveSetup) -> None:
         self.setup, self.calls = setup, 0
         self.resets: list[list[bool]] = []
 
@@ -608,12 +613,12 @@ def test_an_actuator_is_asked_at_the_physics_rate_told_of_resets_and_saved(
     recorder = Term("recorder", Entry("actuator", "recorder", Recorder), {})
     task = dataclasses.replace(make_task(*options), actuator=recorder)
     core, resumed = Go1Core(task, 3), Go1Core(task, 3)
-    actuator, other = core.actuator, resumed.actuator
+    actuator, other = core.plant.actuator, resumed.plant.actuator
     assert isinstance(actuator, Recorder)
     assert isinstance(other, Recorder)
     assert (actuator.setup.num_envs, actuator.setup.physics_dt) == (3, 0.004)
-    assert actuator.setup.effort_limit == (23.7, 23.7, 23.7)
-    assert actuator.setup.velocity_limit == (30.0, 30.0, 30.0)
+    assert actuator.setup.effort_limit.tolist() == [23.7] * 12
+    assert actuator.setup.velocity_limit.tolist() == [30.0] * 12
     core.reset()
     core.step(torch.zeros(3, 12))
     assert actuator.calls == 5

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 
-from go1exp.actuator.setup import ActuatorSetup
-from go1exp.memory import Memory
-from go1exp.registry import NonNegative, actuator
+from go1exp.actuator.setup import Gains
+from go1exp.drive import DriveSetup
+from go1exp.joint_values import JointValues, each_within
+from go1exp.registry import actuator
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+Gain = Annotated[JointValues, each_within(0.0)]
+"""One gain for all joints, hip-thigh-calf, or one for each; not negative."""
 
-@actuator("pd")
-class PD(Memory):
+
+@actuator("pd", gains=True)
+class PD(Gains):
     """Proportional-derivative joint control, clipped at the peak torque: tau = kp (target - q) - kd qd."""
 
-    def __init__(self, setup: ActuatorSetup, *, kp: NonNegative = 20.0, kd: NonNegative = 0.5) -> None:
+    joint_values = ("kp", "kd")
+
+    def __init__(self, setup: DriveSetup, *, kp: Gain = 20.0, kd: Gain = 0.5) -> None:
         """Keep the gains, kp in N m/rad and kd in N m s/rad (20 and 0.5: the paper, section II-B.2)."""
-        self._kp, self._kd = kp, kd
-        self._limit = setup.per_joint(setup.effort_limit)
+        self.kp, self.kd = setup.rows(kp), setup.rows(kd)
+        self._limit = setup.effort_limit
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the joint torques (N, 12), N m; target and q in rad, qd in rad/s."""
-        tau = torch.sub(target, q).mul_(self._kp).sub_(qd, alpha=self._kd)
+        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s."""
+        tau = torch.sub(target, q).mul_(self.kp).addcmul_(self.kd, qd, value=-1.0)
         return torch.clamp(tau, -self._limit, self._limit)
 
     def reset(self, mask: Tensor) -> None:

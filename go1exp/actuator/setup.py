@@ -1,54 +1,52 @@
-"""What every actuator is told when it is built."""
+"""What every actuator promises."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-import torch
-
-from go1exp import robot
+from go1exp.memory import Memory
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-
-@dataclass(frozen=True)
-class ActuatorSetup:
-    """The robot and the batch that an actuator will drive.
-
-    Attributes:
-        num_envs: N.
-        physics_dt: period of its calls, s.
-        effort_limit: peak torque of hip, thigh, calf, N m.
-        velocity_limit: top speed of hip, thigh, calf, rad/s.
-        device: of the tensors to come.
-        dtype: of the joint state to come (float64 on the CPU backend).
-    """
-
-    num_envs: int
-    physics_dt: float
-    effort_limit: tuple[float, float, float]
-    velocity_limit: tuple[float, float, float]
-    device: torch.device
-    dtype: torch.dtype
-
-    def per_joint(self, hip_thigh_calf: tuple[float, float, float]) -> Tensor:
-        """Spread three values over the joints, (12,), on the right device."""
-        return torch.as_tensor(robot.per_joint(hip_thigh_calf), dtype=self.dtype, device=self.device)
 
 
 class Actuator(Protocol):
     """Turns position targets into torques at the physics rate; owns whatever history that takes."""
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return joint torques (N, 12), N m, for targets and angles in rad and speeds in rad/s."""
+        """Return joint torques (N, J), N m, for targets and angles in rad and speeds in rad/s."""
 
     def reset(self, mask: Tensor) -> None:
         """Forget the history of the rows of ``mask`` (N,) bool."""
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Any]:
         """Return the history."""
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue with that history."""
+
+
+@runtime_checkable
+class HasGains(Protocol):
+    """An actuator whose gains, both (N, J), can be written in place: its own, or those of the drive that it wraps."""
+
+    @property
+    def kp(self) -> Tensor:
+        """N m/rad."""
+
+    @property
+    def kd(self) -> Tensor:
+        """N m s/rad."""
+
+
+class Gains(Memory):
+    """Base of actuators with a position gain ``kp`` and a speed gain ``kd``, both (N, J) and writable in place.
+
+    Registered with ``gains=True``, so that effects on the gains know where they can act.
+    """
+
+    memory = ("kp", "kd")
+    kp: Tensor
+    """N m/rad."""
+    kd: Tensor
+    """N m s/rad."""

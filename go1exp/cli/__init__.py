@@ -13,6 +13,7 @@ VERBS = {
     "train": "train a policy from configuration",
     "eval": "run a trained policy through a grid of commands: errors, falls, a table and JSON",
     "play": "watch a trained policy: a clip without a display, a live viewer with one",
+    "record": "drive the simulated robot and log it; audit recordings, import others",
     "list": "list terms, groups and their choices, one line each",
     "bench": "measure speed as ratios in one run",
 }
@@ -20,6 +21,16 @@ VERBS = {
 
 MODULES = {"eval": "evaluate", "list": "listing"}
 """Modules that cannot have their verb's name."""
+
+SUBVERBS = {"record": ("audit", "import")}
+"""Second words of a verb that are verbs of their own; module and configuration are called VERB_WORD."""
+
+POSITIONAL: dict[str, tuple[str, ...]] = {
+    "record_audit": ("files",),
+    "record_import": ("source", "path"),
+    "list": ("group",),
+}
+"""Settings that may be given by position alone; ``files`` takes all that are left."""
 
 HELP = """usage: go1exp VERB [key=value ...]
 
@@ -29,6 +40,7 @@ HELP = """usage: go1exp VERB [key=value ...]
   go1exp train reward=paper rand=table1
   go1exp train -m experiment=ablation/no_gait,ablation/no_noise
   go1exp eval run=runs/NAME
+  go1exp record 'excitation=[chirp,steps]' effect=coulomb
   eval "$(go1exp -sc install=bash)"      tab completion
 """
 
@@ -54,7 +66,28 @@ def main() -> int:
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(VERBS)}"
         print(f"go1exp: unknown verb {verb!r}; {hint}", file=sys.stderr)
         return 2
-    return _module(verb).APP.run(rest)
+    if rest and rest[0] in SUBVERBS.get(verb, ()):
+        verb, rest = f"{verb}_{rest[0]}", rest[1:]
+    return _module(verb).APP.run(_by_name(verb, rest))
+
+
+def _by_name(verb: str, arguments: list[str]) -> list[str]:
+    """Turn arguments by position into ``key=value``: those that are no override, no option and no option's value."""
+    keys = list(POSITIONAL.get(verb, ()))
+    words = [a for a in arguments if keys and "=" not in a and not a.startswith(("-", "~"))]
+    rest = [a for a in arguments if a not in words]
+    named = []
+    for key in keys:
+        if key == "files" and words:
+            return [*rest, f"files=[{','.join(_quoted(w) for w in words)}]"]
+        if words:
+            named.append(f"{key}={_quoted(words.pop(0))}")
+    return [*rest, *named, *words]
+
+
+def _quoted(word: str) -> str:
+    """Write a word so that Hydra takes it as it is."""
+    return "'" + word.replace("'", "\\'") + "'"
 
 
 def _module(verb: str):  # type: ignore[no-untyped-def]  # a module with an APP

@@ -21,6 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from go1exp.cli.files import choices_from_files
 from go1exp.compose import as_container, config_folder, flat_keys, register_groups
 from go1exp.registry import ConfigError, Expected, nearest, unknown_name
 
@@ -38,6 +39,8 @@ class App:
 
     name: str
     task: Callable[[dict[str, Any]], int | None]
+    title: str = ""
+    """What users call it, where that is not its name."""
 
     def run(self, arguments: Sequence[str]) -> int:
         """Run with command-line arguments; print errors; return the exit status."""
@@ -61,8 +64,9 @@ class App:
 
         version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
         # Tab completion is installed for the program, whichever verb serves it.
-        sys.argv = ["go1exp" if "-sc" in arguments else f"go1exp {self.name}", *arguments]
+        title = f"go1exp {self.title or self.name}"
         try:
+            sys.argv = ["go1exp" if "-sc" in arguments else title, *choices_from_files(arguments)]
             hydra.main(**version, config_path=config_folder(), config_name=self.name)(task)()
             if failure:
                 raise failure[0]
@@ -70,7 +74,7 @@ class App:
             if own_traceback:
                 raise
             code, message = self._explain(error, arguments)
-            print(f"go1exp {self.name}: {message}", file=sys.stderr)
+            print(f"{title}: {message}", file=sys.stderr)
             return code
         finally:
             if before is None:

@@ -9,18 +9,23 @@ from go1exp.cli.app import App
 
 
 def _task(container: dict[str, Any]) -> None:
-    import go1exp.actuator
-    import go1exp.mdp  # noqa: F401  (registers every term)
+    import go1exp.config
+    import go1exp.excitations
+    import go1exp.importers
+    import go1exp.record.policy  # noqa: F401  (registers every member)
     from go1exp import registry
     from go1exp.cli.settings import ListSettings, parse
 
     settings = parse(ListSettings, container)
     choices = _choices()
     known = [*registry.groups(), *(g for g in choices if g not in registry.groups())]
-    if settings.group is not None and settings.group not in known:
-        raise registry.ConfigError([registry.unknown_name("group", settings.group, known, "group")])
+    wanted = settings.group
+    if wanted is not None and wanted not in known:
+        wanted = wanted.removesuffix("s")  # effects as well as effect
+    if wanted is not None and wanted not in known:
+        raise registry.ConfigError([registry.unknown_name("group", str(settings.group), known, "group")])
     for group in known:
-        if settings.group in (None, group):
+        if wanted in (None, group):
             _print_group(group, choices.get(group, []), settings.what)
 
 

@@ -9,9 +9,20 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from go1exp.record.plan import Wishes
 from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
 
 T = TypeVar("T")
+
+REQUIRED = {
+    "run": "run=runs/NAME",
+    "files": "go1exp record audit recordings/NAME.parquet",
+    "source": "go1exp record import go2_in_air PATH",
+    "path": "go1exp record import go2_in_air PATH",
+    "logs": "logs=recordings",
+}
+"""Settings without a default, and how they are given."""
+
 Count = Annotated[int, Field(ge=1)]
 RunFolder = Annotated[str, Field(min_length=1)]
 
@@ -75,6 +86,49 @@ class PlaySettings:
 
 
 @dataclass(frozen=True)
+class RecordSettings(Wishes):
+    """``conf/record.yaml`` without the groups and the excitations."""
+
+    run: str | None
+    episodes: Count
+    physics_dt: Annotated[float, Field(gt=0, le=0.002)]
+    out: str
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        lists = ("gains", "seeds", "hang")
+        wrong = [f"{name} = []: at least one is needed" for name in lists if not getattr(self, name)]
+        ratio = 1.0 / (self.sensors.rate_hz * self.physics_dt)
+        if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6:
+            period = 1 / self.sensors.rate_hz
+            wrong.append(f"physics_dt = {self.physics_dt}: 1 / sensors.rate_hz = {period:g} must be a multiple of it")
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+
+@dataclass(frozen=True)
+class AuditSettings:
+    """``conf/record_audit.yaml``."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    files: Annotated[tuple[str, ...], Field(min_length=1)]
+    out: str | None
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """``conf/record_import.yaml``."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    source: str
+    path: str
+    options: dict[str, Any]
+    out: str
+
+
+@dataclass(frozen=True)
 class ListSettings:
     """``conf/list.yaml``."""
 
@@ -121,8 +175,9 @@ def checkpoint_file(run: Path, name: str | None) -> Path | None:
 
 def parse(kind: type[T], container: Mapping[str, Any]) -> T:
     """Validate a composed configuration as ``kind``; raise ConfigError with every problem."""
-    if container.get("run") == "???":
-        raise ConfigError(["run: required, such as run=runs/NAME"])
+    missing = [key for key, value in container.items() if value == "???"]
+    if missing:
+        raise ConfigError([f"{key}: required, such as {REQUIRED[key]}" for key in missing])
     try:
         return TypeAdapter(kind).validate_json(as_json(dict(container)))
     except ValidationError as error:

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.actuator.setup import Actuator, ActuatorSetup
 from go1exp.config import BackendConfig, TaskConfig
 from go1exp.env.faults import NumericalFault
+from go1exp.env.plant import Plant, drive_setup
 from go1exp.mdp.derived import rotate_inverse
 from go1exp.mdp.foot_timers import FootTimers
 from go1exp.mdp.ground import GroundHeight
@@ -50,6 +50,7 @@ class Go1Core:
         first_env: number of the first environment, so that one of a batch can be replayed alone.
         noise: add the observation noise (off in evaluation).
         spread_starts: let first episodes begin at random times (training only).
+        imu: simulate the IMU's sensors too, for a logger.
     """
 
     def __init__(
@@ -61,11 +62,12 @@ class Go1Core:
         first_env: int = 0,
         noise: bool = True,
         spread_starts: bool = False,
+        imu: bool = False,
     ) -> None:
         self.task, self.num_envs, self.noise = task, num_envs, noise
         self._spread_starts = spread_starts
         self.terrain = build_terrain(task.terrain)
-        model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt)
+        model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt, imu=imu)
         self.backend = make_backend(task.backend, model, sensors, num_envs)
         self.device = self.backend.qpos.device
         self.random = EnvRandom(seed, num_envs, first_env, self.device)
@@ -78,7 +80,7 @@ class Go1Core:
 
         self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self._last_action = zeros(robot.NUM_JOINTS)
-        self.target, self.torque = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
+        self.target = zeros(robot.NUM_JOINTS)
         self.joint_acc = zeros(robot.NUM_JOINTS)
         self.spawn = zeros(3)
         self.steps = zeros(dtype=torch.int64)
@@ -88,7 +90,6 @@ class Go1Core:
         self.reward_sums = torch.zeros(len(self._rewards), dtype=torch.float64, device=self.device)
         self.term_values = zeros(len(self._rewards))
         self.feet = FootTimers(num_envs, task.sim.physics_dt, self.device)
-        self._speed = torch.zeros_like(self._state.joint_vel)
         self._touched = torch.zeros_like(self._link_contacts)
         self._calf_touched = torch.zeros_like(self._foot_contact[..., 0])
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
@@ -118,15 +119,8 @@ class Go1Core:
     def _build_terms(self) -> None:
         """Turn the configured terms into callables, and make per-environment the model fields that will vary."""
         task, sim = self.task, self.task.sim
-        setup = ActuatorSetup(
-            self.num_envs,
-            sim.physics_dt,
-            task.robot.effort_limit,
-            task.robot.velocity_limit,
-            self.device,
-            self.backend.qpos.dtype,
-        )
-        self.actuator: Actuator = task.actuator(setup)
+        setup = drive_setup(task.robot, sim.physics_dt, self.backend, self.random)
+        self.plant = Plant(self.backend, setup, task.actuator, task.effect)
         self.command = task.command(self.random.stream("command"))
         self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}
         self._curriculum = [t() for t in task.curriculum]
@@ -156,6 +150,7 @@ class Go1Core:
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if not self._started:
             self.level.copy_(self._initial_levels())
+            self.plant.startup()
             self._randomize_model("startup", everyone)
         self._restart(everyone)
         if self._spread_starts and not self._started:
@@ -195,11 +190,11 @@ class Go1Core:
         for term in self._state_terms:
             term(fresh, self.random.stream(f"rand.{term.key}"))
         self.backend.reset(mask, qpos, qvel)
-        self.actuator.reset(mask)
         self.feet.reset(mask)
-        for tensor in (self.action, self.previous_action, self.torque, self.joint_acc):
+        for tensor in (self.action, self.previous_action, self.joint_acc):
             tensor.masked_fill_(rows, 0.0)  # and not a product: zero times NaN is NaN
         self.target.copy_(torch.where(rows, self._nominal, self.target))
+        self.plant.reset(mask, self.target.to(self.backend.qpos.dtype))
         self.steps.masked_fill_(mask, 0)
         self._first_step.masked_fill_(mask, 0)
         self.episode_return.masked_fill_(mask, 0.0)
@@ -239,21 +234,17 @@ class Go1Core:
         self._last_action.copy_(self.action)
         self.target.copy_(self._nominal + self.task.action.scale * self.action)
         target = self.target.to(self.backend.qpos.dtype)
-        q, qd = self._state.joint_pos, self._state.joint_vel
         self.feet.begin_step()
         self._touched.zero_()
         self._calf_touched.zero_()
         for _ in range(self.task.sim.decimation):
-            torque = self.actuator.torque(target, q, qd)
-            self._speed.copy_(qd)
-            self.backend.step(torque)
+            self.plant.step(target)
             feet = self._foot_contact[..., 0]
             self.feet.update(self._foot_contact[..., 3] != 0)  # the vertical force: exactly zero if there is none
             # Counts, largest over the substeps; a calf's contacts without those of its foot.
             torch.maximum(self._touched, self._link_contacts, out=self._touched)
             torch.maximum(self._calf_touched, self._link_contacts[:, CALVES] - feet, out=self._calf_touched)
-        self.torque.copy_(torque)
-        self.joint_acc.copy_((qd - self._speed) / self.task.sim.physics_dt)
+        self.joint_acc.copy_(self.plant.joint_acceleration())
 
     def _advance_world(self, restart: Tensor) -> None:
         """Let the policy period pass for commands and events; ``restart`` (N,) begins anew."""
@@ -313,7 +304,7 @@ class Go1Core:
             joint_pos=state.joint_pos.float(),
             joint_vel=state.joint_vel.float(),
             joint_acc=self.joint_acc,
-            joint_torque=self.torque,
+            joint_torque=self.plant.torque.float(),
             joint_target=self.target,
             action=self.action,
             previous_action=self.previous_action,
@@ -335,6 +326,8 @@ class Go1Core:
 
     def _observe(self, s: Snapshot) -> Tensor:
         """(N, O) the configured observation of a snapshot, with its noise if that is on."""
+        if self.plant.effects.senses:
+            s = self.plant.sense(s)
         clean = torch.cat([t(s) for t in self.task.observation], dim=-1)
         if not self.noise:
             return clean
@@ -369,7 +362,6 @@ class Go1Core:
         "action",
         "previous_action",
         "target",
-        "torque",
         "joint_acc",
         "spawn",
         "steps",
@@ -382,7 +374,7 @@ class Go1Core:
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own."""
         events = {f"event.{name}": part for name, part in self.events.items()}
-        named = {"backend": self.backend, "random": self.random, "actuator": self.actuator}
+        named = {"backend": self.backend, "random": self.random, "plant": self.plant}
         return {**named, "command": self.command, "feet": self.feet, **events}
 
     def state_dict(self) -> dict[str, Any]:

@@ -73,6 +73,7 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     changes: dict[str, Any] = {"sim": sim, "command": fixed, "curriculum": ()}
     if not config.randomize:
         changes["rand"] = ()
+        changes["effect"] = tuple(dataclasses.replace(e, slots={**e.slots, "spread": {}}) for e in task.effect)
     if not config.push:
         changes["event"] = ()
     if not config.train_ground:

@@ -8,13 +8,14 @@ write the state of a reset. All draws are independent per element. Table I of th
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import torch
 from pydantic import AfterValidator, Field
 
 from go1exp import robot
+from go1exp.drive import ModelFields
 from go1exp.mdp.derived import quat_from_rotvec, quat_multiply
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.randomness import Stream
@@ -28,26 +29,13 @@ Operation = Literal["set", "add", "scale"]
 """``set``: the draw itself; ``add``: nominal + draw; ``scale``: nominal x draw."""
 
 
-class ModelFields(Protocol):
-    """The per-environment model as a randomisation sees it (provided by the physics backend)."""
-
-    def field(self, name: str) -> Tensor:
-        """Live values ``(N, ...)`` of a model field, such as ``body_mass``."""
-
-    def nominal(self, name: str) -> Tensor:
-        """The compiled model's values ``(...)`` of that field."""
-
-    def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
-        """Indices of named bodies or geoms."""
-
-
 def _vary(
     model: ModelFields, name: str, where: tuple[Tensor | int, ...], mask: Tensor, op: Operation, draw: Tensor
 ) -> None:
     """Write ``op(nominal, draw)`` into ``field[mask][where]``."""
     live, nominal = model.field(name), model.nominal(name)
     index = (slice(None), *where)
-    start = nominal[where]
+    start = nominal[index]
     new = {"set": lambda: draw.to(live.dtype), "add": lambda: start + draw, "scale": lambda: start * draw}[op]()
     keep = mask.reshape(-1, *([1] * (new.dim() - 1)))
     live[index] = torch.where(keep, new, live[index])

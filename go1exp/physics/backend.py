@@ -8,6 +8,7 @@ the sensors of the reset rows describe the new state.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import mujoco
@@ -24,9 +25,10 @@ class PhysicsBackend(Protocol):
     sensors: Sensors
     num_envs: int
     qpos: Tensor
-    """(N, 19): position in the world m, quaternion w-x-y-z, joint angles rad."""
+    """(N, 19): position in the world m, quaternion w-x-y-z, joint angles rad; of a held trunk (N, 12), the last."""
     qvel: Tensor
-    """(N, 18): linear velocity in the world m/s, angular velocity in the trunk frame rad/s, joint speeds rad/s."""
+    """(N, 18): linear velocity in the world m/s, angular velocity in the trunk frame rad/s, joint speeds rad/s; of a
+    held trunk (N, 12), the last."""
     sensordata: Tensor
     """(N, S), addressed by ``sensors``."""
 
@@ -34,13 +36,25 @@ class PhysicsBackend(Protocol):
         """Advance one physics step under joint torques (N, 12), N m."""
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Put the rows of ``mask`` (N,) bool into the state of ``qpos`` (N, 19) and ``qvel`` (N, 18)."""
+        """Put the rows of ``mask`` (N,) bool into the state of ``qpos`` and ``qvel``."""
 
     def field(self, name: str) -> Tensor:
         """Live per-environment values ``(N, ...)`` of a model field; made per-environment at the first call."""
 
-    def nominal(self, name: str) -> Tensor:
+    def compiled(self, name: str) -> Tensor:
         """The compiled model's values ``(...)`` of that field."""
+
+    def rebase(self, values: Mapping[str, Tensor]) -> None:
+        """Make ``values`` (N, ...) by field the robots that randomisation starts from, and what the fields hold now."""
+
+    def nominal(self, name: str) -> Tensor:
+        """The values ``(1 or N, ...)`` that randomisation starts from: those of ``rebase``, else the compiled ones."""
+
+    def applied(self) -> Tensor:
+        """Live generalised forces (N, nv) beside the drives' torques, N and N m; kept until they are written anew.
+
+        The first three of a floating trunk are a force on its origin in the world frame.
+        """
 
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
         """Indices ``(len(names),)`` of named objects; ``kind`` is ``body`` or ``geom``."""

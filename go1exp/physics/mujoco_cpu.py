@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any
 
 import mujoco
@@ -14,7 +16,7 @@ from torch import Tensor
 from go1exp.physics.scene import Sensors
 
 STATE_FIELDS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl")
-"""What one simulation carries from step to step (no activations, no applied forces in this model)."""
+"""What one simulation carries from step to step (no activations in this model; applied forces are written anew)."""
 
 
 class MujocoCpu:
@@ -31,6 +33,8 @@ class MujocoCpu:
             warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
             self.sensordata = torch.from_numpy(self._batch.bind("sensordata"))
         self._fields: dict[str, Tensor] = {}
+        self._baseline: dict[str, Tensor] = {}
+        self._applied: Tensor | None = None
 
     def step(self, torque: Tensor) -> None:
         """Advance one physics step under joint torques (N, 12), N m."""
@@ -54,9 +58,25 @@ class MujocoCpu:
             self._fields[name] = torch.from_numpy(self._batch.expand(name))
         return self._fields[name]
 
-    def nominal(self, name: str) -> Tensor:
+    def compiled(self, name: str) -> Tensor:
         """The compiled model's values of that field (a copy)."""
-        return torch.tensor(getattr(self.model, name))
+        return torch.tensor(attrgetter(name)(self.model))
+
+    def rebase(self, values: Mapping[str, Tensor]) -> None:
+        """Set what randomisation starts from, and the fields themselves."""
+        for name, value in values.items():
+            self.field(name).copy_(value)
+            self._baseline[name] = value.clone()
+
+    def nominal(self, name: str) -> Tensor:
+        """The values that randomisation starts from."""
+        return self._baseline[name] if name in self._baseline else self.compiled(name).unsqueeze(0)
+
+    def applied(self) -> Tensor:
+        """Live generalised forces beside the drives'."""
+        if self._applied is None:
+            self._applied = torch.from_numpy(self._batch.bind("qfrc_applied"))
+        return self._applied
 
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
         """Indices of named bodies or geoms."""
@@ -82,11 +102,13 @@ class MujocoCpu:
         return {
             "state": {name: torch.from_numpy(np.array(self._batch.bind(name))) for name in STATE_FIELDS},
             "fields": {name: torch.from_numpy(np.array(v)) for name, v in expanded.items() if v is not None},
+            "baseline": {name: value.clone() for name, value in self._baseline.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``, bit for bit."""
         for name, value in state["fields"].items():
             self.field(name).copy_(value)
+        self._baseline = {name: value.clone() for name, value in state["baseline"].items()}
         for name in STATE_FIELDS:
             self._batch.bind(name)[:] = state["state"][name].numpy()

@@ -18,6 +18,12 @@ from go1exp.terrain import Terrain
 DECORATION_GROUP = 2
 """Geom group of the shapes that are only for the eye; they cost kinematics and are left out of training."""
 
+HELD_HEIGHT = 1.0
+"""Height at which a held trunk hangs, m: no foot reaches the ground."""
+
+RIGID = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""MuJoCo's impedance of dry friction; its default of 0.9 to 0.95 lets a joint creep."""
+
 _DATA_FOUND = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
 _DATA_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
 _REDUCE_NONE, _REDUCE_NETFORCE = 0, 3
@@ -38,10 +44,22 @@ class Sensors:
     """4 x 4: number of contacts of the foot sphere with the ground, then the ground's net force on it (world), N."""
     link_contacts: slice
     """13: number of contacts of thighs (4), calves with their feet (4), trunk with head (1), hips (4)."""
+    imu_gyro: slice
+    """3: angular velocity in the IMU's frame, rad/s; empty, like the next two, unless asked for."""
+    imu_acc: slice
+    """3: specific force in the IMU's frame, m/s2."""
+    imu_quat: slice
+    """4: orientation of the IMU in the world, w-x-y-z."""
 
 
 def build_model(
-    config: RobotConfig, terrain: Terrain, physics_dt: float, decoration: bool = False
+    config: RobotConfig,
+    terrain: Terrain,
+    physics_dt: float,
+    decoration: bool = False,
+    *,
+    imu: bool = False,
+    held: tuple[float, float, float, float] | None = None,
 ) -> tuple[mujoco.MjModel, Sensors]:
     """Compile the scene.
 
@@ -50,8 +68,16 @@ def build_model(
         terrain: the ground, which touches every collision shape of the robot.
         physics_dt: timestep, s.
         decoration: keep the shapes that are only for the eye (they change no trajectory).
+        imu: add the IMU's sensors (they cost time and a policy does not need them).
+        held: orientation w-x-y-z in which the trunk is held in the air, as on a stand; None lets it go. A held robot's
+            state is its joints' alone.
     """
     spec = load_robot(config.inertia)
+    if held is not None:
+        spec.delete(spec.joint("root"))
+        for key in list(spec.keys):  # their state has a free trunk
+            spec.delete(key)
+        spec.body("trunk").pos, spec.body("trunk").quat = [0.0, 0.0, HELD_HEIGHT], list(held)
     if not decoration:
         for geom in list(spec.geoms):
             if geom.group == DECORATION_GROUP:
@@ -69,15 +95,17 @@ def build_model(
             joint.armature = config.armature[kind]
             joint.damping[0] = config.damping[kind]
             joint.frictionloss = config.friction_loss[kind]
+            # Dry friction is as rigid as a step allows: it stops a joint within one (see docs/actuators.md).
+            joint.solref_friction, joint.solimp_friction = [2.0 * physics_dt, 1.0], list(RIGID)
             motor = spec.actuator(f"{leg}_{name}")
             motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             motor.forcerange = [-config.effort_limit[kind], config.effort_limit[kind]]
     add_to_spec(spec, terrain)
-    sensors = _add_sensors(spec)
+    sensors = _add_sensors(spec, imu)
     return spec.compile(), sensors
 
 
-def _add_sensors(spec: mujoco.MjSpec) -> Sensors:
+def _add_sensors(spec: mujoco.MjSpec, imu: bool) -> Sensors:
     """Declare the sensors, block by block, and return where they will lie."""
     site, geom, body = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
     end = 0
@@ -100,10 +128,13 @@ def _add_sensors(spec: mujoco.MjSpec) -> Sensors:
     feet = [f"{leg}_foot" for leg in robot.LEGS]
     links = [f"{leg}_{part}" for part in ("thigh", "calf") for leg in robot.LEGS]
     links += ["trunk", *(f"{leg}_hip" for leg in robot.LEGS)]
-    contact = mujoco.mjtSensor.mjSENS_CONTACT
+    contact, on_imu = mujoco.mjtSensor.mjSENS_CONTACT, ["imu"] if imu else []
     return Sensors(
         foot_pos_w=block(feet, 3, mujoco.mjtSensor.mjSENS_FRAMEPOS, site, []),
         foot_vel_w=block(feet, 3, mujoco.mjtSensor.mjSENS_FRAMELINVEL, site, []),
         foot_contact=block(feet, 4, contact, geom, [_DATA_FOUND | _DATA_FORCE, _REDUCE_NETFORCE, 1]),
         link_contacts=block(links, 1, contact, body, [_DATA_FOUND, _REDUCE_NONE, 1]),
+        imu_gyro=block(on_imu, 3, mujoco.mjtSensor.mjSENS_GYRO, site, []),
+        imu_acc=block(on_imu, 3, mujoco.mjtSensor.mjSENS_ACCELEROMETER, site, []),
+        imu_quat=block(on_imu, 4, mujoco.mjtSensor.mjSENS_FRAMEQUAT, site, []),
     )

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.actuator.setup import ActuatorSetup
 from go1exp.config import TaskConfig
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.physics.mujoco_cpu import MujocoCpu
@@ -570,78 +569,6 @@ def test_body_orientation_turns_the_trunk_by_the_rotation_vector_that_is_drawn()
         got = Rotation.from_quat(state.base_quat_w.numpy(), scalar_first=True)
         assert (expected.inv() * got).magnitude().max() < 1e-6
         np.testing.assert_allclose(state.base_quat_w.norm(dim=1), 1.0, atol=1e-6)
-
-
-# Actuators
-
-
-def actuator_setup(n: int) -> ActuatorSetup:
-    return ActuatorSetup(
-        n, 0.002, robot.EFFORT_LIMIT, robot.VELOCITY_LIMIT, device=torch.device("cpu"), dtype=torch.float64
-    )
-
-
-def joint_noise(n: int, scale: float, seed: int = 0) -> Tensor:
-    return torch.as_tensor(np.random.default_rng(seed).normal(0.0, scale, (n, 12)))
-
-
-@each("actuator")
-def test_an_actuator_never_exceeds_the_torque_limit(entry: Entry) -> None:
-    actuator = entry.target(actuator_setup(20))
-    limit = torch.tensor([23.7, 23.7, 35.55] * 4, dtype=torch.float64)
-    reached = torch.zeros(12, dtype=torch.bool)
-    for k in range(20):
-        tau = actuator.torque(joint_noise(20, 5.0, k), joint_noise(20, 5.0, k + 100), joint_noise(20, 20.0, k + 200))
-        assert tau.shape == (20, 12)
-        assert (tau.abs() <= limit).all()
-        reached |= (tau.abs() > 0.999 * limit).any(0)
-    assert reached.all()
-
-
-@each("actuator")
-def test_an_actuator_gives_no_torque_without_error_at_rest(entry: Entry) -> None:
-    actuator = entry.target(actuator_setup(3))
-    q = torch.as_tensor(robot.NOMINAL_STANCE).repeat(3, 1)
-    for _ in range(10):
-        assert not actuator.torque(q, q, torch.zeros_like(q)).any()
-
-
-@each("actuator")
-def test_an_actuator_drives_a_robot_the_same_alone_and_in_a_batch(entry: Entry) -> None:
-    batch, alone = entry.target(actuator_setup(5)), [entry.target(actuator_setup(1)) for _ in range(5)]
-    for k in range(30):
-        inputs = joint_noise(5, 0.3, k), joint_noise(5, 0.3, k + 100), joint_noise(5, 3.0, k + 200)
-        if k == 15:
-            batch.reset(torch.tensor([False, True, False, True, False]))
-            for i in (1, 3):
-                alone[i].reset(torch.tensor([True]))
-        together = batch.torque(*inputs)
-        for i in range(5):
-            single = alone[i].torque(*(x[i : i + 1] for x in inputs))
-            assert torch.equal(together[i : i + 1], single), (k, i)
-
-
-@each("actuator")
-def test_an_actuator_continues_from_its_saved_state_and_leaves_its_inputs_alone(entry: Entry) -> None:
-    first, second = entry.target(actuator_setup(3)), entry.target(actuator_setup(3))
-    for k in range(20):
-        inputs = joint_noise(3, 0.3, k), joint_noise(3, 0.3, k + 100), joint_noise(3, 3.0, k + 200)
-        copies = [x.clone() for x in inputs]
-        tau = first.torque(*inputs)
-        assert all(torch.equal(a, b) for a, b in zip(inputs, copies, strict=True))
-        if k >= 10:
-            assert torch.equal(tau, second.torque(*inputs))
-        elif k == 9:
-            second.load_state_dict(first.state_dict())
-
-
-def test_pd_is_the_law_of_the_firmware() -> None:
-    pd = members("actuator")["pd"].target(actuator_setup(1), kp=20.0, kd=0.5)
-    target, q, qd = torch.zeros(3, 1, 12, dtype=torch.float64)
-    target[0, 0], q[0, 0], qd[0, 0] = 0.3, 0.1, -2.0  # 20 x 0.2 + 0.5 x 2
-    qd[0, 1] = 4.0  # -0.5 x 4
-    target[0, 2], target[0, 3], target[0, 4] = 9.0, -9.0, 9.0
-    assert pd.torque(target, q, qd)[0, :6].tolist() == pytest.approx([5.0, -2.0, 35.55, -23.7, 23.7, 0.0])
 
 
 # Commands

@@ -1,0 +1,84 @@
+"""``go1exp record``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from go1exp.cli.app import App, spinner
+from go1exp.registry import ConfigError, Term, bind
+
+RIG = ("robot", "actuator", "effect", "terrain", "backend")
+"""Groups of the configuration that describe the robot to be recorded."""
+
+POLICY = "policy"
+"""The excitation that is a trained policy walking."""
+
+
+def _motions(given: Any) -> tuple[list[Term], list[str]]:
+    """Resolve the excitations, a list of names and of ``{name: {parameter: value}}``; return them and the problems."""
+    if not given or not isinstance(given, list):
+        return [], [f"excitation = {given!r}: must be a list, such as [steps,{{chirp: {{band: [0.2, 5.0]}}}}]"]
+    items = [pair for item in given for pair in (item.items() if isinstance(item, Mapping) else [(item, {})])]
+    bound = [bind("excitation", str(key), value, f"excitation.{key}") for key, value in items]
+    return [term for term, _ in bound if term], [p for _, problems in bound for p in problems]
+
+
+def _task(container: dict[str, Any]) -> None:
+    import go1exp.excitations
+    import go1exp.record.policy  # noqa: F401  (registers every excitation)
+    from go1exp import robot
+    from go1exp.cli.settings import RecordSettings, parse, run_folder
+    from go1exp.config import parse_parts
+    from go1exp.effects.rules import drive_problems, has_gains
+
+    parts, problems = parse_parts(container, RIG)
+    motions, found = _motions(container.get("excitation"))
+    problems += found
+    if parts.get("actuator"):
+        problems += drive_problems(parts["actuator"], parts.get("effect") or (), robot.JOINTS)
+        if not problems and any(m.entry.name != POLICY for m in motions) and not has_gains(parts["actuator"]):
+            problems.append(
+                f"gains: actuator {parts['actuator'].entry.name!r} has none to set; use excitation=[policy]"
+            )
+    rest = {k: v for k, v in container.items() if k not in (*RIG, "excitation")}
+    try:
+        settings = parse(RecordSettings, rest)
+    except ConfigError as error:
+        problems += error.problems
+    else:
+        if any(m.entry.name == POLICY for m in motions) and settings.run is None:
+            problems.append("run: required for excitation=[policy], such as run=runs/NAME")
+    if problems:
+        raise ConfigError(problems)
+    walk = run_folder(settings.run) if settings.run else None
+
+    from go1exp import recording
+    from go1exp.record import plan, simulate
+
+    rig = simulate.Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
+    out = Path(settings.out)
+    driven = [m for m in motions if m.entry.name != POLICY]
+    recordings = []
+    if driven:
+        episodes = plan.episodes(driven, settings)
+        show = spinner(1, f"recording {len(episodes)} episodes")
+        recordings += simulate.play(rig, episodes, settings.sensors, settings.seed, show)
+    if walk and len(driven) < len(motions):
+        from go1exp.evaluate.policy import load_run
+
+        trained, policy, _ = load_run(walk)
+        names = [f"policy_{k}" for k in range(settings.episodes)]
+        show = spinner(1, "recording a policy")
+        recordings += simulate.play_policy(
+            rig, trained.task, policy, names, settings.seconds, settings.sensors, settings.seed, show
+        )
+    for r in recordings:
+        recording.write(out / f"{r.meta.episode}.parquet", r)
+    total = sum(float(r.t[-1] - r.t[0]) for r in recordings)
+    print(f"{len(recordings)} recordings, {total:.0f} s, in {out}")
+    print(f"now: go1exp record audit {out}")
+
+
+APP = App("record", _task)

@@ -1,0 +1,49 @@
+"""A signal as it was some time ago."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+
+from go1exp.memory import Memory
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+class DelayLine(Memory):
+    """The last samples of a signal (N, J), read back at a delay that may be a fraction of the sample period.
+
+    Between two samples it interpolates linearly. Each environment and joint may have a delay of its own. A delay of
+    zero returns the sample itself, bit for bit.
+    """
+
+    memory = ("_past", "_fresh")
+
+    def __init__(
+        self, num_envs: int, joints: int, longest: float, dt: float, dtype: torch.dtype, device: torch.device
+    ) -> None:
+        """Allocate for delays up to ``longest`` s of a signal sampled every ``dt`` s."""
+        self._dt = dt
+        self._depth = math.ceil(longest / dt - 1e-9) + 2
+        self._past = torch.zeros(self._depth, num_envs, joints, dtype=dtype, device=device)
+        self._fresh = torch.ones(num_envs, 1, dtype=torch.bool, device=device)
+
+    def reset(self, mask: Tensor) -> None:
+        """Let the next sample stand for the whole past in the rows of ``mask`` (N,)."""
+        self._fresh |= mask.unsqueeze(1)
+
+    def advance(self, sample: Tensor, delay: Tensor) -> Tensor:
+        """Take the newest ``sample`` (N, J) and return the signal ``delay`` (N, J) or (N, 1) s ago."""
+        self._past[1:] = self._past[:-1].clone()
+        self._past[0] = sample
+        self._past.copy_(torch.where(self._fresh, sample, self._past))
+        self._fresh.zero_()
+        steps = (delay / self._dt).clamp(0.0, self._depth - 1).expand_as(sample)
+        newer = steps.floor().clamp(max=self._depth - 2)
+        share = steps - newer
+        index = newer.long().unsqueeze(0)
+        a, b = self._past.gather(0, index).squeeze(0), self._past.gather(0, index + 1).squeeze(0)
+        return torch.where(share == 0, a, torch.lerp(a, b, share))

@@ -1,0 +1,41 @@
+"""Physical effects that a plain model lacks. Importing the package registers every effect."""
+
+from go1exp.effects import (
+    asymmetric_friction,
+    cogging,
+    command_delay,
+    coulomb,
+    encoder_offset,
+    kd_scale,
+    kp_scale,
+    lag,
+    load_friction,
+    parallel_stiffness,
+    quadratic_drag,
+    strength,
+    strength_drift,
+    stribeck,
+    torque_delay,
+    torque_speed_limit,
+    viscous,
+)
+
+__all__ = [
+    "asymmetric_friction",
+    "cogging",
+    "command_delay",
+    "coulomb",
+    "encoder_offset",
+    "kd_scale",
+    "kp_scale",
+    "lag",
+    "load_friction",
+    "parallel_stiffness",
+    "quadratic_drag",
+    "strength",
+    "strength_drift",
+    "stribeck",
+    "torque_delay",
+    "torque_speed_limit",
+    "viscous",
+]

@@ -1,0 +1,165 @@
+"""What a physical effect is: parameters, a law, and the places where it acts.
+
+One effect is one file with one class. Training, evaluation and the gap workflow use the same object; at its null values
+the robot moves as without it, bit for bit.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from go1exp.drive import DriveSetup, ModelFields
+from go1exp.joint_values import JointValues, each_within, numbers
+from go1exp.memory import Memory
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Param:
+    """One parameter of an effect.
+
+    Attributes:
+        name: also the attribute that holds its values.
+        unit: ``-`` for none.
+        low: smallest value that makes sense.
+        high: largest.
+        null: value at which the effect is absent; a shape parameter, which matters only when another is not null,
+            has its usual value here.
+        tolerance: deviation from ``null`` that a user would not care about; the gap workflow names no effect within it.
+            Infinite for a shape parameter.
+        per: ``joint`` or ``robot``.
+        doc: what it is, in a few words.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    null: float
+    tolerance: float
+    per: Literal["joint", "robot"]
+    doc: str
+
+    @property
+    def annotation(self) -> Any:
+        """Type of the YAML value."""
+        if self.per == "joint":
+            return Annotated[JointValues, each_within(self.low, self.high)]
+        return Annotated[float, Field(ge=self.low, le=self.high)]
+
+
+@dataclass
+class Measured:
+    """What the robot's own sensors say, true values on the way in; what is not measured is None.
+
+    Attributes:
+        joint_pos: (N, J) rad.
+        joint_vel: (N, J) rad/s.
+        gravity: (N, 3) direction of gravity in the IMU's frame, unit length.
+        gyro: (N, 3) rad/s in the IMU's frame.
+        acc: (N, 3) specific force in the IMU's frame, m/s2.
+    """
+
+    joint_pos: Tensor
+    joint_vel: Tensor
+    gravity: Tensor | None = None
+    gyro: Tensor | None = None
+    acc: Tensor | None = None
+
+
+class Effect(Memory):
+    """Base of all effects.
+
+    A subclass lists its ``params``, annotates one attribute for each, and overrides the hooks that it needs and no
+    others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
+
+    On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
+    ``on_target``, ``on_encoder``, the actuator, ``on_drive``, ``on_transmission``, then ``on_joint``, ``on_friction``
+    and ``on_base`` beside it.
+    """
+
+    params: ClassVar[tuple[Param, ...]] = ()
+    fields: ClassVar[tuple[str, ...]] = ()
+    """Model fields that ``edit_model`` writes."""
+    joint_values: ClassVar[tuple[str, ...]] = ()
+    """Parameters with a value per joint (filled in by itself)."""
+    order: ClassVar[int] = 0
+    """Place among the effects of the same hook: smaller is nearer to the command."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.joint_values = tuple(p.name for p in cls.params if p.per == "joint")
+        cls.memory = (*(p.name for p in cls.params), *cls.memory)
+        keyword, positional = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+        cls.__signature__ = inspect.Signature(  # type: ignore[attr-defined]  # the registry's schema
+            [
+                inspect.Parameter("setup", positional),
+                *(inspect.Parameter(p.name, keyword, default=p.null, annotation=p.annotation) for p in cls.params),
+            ]
+        )
+
+    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+        """Spread the values over joints and environments; joints that a mapping leaves out have the null value."""
+        self.setup = setup
+        for p in self.params:
+            given = values.get(p.name, p.null)
+            full = setup.rows(given) if p.per == "joint" else setup.zeros()[:, :1] + float(given)  # type: ignore[arg-type]
+            setattr(self, p.name, full.nan_to_num(nan=p.null))
+
+    # ------------------------------------------------------------------ where an effect may act
+
+    def on_target(self, target: Tensor) -> Tensor:
+        """Return the position target that the drive acts on."""
+        return target
+
+    def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the angle and speed that the drive's encoder reads. Called more than once a step: changes nothing."""
+        return q, qd
+
+    def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gains that the drive really has."""
+        return kp, kd
+
+    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+        """Return the torque that the motor really makes; it is the one that the drive reports. q, qd: the encoder's."""
+        return torque
+
+    def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+        """Return the torque that reaches the joint, whose true angle and speed are q and qd."""
+        return torque
+
+    def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Return a further torque that acts on the joint and is not the drive's."""
+        raise NotImplementedError
+
+    def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:
+        """Return the bound of the joint's dry friction under the drive's ``torque``; ``bound`` is that so far."""
+        return bound
+
+    def on_base(self, force: Tensor) -> Tensor:
+        """Return the external force (N, 3) on the trunk's origin, world frame, N; ``force`` is that so far."""
+        return force
+
+    def on_sensor(self, measured: Measured) -> Measured:
+        """Change what the robot's sensors say, as policy and logger see it (encoders are ``on_encoder``'s)."""
+        return measured
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Change ``fields`` of the model in place, every row; they hold the values without this effect."""
+
+    def reset(self, mask: Tensor) -> None:
+        """Begin a new episode in the rows of ``mask`` (N,)."""
+
+
+def is_null(kind: type[Effect], values: Mapping[str, JointValues]) -> bool:
+    """Return whether an effect with these settings is absent everywhere."""
+    sizes = [p for p in kind.params if p.tolerance != math.inf]
+    return all(v == p.null for p in sizes for v in numbers(values.get(p.name, p.null)))

@@ -1,0 +1,27 @@
+"""``effect=kp_scale``: the drives' position gain is off."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from go1exp.effects.base import Effect, Param
+from go1exp.registry import effect
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@effect("kp_scale", gains=True)
+class KpScale(Effect):
+    """The drives' position gain is a multiple of the configured one: kp = scale kp.
+
+    Walk-these-ways randomises 0.8 to 1.3; +-5 to 30 % are likely (a judgement). At rest it cannot be told from
+    ``strength``, in a narrow band not from ``command_delay``. New values count from ``Plant.refresh`` on.
+    """
+
+    params = (Param("scale", "-", 0.2, 2.0, 1.0, 0.1, "joint", "real gain over configured gain"),)
+    scale: Tensor
+
+    def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gains with the real kp."""
+        return kp * self.scale, kd

@@ -1,0 +1,56 @@
+"""What a configuration of drives and effects must satisfy beyond each one's own schema."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from go1exp.joint_values import spread
+from go1exp.registry import Term, members, unknown_name
+
+
+def drives(actuator: Term) -> Iterator[tuple[Term, str]]:
+    """Yield the actuator and, if it is a wrapper, those in it from the outside in, each with its key path."""
+    term, path = actuator, "actuator"
+    yield term, path
+    while inner := term.parameters.get("drive"):
+        parameters = {k: v for k, v in inner.items() if k != "term"}
+        term, path = Term("drive", members("actuator")[inner["term"]], parameters), f"{path}.drive"
+        yield term, path
+
+
+def has_gains(actuator: Term) -> bool:
+    """Return whether the drive has a position and a speed gain; a wrapper has those of the ``drive`` in it."""
+    *_, (innermost, _) = drives(actuator)
+    return bool(innermost.entry.traits.get("gains"))
+
+
+def _values_problems(term: Term, path: str, joints: Sequence[str]) -> list[str]:
+    """Return what is wrong with the joints that a term's values name."""
+    problems = []
+    for name, value in term.parameters.items():
+        if isinstance(value, dict | tuple) and name in getattr(term.entry.target, "joint_values", ()):
+            try:
+                full = spread(value, joints)
+            except ValueError as error:
+                problems.append(f"{path}.{name} = {value!r}: {error}")
+                continue
+            left_out = [j for j, missing in zip(joints, np.isnan(full), strict=True) if missing]
+            if left_out and term.entry.group == "actuator" and term.entry.parameters[name].default is not None:
+                problems.append(f"{path}.{name} = {value!r}: gives {', '.join(left_out)} no value")
+    return problems
+
+
+def drive_problems(actuator: Term, effects: Iterable[Term], joints: Sequence[str]) -> list[str]:
+    """Return what is wrong with actuator and effects together, one line each with its key path."""
+    problems = [problem for term, path in drives(actuator) for problem in _values_problems(term, path, joints)]
+    for term in effects:
+        path = f"effect.{term.key}"
+        problems += _values_problems(term, path, joints)
+        for name in term.slots.get("spread", ()):
+            if name not in term.parameters:
+                problems.append(unknown_name(f"{path}.spread.{name}", name, term.parameters, "parameter"))
+        if term.entry.traits.get("gains") and not has_gains(actuator):
+            problems.append(f"{path}: changes kp or kd, and actuator {actuator.entry.name!r} has neither")
+    return problems

@@ -1,0 +1,168 @@
+"""The robot below the policy: position targets in, motion out, one physics step at a time.
+
+Training, evaluation, recording and identification all step this, so that an effect means the same to each.
+
+Numerics. MuJoCo's Euler step is a leapfrog: qpos belongs to the step's instant, qvel to half a step before it. A drive
+that took both at face value would react half a step late to speed and half a step early to its target, which at 2 ms
+moves a 0.2 rad step by 5 mrad against 0.25 ms. So the drive gets the speed extrapolated to the instant of qpos, and a
+target that changes counts for half of the step in which it changes: second order in the step, 0.3 mrad.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.actuator.setup import Actuator
+from go1exp.drive import DriveSetup
+from go1exp.effects.base import Measured
+from go1exp.effects.stack import EffectStack
+from go1exp.physics.backend import PhysicsBackend
+from go1exp.randomness import EnvRandom
+from go1exp.registry import Term
+from go1exp.robot import RobotConfig
+from go1exp.types import Snapshot
+
+FRICTION = "dof_frictionloss"
+
+
+def drive_setup(config: RobotConfig, physics_dt: float, backend: PhysicsBackend, random: EnvRandom) -> DriveSetup:
+    """Describe the Go1's drives on ``backend``."""
+
+    def spread(hip_thigh_calf: tuple[float, float, float]) -> Tensor:
+        return torch.as_tensor(robot.per_joint(hip_thigh_calf), dtype=like.dtype, device=like.device)
+
+    like = backend.qpos
+    return DriveSetup(
+        num_envs=backend.num_envs,
+        physics_dt=physics_dt,
+        joints=robot.JOINTS,
+        effort_limit=spread(config.effort_limit),
+        velocity_limit=spread(config.velocity_limit),
+        armature=spread(config.armature),
+        random=random,
+        device=like.device,
+        dtype=like.dtype,
+        floating=like.shape[1] > robot.NUM_JOINTS,
+    )
+
+
+class Plant:
+    """N robots with their drives and effects on a physics backend.
+
+    Attributes:
+        q: (N, J) true joint angles, live, rad.
+        qd: (N, J) true joint speeds half a step before ``q``, live, rad/s.
+        torque: (N, J) what the drives made in the last step, N m.
+        actuator: the drives.
+        effects: what else acts.
+        enabled: (N,) bool, which robots' drives are on, or None for all.
+        observer: called before every step with the target (N, J) that takes force in it.
+    """
+
+    enabled: Tensor | None = None
+    observer: Callable[[Tensor], None] | None = None
+
+    def __init__(self, backend: PhysicsBackend, setup: DriveSetup, actuator: Term, effects: Sequence[Term]) -> None:
+        """Put drives and effects on ``backend``, whose last J coordinates are the joints."""
+        self.backend, self._dt = backend, setup.physics_dt
+        joints = len(setup.joints)
+        self._joints = slice(backend.qvel.shape[1] - joints, None)
+        self.q, self.qd = backend.qpos[:, -joints:], backend.qvel[:, -joints:]
+        self.actuator: Actuator = actuator(setup)
+        self._gains = [getattr(self.actuator, name).clone() for name in ("kp", "kd") if hasattr(self.actuator, name)]
+        self.effects = EffectStack(effects, setup)
+        self.torque = setup.zeros()
+        self._before, self._target, self._bound = setup.zeros(), setup.zeros(), setup.zeros()
+        for name in self.effects.fields:
+            backend.field(name)
+        if self.effects.acts("on_friction"):
+            backend.field(FRICTION)
+
+    def set_gains(self, kp: Tensor, kd: Tensor) -> None:
+        """Give each robot gains (N, J) of its own; effects on gains act on top of them."""
+        for own, given in zip(self._gains, (kp, kd), strict=True):
+            own.copy_(given)
+        self.actuator.kp.copy_(kp)  # type: ignore[attr-defined]  # has gains, or there would be none to unpack
+        self.actuator.kd.copy_(kd)  # type: ignore[attr-defined]
+        self.effects.set_gains(self.actuator, *self._gains)
+
+    def startup(self) -> None:
+        """Draw the robots' effects and put them into the model."""
+        self.effects.draw()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Put the effects' present values into the model and the drives."""
+        if self.effects.fields:
+            self.backend.rebase(self.effects.model_values(self.backend.compiled, self.backend.ids))
+            self.backend.derive_constants(torch.ones(len(self.q), dtype=torch.bool, device=self.q.device))
+        if self._gains:
+            self.effects.set_gains(self.actuator, *self._gains)
+        if self.effects.acts("on_friction"):
+            self._bound.copy_(self.backend.nominal(FRICTION)[:, self._joints])
+
+    def reset(self, mask: Tensor, target: Tensor) -> None:
+        """Begin anew in the rows of ``mask`` (N,), whose state is set, with ``target`` (N, J) long in force."""
+        rows = mask.unsqueeze(1)
+        self._before.copy_(torch.where(rows, self.qd, self._before))
+        self._target.copy_(torch.where(rows, target, self._target))
+        self.torque.masked_fill_(rows, 0.0)
+        self.actuator.reset(mask)
+        self.effects.reset(mask)
+
+    def speed(self) -> Tensor:
+        """(N, J) joint speeds at the instant of ``q``, rad/s."""
+        return torch.lerp(self._before, self.qd, 1.5)
+
+    def step(self, target: Tensor) -> None:
+        """Advance one physics step; ``target`` (N, J), rad, is in force from now on."""
+        if self.observer:
+            self.observer(target)
+        effects, q, qd = self.effects, self.q, self.speed()
+        self._before.copy_(self.qd)
+        command = effects.on_target(torch.lerp(self._target, target, 0.5))
+        self._target.copy_(target)
+        encoder = effects.on_encoder(q, qd)
+        self.torque.copy_(effects.on_drive(self.actuator.torque(command, *encoder), *encoder))
+        if self.enabled is not None:
+            self.torque.mul_(self.enabled.unsqueeze(1))
+        if effects.acts("on_joint"):
+            self.backend.applied()[:, self._joints] = effects.on_joint(q, qd)
+        if effects.acts("on_friction"):
+            self.backend.field(FRICTION)[:, self._joints] = effects.on_friction(self._bound, self.torque, qd)
+        if effects.acts("on_base"):
+            force = self.backend.applied()[:, :3]
+            force.copy_(effects.on_base(torch.zeros_like(force)))
+        self.backend.step(effects.on_transmission(self.torque, q, qd))
+
+    def joint_acceleration(self) -> Tensor:
+        """(N, J) change of joint speed over the last step, rad/s2."""
+        return (self.qd - self._before) / self._dt
+
+    def sense(self, s: Snapshot) -> Snapshot:
+        """Replace the truth about the present moment by what the robots' sensors say of it."""
+        seen = self.effects.measure(Measured(self.q, self.qd, s.projected_gravity_b, s.base_ang_vel_b))
+        assert seen.gravity is not None
+        assert seen.gyro is not None
+        joints = {"joint_pos": seen.joint_pos.float(), "joint_vel": seen.joint_vel.float()}
+        return dataclasses.replace(s, **joints, projected_gravity_b=seen.gravity, base_ang_vel_b=seen.gyro)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the drives and effects remember."""
+        own = {name: getattr(self, f"_{name}").clone() for name in ("before", "target", "bound")}
+        parts = {"actuator": self.actuator.state_dict(), "effects": self.effects.state_dict()}
+        return {**own, "torque": self.torque.clone(), **parts}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``; the backend holds the model."""
+        for name in ("before", "target", "bound"):
+            getattr(self, f"_{name}").copy_(state[name])
+        self.torque.copy_(state["torque"])
+        self.actuator.load_state_dict(state["actuator"])
+        self.effects.load_state_dict(state["effects"])

@@ -1,0 +1,57 @@
+"""Recordings of other tools and robots, turned into the format of ``go1exp.recording``: one file, one source.
+
+An importer is ``f(path, *, options) -> list[Recording]``; ``path`` is a file of its source, or a folder of them. It
+maps what the source measured, keeps the source's known flaws in ``notes``, and never makes up a channel. Importing
+the package registers every importer, from this explicit list.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from go1exp.importers import (
+    ak80_double_pendulum,
+    go1_walk_snippet,
+    go2_in_air,
+    mcap_joint_state,
+    scaler_walk_mocap,
+    servo_pendulum_xl330,
+    so101_arm,
+)
+from go1exp.recording import Recording
+from go1exp.registry import ConfigError, members, unknown_name
+
+__all__ = [
+    "ak80_double_pendulum",
+    "go1_walk_snippet",
+    "go2_in_air",
+    "import_recordings",
+    "mcap_joint_state",
+    "scaler_walk_mocap",
+    "servo_pendulum_xl330",
+    "so101_arm",
+]
+
+
+def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list[Recording]:
+    """Read recordings of another source.
+
+    Args:
+        name: a registered importer.
+        path: a file of that source, or a folder that holds some.
+        options: what the importer lets you choose; the rest keeps its defaults.
+
+    Raises:
+        ConfigError: if there is no such importer, or it has no such option or value.
+        RecordingError: if a file is missing, damaged or lacks something.
+    """
+    entry = members("importer").get(name)
+    if entry is None:
+        raise ConfigError([unknown_name("importer", name, members("importer"), "importer")])
+    values, problems = entry.check(options, f"importer.{name}")
+    if problems:
+        raise ConfigError(problems)
+    found: list[Recording] = entry.target(Path(path), **values)
+    return found

@@ -1,0 +1,104 @@
+"""From what a user wants recorded to the list of episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field
+
+from go1exp import robot
+from go1exp.excitations import Motion
+from go1exp.record.sensors import SensorConfig
+from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, Term
+
+SOFT_LIMIT = 0.95
+"""Share of the joint ranges that motions may use."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One recording to make.
+
+    Attributes:
+        name: unique in its set.
+        excitation: name of the motion.
+        motion: what to command, at the logger's rate.
+        kp: position gain, N m/rad.
+        kd: speed gain, N m s/rad.
+        hang: roll and pitch at which a held trunk hangs, rad; None on the ground.
+        repeat_of: name of the episode that this one repeats.
+        seed: of the logger's noise.
+    """
+
+    name: str
+    excitation: str
+    motion: Motion
+    kp: float
+    kd: float
+    hang: tuple[float, float] | None
+    repeat_of: str | None
+    seed: int
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What is to be recorded; ``conf/record.yaml`` says what each means.
+
+    ``gains`` are pairs kp (N m/rad), kd (N m s/rad); ``seconds`` the length of an episode; ``hang`` pairs of roll and
+    pitch, rad.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    gains: tuple[tuple[NonNegative, NonNegative], ...]
+    seconds: Positive
+    seeds: tuple[Annotated[int, Field(ge=0)], ...]
+    repeats: Annotated[int, Field(ge=0)]
+    support: Literal["auto", "hung", "ground"]
+    hang: tuple[tuple[float, float], ...]
+    seed: Annotated[int, Field(ge=0)]
+    sensors: SensorConfig
+
+
+def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion:
+    """Return the motion of an excitation for the Go1, about its nominal stance."""
+    t = np.arange(round(seconds * rate_hz)) / rate_hz
+    motion: Motion = term(t, robot.NOMINAL_STANCE.copy(), robot.soft_limits(SOFT_LIMIT), np.random.default_rng(seed))
+    return motion
+
+
+def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
+    """Return every motion x seed x base x gain set, and the repetitions.
+
+    Raises:
+        ConfigError: if a motion cannot be made on the base that is wanted.
+    """
+    found: list[Episode] = []
+    for term in terms:
+        for seed in wishes.seeds:
+            motion = make_motion(term, wishes.seconds, wishes.sensors.rate_hz, seed)
+            if wishes.support != "auto" and motion.support not in ("either", wishes.support):
+                raise ConfigError([f"support = {wishes.support!r}: {term.key} is for a robot that is {motion.support}"])
+            support = motion.support if wishes.support == "auto" else wishes.support
+            for base in (None,) if support == "ground" else wishes.hang:
+                for kp, kd in wishes.gains:
+                    name = f"{term.key}_kp{kp:g}_kd{kd:g}_{seed}"
+                    if base is not None and len(wishes.hang) > 1:
+                        name += f"_roll{base[0]:g}_pitch{base[1]:g}"
+                    found.append(Episode(name, term.entry.name, motion, kp, kd, base, None, _seed(wishes, len(found))))
+    sets = dict.fromkeys((e.kp, e.kd) for e in found)
+    firsts = [next(e for e in found if (e.kp, e.kd) == gains) for gains in sets]
+    for e in firsts:
+        for k in range(wishes.repeats):
+            name = f"{e.name}_repeat{k + 1}"
+            again = Episode(name, e.excitation, e.motion, e.kp, e.kd, e.hang, e.name, _seed(wishes, len(found)))
+            found.append(again)
+    return found
+
+
+def _seed(wishes: Wishes, index: int) -> int:
+    """Return a seed for the noise of one recording."""
+    return int(np.random.SeedSequence([wishes.seed, index]).generate_state(1)[0])

@@ -1,0 +1,101 @@
+"""What a Go1's logger makes of the truth: rates, steps, noise, an uneven clock, and only what the robot measures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import ConfigDict, Field
+
+from go1exp import robot
+from go1exp.recording import VECTORS, joint_channels
+from go1exp.registry import STRICT, Fraction, NonNegative, Positive
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Errors of one kind of channel: standard deviation of white noise, and the step of its values (0 for none)."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    noise: NonNegative
+    step: NonNegative
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The logger.
+
+    Attributes:
+        rate_hz: samples per second (the vendor's SDK: 500).
+        jitter: standard deviation of the lateness of a time stamp, s.
+        dropped: share of the samples that get lost.
+        q: joint angle, rad.
+        qd: joint speed, rad/s.
+        tau_est: torque that the drive reports, N m.
+        gyro: rad/s.
+        acc: m/s2.
+        attitude: error of the reported attitude as a small rotation, rad (its ``step`` is of the quaternion).
+        foot_force: N.
+        truth: also write the base's true position and velocity, as motion capture would.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    rate_hz: Positive
+    jitter: NonNegative
+    dropped: Annotated[Fraction, Field(lt=0.9)]
+    q: Channel
+    qd: Channel
+    tau_est: Channel
+    gyro: Channel
+    acc: Channel
+    attitude: Channel
+    foot_force: Channel
+    truth: bool
+
+
+def _spoil(true: np.ndarray, channel: Channel, rng: np.random.Generator) -> np.ndarray:
+    noisy = true + channel.noise * rng.standard_normal(true.shape)
+    return np.round(noisy / channel.step) * channel.step if channel.step else noisy
+
+
+def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return the channels of a recording.
+
+    Args:
+        true: samples on an even clock: ``q``, ``qd``, ``q_target``, ``tau_est`` (T, J), ``gyro``, ``acc`` (T, 3) and
+            ``quat`` (T, 4) of the IMU, ``foot_force`` (T, 4), ``torque_enable`` (T,), and for the ground truth
+            ``base_pos``, ``base_quat``, ``base_lin_vel``, ``base_ang_vel``.
+        config: the logger.
+        rng: of its noise.
+    """
+    from scipy.spatial.transform import Rotation  # slow to import, and settings are checked first
+
+    rows = len(true["q"])
+    dt = 1.0 / config.rate_hz
+    # A stamp is late by the bus, never early, and a late sample does not overtake the next.
+    late = np.minimum(np.abs(config.jitter * rng.standard_normal(rows)), 0.9 * dt)
+    found: dict[str, np.ndarray] = {"t": np.arange(rows) * dt + late}
+    for name in ("q", "qd", "tau_est"):
+        spoilt = _spoil(true[name], getattr(config, name), rng)
+        found |= dict(zip(joint_channels(name, robot.JOINTS), spoilt.T, strict=True))
+    found |= dict(zip(joint_channels("q_target", robot.JOINTS), true["q_target"].T, strict=True))
+    for name in ("gyro", "acc"):
+        found |= dict(zip(VECTORS[f"imu_{name}"], _spoil(true[name], getattr(config, name), rng).T, strict=True))
+    error = Rotation.from_rotvec(config.attitude.noise * rng.standard_normal((rows, 3)))
+    attitude = Rotation.from_quat(true["quat"], scalar_first=True) * error
+    found |= dict(zip(VECTORS["imu_quat"], attitude.as_quat(canonical=True, scalar_first=True).T, strict=True))
+    forces = np.maximum(_spoil(true["foot_force"], config.foot_force, rng), 0.0)
+    found |= {f"foot_force_{leg}": forces[:, k] for k, leg in enumerate(robot.LEGS)}
+    if not true["torque_enable"].all():
+        found["torque_enable"] = true["torque_enable"].astype(bool)
+    if config.truth:
+        for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel"):
+            if name in true:
+                found |= dict(zip(VECTORS[name], true[name].T, strict=True))
+    kept = rng.random(rows) >= config.dropped
+    kept[0] = True
+    return {name: np.ascontiguousarray(values[kept]) for name, values in found.items()}

@@ -1,0 +1,215 @@
+"""Drive simulated robots through motions and return what their loggers wrote."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from go1exp import __version__, robot
+from go1exp.config import BackendConfig, TaskConfig
+from go1exp.env.core import Go1Core, make_backend
+from go1exp.env.plant import Plant, drive_setup
+from go1exp.joint_values import spread
+from go1exp.physics.scene import build_model
+from go1exp.randomness import EnvRandom
+from go1exp.record.plan import Episode
+from go1exp.record.sensors import SensorConfig, log
+from go1exp.record.tape import Tape
+from go1exp.recording import Meta, Recording
+from go1exp.registry import Term
+from go1exp.robot import RobotConfig
+from go1exp.terrain import TerrainConfig, build_terrain
+
+SETTLE_S = 1.0
+"""Time for which the first target is held before the recording begins, s (not before a drop)."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The robots of a recording: what they are, how they are driven, and the step at which they are simulated, s."""
+
+    robot: RobotConfig
+    actuator: Term
+    effect: tuple[Term, ...]
+    terrain: TerrainConfig
+    backend: BackendConfig
+    physics_dt: float
+
+
+def held_quat(hang: tuple[float, float]) -> tuple[float, float, float, float]:
+    """Return the attitude w-x-y-z of a trunk that hangs with this roll and pitch, rad (about x, then about y)."""
+    w, x, y, z = Rotation.from_euler("xyz", [*hang, 0.0]).as_quat(scalar_first=True)
+    return float(w), float(x), float(y), float(z)
+
+
+def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
+    """Simulate episodes side by side and return their recordings, in the same order.
+
+    All must last equally long. Those that hang alike, or stand, share a batch. ``on_step`` is told the progress.
+    """
+    found: dict[str, Recording] = {}
+    places = list(dict.fromkeys((e.hang, e.motion.height > 0) for e in episodes))
+    for k, place in enumerate(places):
+        group = [e for e in episodes if (e.hang, e.motion.height > 0) == place]
+
+        def part(done: int, total: int, k: int = k) -> None:
+            on_step(k * total + done, len(places) * total)
+
+        found |= {r.meta.episode: r for r in _play_alike(rig, group, sensors, seed, part)}
+    return [found[e.name] for e in episodes]
+
+
+def _play_alike(
+    rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress
+) -> list[Recording]:
+    """Simulate episodes that share a base."""
+    n, hang = len(episodes), episodes[0].hang
+    model, blocks = build_model(
+        rig.robot,
+        build_terrain(rig.terrain),
+        rig.physics_dt,
+        imu=True,
+        held=None if hang is None else held_quat(hang),
+    )
+    backend = make_backend(rig.backend, model, blocks, n)
+    random = EnvRandom(seed, n, device=backend.qpos.device)
+    plant = Plant(backend, drive_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
+    kp, kd = (torch.tensor([[getattr(e, g)] for e in episodes], dtype=plant.q.dtype) for g in ("kp", "kd"))
+    plant.set_gains(kp.expand_as(plant.q), kd.expand_as(plant.q))
+    plant.startup()
+
+    targets = torch.as_tensor(np.stack([e.motion.target for e in episodes], axis=1), dtype=plant.q.dtype)
+    enabled = torch.as_tensor(np.stack([e.motion.torque_enable for e in episodes], axis=1))
+    everyone = torch.ones(n, dtype=torch.bool)
+    qpos, qvel = torch.zeros_like(backend.qpos), torch.zeros_like(backend.qvel)
+    qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(np.stack([e.motion.start for e in episodes]))
+    if hang is None:
+        qpos[:, 2] = robot.NOMINAL_HEIGHT + torch.tensor([e.motion.height for e in episodes])
+        qpos[:, 3] = 1.0
+    backend.reset(everyone, qpos, qvel)
+    start = qpos[:, -robot.NUM_JOINTS :].clone()
+    plant.reset(everyone, start)
+    per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
+    if episodes[0].motion.height == 0:
+        for _ in range(round(SETTLE_S / rig.physics_dt)):
+            plant.step(start)
+        plant.effects.reset(everyone)  # what drifts within an episode begins with it
+
+    rows = len(targets)
+    soft = torch.tensor([[e.motion.soft_start] for e in episodes], dtype=plant.q.dtype)
+    since, origin = torch.full_like(soft, torch.inf), start.clone()
+    tape = Tape(plant, per_sample, rows)
+    plant.enabled = enabled[0]
+    for row in range(rows):
+        back_on = (enabled[row] & ~plant.enabled).unsqueeze(1)
+        since = torch.where(back_on, 0.0, since + 1.0 / sensors.rate_hz)
+        origin = torch.where(back_on, plant.q, origin)
+        share = (since / soft.clamp(min=1e-9)).clamp(max=1.0)
+        target = torch.lerp(origin, targets[row], share)
+        plant.enabled = tape.enabled = enabled[row]
+        for _ in range(per_sample):
+            plant.step(target)
+        if row % 100 == 99 or row + 1 == rows:
+            on_step(row + 1, rows)
+    tape.stop()
+    return [_recording(rig, sensors, e, tape.true(k)) for k, e in enumerate(episodes)]
+
+
+def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[str, np.ndarray]) -> Recording:
+    """Write one robot's log."""
+    return Recording(
+        meta(
+            rig.robot,
+            sensors,
+            base="floating" if episode.hang is None else "fixed",
+            base_quat=None if episode.hang is None else held_quat(episode.hang),
+            kp=(episode.kp,) * robot.NUM_JOINTS,
+            kd=(episode.kd,) * robot.NUM_JOINTS,
+            excitation=episode.excitation,
+            episode=episode.name,
+            repeat_of=episode.repeat_of,
+        ),
+        log(true, sensors, np.random.default_rng(episode.seed)),
+    )
+
+
+def meta(config: RobotConfig, sensors: SensorConfig, **changes: Any) -> Meta:
+    """Describe a recording of a simulated Go1; nothing in it tells which effects it has."""
+    limit = tuple(float(v) for v in robot.per_joint(config.effort_limit))
+    usual: dict[str, Any] = {"robot": "go1", "joints": robot.JOINTS, "rate_hz": sensors.rate_hz, "tau_limit": limit}
+    about: dict[str, Any] = {"source": "simulated", "tool": "go1exp record", "notes": ""}
+    versions = {"go1exp": __version__, "mujoco": version("mujoco-core")}
+    return Meta(**usual, **about, versions=versions, **changes)
+
+
+def policy_task(rig: Rig, trained: TaskConfig, seconds: float) -> TaskConfig:
+    """Return the task in which a policy is recorded: the rig's robot under the commands of training, on flat ground."""
+    period = trained.sim.policy_dt
+    sim = dataclasses.replace(
+        trained.sim, physics_dt=rig.physics_dt, episode_s=(round(seconds / period) + 2) * period, spread_starts=False
+    )
+    parts = {f.name: getattr(rig, f.name) for f in dataclasses.fields(rig) if f.name != "physics_dt"}
+    return dataclasses.replace(trained, sim=sim, rand=(), event=(), curriculum=(), **parts)
+
+
+def play_policy(
+    rig: Rig,
+    trained: TaskConfig,
+    policy: Callable[[torch.Tensor], torch.Tensor],
+    names: Sequence[str],
+    seconds: float,
+    sensors: SensorConfig,
+    seed: int,
+    on_step: Progress,
+) -> list[Recording]:
+    """Let a policy walk under random commands, one robot for each of ``names``, and return the recordings.
+
+    A robot that falls is recorded up to its fall.
+    """
+    core = Go1Core(policy_task(rig, trained, seconds), len(names), seed, imu=True)
+    observation = core.reset()
+    per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
+    samples_per_step = round(core.task.sim.policy_dt * sensors.rate_hz)
+    steps = round(seconds / core.task.sim.policy_dt)
+    tape = Tape(core.plant, per_sample, steps * samples_per_step)
+    rows = np.full(len(names), steps * samples_per_step)
+    walking = torch.ones(len(names), dtype=torch.bool)
+    for step in range(steps):
+        result = core.step(policy(observation))
+        observation = result.observation
+        fell = walking & (result.terminated | result.truncated)
+        rows[fell.numpy()] = (step + 1) * samples_per_step
+        walking &= ~fell
+        on_step(step + 1, steps)
+    tape.stop()
+    found = []
+    for k, name in enumerate(names):
+        true = {key: values[: rows[k]] for key, values in tape.true(k).items()}
+        about = meta(
+            rig.robot,
+            sensors,
+            base="floating",
+            base_quat=None,
+            kp=_configured(rig.actuator, "kp"),
+            kd=_configured(rig.actuator, "kd"),
+            excitation="policy",
+            episode=name,
+            repeat_of=None,
+        )
+        found.append(Recording(about, log(true, sensors, np.random.default_rng([seed, k]))))
+    return found
+
+
+def _configured(actuator: Term, gain: str) -> tuple[float, ...] | None:
+    """Return a gain as it is configured (not as effects make it), per joint; None if the actuator has none."""
+    value = actuator.parameters.get(gain)
+    return None if value is None else tuple(float(v) for v in spread(value, robot.JOINTS))

@@ -1,0 +1,496 @@
+"""What every effect promises, whichever it is: a new one is tested here by being registered.
+
+The robots hang in the air or stand on the ground, below the policy (``env/plant.py``), and follow large, fast targets.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import mujoco
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from go1exp import data_root, robot
+from go1exp.compose import compose
+from go1exp.config import MANY_TERMS, TaskConfig, parse_task
+from go1exp.drive import DriveSetup
+from go1exp.effects.base import Effect, Measured, Param, is_null
+from go1exp.effects.stack import HOOKS
+from go1exp.env.core import Go1Core
+from go1exp.env.plant import Plant, drive_setup
+from go1exp.joint_values import spread
+from go1exp.mdp.derived import rotate_inverse
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import Sensors, build_model
+from go1exp.randomness import EnvRandom
+from go1exp.registry import Entry, Term, bind, members
+from go1exp.terrain import build_terrain
+
+DT = 0.002
+EFFECTS = members("effect")
+each = pytest.mark.parametrize("entry", EFFECTS.values(), ids=EFFECTS.keys())
+
+PROBES: dict[tuple[str, str], float] = {
+    ("torque_speed_limit", "peak"): 0.3,
+    ("torque_speed_limit", "droop"): 2.0,
+    ("strength_drift", "rate"): 0.2,
+}
+"""Sensible values, not null, where five tolerances would not show: an effect with a threshold, one that needs time."""
+
+BRAKES = ("asymmetric_friction", "coulomb", "load_friction", "quadratic_drag", "stribeck", "viscous")
+"""Effects that may only take energy from the joints."""
+
+FLOORS = {"q": 5e-4, "qd": 0.05, "torque": 0.1, "gravity": 2e-3, "gyro": 0.02, "acc": 0.2, "pos": 1e-3, "vel": 0.01}
+"""What a good sensor tells from noise: rad, rad/s, N m, -, rad/s, m/s2; of motion capture: m, m/s."""
+
+
+# ---------------------------------------------------------------------- robots to try effects on
+
+
+@cache
+def task() -> TaskConfig:
+    return parse_task(compose("train", ["backend.threads=1"]))
+
+
+@cache
+def compiled(held: bool) -> tuple[mujoco.MjModel, Sensors]:
+    ground = build_terrain(task().terrain)
+    return build_model(task().robot, ground, DT, imu=True, held=(1.0, 0.0, 0.0, 0.0) if held else None)
+
+
+def term(name: str, values: Mapping[str, Any]) -> Term:
+    """Bind an effect as a configuration does; raise what is wrong with it."""
+    bound, problems = bind("effect", name, values, f"effect.{name}", MANY_TERMS["effect"])
+    assert bound, problems
+    return bound
+
+
+class Rig:
+    """N robots on a stand, or on the ground, with effects."""
+
+    def __init__(self, n: int, effects: Sequence[Term], *, held: bool, first_env: int = 0) -> None:
+        model, sensors = compiled(held)
+        self.backend = MujocoCpu(model, sensors, n, 1)
+        self.random = EnvRandom(3, n, first_env)
+        setup = drive_setup(task().robot, DT, self.backend, self.random)
+        self.held, self.plant, self.clock = held, Plant(self.backend, setup, task().actuator, effects), 0
+        self.plant.startup()
+        self.stance = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float64).repeat(n, 1)
+        self.reset(torch.ones(n, dtype=torch.bool))
+
+    def reset(self, mask: Tensor) -> None:
+        qpos, qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
+        qpos[:, -robot.NUM_JOINTS :] = self.stance
+        if not self.held:
+            qpos[:, 2], qpos[:, 3] = 0.31, 1.0
+        self.backend.reset(mask, qpos, qvel)
+        self.plant.reset(mask, self.stance)
+
+    def step(self) -> dict[str, Tensor]:
+        """Advance one step and return the truth and what the sensors say."""
+        t, k = self.clock * DT, torch.arange(robot.NUM_JOINTS, dtype=torch.float64)
+        swing = 0.25 * torch.sin(2.0 * math.pi * (1.5 + 0.1 * k) * t + k)
+        jump = 0.6 * torch.sign(torch.sin(2.0 * math.pi * 4.0 * t + 0.8 * k)) if self.held else 0.0
+        self.plant.step(self.stance + swing + jump)
+        self.clock += 1
+        b, blocks = self.backend, self.backend.sensors
+        down = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(b.qpos), 3)
+        gravity = rotate_inverse(b.sensordata[:, blocks.imu_quat], down)
+        gyro, acc = b.sensordata[:, blocks.imu_gyro], b.sensordata[:, blocks.imu_acc]
+        seen = self.plant.effects.measure(Measured(self.plant.q, self.plant.speed(), gravity, gyro, acc))
+        assert seen.gravity is not None
+        assert seen.gyro is not None
+        assert seen.acc is not None
+        read = {"q": seen.joint_pos, "qd": seen.joint_vel, "torque": self.plant.torque}
+        read |= {"gravity": seen.gravity, "gyro": seen.gyro, "acc": seen.acc}
+        read |= {"true_q": self.plant.q, "true_qd": self.plant.qd}
+        if not self.held:
+            read |= {"pos": b.qpos[:, :3], "vel": b.qvel[:, :3]}
+        return {name: value.clone() for name, value in read.items()}
+
+    def run(self, steps: int) -> dict[str, Tensor]:
+        """Advance and return every reading (steps, N, ...)."""
+        readings = [self.step() for _ in range(steps)]
+        return {name: torch.stack([r[name] for r in readings]) for name in readings[0]}
+
+    def write(self, name: str, row: int, values: Mapping[str, float]) -> None:
+        """Change one robot's values of an effect, as an identification does."""
+        for key, value in values.items():
+            getattr(self.plant.effects.effects[name], key)[row] = value
+
+    def state_dict(self) -> dict[str, Any]:
+        parts = {"backend": self.backend, "plant": self.plant, "random": self.random}
+        return {"clock": self.clock, **{key: part.state_dict() for key, part in parts.items()}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.clock = state["clock"]
+        self.backend.load_state_dict(state["backend"])
+        self.plant.load_state_dict(state["plant"])
+        self.random.load_state_dict(state["random"])
+
+
+def same(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> list[str]:
+    """Return the readings that are not equal bit for bit."""
+    return [name for name in a if not torch.equal(a[name], b[name])]
+
+
+def sizes(entry: Entry) -> list[Param]:
+    """Return the parameters that make an effect present."""
+    return [p for p in kind(entry).params if p.tolerance != math.inf]
+
+
+def kind(entry: Entry) -> type[Effect]:
+    assert isinstance(entry.target, type)
+    assert issubclass(entry.target, Effect)
+    return entry.target
+
+
+def probe(entry: Entry, p: Param) -> float:
+    """Return a sensible value that is not null: five tolerances, as far as the bounds go."""
+    step = 5.0 * p.tolerance
+    return PROBES.get((entry.name, p.name), min(p.null + step, p.high) if p.null < p.high else max(p.null - step, p.low))
+
+
+def probes(entry: Entry) -> dict[str, float]:
+    """Return such a value for every size."""
+    return {p.name: probe(entry, p) for p in sizes(entry)}
+
+
+def overrides(entry: Entry, hook: str) -> bool:
+    return getattr(kind(entry), hook) is not getattr(Effect, hook)
+
+
+def places(entry: Entry) -> tuple[bool, ...]:
+    """Return where an effect can be tried: on the stand and on the ground; a held trunk feels no force."""
+    return (False,) if overrides(entry, "on_base") else (True, False)
+
+
+@cache
+def plain(held: bool, steps: int) -> dict[str, Tensor]:
+    return Rig(1, [], held=held).run(steps)
+
+
+# ---------------------------------------------------------------------- description
+
+
+@each
+def test_an_effect_describes_its_parameters(entry: Entry) -> None:
+    assert sizes(entry)
+    for p in kind(entry).params:
+        assert p.name.isidentifier()
+        assert p.unit
+        assert p.doc
+        assert p.low <= p.null <= p.high
+        assert p.low < p.high
+        assert p.tolerance > 0.0
+        assert all(math.isfinite(x) for x in (p.low, p.null, p.high))
+    assert len({p.name for p in kind(entry).params}) == len(kind(entry).params)
+    assert set(entry.parameters) == {p.name for p in kind(entry).params}
+    assert entry.doc.endswith(".")
+    assert "".join(part.capitalize() for part in entry.name.split("_")) == kind(entry).__name__
+
+
+@each
+def test_what_is_not_configured_is_null_and_what_is_out_of_bounds_is_refused(entry: Entry) -> None:
+    values, problems = entry.check({}, "effect")
+    assert problems == []
+    assert values == {p.name: p.null for p in kind(entry).params}
+    assert is_null(kind(entry), values)
+    for p in sizes(entry):
+        assert not is_null(kind(entry), {p.name: probe(entry, p)})
+    for p in kind(entry).params:
+        width = p.high - p.low
+        for value in (p.low - 0.01 * width, p.high + 0.01 * width):
+            assert len(entry.check({p.name: value}, "effect")[1]) == 1, p.name
+        for value in (p.low, p.high):
+            assert entry.check({p.name: value}, "effect")[1] == [], p.name
+
+
+@each
+def test_an_effect_says_where_it_acts(entry: Entry) -> None:
+    acting = [hook for hook in (*HOOKS, "on_sensor", "edit_model") if overrides(entry, hook)]
+    assert acting
+    assert bool(entry.traits.get("gains")) == ("on_gains" in acting)
+    assert bool(kind(entry).fields) == ("edit_model" in acting)
+
+
+@each
+def test_there_is_a_ready_choice_with_the_effect_in_it(entry: Entry) -> None:
+    file = data_root() / f"conf/effect/{entry.name}.yaml"
+    choice = OmegaConf.to_container(OmegaConf.load(file))
+    assert isinstance(choice, dict)
+    assert list(choice) == [entry.name]
+    ready = term(entry.name, choice[entry.name])
+    widths = ready.slots["spread"]
+    assert not is_null(kind(entry), ready.parameters) or any(widths.get(p.name) for p in sizes(entry))
+    lines = file.read_text().splitlines()
+    assert lines[0].startswith("# ")
+    for p in kind(entry).params:
+        (line,) = (line for line in lines if line.startswith(f"  {p.name}:"))
+        assert f"# {p.unit}" in line
+
+
+def test_choices_of_effects_compose_alone_and_together() -> None:
+    for names in (["none"], ["coulomb"], ["viscous", "lag"], list(EFFECTS)):
+        choice = f"effect={names[0]}" if len(names) == 1 else f"effect=[{','.join(names)}]"
+        found = parse_task(compose("train", [choice])).effect
+        assert sorted(t.key for t in found) == sorted(n for n in names if n != "none")
+
+
+# ---------------------------------------------------------------------- absence
+
+
+def core_readings(effects: tuple[Term, ...], steps: int) -> list[Tensor]:
+    """Let trained-for robots tumble through short episodes, with all the configured randomness but noise."""
+    short = dataclasses.replace(task().sim, episode_s=0.16)
+    core = Go1Core(dataclasses.replace(task(), sim=short, effect=effects), 2, seed=5, noise=False)
+    assert [type(e) for e in core.plant.effects.effects.values()] == [t.entry.target for t in effects]
+    read = [core.reset().clone()]
+    for k in range(steps):
+        action = 4.0 * torch.sin(0.9 * k + torch.arange(24.0).reshape(2, 12))
+        result = core.step(action)
+        read += [result.observation, result.final_observation, result.reward, core.backend.qpos, core.backend.qvel]
+        read = [*read[:-5], *(x.clone() for x in read[-5:]), core.plant.torque.clone()]
+    return read
+
+
+@cache
+def plain_core() -> list[Tensor]:
+    return core_readings((), 12)
+
+
+@each
+def test_an_absent_effect_changes_no_bit_in_training(entry: Entry) -> None:
+    found = core_readings((term(entry.name, {}),), 12)
+    assert all(torch.equal(a, b) for a, b in zip(plain_core(), found, strict=True))
+
+
+@each
+def test_an_absent_effect_changes_no_bit_on_the_stand(entry: Entry) -> None:
+    for held in places(entry):
+        assert same(plain(held, 100), Rig(1, [term(entry.name, {})], held=held).run(100)) == []
+
+
+def test_all_effects_absent_together_change_no_bit() -> None:
+    found = core_readings(tuple(term(name, {}) for name in EFFECTS), 12)
+    assert all(torch.equal(a, b) for a, b in zip(plain_core(), found, strict=True))
+
+
+# ---------------------------------------------------------------------- presence
+
+
+@each
+def test_every_size_moves_something_that_a_robot_measures(entry: Entry) -> None:
+    """An identification can find no parameter that does not."""
+    moved: dict[str, dict[str, float]] = {p.name: {} for p in sizes(entry)}
+    for held in places(entry):
+        rig = Rig(1 + len(moved), [term(entry.name, {})], held=held)
+        for row, p in enumerate(sizes(entry), start=1):
+            rig.write(entry.name, row, {p.name: probe(entry, p)})
+        rig.plant.refresh()
+        read = rig.run(200)
+        for row, p in enumerate(sizes(entry), start=1):
+            for channel, floor in FLOORS.items():
+                if channel in read:
+                    ratio = float((read[channel][:, row] - read[channel][:, 0]).abs().max()) / floor
+                    moved[p.name][channel] = max(moved[p.name].get(channel, 0.0), ratio)
+    for name, channels in moved.items():
+        assert max(channels.values()) > 2.0, (name, channels)
+
+
+@each
+def test_robots_of_a_batch_have_their_own_values_and_move_as_alone(entry: Entry) -> None:
+    """Rows: absent, probe, half a probe, all written while it runs; alone: configured."""
+    values = [{p.name: p.null + share * (probe(entry, p) - p.null) for p in sizes(entry)} for share in (0.0, 1.0, 0.5)]
+    for held in places(entry)[:1]:
+        batch = Rig(3, [term(entry.name, {})], held=held)
+        for row, own in enumerate(values):
+            batch.write(entry.name, row, own)
+        batch.plant.refresh()
+        together = batch.run(80)
+        for row, own in enumerate(values):
+            alone = Rig(1, [term(entry.name, own)], held=held, first_env=row).run(80)
+            assert same({k: v[:, row : row + 1] for k, v in together.items()}, alone) == [], (row, held)
+
+
+@each
+def test_an_effect_continues_from_its_saved_state(entry: Entry) -> None:
+    held = places(entry)[0]
+    configured = [term(entry.name, probes(entry))]
+    first, second = Rig(2, configured, held=held), Rig(2, [term(entry.name, {})], held=held)
+    first.run(50)
+    second.load_state_dict(first.state_dict())
+    assert same(first.run(50), second.run(50)) == []
+
+
+@each
+def test_a_reset_forgets_the_robots_that_are_reset_and_no_other(entry: Entry) -> None:
+    held = places(entry)[0]
+    configured = [term(entry.name, probes(entry))]
+    through, reset, anew = (Rig(2, configured, held=held) for _ in range(3))
+    numbers = anew.random.state_dict()
+    second = torch.tensor([False, True])
+    fresh = anew.run(40)
+    for rig in (through, reset, anew):
+        if rig is not anew:
+            rig.run(40)
+    reset.reset(second)
+    ahead, after = through.run(40), reset.run(40)
+    assert same({k: v[:, :1] for k, v in ahead.items()}, {k: v[:, :1] for k, v in after.items()}) == []
+    anew.reset(second)  # and from the same random numbers and targets as at the beginning
+    anew.random.load_state_dict(numbers)
+    anew.clock = 0
+    again = anew.run(40)
+    assert same({k: v[:, 1:] for k, v in fresh.items()}, {k: v[:, 1:] for k, v in again.items()}) == []
+
+
+def joint_noise(n: int, scale: float, seed: int) -> Tensor:
+    return scale * torch.randn(n, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def calls(effect: Effect, n: int, k: int) -> Iterator[tuple[str, tuple[Any, ...], tuple[Tensor, ...]]]:
+    """Yield every hook that the effect has, with arguments for it and the tensors among them."""
+    q, qd, torque = joint_noise(n, 1.0, k), joint_noise(n, 10.0, k + 1), joint_noise(n, 10.0, k + 2)
+    three = [joint_noise(n, 1.0, k + j)[:, :3] for j in (3, 4, 5)]
+    given: dict[str, tuple[Tensor, ...]] = {
+        "on_target": (q,),
+        "on_encoder": (q, qd),
+        "on_gains": (torque.abs(), qd.abs()),
+        "on_drive": (torque, q, qd),
+        "on_transmission": (torque, q, qd),
+        "on_joint": (q, qd),
+        "on_friction": (torque.abs(), torque, qd),
+        "on_base": (three[0],),
+    }
+    for hook, tensors in given.items():
+        if getattr(type(effect), hook) is not getattr(Effect, hook):
+            yield hook, tensors, tensors
+    if type(effect).on_sensor is not Effect.on_sensor:
+        single = tuple(x.float() for x in three)
+        yield "on_sensor", (Measured(q, qd, *single),), (q, qd, *single)
+
+
+def tensors_of(result: Any) -> tuple[Tensor, ...]:
+    if isinstance(result, Measured):
+        return tuple(x for x in (result.joint_pos, result.joint_vel, result.gravity, result.gyro, result.acc) if x is not None)
+    return result if isinstance(result, tuple) else (result,)
+
+
+@each
+def test_hooks_leave_their_arguments_as_they_are(entry: Entry, drives: Callable[..., DriveSetup]) -> None:
+    effect = term(entry.name, probes(entry))(drives(4))
+    for k in range(5):
+        for hook, arguments, tensors in calls(effect, 4, 10 * k):
+            before = [x.clone() for x in tensors]
+            result = tensors_of(getattr(effect, hook)(*arguments))
+            assert all(torch.equal(a, b) for a, b in zip(tensors, before, strict=True)), hook
+            for x in result:
+                assert x.shape[0] == 4
+                assert torch.isfinite(x).all()
+                assert x.dtype in (torch.float64, torch.float32)
+
+
+@each
+def test_reading_the_encoder_twice_gives_the_same(entry: Entry, drives: Callable[..., DriveSetup]) -> None:
+    effect = term(entry.name, probes(entry))(drives(4))
+    q, qd = joint_noise(4, 1.0, 0), joint_noise(4, 5.0, 1)
+    before = effect.state_dict()
+    first, second = effect.on_encoder(q, qd), effect.on_encoder(q, qd)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert all(torch.equal(before[name], value) for name, value in effect.state_dict().items())
+
+
+@each
+def test_spreads_are_drawn_for_each_robot_within_the_bounds(entry: Entry) -> None:
+    for p in kind(entry).params:
+        width = 0.7 * (p.high - p.low)  # wide enough to meet a bound
+        given = {"calf": p.null} if p.per == "joint" else p.null
+        configured = [term(entry.name, {p.name: given, "spread": {p.name: width}})]
+        rig, alone = (Rig(n, configured, held=places(entry)[0], first_env=f) for n, f in ((12, 0), (1, 7)))
+        live = getattr(rig.plant.effects.effects[entry.name], p.name)
+        assert ((live >= p.low) & (live <= p.high)).all()
+        assert torch.equal(live[7:8], getattr(alone.plant.effects.effects[entry.name], p.name))
+        drawn = live[:, 2::3] if p.per == "joint" else live
+        assert (drawn.max() - drawn.min()) > 0.5 * width
+        assert (drawn.std(0) > 0.0).all()
+        if p.per == "joint":
+            assert drawn[0].unique().numel() > 1
+            assert (live.reshape(12, 4, 3)[..., :2] == p.null).all()
+
+
+@each
+def test_values_can_differ_between_joints(entry: Entry, drives: Callable[..., DriveSetup]) -> None:
+    for p in kind(entry).params:
+        if p.per == "joint":
+            mixed = {"FR": p.low, "calf": p.high, "RL_hip": 0.5 * (p.low + p.high)}
+            effect = term(entry.name, {p.name: mixed})(drives(2))
+            expected = torch.as_tensor(spread(mixed, robot.JOINTS)).nan_to_num(nan=p.null)
+            assert torch.equal(getattr(effect, p.name), expected.repeat(2, 1))
+
+
+def test_all_effects_together_leave_a_robot_that_moves() -> None:
+    rig = Rig(2, [term(name, probes(entry)) for name, entry in EFFECTS.items()], held=False)
+    read = rig.run(150)
+    assert all(torch.isfinite(value).all() for value in read.values())
+    assert float(read["true_q"].std(0).min()) > 1e-3
+
+
+# ---------------------------------------------------------------------- energy
+
+
+@pytest.mark.parametrize("name", BRAKES)
+def test_a_brake_only_brakes(name: str, drives: Callable[..., DriveSetup]) -> None:
+    """Power of the torque on the joint, with dry friction at its bound, is nowhere positive."""
+    entry, setup = EFFECTS[name], drives(500)
+    effect = term(name, {})(setup)
+    if overrides(entry, "edit_model"):
+        assert effect.fields == ("dof_frictionloss",)  # a bound; MuJoCo solves for the rest
+        return
+    generator = torch.Generator().manual_seed(0)
+    for p in effect.params:
+        unit = torch.rand(500, 12, dtype=torch.float64, generator=generator)
+        getattr(effect, p.name).copy_(p.low + (p.high - p.low) * unit)
+    q, qd, torque = joint_noise(500, 1.0, 0), joint_noise(500, 10.0, 1), joint_noise(500, 20.0, 2)
+    power, none = torch.zeros_like(q), torch.zeros_like(q)
+    if overrides(entry, "on_joint"):
+        power += effect.on_joint(q, qd) * qd
+    if overrides(entry, "on_friction"):
+        bound = effect.on_friction(none, torque, qd)
+        assert (bound >= 0.0).all()
+        power -= bound * qd.abs()
+    assert (power <= 1e-12).all()
+    assert (power < -1e-3).any()
+
+
+@pytest.mark.parametrize("name", BRAKES)
+@pytest.mark.parametrize("share", [0.05, 1.0])
+def test_a_brake_takes_energy_from_a_swinging_robot(name: str, share: float) -> None:
+    """Drives off, weightless, legs swung at 8 rad/s; at the largest value too the step must not feed energy in."""
+    entry = EFFECTS[name]
+    top = {p.name: p.null + share * (p.high - p.null) for p in sizes(entry)}
+    if name == "asymmetric_friction":
+        top["backward"] = 0.0  # the constant torque in full
+    rig = Rig(1, [term(name, top)], held=True)
+    rig.plant.set_gains(torch.zeros(1, 12), torch.zeros(1, 12))
+    model = rig.backend.env_model(0)
+    rig.backend.field("opt.gravity").zero_()
+    qpos = rig.backend.qpos.clone()
+    rig.backend.reset(torch.tensor([True]), qpos, 8.0 * torch.cos(torch.arange(12.0)).double().unsqueeze(0))
+    rig.plant.reset(torch.tensor([True]), rig.stance)
+    energy = []
+    for _ in range(40):
+        rig.plant.step(rig.stance)
+        data = rig.backend.env_data(0)
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_energyVel(model, data)
+        energy.append(float(data.energy[1]))
+    assert all(b <= a * (1.0 + 2e-3) + 1e-6 for a, b in zip(energy, energy[1:], strict=False)), energy
+    if name != "load_friction":  # without a drive's torque there is none
+        assert energy[-1] < 0.97 * energy[0]

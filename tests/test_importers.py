@@ -1,0 +1,611 @@
+"""The importers: on the real recordings against what their sources say of them, and on damaged ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from go1exp import data_root, recording
+from go1exp.importers import import_recordings
+from go1exp.recording import Recording, RecordingError
+from go1exp.registry import ConfigError, members
+from go1exp.robot import JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE
+
+DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
+
+COUNTS = {
+    "go2_in_air": 1,
+    "ak80_double_pendulum": 18,
+    "servo_pendulum_xl330": 12,
+    "so101_arm": 40,
+    "scaler_walk_mocap": 8,
+    "go1_walk_snippet": 1,
+}
+
+
+def imported(name: str, **options: Any) -> list[Recording]:
+    """All recordings of a real source."""
+    if not (DATA / name).is_dir():
+        pytest.skip(f"the recordings of {name} are not here; GO1EXP_DATA names their folder")
+    return import_recordings(name, DATA / name, options)
+
+
+def raw(name: str, episode_file: str) -> dict[str, np.ndarray]:
+    with np.load(DATA / name / episode_file) as file:
+        return {key: file[key] for key in file.files}
+
+
+def multiples(values: np.ndarray, step: float, tolerance: float) -> bool:
+    """Whether all differences are whole numbers of ``step``."""
+    turns = (values - values[0]) / step
+    return bool(np.abs(turns - turns.round()).max() < tolerance)
+
+
+# ---------------------------------------------------------------------- every source
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_every_recording_is_sound_and_survives_the_file(name: str, tmp_path: Path) -> None:
+    found = imported(name)
+    assert len(found) == COUNTS[name]
+    assert len({r.meta.episode for r in found}) == len(found)
+    for r in found:
+        assert recording.problems(r) == []
+        assert r.meta.source == "measured"
+        assert r.meta.notes
+        assert r.has("q")
+    path = tmp_path / "x.parquet"
+    recording.write(path, found[0])
+    again = recording.read(path)
+    assert again.meta == found[0].meta
+    assert all(again.channels[k].tobytes() == v.tobytes() for k, v in found[0].channels.items())
+
+
+def test_a_file_gives_what_its_folder_gives() -> None:
+    folder = imported("so101_arm")
+    (alone,) = import_recordings("so101_arm", DATA / "so101_arm/chirp_sweep.npz", {})
+    (same,) = [r for r in folder if r.meta.episode == alone.meta.episode]
+    assert same.meta == alone.meta
+    assert np.array_equal(same.joint("q"), alone.joint("q"))
+
+
+def test_no_source_without_torque_gets_one() -> None:
+    for name in ("go2_in_air", "servo_pendulum_xl330", "so101_arm", "scaler_walk_mocap", "go1_walk_snippet"):
+        for r in imported(name):
+            assert not [c for c in r.channels if c.startswith("tau_")]
+
+
+# ---------------------------------------------------------------------- one by one
+
+
+def test_go2_targets_change_every_fourth_row_at_200_hz() -> None:
+    (r,) = imported("go2_in_air")
+    assert r.t.shape == (8500,)
+    assert r.meta.rate_hz == 200.0
+    assert r.t[-1] == pytest.approx(8499 / 200)
+    assert (r.meta.kp, r.meta.kd) == ((20.0,) * 12, (0.5,) * 12)
+    changes = np.flatnonzero((np.diff(r.joint("q_target"), axis=0) != 0).any(axis=1))
+    steps = np.diff(changes)
+    assert (steps == 4).mean() > 0.99  # the source drifts by a row three times in 8,500
+    assert "No clock" in r.meta.notes
+
+
+def test_go2_joints_are_in_our_order_and_follow_their_own_targets() -> None:
+    (r,) = imported("go2_in_air")
+    assert r.meta.joints == JOINTS
+    assert r.joint("q_target")[0] == pytest.approx([0.0, 0.8, -1.5] * 4)
+    first = r.joint("q")[0]  # row 0 of the source: FL -0.0249 0.783 -1.483, FR 0.0191 0.792 -1.494, RL ..., RR ...
+    assert first[:6] == pytest.approx([0.019128, 0.791984, -1.49415, -0.0248504, 0.782628, -1.48312])
+    assert first[6:] == pytest.approx([0.0212727, 0.793492, -1.48734, -0.0227865, 0.786619, -1.47908])
+    q, target = r.joint("q"), r.joint("q_target")
+    lagged = np.corrcoef(q[8:].T, target[:-8].T)[:12, 12:]
+    assert (lagged.argmax(axis=1) == np.arange(12)).all()
+
+
+def test_go2_speed_is_too_large_by_the_factor_its_notes_state() -> None:
+    (r,) = imported("go2_in_air")
+    for q, qd in zip(r.joint("q").T, r.joint("qd").T, strict=True):
+        travelled = np.concatenate([[0.0], np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(r.t))])
+        moved, summed = q[20:] - q[:-20], travelled[20:] - travelled[:-20]  # over 0.1 s, before the error drifts away
+        assert 1.10 < moved @ summed / (moved @ moved) < 1.17
+
+
+def test_ak80_sits_on_the_steps_of_the_motors_messages() -> None:
+    found = imported("ak80_double_pendulum")
+    assert [r.meta.robot for r in found].count("ak80_double_pendulum_a") == 9
+    for r in found:
+        assert r.meta.joints == ("shoulder", "elbow")
+        assert 495 < r.meta.rate_hz < 670
+        assert 5.9 < r.t[-1] < 10.1
+        for joint in r.meta.joints:
+            assert multiples(r.channels[f"q_{joint}"], 25 / 65535, 1e-3)  # 16 bits over +-12.5 rad: 3.81e-4 rad
+            assert multiples(r.channels[f"tau_est_{joint}"], 24 / 4095, 1e-3)  # 12 bits over +-12 N m: 5.86e-3 N m
+
+
+def test_ak80_has_a_target_exactly_where_a_controller_followed_one() -> None:
+    found = imported("ak80_double_pendulum")
+    followed = {r.meta.episode for r in found if r.has("q_target")}
+    assert followed == {"ak80_a_trajectory_11", "ak80_c_trajectory_12", "ak80_c_trajectory_13"}
+    for r in found:
+        assert not any("q_target" in name for name in r.channels) or r.has("q_target")
+        assert r.has("tau_cmd")
+        assert r.has("tau_est")
+
+
+def test_ak80_reports_the_torque_it_was_given_with_the_same_sign() -> None:
+    for r in imported("ak80_double_pendulum"):
+        if not r.has("q_target"):
+            given, reported = r.joint("tau_cmd"), r.joint("tau_est")
+            moving = np.abs(given).max(axis=0) > 0.1
+            assert moving.any()
+            slope = (given * reported).sum(axis=0)[moving] / (given**2).sum(axis=0)[moving]
+            assert ((slope > 0.6) & (slope < 1.2)).all()
+
+
+def test_xl330_sits_on_4096_steps_a_turn_and_says_when_it_is_off() -> None:
+    found = imported("servo_pendulum_xl330")
+    for r in found:
+        assert r.meta.joints == ("pendulum",)
+        assert r.meta.kp is None  # the firmware's gain is no N m/rad
+        assert 5.9 < r.t[-1] < 6.1
+        assert multiples(r.channels["q_pendulum"], 2 * np.pi / 4096, 1e-6)
+        falls = r.meta.excitation == "lift_and_drop"
+        assert (280 < r.meta.rate_hz < 290) if falls else (186 < r.meta.rate_hz < 190)
+        assert r.channels["torque_enable"].all() != falls
+    assert {r.meta.excitation for r in found} == {"sin_sin", "sin_time_square", "up_and_down", "lift_and_drop"}
+    assert "gain 800 in the firmware's own unit" in found[-1].meta.notes
+
+
+def test_xl330_follows_its_target_and_hangs_down_after_its_fall() -> None:
+    for r in imported("servo_pendulum_xl330"):
+        q, target = r.channels["q_pendulum"], r.channels["q_target_pendulum"]
+        if r.meta.excitation == "lift_and_drop":
+            assert abs(q[-50:].mean()) < 0.05
+        elif r.meta.excitation != "sin_time_square":  # which outruns the servo at low gain
+            assert np.corrcoef(q, target)[0, 1] > 0.95
+
+
+def test_so101_moves_by_whole_steps_and_the_jaw_is_left_out() -> None:
+    for r in imported("so101_arm"):
+        assert r.meta.joints == ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
+        assert r.meta.rate_hz == pytest.approx(49.85, abs=0.01)
+        assert 35 < r.t[-1] < 206
+        assert multiples(r.joint("q"), 2 * np.pi / 4096, 1e-4)
+        assert "Jaw" not in "".join(r.channels)
+    (r,) = import_recordings("so101_arm", DATA / "so101_arm/sinusoidal_sweep.npz", {"base_quat": [0, 1, 0, 0]})
+    source = raw("so101_arm", "sinusoidal_sweep.npz")
+    assert r.meta.base_quat == (0, 1, 0, 0)
+    assert np.array_equal(r.joint("q_target"), source["cmd_pos"][:, :5])
+
+
+def test_scaler_reads_gravity_upwards_in_its_world() -> None:
+    for r in imported("scaler_walk_mocap"):
+        assert 95 < r.meta.rate_hz < 100
+        assert not r.has("qd")  # flawed in the source
+        attitude = Rotation.from_quat(r.block("base_quat_x", "base_quat_y", "base_quat_z", "base_quat_w"))
+        up = attitude.apply(r.block("imu_acc_x", "imu_acc_y", "imu_acc_z")).mean(axis=0)
+        assert up == pytest.approx([0, 0, 9.81], abs=0.15)
+        walked = r.block("base_pos_x_w", "base_pos_y_w")
+        assert 2.0 < np.linalg.norm(walked[-1] - walked[0]) < 2.5
+
+
+def test_scaler_turns_with_its_gyro() -> None:
+    """Rotations over 0.1 s are those of the gyro: axes, signs and clocks fit together; pitch is small in this gait."""
+    for r in imported("scaler_walk_mocap"):
+        attitude = Rotation.from_quat(r.block("base_quat_x", "base_quat_y", "base_quat_z", "base_quat_w"))
+        seen = (attitude[:-10].inv() * attitude[10:]).as_rotvec()
+        gyro = r.block("imu_gyro_x", "imu_gyro_y", "imu_gyro_z")
+        turned = np.cumsum(gyro * np.gradient(r.t)[:, None], axis=0)
+        agreement = np.corrcoef(seen.T, (turned[10:] - turned[:-10]).T).diagonal(3)
+        assert (agreement > [0.9, 0.4, 0.8]).all()
+
+
+def test_scaler_has_foot_forces_only_where_a_sensor_worked() -> None:
+    legs = {r.meta.episode[-2:]: {c[-2:] for c in r.channels if "foot" in c} for r in imported("scaler_walk_mocap")}
+    everything = {"FL", "FR", "RR", "RL"}
+    assert {run for run, there in legs.items() if not there} == {"19", "20", "22"}
+    assert legs.pop("14") == everything - {"FR"}  # its sensor reads some 1500 N throughout
+    assert all(there == everything for run, there in legs.items() if run in ("13", "15", "17", "23"))
+
+
+def test_scaler_without_near_motion_capture_has_no_truth() -> None:
+    for r in imported("scaler_walk_mocap", mocap_tolerance_s=0.004):
+        assert not [c for c in r.channels if c.startswith("base_")]
+        assert "No ground truth" in r.meta.notes
+
+
+def test_go1_snippet_explains_its_computed_torque() -> None:
+    (r,) = imported("go1_walk_snippet")
+    source = raw("go1_walk_snippet", "go1_walk_2021-12-20_05-27-36.npz")
+    assert r.t.shape == (54,)
+    assert r.meta.rate_hz == 50.0
+    assert r.t[-1] - r.t[0] == pytest.approx(1.06)
+    assert r.meta.kp is not None
+    assert r.meta.kd is not None
+    kp, kd = np.array(r.meta.kp), np.array(r.meta.kd)
+    torque = kp * (r.joint("q_target")[1:] - r.joint("q")[:-1]) - kd * r.joint("qd")[:-1]
+    theirs = source["tau_pd_computed"].reshape(54, 4, 3)[1:, [1, 0, 3, 2]].reshape(53, 12)  # FL FR RL RR -> ours
+    assert torque == pytest.approx(theirs, abs=1e-4)
+
+
+def test_go1_snippet_stands_like_a_go1() -> None:
+    (r,) = imported("go1_walk_snippet")
+    q = r.joint("q")
+    assert r.meta.joints == JOINTS
+    assert ((q > JOINT_POS_LIMITS[:, 0]) & (q < JOINT_POS_LIMITS[:, 1])).all()
+    hips = [0, 3, 6, 9]
+    assert (np.sign(q[:, hips].mean(axis=0)) == np.sign(NOMINAL_STANCE[hips])).all()  # right hips turn out by minus
+    quat = r.block("imu_quat_x", "imu_quat_y", "imu_quat_z", "imu_quat_w")
+    up = Rotation.from_quat(quat).inv().apply([0, 0, 9.81])
+    acc = r.block("imu_acc_x", "imu_acc_y", "imu_acc_z")
+    assert acc[0] == pytest.approx(up[0], abs=0.2)  # the first sample, before the steps shake it
+    assert not [c for c in r.channels if c.startswith("foot_force")]  # contact is 0 or 1, no force
+
+
+# ---------------------------------------------------------------------- damaged sources
+
+
+def npz(path: Path, **arrays: Any) -> Path:
+    np.savez(path, **arrays)
+    return path
+
+
+def so101(**changes: Any) -> dict[str, Any]:
+    names = np.array(["Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw"])
+    whole = {"t": np.arange(9) * 0.02, "joint_names": names} | {k: np.zeros((9, 6)) for k in ("pos", "vel", "cmd_pos")}
+    return {k: v for k, v in (whole | changes).items() if v is not None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"vel": None}, "no array 'vel'; it has"),
+        ({"joint_names": None}, "no array 'joint_names'"),
+        ({"pos": np.zeros((9, 5))}, r"pos: must be numbers \(T, 6\), not float64 \(9, 5\)"),
+        ({"pos": np.array([["a"] * 6] * 9)}, "pos: must be numbers"),
+        ({"t": np.zeros((9, 1))}, r"t: must be numbers \(T,\)"),
+        ({"t": np.zeros(9)}, "time must have at least two stamps and advance"),
+        ({"t": np.arange(8) * 0.02}, r"q_Rotation: must have shape \(8,\) like t, not \(9,\)"),
+        ({"pos": np.full((9, 6), np.nan)}, "q_Rotation: must be finite"),
+        ({"t": np.array([0, 1, 2, 3, 3, 4, 5, 6, 7]) * 0.02}, "t: must increase strictly, but row 4"),
+        ({"joint_names": np.arange(6)}, "joint_names: must be a list of words"),
+        ({"joint_names": np.array(list("abcdef"))}, "joint_names: must have 'Jaw' among them"),
+        ({"pos": np.array([[None] * 6] * 9, dtype=object)}, "not a whole .npz of plain arrays"),
+    ],
+)
+def test_a_damaged_npz_is_named_with_its_key(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
+    path = npz(tmp_path / "x.npz", **so101(**changes))
+    with pytest.raises(RecordingError, match=match) as caught:
+        import_recordings("so101_arm", path, {})
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_sound_npz_of_the_same_kind_passes(tmp_path: Path) -> None:
+    (r,) = import_recordings("so101_arm", npz(tmp_path / "x.npz", **so101()), {})
+    assert r.joint("q").shape == (9, 5)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.2, 0.7, 0.999])
+def test_a_truncated_npz_is_refused(tmp_path: Path, kept: float) -> None:
+    path = npz(tmp_path / "x.npz", **so101())
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(kept * len(whole))])
+    with pytest.raises(RecordingError, match=r"x\.npz: not a whole \.npz"):
+        import_recordings("so101_arm", path, {})
+
+
+def test_an_array_that_is_no_archive_is_refused(tmp_path: Path) -> None:
+    with (tmp_path / "x.npz").open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(RecordingError, match="not a whole"):
+        import_recordings("so101_arm", tmp_path / "x.npz", {})
+
+
+def test_a_missing_path_and_an_empty_folder_are_named(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no such file or folder"):
+        import_recordings("so101_arm", tmp_path / "none", {})
+    with pytest.raises(RecordingError, match=r"no \*\.npz in this folder"):
+        import_recordings("so101_arm", tmp_path, {})
+
+
+def test_the_design_of_a_lone_pendulum_file_must_be_told(tmp_path: Path) -> None:
+    keys = [f"{k}{i}" for k in ("pos_meas", "vel_meas", "tau_meas", "tau_con") for i in (1, 2)]
+    path = npz(tmp_path / "run.npz", time=np.arange(5) * 0.002, **dict.fromkeys(keys, np.zeros(5)))
+    with pytest.raises(RecordingError, match="set design=A or design=C"):
+        import_recordings("ak80_double_pendulum", path, {})
+    (r,) = import_recordings("ak80_double_pendulum", path, {"design": "C"})
+    assert r.meta.robot == "ak80_double_pendulum_c"
+    assert not r.has("q_target")
+    with pytest.raises(RecordingError, match="no array 'tau_con2'"):
+        import_recordings(
+            "ak80_double_pendulum",
+            npz(tmp_path / "run.npz", time=np.arange(5) * 0.002, **dict.fromkeys(keys[:-1], np.zeros(5))),
+            {"design": "C"},
+        )
+
+
+HEADER = [*(f"jpos{i}" for i in range(12)), *(f"jvel{i}" for i in range(12)), *(f"jpos{i}_des" for i in range(12))]
+WHOLE = ",".join([*HEADER, "kp", "kd"])
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "has no rows"),
+        ("kp,kd\n", "has no rows"),
+        ("kp,kd\n20,0.5\n20\n", "not a table of numbers"),
+        ("kp,kd\n20,a\n", "not a table of numbers"),
+        ("kp,kd\n20,0.5,1\n", "one name for each of its 3 columns"),
+        ("kp,kd\n20,0.5\n", "no column 'jpos0'"),
+        (
+            ",".join([*HEADER, "kp", "kd"]) + "\n" + ("0," * 36 + "20,0.5\n") * 3 + "0," * 36 + "25,0.5\n",
+            "kp: must be one",
+        ),
+        (",".join([*HEADER, "kp"]) + "\n" + ("0," * 36 + "20\n") * 3, "no column 'kd'"),
+        (f"{WHOLE}\n" + ("0," * 36 + "-1,0.5\n") * 3, "metadata.kp.0 = -1.0"),
+        (f"{WHOLE}\n" + ("nan," * 36 + "20,0.5\n") * 3, "q_FR_hip: must be finite"),
+    ],
+)
+def test_a_damaged_table_is_named_with_its_column(tmp_path: Path, text: str, match: str) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text(text)
+    with pytest.raises(RecordingError, match=match) as caught:
+        import_recordings("go2_in_air", path, {})
+    assert str(caught.value).startswith(str(path))
+
+
+def xl330(**changes: Any) -> str:
+    row = {"timestamp": 0.0, "position": 0.0, "speed": 0.0, "goal_position": 0.0, "torque_enable": True}
+    row |= {"input_volts": 7.4, "temp": 30, "load": 3}
+    rows = [row | {"timestamp": 0.005 * i} | changes for i in range(5)]
+    rows = [{k: v for k, v in r.items() if v is not None} for r in rows]
+    head = {"mass": 0.5, "length": 0.1, "kp": 100, "vin": 7.4, "motor": "xl330", "trajectory": "sin_sin"}
+    return json.dumps(head | {"entries": rows})
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "invalid json"),
+        (xl330()[:-30], "invalid json"),
+        ("{}", "mass: required, but not given"),
+        (xl330(speed=None), r"entries.0.speed: required, but not given\n(.*\n)+.*and 2 more"),
+        (xl330(torque_enable=1), "entries.0.torque_enable = 1"),
+        (xl330(position="0"), "entries.0.position = '0'"),
+        (xl330(timestamp=1.0), "time must have at least two stamps and advance"),
+    ],
+)
+def test_a_damaged_servo_log_is_named_with_its_key(tmp_path: Path, text: str, match: str) -> None:
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    with pytest.raises(RecordingError, match=match) as caught:
+        import_recordings("servo_pendulum_xl330", path, {})
+    assert str(caught.value).startswith(str(path))
+
+
+def test_torques_of_other_gains_are_noticed(tmp_path: Path) -> None:
+    imported("go1_walk_snippet")
+    source = raw("go1_walk_snippet", "go1_walk_2021-12-20_05-27-36.npz")
+    source["tau_pd_computed"] = source["tau_pd_computed"] * 1.01
+    with pytest.raises(RecordingError, match=r"tau_pd_computed: does not belong to kp = 20, kd = 0.5"):
+        import_recordings("go1_walk_snippet", npz(tmp_path / "x.npz", **source), {})
+
+
+# ---------------------------------------------------------------------- the registry
+
+
+def test_names_and_options_are_checked_before_any_file_is_opened() -> None:
+    nowhere = Path("nowhere")
+    with pytest.raises(ConfigError, match="unknown importer 'so101'; did you mean 'so101_arm'"):
+        import_recordings("so101", nowhere, {})
+    with pytest.raises(ConfigError, match="rate: unknown key 'rate'; did you mean 'rate_hz'"):
+        import_recordings("go2_in_air", nowhere, {"rate": 100})
+    with pytest.raises(ConfigError, match=r"importer.go2_in_air.rate_hz = -1"):
+        import_recordings("go2_in_air", nowhere, {"rate_hz": -1})
+    with pytest.raises(ConfigError, match="design = 'B'"):
+        import_recordings("ak80_double_pendulum", nowhere, {"design": "B"})
+
+
+def test_every_importer_is_listed_with_a_sentence() -> None:
+    found = members("importer")
+    assert set(found) == {*COUNTS, "mcap_joint_state"}
+    for entry in found.values():
+        assert entry.doc.endswith(".")
+        assert entry.schema.model_fields.keys() == entry.parameters.keys()
+
+
+# ---------------------------------------------------------------------- MCAP
+
+MSGDEF = """std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+START = 1_700_000_000_123_456_789
+"""ns"""
+
+
+def message(i: int, names: list[str], stamp: int | None = None, **fields: Any) -> dict[str, Any]:
+    """One JointState every 2 ms."""
+    ns = START + 2_000_000 * i if stamp is None else stamp
+    whole = {"position": [0.1 * i + j for j in range(len(names))], "velocity": [1.0] * len(names), "effort": []}
+    header = {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": ""}
+    return {"header": header, "name": names, **whole, **fields}
+
+
+Sent = list[tuple[int, str, dict[str, Any]]]
+
+
+def write_cdr(path: Path, sent: Sent, kind: str = "sensor_msgs/msg/JointState") -> Path:
+    """Write (row, topic, message); rows are logged a millisecond late."""
+    from mcap_ros2.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        schema = writer.register_msgdef(kind, MSGDEF)
+        for i, topic, content in sent:
+            log = START + 2_000_000 * i + 1_000_000
+            writer.write_message(topic=topic, schema=schema, message=content, log_time=log, publish_time=log)
+        writer.finish()
+    return path
+
+
+def write_json(path: Path, sent: Sent) -> Path:
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("JointState", "jsonschema", b"{}")
+        channels: dict[str, int] = {}
+        for i, topic, content in sent:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "json", schema)
+            log = START + 2_000_000 * i + 1_000_000
+            writer.add_message(channels[topic], log_time=log, data=json.dumps(content).encode(), publish_time=log)
+        writer.finish()
+    return path
+
+
+WRITERS: list[Callable[[Path, Sent], Path]] = [write_cdr, write_json]
+
+
+def states(rows: int, names: list[str], **fields: Any) -> Sent:
+    return [(i, "/joint_states", message(i, names, **fields)) for i in range(rows)]
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_mcap_states_come_by_name_with_the_stamps_of_their_headers(
+    tmp_path: Path, write: Callable[[Path, Sent], Path]
+) -> None:
+    sent = states(20, ["b", "a"])
+    sent[7][2]["name"] = ["a", "b"]  # a driver may change its mind
+    (r,) = import_recordings("mcap_joint_state", write(tmp_path / "log.mcap", sent), {"robot": "arm"})
+    assert r.meta.joints == ("b", "a")
+    assert r.meta.rate_hz == 500.0
+    assert np.array_equal(r.t, np.arange(20) * 2_000_000 / 1e9)
+    expected = 0.1 * np.arange(20)[:, None] + [0, 1]
+    expected[7] = expected[7, ::-1]
+    assert np.array_equal(r.joint("q"), expected)
+    assert (r.joint("qd") == 1).all()
+    assert not r.has("tau_est")
+    assert not r.has("q_target")
+    assert f"{START} ns of the header stamps" in r.meta.notes
+
+
+def test_mcap_commands_hold_until_the_next(tmp_path: Path) -> None:
+    sent = states(10, ["a"], effort=[0.5])
+    for at, value in ((2, 7.0), (5, 8.0)):  # sent at the very time of rows 2 and 5
+        sent.append((at, "/command", message(at, ["a"], position=[value], velocity=[], effort=[value / 10])))
+    path = write_cdr(tmp_path / "log.mcap", sent)
+    (r,) = import_recordings("mcap_joint_state", path, {"command_topic": "/command"})
+    assert r.channels["q_target_a"].tolist() == [7.0] * 3 + [8.0] * 5
+    assert r.channels["tau_cmd_a"].tolist() == [0.7] * 3 + [0.8] * 5
+    assert r.channels["tau_est_a"].tolist() == [0.5] * 8
+    assert r.channels["q_a"] == pytest.approx(0.1 * np.arange(2, 10))
+    assert r.t[0] == pytest.approx(0.004)
+    assert "2 states before the first command" in r.meta.notes
+
+
+def test_mcap_of_a_go1_comes_in_our_order_unless_told_otherwise(tmp_path: Path) -> None:
+    names = sorted(JOINTS)
+    path = write_cdr(tmp_path / "log.mcap", states(5, names))
+    (r,) = import_recordings("mcap_joint_state", path, {"kp": [20.0] * 12, "base": "fixed", "base_quat": [1, 0, 0, 0]})
+    assert r.meta.joints == JOINTS
+    assert np.array_equal(r.joint("q")[0], [float(names.index(j)) for j in JOINTS])
+    (r,) = import_recordings("mcap_joint_state", path, {"joints": ["RL_calf", "FR_hip"]})
+    assert r.meta.joints == ("RL_calf", "FR_hip")
+
+
+def test_mcap_without_stamps_takes_the_time_of_logging(tmp_path: Path) -> None:
+    sent = states(5, ["a"])
+    sent[3] = (3, "/joint_states", message(3, ["a"], stamp=0))
+    (r,) = import_recordings("mcap_joint_state", write_cdr(tmp_path / "log.mcap", sent), {})
+    assert np.array_equal(r.t, np.arange(5) * 2_000_000 / 1e9)
+    assert "t is the time of logging" in r.meta.notes
+    assert f"{START + 1_000_000} ns of the log" in r.meta.notes
+
+
+@pytest.mark.parametrize("blank", [0.0, float("nan")])
+def test_mcap_fields_that_no_one_filled_in_have_no_column(tmp_path: Path, blank: float) -> None:
+    path = write_cdr(tmp_path / "log.mcap", states(5, ["a", "b"], effort=[blank] * 2, velocity=[blank] * 2))
+    (r,) = import_recordings("mcap_joint_state", path, {})
+    assert not r.has("tau_est")
+    assert not r.has("qd")
+    assert "effort of /joint_states is zero or NaN throughout" in r.meta.notes
+
+
+def spoilt(**fields: Any) -> Sent:
+    sent = states(5, ["a", "b"])
+    sent[3][2].update(fields)
+    return sent
+
+
+@pytest.mark.parametrize(
+    ("sent", "options", "match"),
+    [
+        (states(5, ["a"]), {"state_topic": "/joints"}, "no message on topic '/joints'; it has /joint_states"),
+        (states(5, ["a"]), {"command_topic": "/go"}, "no message on topic '/go'"),
+        (states(5, ["a"]), {"joints": ["c"]}, "/joint_states: message 0 lacks joint c"),
+        (states(5, ["a"]), {"kp": [1.0, 2.0]}, "metadata.kp: has 2 values for 1 joints"),
+        (states(5, ["a"], position=[]), {}, "its messages hold no position"),
+        (states(1, ["a"]), {}, "time must have at least two stamps"),
+        (spoilt(name=["a", "c"]), {}, "message 3 lacks joint b"),
+        (spoilt(position=[1.0]), {}, "message 3 has 2 names, but 1 of position"),
+        (spoilt(effort=[1.0, 2.0]), {}, "message 0 has 2 names, but 0 of effort"),
+        (spoilt(position=[1.0, float("nan")]), {}, "q_b: must be finite"),
+        (spoilt(header=message(2, [])["header"]), {}, "t: must increase strictly, but row 3"),
+    ],
+)
+def test_a_log_that_lacks_something_is_named(tmp_path: Path, sent: Sent, options: dict[str, Any], match: str) -> None:
+    path = write_cdr(tmp_path / "log.mcap", sent)
+    with pytest.raises(RecordingError, match=match) as caught:
+        import_recordings("mcap_joint_state", path, options)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:
+    path = write_cdr(tmp_path / "log.mcap", states(5, ["a"]), kind="my_msgs/msg/Joints")
+    with pytest.raises(RecordingError, match="must be sensor_msgs/msg/JointState, not my_msgs/msg/Joints"):
+        import_recordings("mcap_joint_state", path, {})
+    path = write_json(tmp_path / "log.mcap", [(0, "/joint_states", {"position": [1.0]})])
+    with pytest.raises(RecordingError, match="/joint_states: message 0: name: required"):
+        import_recordings("mcap_joint_state", path, {})
+
+
+def test_a_damaged_log_is_refused(tmp_path: Path) -> None:
+    path = write_cdr(tmp_path / "log.mcap", states(50, ["a", "b"]))
+    whole = path.read_bytes()
+    for kept in (0, 4, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:kept])
+        with pytest.raises(RecordingError, match="not a whole MCAP file"):
+            import_recordings("mcap_joint_state", path, {})
+    chunk = whole.index(b"\x28\xb5\x2f\xfd") + 20  # inside the first block of Zstandard
+    path.write_bytes(whole[:chunk] + bytes([whole[chunk] ^ 255]) + whole[chunk + 1 :])
+    with pytest.raises(RecordingError, match="not a whole MCAP file"):
+        import_recordings("mcap_joint_state", path, {})
+
+
+def test_without_the_extra_the_message_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_cdr(tmp_path / "log.mcap", states(5, ["a"]))
+    monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
+    with pytest.raises(RecordingError, match=r'pip install "go1exp\[logs\]"'):
+        import_recordings("mcap_joint_state", path, {})
