@@ -20,7 +20,7 @@ class DelayLine(Memory):
     zero returns the sample itself, bit for bit.
     """
 
-    memory = ("_past", "_fresh")
+    memory = ("_past", "_newest", "_age")
 
     def __init__(
         self, num_envs: int, joints: int, longest: float, dt: float, dtype: torch.dtype, device: torch.device
@@ -29,21 +29,22 @@ class DelayLine(Memory):
         self._dt = dt
         self._depth = math.ceil(longest / dt - 1e-9) + 2
         self._past = torch.zeros(self._depth, num_envs, joints, dtype=dtype, device=device)
-        self._fresh = torch.ones(num_envs, 1, dtype=torch.bool, device=device)
+        self._newest = torch.zeros(1, dtype=torch.int64, device=device)
+        self._age = torch.zeros(num_envs, 1, dtype=torch.int64, device=device)
 
     def reset(self, mask: Tensor) -> None:
         """Let the next sample stand for the whole past in the rows of ``mask`` (N,)."""
-        self._fresh |= mask.unsqueeze(1)
+        self._age.masked_fill_(mask.unsqueeze(1), 0)
 
     def advance(self, sample: Tensor, delay: Tensor) -> Tensor:
         """Take the newest ``sample`` (N, J) and return the signal ``delay`` (N, J) or (N, 1) s ago."""
-        self._past[1:] = self._past[:-1].clone()
-        self._past[0] = sample
-        self._past.copy_(torch.where(self._fresh, sample, self._past))
-        self._fresh.zero_()
-        steps = (delay / self._dt).clamp(0.0, self._depth - 1).expand_as(sample)
-        newer = steps.floor().clamp(max=self._depth - 2)
-        share = steps - newer
-        index = newer.long().unsqueeze(0)
-        a, b = self._past.gather(0, index).squeeze(0), self._past.gather(0, index + 1).squeeze(0)
+        self._newest.add_(1).remainder_(self._depth)
+        self._past.index_copy_(0, self._newest, sample.unsqueeze(0))
+        steps = torch.minimum((delay / self._dt).clamp(0.0, self._depth - 2), self._age).expand_as(sample)
+        self._age += 1
+        whole = steps.floor()
+        share = steps - whole
+        index = (self._newest - whole.long()).remainder_(self._depth).unsqueeze(0)
+        a = self._past.gather(0, index).squeeze(0)
+        b = self._past.gather(0, index.sub_(1).remainder_(self._depth)).squeeze(0)
         return torch.where(share == 0, a, torch.lerp(a, b, share))

@@ -16,32 +16,50 @@ from pathlib import Path
 import pytest
 
 from go1exp import data_root, registry
-from go1exp.cli import MODULES, VERBS
+from go1exp.cli import MODULES, SUBVERBS, VERBS
 
 PACKAGE = data_root() / "go1exp"
 FILES = sorted(PACKAGE.rglob("*.py"))
 RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
 
 FOREIGN = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra")
-OWN = ("physics", "env", "train", "evaluate", "bench", "cli")
+OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "bench", "cli")
+
+
+def up(*but: str) -> tuple[str, ...]:
+    """The upper packages, but those."""
+    return tuple(f"go1exp.{m}" for m in OWN if m not in but)
+
+
+UP = up()
 
 FORBIDDEN: dict[str, tuple[str, ...]] = {
     # plain descriptions
     "__init__.py": (*FOREIGN, "torch", "numpy", "go1exp"),
-    "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *(f"go1exp.{m}" for m in OWN)),
-    "types.py": (*FOREIGN, "go1exp.mdp", *(f"go1exp.{m}" for m in OWN)),
+    "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
+    "types.py": (*FOREIGN, "go1exp.mdp", *UP),
     "registry.py": (*FOREIGN, "torch", "go1exp"),
     "randomness.py": (*FOREIGN, "go1exp"),
     "memory.py": (*FOREIGN, "go1exp"),
-    "terrain.py": (*FOREIGN, "torch", "go1exp.mdp", *(f"go1exp.{m}" for m in OWN)),
-    "config.py": (*FOREIGN, "omegaconf", "go1exp.compose", *(f"go1exp.{m}" for m in OWN)),
-    "compose.py": ("mujoco", "gymnasium", "stable_baselines3", "torch", "go1exp.config", *(f"go1exp.{m}" for m in OWN)),
+    "terrain.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
+    "config.py": (*FOREIGN, "omegaconf", "go1exp.compose", *UP),
+    "joint_values.py": (*FOREIGN, "torch", "go1exp"),
+    "delay_line.py": (*FOREIGN, "go1exp.registry", "go1exp.robot", "go1exp.mdp", *UP),
+    "drive.py": (*FOREIGN, "go1exp.registry", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
+    # recordings, which need no robot and no engine
+    "recording.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
+    "importers/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    "audit/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    "excitations/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    "compose.py": ("mujoco", "gymnasium", "stable_baselines3", "torch", "go1exp.config", *UP),
     # the MDP knows no engine, the engine no MDP
-    "mdp/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.actuator", *(f"go1exp.{m}" for m in OWN)),
-    "actuator/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *(f"go1exp.{m}" for m in OWN)),
+    "mdp/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.actuator", *UP),
+    # an actuator may load a net: the file's format, not the way it is fitted
+    "actuator/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *up("fit")),
+    "effects/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *UP),
     "physics/": (
         *("gymnasium", "stable_baselines3", "hydra", "omegaconf", "go1exp.mdp", "go1exp.actuator", "go1exp.config"),
-        *("go1exp.env", "go1exp.train", "go1exp.evaluate", "go1exp.bench", "go1exp.cli"),
+        *("go1exp.effects", *up("physics")),
     ),
     # the environment joins them
     "env/": ("mujoco", "hydra", "omegaconf", "go1exp.train", "go1exp.bench", "go1exp.cli"),
@@ -50,13 +68,24 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "env/gym_env.py": ("stable_baselines3",),
     "env/sb3_env.py": ("go1exp.compose", "go1exp.evaluate"),
     # users of the environment
+    "record/": (
+        "mujoco",
+        "gymnasium",
+        "stable_baselines3",
+        "hydra",
+        "omegaconf",
+        "go1exp.compose",
+        *up("physics", "env", "record"),
+    ),
+    "fit/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *up("fit")),
+    "gap/": ("mujoco", "hydra", "omegaconf", "go1exp.compose", "go1exp.train", "go1exp.bench", "go1exp.cli"),
     "train/": ("mujoco", "hydra", "go1exp.compose", "go1exp.physics", "go1exp.evaluate", "go1exp.bench", "go1exp.cli"),
     "evaluate/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
 }
 """File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""
 
-SETTLED = {"compose.py", "cli/app.py", "cli/train.py"}
+SETTLED = {"compose.py", "cli/app.py", "cli/files.py", "cli/train.py"}
 """The only files that may import hydra."""
 
 
@@ -187,10 +216,14 @@ def decorated(file: Path) -> Iterator[tuple[str, str]]:
 
 
 def test_terms_are_registered_in_the_order_of_the_source() -> None:
-    import go1exp.config  # noqa: F401  (registers every term)
+    import go1exp.config
+    import go1exp.excitations
+    import go1exp.importers
+    import go1exp.record.policy  # noqa: F401  (registers every member)
 
     groups = registry.groups()
-    assert {"reward", "observation", "rand", "command", "event", "termination", "curriculum", "actuator"} <= set(groups)
+    expected = {"reward", "observation", "rand", "command", "event", "termination", "curriculum", "actuator"}
+    assert expected | {"effect", "excitation", "importer"} <= set(groups)
     for name, file in RELATIVE.items():
         found = list(decorated(file))
         for group in {g for g, _ in found}:
@@ -259,6 +292,6 @@ def test_nothing_is_evaluated_from_text() -> None:
 
 
 def test_every_verb_has_a_module_and_a_configuration() -> None:
-    for verb in VERBS:
+    for verb in [*VERBS, *(f"{verb}_{word}" for verb, words in SUBVERBS.items() for word in words)]:
         assert f"cli/{MODULES.get(verb, verb)}.py" in RELATIVE
         assert (data_root() / f"conf/{verb}.yaml").is_file()

@@ -42,7 +42,9 @@ def settings_and_rig(*overrides: str) -> tuple[RecordSettings, simulate.Rig, lis
 
 def make(*overrides: str) -> list[Recording]:
     settings, rig, terms = settings_and_rig(*overrides)
-    found = simulate.play(rig, plan.episodes(terms, settings), settings.sensors, settings.seed, lambda done, total: None)
+    found = simulate.play(
+        rig, plan.episodes(terms, settings), settings.sensors, settings.seed, lambda done, total: None
+    )
     return found
 
 
@@ -120,7 +122,9 @@ def test_a_hung_trunk_hangs_as_it_is_told() -> None:
         up = [-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)]
         acc = r.block("imu_acc_x", "imu_acc_y", "imu_acc_z").mean(0)
         np.testing.assert_allclose(acc, 9.81 * np.array(up), atol=0.05)
-        np.testing.assert_allclose(r.block(*(f"imu_quat_{a}" for a in "wxyz")).mean(0), r.meta.base_quat, atol=1e-3)
+        assert r.meta.base_quat is not None
+        attitude = r.block(*(f"imu_quat_{a}" for a in "wxyz"))
+        np.testing.assert_allclose(attitude.mean(0), np.array(r.meta.base_quat), atol=1e-3)
         assert not any(name.startswith("base_") for name in r.channels)  # nothing to measure
 
 
@@ -195,9 +199,8 @@ def test_a_policy_is_recorded_until_it_falls(make_task: Callable[..., Any]) -> N
         kick[0] = torch.tensor([8.0, 0.0, 0.0] * 4)  # the first robot throws itself over
         return kick
 
-    names = ["a", "b"]
-    found = simulate.play_policy(rig, trained, policy, names, 1.6, settings.sensors, 0, lambda done, total: None)
-    fallen, standing = found
+    walk = simulate.Walk(trained, policy, ["a", "b"], 1.6, None)
+    fallen, standing = simulate.play_policy(rig, walk, settings.sensors, 0, lambda done, total: None)
     assert len(standing.t) == 800
     assert len(fallen.t) < 800
     assert standing.meta.excitation == "policy"
@@ -205,6 +208,25 @@ def test_a_policy_is_recorded_until_it_falls(make_task: Callable[..., Any]) -> N
     np.testing.assert_array_equal(standing.joint("q_target")[5], robot.NOMINAL_STANCE.astype(np.float32))
     changes = np.flatnonzero(np.any(np.diff(fallen.joint("q_target"), axis=0) != 0, axis=1)) + 1
     assert (changes % 10 == 0).all()  # a policy of 50 Hz in a log of 500
+
+
+def test_a_hung_robot_can_tread_the_air_under_a_policy(make_task: Callable[..., Any]) -> None:
+    settings, rig, _ = settings_and_rig()
+    seen: list[torch.Tensor] = []
+
+    def policy(observation: torch.Tensor) -> torch.Tensor:
+        seen.append(observation.clone())
+        return torch.sin(torch.tensor(float(len(seen)))) * torch.ones(len(observation), 12)
+
+    walk = simulate.Walk(make_task("backend.threads=1", "experiment=ablation/no_noise"), policy, ["a"], 1.0, (0.0, 0.2))
+    (r,) = simulate.play_policy(rig, walk, settings.sensors, 0, lambda done, total: None)
+    assert (r.meta.base, r.meta.base_quat) == ("fixed", simulate.held_quat((0.0, 0.2)))
+    assert np.ptp(r.joint("q"), axis=0).min() > 0.05
+    acc = r.block("imu_acc_x", "imu_acc_y", "imu_acc_z").mean(0)
+    np.testing.assert_allclose(acc, 9.81 * np.array([-np.sin(0.2), 0.0, np.cos(0.2)]), atol=0.05)
+    for observation in seen:  # base velocity, angular velocity, gravity: those of a trunk that does not move
+        expected = [0.0] * 6 + [np.sin(0.2), 0.0, -np.cos(0.2)]
+        np.testing.assert_allclose(observation[0, :9], expected, atol=1e-6)
 
 
 def test_settings_that_do_not_fit_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -259,8 +281,8 @@ def test_channels_without_noise_or_steps_are_left_as_they_are() -> None:
     np.testing.assert_array_equal(found["imu_acc_z"], true["acc"][:, 2])
     np.testing.assert_array_equal(found["base_lin_vel_y_w"], true["base_lin_vel"][:, 1])
     assert "torque_enable" not in found  # on throughout
-    true["torque_enable"] = np.arange(rows) < 5
-    assert log(true, config, rng)["torque_enable"].sum() == 5
+    switched: dict[str, np.ndarray] = {**true, "torque_enable": np.arange(rows) < 5}
+    assert log(switched, config, rng)["torque_enable"].sum() == 5
     assert not any(n.startswith("base_") for n in log(true, dataclasses.replace(config, truth=False), rng))
     with pytest.raises(ConfigError):
         parse(RecordSettings, {"gains": []})

@@ -14,12 +14,13 @@ VERBS = {
     "eval": "run a trained policy through a grid of commands: errors, falls, a table and JSON",
     "play": "watch a trained policy: a clip without a display, a live viewer with one",
     "record": "drive the simulated robot and log it; audit recordings, import others",
+    "fit-actuator": "learn an actuator net from recordings",
     "list": "list terms, groups and their choices, one line each",
     "bench": "measure speed as ratios in one run",
 }
 """Verb -> one line; the module has the verb's name (``list`` is ``listing``)."""
 
-MODULES = {"eval": "evaluate", "list": "listing"}
+MODULES = {"eval": "evaluate", "fit-actuator": "fit_actuator", "list": "listing"}
 """Modules that cannot have their verb's name."""
 
 SUBVERBS = {"record": ("audit", "import")}
@@ -51,7 +52,7 @@ def main() -> int:
     if arguments[:1] == ["-sc"] and len(arguments) > 1:
         return _complete(arguments[1])
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(HELP.format(verbs="\n".join(f"  {verb:8} {text}" for verb, text in VERBS.items())), end="")
+        print(HELP.format(verbs="\n".join(f"  {verb:12} {text}" for verb, text in VERBS.items())), end="")
         return 0
     if arguments[0] in ("-V", "--version"):
         from go1exp import __version__

@@ -69,11 +69,11 @@ def _task(container: dict[str, Any]) -> None:
         from go1exp.evaluate.policy import load_run
 
         trained, policy, _ = load_run(walk)
-        names = [f"policy_{k}" for k in range(settings.episodes)]
+        names = [f"policy_{settings.seed}_{k}" for k in range(settings.episodes)]
+        hang = settings.hang[0] if settings.support == "hung" else None
+        taught = simulate.Walk(trained.task, policy, names, settings.seconds, hang)
         show = spinner(1, "recording a policy")
-        recordings += simulate.play_policy(
-            rig, trained.task, policy, names, settings.seconds, settings.sensors, settings.seed, show
-        )
+        recordings += simulate.play_policy(rig, taught, settings.sensors, settings.seed, show)
     for r in recordings:
         recording.write(out / f"{r.meta.episode}.parquet", r)
     total = sum(float(r.t[-1] - r.t[0]) for r in recordings)

@@ -19,6 +19,7 @@ REQUIRED = {
     "files": "go1exp record audit recordings/NAME.parquet",
     "source": "go1exp record import go2_in_air PATH",
     "path": "go1exp record import go2_in_air PATH",
+    "recordings": "recordings=recordings",
     "logs": "logs=recordings",
 }
 """Settings without a default, and how they are given."""
@@ -125,6 +126,33 @@ class ImportSettings:
     source: str
     path: str
     options: dict[str, Any]
+    out: str
+
+
+@dataclass(frozen=True)
+class FitActuatorSettings:
+    """``conf/fit-actuator.yaml``; what they mean and further rules are in ``go1exp.fit.FitSettings``."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    recordings: str | tuple[str, ...]
+    inputs: tuple[str, ...]
+    history: Count
+    period: Positive | None
+    hidden: tuple[Count, ...]
+    skip: bool
+    share: Literal["all", "kind", "none"]
+    target: Literal["tau_est", "joint_torque"]
+    epochs: Count
+    batch: Count
+    learning_rate: Positive
+    patience: Count
+    epoch_rows: Count
+    holdout: float | tuple[str, ...]
+    validation: float | tuple[str, ...]
+    half_net: bool
+    seed: Annotated[int, Field(ge=0)]
+    plots: bool
     out: str
 
 

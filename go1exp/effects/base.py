@@ -75,6 +75,21 @@ class Measured:
     acc: Tensor | None = None
 
 
+@dataclass
+class Gears:
+    """How the gears between motors and joints yield (``effects/two_mass.py``); zeros for gears that do not.
+
+    Attributes:
+        compliance: (N, J) twist per torque, rad/(N m).
+        gap: (N, J) play, rad.
+        damping: (N, J) damping ratio of the rotor on the gears' spring, the joint held.
+    """
+
+    compliance: Tensor
+    gap: Tensor
+    damping: Tensor
+
+
 class Effect(Memory):
     """Base of all effects.
 
@@ -82,8 +97,8 @@ class Effect(Memory):
     others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
-    ``on_target``, ``on_encoder``, the actuator, ``on_drive``, ``on_transmission``, then ``on_joint``, ``on_friction``
-    and ``on_base`` beside it.
+    ``on_target``, ``on_encoder``, the actuator, ``on_drive``, ``on_transmission``, ``on_gears``, then ``on_joint``,
+    ``on_friction`` and ``on_base`` beside it.
     """
 
     params: ClassVar[tuple[Param, ...]] = ()
@@ -135,6 +150,10 @@ class Effect(Memory):
     def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque that reaches the joint, whose true angle and speed are q and qd."""
         return torque
+
+    def on_gears(self, gears: Gears) -> Gears:
+        """Return how the gears yield, given how they do so far; what goes through them reaches the joint."""
+        return gears
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return a further torque that acts on the joint and is not the drive's."""

@@ -10,11 +10,15 @@ from torch import Tensor
 
 from go1exp.actuator.setup import Actuator, HasGains
 from go1exp.drive import DriveSetup, ModelFields
-from go1exp.effects.base import Effect, Measured
+from go1exp.effects.base import Effect, Gears, Measured
+from go1exp.effects.two_mass import TwoMass
 from go1exp.joint_values import spread
 from go1exp.registry import Term
 
-HOOKS = ("on_target", "on_encoder", "on_gains", "on_drive", "on_transmission", "on_joint", "on_friction", "on_base")
+HOOKS = (
+    *("on_target", "on_encoder", "on_gains", "on_drive", "on_transmission", "on_gears"),
+    *("on_joint", "on_friction", "on_base"),
+)
 
 
 class _Fields:
@@ -32,7 +36,12 @@ class _Fields:
 
 
 class EffectStack:
-    """The configured effects, called hook by hook; with none configured every hook returns what it was given."""
+    """The configured effects, called hook by hook; with none configured every hook returns what it was given.
+
+    Attributes:
+        effects: by their keys in the configuration.
+        rotors: of gears that yield; None if no effect makes them.
+    """
 
     def __init__(self, terms: Sequence[Term], setup: DriveSetup) -> None:
         """Build the effects of ``terms``."""
@@ -46,6 +55,7 @@ class EffectStack:
             for hook in (*HOOKS, "on_sensor", "edit_model")
         }
         self.fields = tuple(dict.fromkeys(name for e in ranked for name in e.fields))
+        self.rotors = TwoMass(setup) if self.acts("on_gears") else None
 
     def acts(self, hook: str) -> bool:
         """Return whether any effect overrides ``hook``."""
@@ -99,6 +109,8 @@ class EffectStack:
 
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the drives' encoders read."""
+        if self.rotors:
+            q, qd = self.rotors.motor(q, qd)
         for effect in self._acting["on_encoder"]:
             q, qd = effect.on_encoder(q, qd)
         return q, qd
@@ -114,6 +126,13 @@ class EffectStack:
         for effect in self._acting["on_transmission"]:
             torque = effect.on_transmission(torque, q, qd)
         return torque
+
+    def gears(self) -> Gears:
+        """Return how the gears yield."""
+        gears = Gears(self._setup.zeros(), self._setup.zeros(), self._setup.zeros())
+        for effect in self._acting["on_gears"]:
+            gears = effect.on_gears(gears)
+        return gears
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the sum of all torques on the joints that are not the drives'."""
@@ -142,7 +161,7 @@ class EffectStack:
     @property
     def senses(self) -> bool:
         """Whether any effect changes what the sensors say."""
-        return self.acts("on_sensor") or self.acts("on_encoder")
+        return self.acts("on_sensor") or self.acts("on_encoder") or self.rotors is not None
 
     # ------------------------------------------------------------------ state
 

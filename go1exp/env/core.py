@@ -51,6 +51,7 @@ class Go1Core:
         noise: add the observation noise (off in evaluation).
         spread_starts: let first episodes begin at random times (training only).
         imu: simulate the IMU's sensors too, for a logger.
+        held: attitude w-x-y-z in which the trunks are held in the air; None lets them go.
     """
 
     def __init__(
@@ -63,15 +64,17 @@ class Go1Core:
         noise: bool = True,
         spread_starts: bool = False,
         imu: bool = False,
+        held: tuple[float, float, float, float] | None = None,
     ) -> None:
         self.task, self.num_envs, self.noise = task, num_envs, noise
         self._spread_starts = spread_starts
         self.terrain = build_terrain(task.terrain)
-        model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt, imu=imu)
+        model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt, imu=imu, held=held)
         self.backend = make_backend(task.backend, model, sensors, num_envs)
         self.device = self.backend.qpos.device
         self.random = EnvRandom(seed, num_envs, first_env, self.device)
-        self._state = KinematicState.of(self.backend.qpos, self.backend.qvel)
+        self._held = held
+        self._state = KinematicState.of(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
         self._build_terms()
 
@@ -182,7 +185,7 @@ class Go1Core:
         rows = mask.unsqueeze(1)
         self.spawn.copy_(torch.where(rows, self._origins[self.level, self.tile_column], self.spawn))
         qpos, qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
-        fresh = KinematicState.of(qpos, qvel)
+        fresh = KinematicState.of(qpos, qvel, self._held)
         fresh.base_pos_w.copy_(self.spawn)
         fresh.base_pos_w[:, 2] += robot.NOMINAL_HEIGHT
         fresh.base_quat_w[:, 0] = 1.0

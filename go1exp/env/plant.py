@@ -6,6 +6,8 @@ Numerics. MuJoCo's Euler step is a leapfrog: qpos belongs to the step's instant,
 that took both at face value would react half a step late to speed and half a step early to its target, which at 2 ms
 moves a 0.2 rad step by 5 mrad against 0.25 ms. So the drive gets the speed extrapolated to the instant of qpos, and a
 target that changes counts for half of the step in which it changes: second order in the step, 0.3 mrad.
+Dry friction changes its sign within the step in which a joint turns. MuJoCo's has the sign of the speed at its end all
+the step long; the difference is given beside it.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from go1exp.registry import Term
 from go1exp.robot import RobotConfig
 from go1exp.types import Snapshot
 
-FRICTION = "dof_frictionloss"
+FRICTION, ARMATURE = "dof_frictionloss", "dof_armature"
 
 
 def drive_setup(config: RobotConfig, physics_dt: float, backend: PhysicsBackend, random: EnvRandom) -> DriveSetup:
@@ -79,10 +81,14 @@ class Plant:
         self.effects = EffectStack(effects, setup)
         self.torque = setup.zeros()
         self._before, self._target, self._bound = setup.zeros(), setup.zeros(), setup.zeros()
-        for name in self.effects.fields:
+        self._rotors, self._floating = self.effects.rotors, setup.floating
+        self._inertia = setup.zeros()
+        self._dry = self.effects.acts("on_friction") or FRICTION in self.effects.fields
+        self._dry |= bool(backend.compiled(FRICTION).any())
+        self._ease = setup.physics_dt * backend.compiled("dof_invweight0")[self._joints]
+        live = [*self.effects.fields, *([FRICTION] if self._dry else []), *([ARMATURE] if self._rotors else [])]
+        for name in live:
             backend.field(name)
-        if self.effects.acts("on_friction"):
-            backend.field(FRICTION)
 
     def set_gains(self, kp: Tensor, kd: Tensor) -> None:
         """Give each robot gains (N, J) of its own; effects on gains act on top of them."""
@@ -106,6 +112,8 @@ class Plant:
             self.effects.set_gains(self.actuator, *self._gains)
         if self.effects.acts("on_friction"):
             self._bound.copy_(self.backend.nominal(FRICTION)[:, self._joints])
+        if self._rotors:
+            self._inertia.copy_(self.backend.nominal(ARMATURE)[:, self._joints])
 
     def reset(self, mask: Tensor, target: Tensor) -> None:
         """Begin anew in the rows of ``mask`` (N,), whose state is set, with ``target`` (N, J) long in force."""
@@ -115,6 +123,8 @@ class Plant:
         self.torque.masked_fill_(rows, 0.0)
         self.actuator.reset(mask)
         self.effects.reset(mask)
+        if self._rotors:
+            self._rotors.reset(mask)
 
     def speed(self) -> Tensor:
         """(N, J) joint speeds at the instant of ``q``, rad/s."""
@@ -125,6 +135,7 @@ class Plant:
         if self.observer:
             self.observer(target)
         effects, q, qd = self.effects, self.q, self.speed()
+        turn = self.qd - self._before
         self._before.copy_(self.qd)
         command = effects.on_target(torch.lerp(self._target, target, 0.5))
         self._target.copy_(target)
@@ -132,14 +143,34 @@ class Plant:
         self.torque.copy_(effects.on_drive(self.actuator.torque(command, *encoder), *encoder))
         if self.enabled is not None:
             self.torque.mul_(self.enabled.unsqueeze(1))
-        if effects.acts("on_joint"):
-            self.backend.applied()[:, self._joints] = effects.on_joint(q, qd)
+        geared, beside = effects.on_transmission(self.torque, q, qd), effects.on_joint(q, qd)
         if effects.acts("on_friction"):
             self.backend.field(FRICTION)[:, self._joints] = effects.on_friction(self._bound, self.torque, qd)
-        if effects.acts("on_base"):
+        if self._dry:
+            beside = beside + self._late_friction(turn)
+        if self._rotors:
+            rigid, through, carried = self._rotors.transmit(effects.gears(), geared, self._inertia)
+            self.backend.field(ARMATURE)[:, self._joints] = carried
+            # The motor's torque limit is not the gears'.
+            geared, beside = torch.where(rigid, geared, 0.0), torch.where(rigid, beside, beside + through)
+        if self._dry or self._rotors or effects.acts("on_joint"):
+            self.backend.applied()[:, self._joints] = beside
+        if self._floating and effects.acts("on_base"):
             force = self.backend.applied()[:, :3]
             force.copy_(effects.on_base(torch.zeros_like(force)))
-        self.backend.step(effects.on_transmission(self.torque, q, qd))
+        self.backend.step(geared)
+        if self._rotors:
+            self._rotors.follow(self.joint_acceleration())
+
+    def _late_friction(self, turn: Tensor) -> Tensor:
+        """Return the torque by which dry friction differs from MuJoCo's, which changes its sign too early.
+
+        A joint that goes on to change its speed by ``turn`` (N, J), rad/s, rests after ``share`` of the step; so long
+        friction has the old sign. Where it would end up sticking this changes nothing, and it turns no joint by itself.
+        """
+        bound, share = self.backend.field(FRICTION)[:, self._joints], -self.qd / turn
+        turns = (share > 0.0) & (share < 1.0) & (turn.abs() > 2.0 * bound * self._ease)
+        return torch.where(turns, 2.0 * share * bound * turn.sign(), 0.0)
 
     def joint_acceleration(self) -> Tensor:
         """(N, J) change of joint speed over the last step, rad/s2."""
@@ -153,16 +184,22 @@ class Plant:
         joints = {"joint_pos": seen.joint_pos.float(), "joint_vel": seen.joint_vel.float()}
         return dataclasses.replace(s, **joints, projected_gravity_b=seen.gravity, base_ang_vel_b=seen.gyro)
 
+    _STATE = ("before", "target", "bound", "inertia")
+
     def state_dict(self) -> dict[str, Any]:
         """Return what the drives and effects remember."""
-        own = {name: getattr(self, f"_{name}").clone() for name in ("before", "target", "bound")}
+        own = {name: getattr(self, f"_{name}").clone() for name in self._STATE}
         parts = {"actuator": self.actuator.state_dict(), "effects": self.effects.state_dict()}
+        if self._rotors:
+            parts["rotors"] = self._rotors.state_dict()
         return {**own, "torque": self.torque.clone(), **parts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``; the backend holds the model."""
-        for name in ("before", "target", "bound"):
+        for name in self._STATE:
             getattr(self, f"_{name}").copy_(state[name])
         self.torque.copy_(state["torque"])
         self.actuator.load_state_dict(state["actuator"])
         self.effects.load_state_dict(state["effects"])
+        if self._rotors:
+            self._rotors.load_state_dict(state["rotors"])

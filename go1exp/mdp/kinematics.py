@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import torch
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -30,6 +32,14 @@ class KinematicState:
     """(N, 12) rad/s."""
 
     @classmethod
-    def of(cls, qpos: Tensor, qvel: Tensor) -> KinematicState:
-        """View MuJoCo's qpos (N, 19) and qvel (N, 18): writing here writes there."""
-        return cls(qpos[:, :3], qpos[:, 3:7], qvel[:, :3], qvel[:, 3:6], qpos[:, 7:], qvel[:, 6:])
+    def of(cls, qpos: Tensor, qvel: Tensor, held: tuple[float, float, float, float] | None = None) -> KinematicState:
+        """View MuJoCo's qpos (N, 19) and qvel (N, 18): writing here writes there.
+
+        The state of a robot whose trunk is ``held`` at an attitude w-x-y-z is its joints' alone, (N, 12); its trunk
+        rests at the origin, and writing that writes nowhere.
+        """
+        if held is None:
+            return cls(qpos[:, :3], qpos[:, 3:7], qvel[:, :3], qvel[:, 3:6], qpos[:, 7:], qvel[:, 6:])
+        still = torch.zeros(len(qpos), 3, dtype=qpos.dtype, device=qpos.device)
+        quat = torch.tensor(held, dtype=qpos.dtype, device=qpos.device).repeat(len(qpos), 1)
+        return cls(still, quat, still.clone(), still.clone(), qpos, qvel)

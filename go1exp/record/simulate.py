@@ -161,30 +161,41 @@ def policy_task(rig: Rig, trained: TaskConfig, seconds: float) -> TaskConfig:
     return dataclasses.replace(trained, sim=sim, rand=(), event=(), curriculum=(), **parts)
 
 
-def play_policy(
-    rig: Rig,
-    trained: TaskConfig,
-    policy: Callable[[torch.Tensor], torch.Tensor],
-    names: Sequence[str],
-    seconds: float,
-    sensors: SensorConfig,
-    seed: int,
-    on_step: Progress,
-) -> list[Recording]:
-    """Let a policy walk under random commands, one robot for each of ``names``, and return the recordings.
+@dataclass(frozen=True)
+class Walk:
+    """A policy to record.
+
+    Attributes:
+        trained: the task that it was trained in.
+        policy: observations (N, O) -> actions (N, 12).
+        names: of the episodes, one robot each.
+        seconds: length of each.
+        hang: roll and pitch of a held trunk, rad, for a policy that treads the air; None on the ground.
+    """
+
+    trained: TaskConfig
+    policy: Callable[[torch.Tensor], torch.Tensor]
+    names: Sequence[str]
+    seconds: float
+    hang: tuple[float, float] | None
+
+
+def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
+    """Let a policy move robots under random commands and return the recordings.
 
     A robot that falls is recorded up to its fall.
     """
-    core = Go1Core(policy_task(rig, trained, seconds), len(names), seed, imu=True)
+    held = None if walk.hang is None else held_quat(walk.hang)
+    core = Go1Core(policy_task(rig, walk.trained, walk.seconds), len(walk.names), seed, imu=True, held=held)
     observation = core.reset()
     per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
     samples_per_step = round(core.task.sim.policy_dt * sensors.rate_hz)
-    steps = round(seconds / core.task.sim.policy_dt)
+    steps = round(walk.seconds / core.task.sim.policy_dt)
     tape = Tape(core.plant, per_sample, steps * samples_per_step)
-    rows = np.full(len(names), steps * samples_per_step)
-    walking = torch.ones(len(names), dtype=torch.bool)
+    rows = np.full(len(walk.names), steps * samples_per_step)
+    walking = torch.ones(len(walk.names), dtype=torch.bool)
     for step in range(steps):
-        result = core.step(policy(observation))
+        result = core.step(walk.policy(observation))
         observation = result.observation
         fell = walking & (result.terminated | result.truncated)
         rows[fell.numpy()] = (step + 1) * samples_per_step
@@ -192,13 +203,13 @@ def play_policy(
         on_step(step + 1, steps)
     tape.stop()
     found = []
-    for k, name in enumerate(names):
+    for k, name in enumerate(walk.names):
         true = {key: values[: rows[k]] for key, values in tape.true(k).items()}
         about = meta(
             rig.robot,
             sensors,
-            base="floating",
-            base_quat=None,
+            base="floating" if held is None else "fixed",
+            base_quat=held,
             kp=_configured(rig.actuator, "kp"),
             kd=_configured(rig.actuator, "kd"),
             excitation="policy",

@@ -9,6 +9,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import mujoco
@@ -126,7 +127,7 @@ class Rig:
             getattr(self.plant.effects.effects[name], key)[row] = value
 
     def state_dict(self) -> dict[str, Any]:
-        parts = {"backend": self.backend, "plant": self.plant, "random": self.random}
+        parts: dict[str, Any] = {"backend": self.backend, "plant": self.plant, "random": self.random}
         return {"clock": self.clock, **{key: part.state_dict() for key, part in parts.items()}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -155,7 +156,9 @@ def kind(entry: Entry) -> type[Effect]:
 def probe(entry: Entry, p: Param) -> float:
     """Return a sensible value that is not null: five tolerances, as far as the bounds go."""
     step = 5.0 * p.tolerance
-    return PROBES.get((entry.name, p.name), min(p.null + step, p.high) if p.null < p.high else max(p.null - step, p.low))
+    return PROBES.get(
+        (entry.name, p.name), min(p.null + step, p.high) if p.null < p.high else max(p.null - step, p.low)
+    )
 
 
 def probes(entry: Entry) -> dict[str, float]:
@@ -295,7 +298,7 @@ def test_every_size_moves_something_that_a_robot_measures(entry: Entry) -> None:
         for row, p in enumerate(sizes(entry), start=1):
             rig.write(entry.name, row, {p.name: probe(entry, p)})
         rig.plant.refresh()
-        read = rig.run(200)
+        read = rig.run(150)
         for row, p in enumerate(sizes(entry), start=1):
             for channel, floor in FLOORS.items():
                 if channel in read:
@@ -379,7 +382,9 @@ def calls(effect: Effect, n: int, k: int) -> Iterator[tuple[str, tuple[Any, ...]
 
 def tensors_of(result: Any) -> tuple[Tensor, ...]:
     if isinstance(result, Measured):
-        return tuple(x for x in (result.joint_pos, result.joint_vel, result.gravity, result.gyro, result.acc) if x is not None)
+        return tuple(
+            x for x in (result.joint_pos, result.joint_vel, result.gravity, result.gyro, result.acc) if x is not None
+        )
     return result if isinstance(result, tuple) else (result,)
 
 
@@ -395,6 +400,14 @@ def test_hooks_leave_their_arguments_as_they_are(entry: Entry, drives: Callable[
                 assert x.shape[0] == 4
                 assert torch.isfinite(x).all()
                 assert x.dtype in (torch.float64, torch.float32)
+
+
+@each
+def test_a_sensor_that_the_robot_lacks_stays_unmeasured(entry: Entry, drives: Callable[..., DriveSetup]) -> None:
+    effect = term(entry.name, probes(entry))(drives(4))
+    seen = effect.on_sensor(Measured(joint_noise(4, 1.0, 0), joint_noise(4, 1.0, 1)))
+    assert (seen.gravity, seen.gyro, seen.acc) == (None, None, None)
+    assert seen.joint_pos.shape == seen.joint_vel.shape == (4, 12)
 
 
 @each
@@ -421,7 +434,7 @@ def test_spreads_are_drawn_for_each_robot_within_the_bounds(entry: Entry) -> Non
         assert (drawn.max() - drawn.min()) > 0.5 * width
         assert (drawn.std(0) > 0.0).all()
         if p.per == "joint":
-            assert drawn[0].unique().numel() > 1
+            assert (drawn.std(1) > 0.0).any()
             assert (live.reshape(12, 4, 3)[..., :2] == p.null).all()
 
 
@@ -472,7 +485,7 @@ def test_a_brake_only_brakes(name: str, drives: Callable[..., DriveSetup]) -> No
 @pytest.mark.parametrize("name", BRAKES)
 @pytest.mark.parametrize("share", [0.05, 1.0])
 def test_a_brake_takes_energy_from_a_swinging_robot(name: str, share: float) -> None:
-    """Drives off, weightless, legs swung at 8 rad/s; at the largest value too the step must not feed energy in."""
+    """Drives off, weightless, legs swung; at the largest value too the step must not feed energy in."""
     entry = EFFECTS[name]
     top = {p.name: p.null + share * (p.high - p.null) for p in sizes(entry)}
     if name == "asymmetric_friction":
@@ -482,7 +495,8 @@ def test_a_brake_takes_energy_from_a_swinging_robot(name: str, share: float) -> 
     model = rig.backend.env_model(0)
     rig.backend.field("opt.gravity").zero_()
     qpos = rig.backend.qpos.clone()
-    rig.backend.reset(torch.tensor([True]), qpos, 8.0 * torch.cos(torch.arange(12.0)).double().unsqueeze(0))
+    speed = 0.3 if name == "stribeck" else 8.0  # rad/s
+    rig.backend.reset(torch.tensor([True]), qpos, speed * torch.cos(torch.arange(12.0)).double().unsqueeze(0))
     rig.plant.reset(torch.tensor([True]), rig.stance)
     energy = []
     for _ in range(40):
@@ -491,6 +505,6 @@ def test_a_brake_takes_energy_from_a_swinging_robot(name: str, share: float) -> 
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_energyVel(model, data)
         energy.append(float(data.energy[1]))
-    assert all(b <= a * (1.0 + 2e-3) + 1e-6 for a, b in zip(energy, energy[1:], strict=False)), energy
+    assert all(b <= a * (1.0 + 2e-3) + 1e-6 for a, b in pairwise(energy)), energy
     if name != "load_friction":  # without a drive's torque there is none
         assert energy[-1] < 0.97 * energy[0]

@@ -1,0 +1,113 @@
+"""The audit of one recording: every check, put together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from go1exp.audit import commands, limits, related, signals, single
+from go1exp.audit.log import Log, finding
+from go1exp.audit.report import ORDER, AuditReport, Channel, Finding, worst
+from go1exp.recording import Recording, problems, read
+
+SHORTEST = 20
+"""Rows below which nothing can be said."""
+
+
+def audit_file(path: Path) -> AuditReport:
+    """Read a recording and audit it.
+
+    Raises:
+        RecordingError: if the file cannot be read or breaks the format.
+    """
+    return audit(read(path))
+
+
+def audit(recording: Recording) -> AuditReport:
+    """Look for what is wrong with a recording; nothing is mended and nothing is raised.
+
+    A recording that breaks the format so that it cannot be computed with (no clock, not finite, a clock that runs
+    backward) gets only those findings.
+    """
+    broken = [_as_finding(line) for line in problems(recording)]
+    if not _computable(recording):
+        return _report(recording, broken, ())
+    log = Log(recording)
+    found = list(single.clock(log))
+    repeats_found, repeats = single.stale(log)
+    noise_found, floors = single.noise(log, repeats)
+    delay_found, delay = commands.timing(log)
+    found += [*repeats_found, *single.resolution(log), *noise_found, *single.dead(log), *single.saturation(log)]
+    found += [*single.ranges(log), *related.attitude_length(log), *related.speed(log), *related.torque(log)]
+    found += [*related.rotation(log), *related.gravity(log), *commands.order_and_sign(log), *delay_found]
+    off = _times(log, ~log.on)
+    still = _times(log, log.still)
+    if off:
+        total = sum(b - a for a, b in off)
+        found.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {len(off)} stretches"))
+    if (share := float(log.still.mean())) > limits.STILL_SHARE:
+        found.append(finding("still", "all", "suspect", share, "", "no joint moves: nothing can be learned from this"))
+    named = {f.channel for f in found if f.verdict == "bad"}
+    found += [f for f in broken if f.channel not in named]
+    table = []
+    for name, values in recording.channels.items():
+        verdict = worst(f.verdict for f in found if _concerns(f, name, log))
+        d = delay.get(name)
+        table.append(
+            Channel(
+                name,
+                verdict,
+                log.unit(name),
+                float(values.min()),
+                float(values.max()),
+                log.steps.get(name),
+                floors.get(name),
+                repeats.get(name),
+                None if d is None else d.time * 1e3,
+                None if d is None else d.error * 1e3,
+            )
+        )
+    return _report(recording, found, tuple(table), off, still)
+
+
+def _as_finding(line: str) -> Finding:
+    channel, _, message = line.partition(": ")
+    return Finding("format", channel, "bad", None, "", message)
+
+
+def _computable(recording: Recording) -> bool:
+    channels = recording.channels
+    t = channels.get("t")
+    if t is None or np.ndim(t) != 1 or len(t) < SHORTEST:
+        return False
+    plain = all(isinstance(v, np.ndarray) and v.shape == t.shape and v.dtype.kind in "fb" for v in channels.values())
+    return plain and all(np.isfinite(v).all() for v in channels.values()) and bool(np.all(np.diff(t) > 0))
+
+
+def _concerns(f: Finding, name: str, log: Log) -> bool:
+    """Whether a finding is about this column: by its name, or by its quantity (``imu_acc``)."""
+    return f.channel == name or f.channel == log.quantity.get(name)
+
+
+def _times(log: Log, flags: np.ndarray) -> tuple[tuple[float, float], ...]:
+    return tuple((float(log.t[a]), float(log.t[b - 1])) for a, b in signals.stretches(flags))
+
+
+def _report(
+    recording: Recording,
+    found: list[Finding],
+    table: tuple[Channel, ...],
+    off: tuple[tuple[float, float], ...] = (),
+    still: tuple[tuple[float, float], ...] = (),
+) -> AuditReport:
+    t = np.asarray(recording.channels.get("t", []), dtype=float)
+    steps = np.diff(t) if t.ndim == 1 else np.empty(0)
+    middle = float(np.median(steps)) if len(steps) else 0.0
+    if t.ndim == 1 and len(t) < SHORTEST:
+        said = f"{len(t)} samples are too few to judge; at least {SHORTEST} are needed"
+        found = [*found, finding("length", "all", "suspect", len(t), "samples", said)]
+    ranked = sorted(found, key=lambda f: -ORDER.index(f.verdict))
+    duration = float(t[-1] - t[0]) if t.ndim == 1 and len(t) else 0.0
+    rate = 1 / middle if middle > 0 else 0.0
+    return AuditReport(recording.meta.episode, len(t), duration, rate, table, tuple(ranked), off, still)

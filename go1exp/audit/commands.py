@@ -1,0 +1,117 @@
+"""Checks of commands against what the joints did: order, sign, delay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from go1exp.audit import limits, signals
+from go1exp.audit.delay import Delay, delays
+from go1exp.audit.log import Log, finding
+from go1exp.audit.report import Finding
+from go1exp.recording import joint_channel
+
+SMOOTH = 0.2
+"""s; order and sign are judged below some 3 Hz, where a joint follows its target whatever its gains."""
+LONGEST_LAG = 0.12
+"""s by which a joint may trail its target."""
+LONGEST_TRAIL = 0.3
+"""s; the same for a soft position servo."""
+
+
+def order_and_sign(log: Log) -> Iterator[Finding]:
+    """Does each joint follow its own target better than another's, and forward?"""
+    if not (log.recording.has("q_target") and log.recording.has("q")) or not _enough(log):
+        return
+    target, q = _matches_inputs(log)
+    match = _lagged_correlation(log, target, q)
+    partner = signals.mixed_up(match)
+    for j, joint in enumerate(log.joints):
+        if j in partner:
+            other = log.joints[partner[j]]
+            said = f"moves with q_{other} (correlation {match[j, partner[j]]:.2f}), not with its own joint"
+            said += f" ({match[j, j]:.2f}): "
+            swap = partner[partner[j]] == j
+            said += f"{joint} and {other} are swapped" if swap else f"what is called {other} is the joint it drives"
+            yield finding("order", joint_channel("q_target", joint), "bad", match[j, partner[j]], "", said)
+        elif match[j, j] < -limits.CLEARLY:
+            said = f"goes against q_target_{joint} (correlation {match[j, j]:.2f}): a sign is flipped"
+            yield finding("sign", joint_channel("q", joint), "bad", match[j, j], "", said)
+
+
+def _enough(log: Log) -> bool:
+    return log.on.sum() >= max(2 * limits.ENOUGH, limits.LEAST_TIME / log.dt)
+
+
+def _matches_inputs(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Targets and angles without their mean and without what is fast; while the drives are off, as they stood."""
+    n = log.samples(SMOOTH)
+    held = np.maximum.accumulate(np.where(log.on, np.arange(len(log.t)), 0))
+    target, q = (uniform_filter1d(log.recording.joint(name)[held], n, axis=0) for name in ("q_target", "q"))
+    return target - target.mean(axis=0), q - q.mean(axis=0)
+
+
+def _lagged_correlation(log: Log, target: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Largest correlation (by size) of each target (rows) with each joint (columns) that trails it; 0 if one rests."""
+    best = np.zeros((target.shape[1], q.shape[1]))
+    live = np.outer(np.ptp(target, axis=0) > limits.STILL_ANGLE, np.ptp(q, axis=0) > limits.STILL_ANGLE)
+    for lag in range(0, log.samples(LONGEST_LAG) + 1, log.samples(0.01)):
+        a, b = target[: len(target) - lag], q[lag:]
+        a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+        spread = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
+        match = np.where(live, a.T @ b / np.maximum(spread, 1e-12), 0.0)
+        best = np.where(np.abs(match) > np.abs(best), match, best)
+    return best
+
+
+def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
+    """Delay of each joint; return it by the name of the ``q`` column too."""
+    if log.command is None or not log.recording.has("q") or not _enough(log):
+        return [], {}
+    q = log.recording.joint("q")
+    estimates = delays(log.t, log.recording.joint(log.command), q, log.on)
+    known = {j: d for j, d in zip(log.joints, estimates, strict=True) if d is not None}
+    found = []
+    middle = float(np.median([d.time for d in known.values()])) if known else 0.0
+    threshold = limits.DELAY + log.dt
+    late = {j: d for j, d in known.items() if abs(d.time) - 2 * d.error > threshold}
+    for joint, d in known.items():
+        name = joint_channel("q", joint)
+        shown = f"answers {log.command} after {d.time * 1e3:.1f} ± {d.error * 1e3:.1f} ms"
+        apart = abs(d.time - middle) - 2 * d.error > limits.DELAY_SPREAD and len(known) > 2
+        if joint in late and d.time > 0:
+            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", f"{shown}: delay or clock offset"))
+        elif joint in late:
+            said = f"{shown}, before it is given: a clock offset, or a command logged late"
+            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", said))
+        elif apart:
+            said = f"{shown}, the other joints after {middle * 1e3:.1f} ms: delay or clock offset of this one"
+            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", said))
+    if known and not found:
+        low, high = (f(d.time for d in known.values()) * 1e3 for f in (min, max))
+        said = f"{len(known)} of {len(log.joints)} joints answer after {low:.1f} to {high:.1f} ms"
+        found.append(finding("delay", "q", "ok", middle * 1e3, "ms", said))
+    found += _trailing(log, [j for j in log.joints if j not in known])
+    return found, {joint_channel("q", joint): d for joint, d in known.items()}
+
+
+def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
+    """Tell by how much joints of unknown delay trail their targets: delay and response of the drive in one."""
+    if log.command != "q_target" or not joints:
+        return
+    n, most = log.samples(0.05), log.samples(LONGEST_TRAIL)
+    trail = {}
+    for joint in joints:
+        pair = (log.recording.channels[joint_channel(name, joint)] for name in ("q_target", "q"))
+        a, b = (np.gradient(uniform_filter1d(x, n)) for x in pair)
+        a, b = a[: len(a) - most], np.lib.stride_tricks.sliding_window_view(b, len(a) - most)
+        spread = np.linalg.norm(a) * np.linalg.norm(b, axis=1)
+        match = np.divide(b @ a, spread, out=np.zeros_like(spread), where=spread > 0)
+        if match.max() > limits.CLEARLY and 0 < np.argmax(match) < most:
+            trail[joint] = float(np.argmax(match)) * log.dt * 1e3
+    if trail:
+        low, high = min(trail.values()), max(trail.values())
+        said = f"{', '.join(trail)} trail their targets by {low:.3g} to {high:.3g} ms, delay and drive together; "
+        yield finding("trail", "q", "ok", high, "ms", said + "the motion does not tell them apart")

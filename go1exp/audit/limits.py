@@ -1,0 +1,118 @@
+"""Every threshold of the audit, with its reason. Pairs are (suspect, bad).
+
+All were chosen so that noise-free simulated motion passes and the flaws of known public recordings do not; where a
+number comes from hardware, it says so.
+"""
+
+from __future__ import annotations
+
+import math
+
+# ---------------------------------------------------------------------- clock
+
+RATE = (0.02, 0.10)
+"""Relative distance of the median step from 1 / ``rate_hz``: 2 % shifts a 20 s chirp by 0.4 s."""
+JITTER = (0.10, 0.50)
+"""Standard deviation of the steps over their median: a tenth of 2 ms is the encoder noise of a joint at 2 rad/s."""
+GAP_STEPS = 1.8
+"""A step longer than this many medians (and 6 robust deviations more than one) is a gap: a sample is missing."""
+GAPS = (0.0, 0.02)
+"""Share of missing samples: one is worth a word, 2 % spoil a derivative somewhere in every tenth of a second."""
+LONGEST_GAP = 0.1
+"""s; longer ones are bad: half a stride is missing."""
+
+# ---------------------------------------------------------------------- single channels
+
+REPEATS = (0.01, 0.20)
+"""Share of samples that repeat the last value although the channel moves, beyond what its step explains."""
+ENOUGH = 50
+"""Samples that a share or a scale needs at least."""
+SURE = 4.0
+"""Standard deviations (of a count) by which stale samples must exceed chance."""
+ENOUGH_NOISE = 500
+"""Samples that a noise floor needs to be judged; shorter snippets (a second of walking) are mostly motion."""
+COARSE_ANGLE = 4e-3
+"""rad; a coarser encoder than any known one (the coarsest, 2 pi / 4096, is 1.5e-3)."""
+NOISE = {"rad": (5e-3, 2e-2), "rad/s": (0.5, 2.0), "N m": (1.0, 5.0), "m/s2": (2.0, 10.0)}
+"""White noise by unit: some five times what drives of this class show (0.2 to 1 mrad, 0.05 rad/s, 0.15 N m)."""
+WHITE = (0.8, 1.25)
+"""Noise estimates by third and by fifth differences agree within this ratio if it is noise and not motion."""
+PLATEAU = 5
+"""Samples in a row at the extreme value, entered and left at speed, that count as clipped."""
+CLIPPED = (0.0, 0.05)
+"""Share of clipped samples: any is suspect; a twentieth is bad."""
+CONTINUOUS = 2.0**-22
+"""Steps below this share of the largest value are those of 32-bit floats, not of a sensor."""
+
+KNOWN_STEPS = {
+    "12 bits a turn (Dynamixel XL330, Feetech STS3215)": 2 * math.pi / 4096,
+    "14 bits a turn": 2 * math.pi / 16384,
+    "14 bits a turn behind 6.33:1 (Unitree Go1 hip and thigh)": 2 * math.pi / 16384 / 6.33,
+    "14 bits a turn behind 9.5:1 (Unitree Go1 calf)": 2 * math.pi / 16384 / 9.5,
+    "15 bits a turn behind 6.33:1 (Unitree GO-M8010-6 class)": 2 * math.pi / 32768 / 6.33,
+    "15 bits a turn behind 9.5:1 (Unitree calf)": 2 * math.pi / 32768 / 9.5,
+    "16 bits over 25 rad (T-Motor AK series, CAN)": 25 / 65535,
+    "12 bits over 24 N m (T-Motor AK80-6, CAN)": 24 / 4095,
+    "12 bits over 45 rad/s (T-Motor AK80-6, CAN)": 45 / 4095,
+}
+"""Steps of encoders and messages in use; a step within ``KNOWN`` of one is called by its name."""
+KNOWN = 2e-3
+"""Relative error: a step is found to better than a thousandth, and the closest two differ by five."""
+
+# ---------------------------------------------------------------------- channels against one another
+
+SCALE = (0.05, 0.20)
+"""Relative error of a scale (speed against the change of angle, gyroscope against attitude) beyond its uncertainty."""
+LAG_RANGE = 0.06
+"""s by which a speed is searched before and behind its angle."""
+LAG = 4e-3
+"""s beyond one sample period: a speed that trails its angle by more was filtered, or read at another time."""
+LAG_GAIN = 1.5
+"""The unexplained part at no lag over that at the best lag: below it, the lag is chance."""
+MOTION = 5.0
+"""How many times its noise a change of angle, or an expected torque, must be to compare another channel with it."""
+TORQUE_SCALE = (0.15, 0.50)
+"""The same of the reported torque against the PD law; motor strength and gains really are off by 5 to 15 %."""
+TORQUE_LAG = 0.04
+"""s by which a torque is searched behind the control law; commands to a Go1 come up to 40 ms late."""
+UNIT_SCALES = {"degrees instead of radians": 180 / math.pi, "milliseconds instead of seconds": 1e-3}
+"""Scales that have a name, recognised within a tenth."""
+RELATED = 0.5
+"""Correlation below which two channels that should follow one another do not."""
+CLEARLY = 0.7
+"""Correlation from which a sign is certain, and another joint may be called a better match."""
+BETTER = 0.25
+"""By how much the correlation with another joint must beat that with a joint's own."""
+LEAST_TIME = 2.0
+"""s of motion below which order, sign and delay are not judged: any two slow curves of a second are alike."""
+DELAY = 8e-3
+"""s beyond one sample period: an intact bus and drive answer within it. A Go1 policy's 20 ms is worth knowing."""
+DELAY_SPREAD = 5e-3
+"""s between joints, beyond their uncertainty: they were not sampled together."""
+DELAY_RANGE = (-0.05, 0.16)
+"""s; delays that are searched. Longer ones are not delays of a drive."""
+DELAY_POWER = 0.6
+"""Share of what angle, speed and neighbours leave unexplained that the command must explain, to tell its timing."""
+DELAY_SAMPLES = 0.25
+"""Samples; error of a delay due to what happened between samples (measured: a fifth of one at 50 Hz)."""
+DELAY_ERROR = 4e-3
+"""s; delays with a larger standard error are not given: the motion was too smooth to tell."""
+GRAVITY = 9.81
+"""m/s2."""
+GRAVITY_ERROR = (0.06, 0.15)
+"""Relative error of the accelerometer at rest: 6 % is a poor calibration."""
+TILT = (10.0, 30.0)
+"""Degrees between the accelerometer's mean and the attitude's vertical: walking alone makes a few."""
+POSITION_MARGIN = (0.05, 0.3)
+"""rad beyond a hard stop: 3 degrees are play and zero offset, 17 are another unit, order or sign."""
+EXCEEDED = 1.1
+"""Torque and speed may exceed their limit by this factor; limits are nominal figures."""
+
+# ---------------------------------------------------------------------- what the episode holds
+
+STILL_TIME = 0.5
+"""s; the shortest stretch that counts as still."""
+STILL_ANGLE = 5e-3
+"""rad; joints that move less within that time stand still."""
+STILL_SHARE = 0.99
+"""A recording of a robot that rests for more than this share teaches nothing."""

@@ -1,0 +1,160 @@
+"""What an audit says, and how it is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+Verdict = Literal["ok", "suspect", "bad"]
+ORDER: tuple[Verdict, ...] = ("ok", "suspect", "bad")
+
+
+def worst(verdicts: Iterable[Verdict]) -> Verdict:
+    """Return the worst of ``verdicts``; ``ok`` if there are none."""
+    return max(verdicts, key=ORDER.index, default="ok")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at and is worth a line.
+
+    Attributes:
+        check: ``rate``, ``repeats``, ``sign``, ``delay``, ...
+        channel: column, or ``t``, or ``all`` where it concerns the whole recording.
+        verdict: ``ok`` for facts that are no flaws.
+        size: the number behind it, or None.
+        unit: of ``size``.
+        message: a sentence.
+    """
+
+    check: str
+    channel: str
+    verdict: Verdict
+    size: float | None
+    unit: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One column in numbers; None where a number could not be had or makes no sense.
+
+    Attributes:
+        name: column.
+        verdict: worst of the findings about it.
+        unit: of ``low``, ``high``, ``step`` and ``noise``.
+        low: smallest value.
+        high: largest value.
+        step: quantisation; 0 where values are continuous.
+        noise: standard deviation of what changes from sample to sample, an upper bound while the joint moves fast.
+        repeats: share of stale samples while the channel moves.
+        delay_ms: time from command to answer, ms, on the columns ``q_J``.
+        delay_sd_ms: its standard error, ms.
+    """
+
+    name: str
+    verdict: Verdict
+    unit: str
+    low: float
+    high: float
+    step: float | None = None
+    noise: float | None = None
+    repeats: float | None = None
+    delay_ms: float | None = None
+    delay_sd_ms: float | None = None
+
+
+@dataclass(frozen=True)
+class AuditReport:
+    """The audit of one recording.
+
+    Attributes:
+        episode: its name.
+        samples: number of rows.
+        duration: s.
+        rate_hz: one over the median step of ``t``.
+        channels: one line for each column, ``t`` first.
+        findings: flaws first, then facts.
+        torque_off: stretches without drives, (start, end) in s.
+        still: stretches in which no joint moves, (start, end) in s.
+    """
+
+    episode: str
+    samples: int
+    duration: float
+    rate_hz: float
+    channels: tuple[Channel, ...]
+    findings: tuple[Finding, ...]
+    torque_off: tuple[tuple[float, float], ...] = ()
+    still: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst verdict."""
+        return worst(f.verdict for f in self.findings)
+
+    def of(self, check: str) -> list[Finding]:
+        """Return the findings of one check."""
+        return [f for f in self.findings if f.check == check]
+
+    @property
+    def flaws(self) -> list[Finding]:
+        """The findings that are not ``ok``."""
+        return [f for f in self.findings if f.verdict != "ok"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain values that JSON can hold."""
+        plain = asdict(self)
+        for key in ("channels", "findings"):
+            plain[key] = list(plain[key])
+        for key in ("torque_off", "still"):
+            plain[key] = [list(stretch) for stretch in plain[key]]
+        return {"verdict": self.verdict, **plain}
+
+    def text(self) -> str:
+        """Return a table of the channels, and below it the findings, one to a line."""
+        counts = {v: sum(c.verdict == v for c in self.channels) for v in ORDER}
+        lines = [
+            f"{self.episode}: {self.verdict}",
+            f"{self.samples} samples, {self.duration:.2f} s at {self.rate_hz:.4g} Hz; "
+            + ", ".join(f"{n} channels {v}" for v, n in counts.items() if n),
+            *(f"{name}: {_stretches(s)}" for name, s in (("drives off", self.torque_off), ("still", self.still)) if s),
+            "",
+        ]
+        head = ("channel", "verdict", "unit", "low", "high", "step", "noise", "repeats", "delay ms")
+        rows = [head, *map(_row, self.channels)]
+        widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+        for row in rows:
+            left = [cell.ljust(w) for cell, w in zip(row[:3], widths[:3], strict=True)]
+            right = [cell.rjust(w) for cell, w in zip(row[3:], widths[3:], strict=True)]
+            lines.append("  ".join([*left, *right]).rstrip())
+        if self.findings:
+            lines += ["", *_grouped(self.findings)]
+        return "\n".join(lines)
+
+
+def _grouped(findings: tuple[Finding, ...]) -> list[str]:
+    """One line for each finding, or for several channels of which the same is said."""
+    same: dict[tuple[str, str, str], list[str]] = {}
+    for f in findings:
+        same.setdefault((f.verdict, f.check, f.message), []).append(f.channel)
+    lines = []
+    for (verdict, check, message), channels in same.items():
+        shown = ", ".join(channels[:3]) + (f" and {len(channels) - 3} more" if len(channels) > 3 else "")
+        lines.append(f"{verdict:<7}  {check:<10}  {shown}: {message}")
+    return lines
+
+
+def _row(c: Channel) -> tuple[str, ...]:
+    delay = "" if c.delay_ms is None else f"{c.delay_ms:.1f} ± {c.delay_sd_ms or 0:.1f}"
+    step = "" if c.step is None else "-" if c.step == 0 else f"{c.step:.3g}"
+    noise = "" if c.noise is None else f"{c.noise:.2g}"
+    repeats = "" if c.repeats is None else f"{c.repeats:.1%}"
+    return (c.name, c.verdict, c.unit, f"{c.low:.4g}", f"{c.high:.4g}", step, noise, repeats, delay)
+
+
+def _stretches(stretches: tuple[tuple[float, float], ...]) -> str:
+    shown = ", ".join(f"{a:.2f}-{b:.2f}" for a, b in stretches[:6])
+    more = f" and {len(stretches) - 6} more" if len(stretches) > 6 else ""
+    return f"{shown}{more} s ({sum(b - a for a, b in stretches):.1f} s)"

@@ -1,0 +1,175 @@
+"""Estimators that need no model of the robot: step, noise, stale samples, clipping, scale between two channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import linear_sum_assignment
+
+from go1exp.audit import limits
+
+MOST_GAPS = 300
+"""Gaps that a step is sought in; of more, evenly ranked ones are taken."""
+
+
+def stretches(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Return (first, end) of each run of true ``flags`` (T,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def quantum(values: np.ndarray) -> float:
+    """Return the step that all ``values`` (T,) are a whole number of apart, or 0 if there is none.
+
+    Candidates are small gaps between neighbouring distinct values and their fractions; one is refined by regression on
+    ever larger gaps, and holds if the gaps are whole numbers of it (mean resultant of their phases above 0.9, which
+    forgives rounding to a tenth of a step, as in decimal text).
+    """
+    distinct = np.unique(values)
+    gaps = np.diff(distinct)
+    largest = float(np.abs(distinct[[0, -1]]).max())
+    gaps = np.sort(gaps[gaps > 1e-9 * largest])
+    if len(gaps) < (2 if len(values) > 20 * len(distinct) else 10):  # few values that come often are steps too
+        return 0.0
+    gaps = gaps[:: -(-len(gaps) // MOST_GAPS)]
+    guesses = {float(gaps[int(share * len(gaps))]) / m for share in (0, 0.02, 0.1, 0.5) for m in range(1, 7)}
+    for guess in sorted(guesses, reverse=True):
+        step = _refined(gaps, guess)
+        if step > limits.CONTINUOUS * largest and np.abs(np.mean(np.exp(2j * np.pi * gaps / step))) > 0.9:
+            return step
+    return 0.0
+
+
+def _refined(gaps: np.ndarray, step: float) -> float:
+    for most in (3, 10, 30, 100):
+        count = np.round(gaps / step)
+        use = (count >= 1) & (count <= most)
+        if not use.any():
+            break
+        step = float(gaps[use] @ count[use] / (count[use] @ count[use]))
+    return step
+
+
+def noise(values: np.ndarray) -> tuple[float, bool]:
+    """Return the standard deviation of white noise on a smooth signal (T,), and whether it looks white at all.
+
+    Third differences remove what is smooth; their median is blind to rare events. Fifth differences give the same for
+    noise and another value for motion.
+    """
+    if len(values) < limits.ENOUGH:
+        return float("nan"), False
+    sigma = []
+    for order, gain in ((3, 20.0), (5, 252.0)):  # sums of the squared binomial coefficients
+        d = np.diff(values, order)
+        sigma.append(1.4826 * float(np.median(np.abs(d - np.median(d)))) / np.sqrt(gain))
+    sigma = [s if s > 1e-9 * float(np.ptp(values)) else 0.0 for s in sigma]
+    white = sigma[0] > 0 and limits.WHITE[0] < sigma[1] / sigma[0] < limits.WHITE[1]
+    return sigma[0], white
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Which samples (T,) of a channel were moving, and which of those are stale; and how many too many are."""
+
+    moving: np.ndarray
+    stale: np.ndarray
+    share: float
+
+
+def repeats(values: np.ndarray, step: float, reach: int) -> Repeats:
+    """Find samples that repeat the one before, although the ``reach`` samples before and after move the same way.
+
+    A channel moves where it changes by at least two steps a sample on both sides. A value may then repeat by chance,
+    but not more often than it changes by one step; only what exceeds that counts.
+    """
+    n = len(values)
+    moving, same = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+    same[1:] = values[1:] == values[:-1]
+    least = reach * max(2 * step, 1e-7 * float(np.ptp(values)))
+    i = np.arange(reach + 1, n - reach)
+    if least == 0 or not len(i):
+        return Repeats(moving, same & moving, 0.0)
+    before, after = values[i - 1] - values[i - 1 - reach], values[i + reach] - values[i]
+    moving[i] = (np.abs(before) >= least) & (np.abs(after) >= least) & (before * after > 0)
+    forward = (values[i] - values[i - 1]) * np.sign(after)
+    natural = np.sum(moving[i] & (forward > 0.5 * step) & (forward < 1.5 * step)) if step else 0
+    count, twice = int(moving.sum()), int(np.sum(same & moving))
+    excess = twice - int(natural)
+    sure = count >= limits.ENOUGH and excess > limits.SURE * np.sqrt(twice + natural)
+    return Repeats(moving, same & moving, excess / count if sure else 0.0)
+
+
+def clipped(values: np.ndarray, step: float) -> tuple[float, list[float]]:
+    """Return the share of samples (T,) on flat tops or bottoms that are entered or left at speed, and their levels.
+
+    The peak of a smooth signal has no speed where it begins; that of a clipped one has.
+    """
+    span = float(np.ptp(values))
+    share, levels = 0.0, []
+    for level in (float(values.max()), float(values.min())):
+        runs = [(a, b) for a, b in stretches(np.abs(values - level) <= 1e-9 * span) if b - a >= limits.PLATEAU]
+        fast = max(6 * step, 1e-3 * span)  # over two samples, as the first may just miss the level
+        around = [[values[i] for i in (a - 2, b + 1) if 0 <= i < len(values)] for a, b in runs]
+        hard = [run for run, v in zip(runs, around, strict=True) if v and np.abs(np.array(v) - level).min() > fast]
+        if len(hard) >= 2 or any(b - a >= 2 * limits.PLATEAU for a, b in hard):
+            share += sum(b - a for a, b in hard) / len(values)
+            levels.append(level)
+    return share, levels
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One channel against another: factor, its standard error, correlation."""
+
+    factor: float
+    error: float
+    correlation: float
+
+
+def scale(reference: np.ndarray, other: np.ndarray, blocks: int = 10) -> Scale | None:
+    """Return how large ``other`` (N,) is against ``reference`` (N,), with a jackknife error over ``blocks`` in time.
+
+    Least squares: noise of ``other`` does no harm. None if there are too few samples or nothing varies.
+    """
+    if len(reference) < limits.ENOUGH:
+        return None
+    parts = np.array_split(np.arange(len(reference)), blocks)
+    sums = np.array([[a @ a, a @ b, b @ b] for a, b in ((reference[p], other[p]) for p in parts)])
+    total = sums.sum(axis=0)
+    if total[0] <= 0 or total[2] <= 0:
+        return None
+
+    def factor(s: np.ndarray) -> float:
+        return float(s[1] / s[0]) if s[0] > 0 else float("nan")
+
+    left_out = np.array([factor(total - s) for s in sums])
+    spread = np.std(left_out) * np.sqrt(blocks - 1)
+    return Scale(factor(total), float(spread), float(total[1] / np.sqrt(total[0] * total[2])))
+
+
+def antiderivative(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Integrate a cubic spline through ``rate`` (T, ...) from the first sample to each."""
+    return CubicSpline(t, rate, axis=0).antiderivative()(t)
+
+
+def mixed_up(match: np.ndarray) -> dict[int, int]:
+    """Return which columns the rows of ``match`` (J, J; correlations) belong to, for those that are not in place.
+
+    The best assignment is taken apart into cycles (a swap is one of two); a cycle counts only if every member of it
+    matches its new partner clearly, and clearly better than its own. One odd joint mixes up nothing.
+    """
+    size = np.abs(match)
+    own = np.diag(size)
+    _, partner = linear_sum_assignment(-(size**2))
+    found: dict[int, int] = {}
+    for start in range(len(partner)):
+        cycle, k = [start], int(partner[start])
+        while k != start:
+            cycle.append(k)
+            k = int(partner[k])
+        better = [size[j, partner[j]] > max(limits.CLEARLY, own[j] + limits.BETTER) for j in cycle]
+        if len(cycle) > 1 and all(better):
+            found[start] = int(partner[start])
+    return found

@@ -1,0 +1,204 @@
+"""Checks of the clock, and of each channel by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from go1exp.audit import limits, signals
+from go1exp.audit.log import Log, finding, graded
+from go1exp.audit.report import Finding
+from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
+
+
+def clock(log: Log) -> Iterator[Finding]:
+    """Rate against the metadata, jitter, gaps."""
+    steps = np.diff(log.t)
+    nominal = 1 / log.recording.meta.rate_hz
+    for factor, unit in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
+        if 0.9 < log.dt / (factor * nominal) < 1.1:
+            yield finding("rate", "t", "bad", log.dt, "s", f"steps by {log.dt:g}: it is in {unit}, not in seconds")
+            return
+    off = log.dt / nominal - 1
+    verdict = graded(abs(off), limits.RATE)
+    said = f"{1 / log.dt:.5g} Hz (median step {log.dt * 1e3:.4g} ms)"
+    if verdict == "ok":
+        yield finding("rate", "t", "ok", 1 / log.dt, "Hz", said)
+    else:
+        yield finding("rate", "t", verdict, 1 / log.dt, "Hz", f"{said}, but rate_hz = {1 / nominal:g}")
+    usual = 1.4826 * float(np.median(np.abs(steps - log.dt)))
+    long = steps > max(limits.GAP_STEPS * log.dt, log.dt + 6 * usual)
+    jitter = float(np.std(steps[~long]))
+    worst = float(np.abs(steps[~long] - log.dt).max())
+    said = (
+        f"steps vary by {jitter * 1e3:.3g} ms (standard deviation; {jitter / log.dt:.1%}), at most {worst * 1e3:.3g} ms"
+    )
+    if jitter < 1e-6 * log.dt and log.recording.meta.source == "measured":
+        said += "; a clock this even was counted, not read, so its true jitter is unknown"
+    yield finding("jitter", "t", graded(jitter / log.dt, limits.JITTER), jitter * 1e3, "ms", said)
+    if long.any():
+        missing = int(np.sum(np.round(steps[long] / log.dt) - 1))
+        longest = float(steps.max())
+        share = missing / (len(log.t) + missing)
+        verdict = "bad" if longest > limits.LONGEST_GAP else graded(share, limits.GAPS)
+        at = float(log.t[int(np.argmax(steps))])
+        said = (
+            f"{missing} samples are missing ({share:.2%}) in {int(long.sum())} gaps, the longest {longest * 1e3:.4g} ms"
+        )
+        yield finding("gaps", "t", verdict, missing, "samples", f"{said} at {at:.3f} s")
+
+
+def stale(log: Log) -> tuple[list[Finding], dict[str, float]]:
+    """Rows and channels that repeat although they move; return the share by channel too."""
+    reach = log.samples(0.02, 3)
+    found: list[Finding] = []
+    each = {c: signals.repeats(log.recording.channels[c], log.steps[c], reach) for c in log.measured}
+    moving = np.any([r.moving for r in each.values()], axis=0) if each else np.zeros(len(log.t), dtype=bool)
+    rows = log.recording.block(*log.measured) if each else np.zeros((len(log.t), 0))
+    twice = moving & np.append(False, np.all(rows[1:] == rows[:-1], axis=1))
+    share = float(twice.sum() / max(1, moving.sum()))
+    if len(each) > 1 and moving.sum() >= limits.ENOUGH and share > limits.REPEATS[0] / 2:
+        verdict = graded(share, (limits.REPEATS[0] / 2, limits.REPEATS[1]))
+        said = f"{share:.1%} of the rows are exact copies of the row before ({int(twice.sum())}, while joints move)"
+        found.append(finding("duplicates", "all", verdict, share, "", said))
+    shares = {}
+    for name, r in each.items():
+        shares[name] = max(0.0, r.share - (float((twice & r.stale).sum()) / max(1, int(r.moving.sum()))))
+        verdict = graded(shares[name], limits.REPEATS)
+        if verdict != "ok":
+            rate = (1 - shares[name]) / log.dt
+            said = f"repeats its last value in {shares[name]:.1%} of its moving samples, as if read at {rate:.2g} Hz"
+            found.append(finding("repeats", name, verdict, shares[name], "", said))
+    return found, shares
+
+
+def resolution(log: Log) -> Iterator[Finding]:
+    """Quantisation step, by the name of a known encoder where it is one."""
+    for name, step in log.steps.items():
+        if step == 0:
+            continue
+        unit = log.unit(name)
+        known = next((k for k, s in limits.KNOWN_STEPS.items() if abs(step / s - 1) < limits.KNOWN), None)
+        said = f"steps of {step:.3g} {unit}".rstrip() + (f": {known}" if known else "")
+        coarse = unit == "rad" and step > limits.COARSE_ANGLE
+        if coarse:
+            said += f"; coarser than any known encoder ({limits.COARSE_ANGLE:g} rad)"
+        yield finding("resolution", name, "suspect" if coarse else "ok", step, unit, said)
+
+
+def noise(log: Log, repeats: dict[str, float]) -> tuple[list[Finding], dict[str, float]]:
+    """Noise floor of each channel; judged where it looks like noise and neither stale samples nor motion make it."""
+    found, floors = [], {}
+    for name, (sigma, white) in log.floors.items():
+        if not np.isfinite(sigma):
+            continue
+        floors[name] = sigma
+        unit = log.unit(name)
+        if len(log.t) < limits.ENOUGH_NOISE or repeats.get(name, 0) > limits.REPEATS[0]:
+            continue
+        if white and unit in limits.NOISE and (verdict := graded(sigma, limits.NOISE[unit])) != "ok":
+            usual = limits.NOISE[unit][0]
+            said = f"white noise of {sigma:.3g} {unit} (standard deviation); drives of this class stay below {usual:g}"
+            found.append(finding("noise", name, verdict, sigma, unit, said))
+    return found, floors
+
+
+def dead(log: Log) -> Iterator[Finding]:
+    """Channels that never change although what they measure does."""
+    meta = log.recording.meta
+    moved = {}
+    if log.recording.has("q"):
+        for joint, q in zip(log.joints, log.recording.joint("q").T, strict=True):
+            moved[joint] = np.ptp(q) > limits.STILL_ANGLE
+    for name in log.measured:
+        values = log.recording.channels[name]
+        if np.ptp(values) > 0 or len(values) < limits.ENOUGH:
+            continue
+        quantity = log.quantity[name]
+        said = f"is {values[0]:g} throughout"
+        if quantity in ("qd", "tau_est"):
+            joint = name.removeprefix(f"{quantity}_")
+            verdict, why = (
+                ("bad", "while the joint moves") if moved.get(joint, False) else ("ok", "and the joint rests")
+            )
+        elif quantity == "q":
+            commanded = log.recording.channels.get(name.replace("q_", "q_target_", 1), values)
+            live = bool(np.ptp(commanded) > limits.STILL_ANGLE or any(moved.values()))
+            verdict, why = ("bad", "while joints move") if live else ("ok", "and no joint moves")
+        elif meta.base == "fixed":
+            verdict, why = "ok", "and the base is fixed"
+            if meta.source == "measured" and quantity in ("imu_gyro", "imu_acc"):
+                verdict, why = "suspect", "but a real sensor has noise"
+        else:
+            live = any(moved.values()) and quantity in ("imu_gyro", "imu_acc", "imu_quat", "base_quat", "base_pos")
+            verdict, why = ("bad", "while the robot moves") if live else ("suspect", "")
+        yield finding("dead", name, verdict, float(values[0]), log.unit(name), f"{said} {why}".rstrip())  # type: ignore[arg-type]
+
+
+def saturation(log: Log) -> Iterator[Finding]:
+    """Values that stick at an extreme."""
+    for name in log.measured:
+        quantity = log.quantity[name]
+        if quantity in ("q", "base_pos", "imu_quat", "base_quat", "foot_force"):
+            continue  # an angle may well rest where it is largest, a force at zero
+        values = log.recording.channels[name]
+        use = log.on if quantity == "tau_est" else np.ones(len(values), dtype=bool)
+        if use.sum() < limits.ENOUGH or np.ptp(values[use]) == 0:
+            continue
+        share, levels = signals.clipped(values[use], log.steps[name])
+        levels = [v for v in levels if v]  # at zero it rests
+        if not levels:
+            continue
+        at = " and ".join(f"{v:.4g}" for v in levels)
+        said = f"sticks at {at} {log.unit(name)} in {share:.1%} of the samples"
+        verdict = graded(share, limits.CLIPPED)
+        if quantity == "tau_est":
+            limit = _torque_limit(log, name.removeprefix("tau_est_"))
+            if limit is None or all(abs(abs(v) / limit - 1) < 0.02 for v in levels):
+                verdict = "ok"
+                said += ": the drive's limit" if limit else ": perhaps the drive's limit, which the file does not give"
+            else:
+                said += f", but the limit is {limit:.4g} N m"
+        yield finding("saturation", name, verdict, share, "", said)
+
+
+def _torque_limit(log: Log, joint: str) -> float | None:
+    limit = log.recording.meta.tau_limit
+    if limit is not None:
+        return float(limit[log.joints.index(joint)])
+    if log.recording.meta.robot == "go1" and joint in JOINTS:
+        return EFFORT_LIMIT[JOINTS.index(joint) % 3]
+    return None
+
+
+def ranges(log: Log) -> Iterator[Finding]:
+    """Angles beyond the stops, torques and speeds beyond their limits (Go1), angles in degrees (any robot)."""
+    go1 = log.recording.meta.robot == "go1"
+    for name, quantity in log.quantity.items():
+        values = log.recording.channels[name]
+        joint = name.removeprefix(f"{quantity}_")
+        known = go1 and joint in JOINTS
+        if quantity in ("q", "q_target"):
+            degrees = float(np.median(np.abs(values))) > 2 * np.pi
+            over = 0.0
+            if known:
+                low, high = JOINT_POS_LIMITS[JOINTS.index(joint)]
+                inside = np.mean((np.radians(values) > low - 0.3) & (np.radians(values) < high + 0.3))
+                over = float(max(values.max() - high, low - values.min()))
+                degrees = over > limits.POSITION_MARGIN[1] and inside > 0.99 and float(np.abs(values).max()) > 2 * np.pi
+            if degrees:
+                said = f"reaches {np.abs(values).max():.4g}: it looks like degrees, not radians"
+                yield finding("units", name, "bad", float(np.abs(values).max()), "rad", said)
+            elif quantity == "q" and over > limits.POSITION_MARGIN[0]:
+                said = f"goes {over:.3g} rad beyond the joint's stops, {low:g} to {high:g} rad"
+                yield finding("limits", name, graded(over, limits.POSITION_MARGIN), over, "rad", said)
+        elif quantity in ("qd", "tau_est"):
+            limit = _torque_limit(log, joint) if quantity == "tau_est" else None
+            if quantity == "qd" and known:
+                limit = VELOCITY_LIMIT[JOINTS.index(joint) % 3]
+            worst = float(np.abs(values).max())
+            if limit is not None and worst > limits.EXCEEDED * limit:
+                said = f"reaches {worst:.4g} {log.unit(name)}; the limit is {limit:.4g}"
+                verdict = graded(worst / limit, (limits.EXCEEDED, 2.0))
+                yield finding("limits", name, verdict, worst, log.unit(name), said)

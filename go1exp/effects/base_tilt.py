@@ -1,0 +1,61 @@
+"""``effect=base_tilt``: what should be level is not."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from go1exp.drive import ModelFields
+from go1exp.effects.base import Effect, Measured, Param
+from go1exp.registry import effect
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def _tilted(roll: Tensor, pitch: Tensor, v: Tensor) -> Tensor:
+    """Express vectors (N, 3) in a frame turned by ``pitch`` about y and then, in itself, by ``roll`` about x."""
+    roll, pitch = roll.squeeze(1).to(v.dtype), pitch.squeeze(1).to(v.dtype)
+    x, y, z = v.unbind(-1)
+    x, z = torch.cos(pitch) * x - torch.sin(pitch) * z, torch.sin(pitch) * x + torch.cos(pitch) * z
+    y, z = torch.cos(roll) * y + torch.sin(roll) * z, torch.cos(roll) * z - torch.sin(roll) * y
+    return torch.stack([x, y, z], dim=-1)
+
+
+@effect("base_tilt")
+class BaseTilt(Effect):
+    """A held trunk hangs tilted, against what is believed; in one that is free the IMU sits tilted.
+
+    Held: gravity turns in the trunk's frame, for the joints and for the IMU. Free: what the IMU says turns. Tilt: by
+    ``pitch`` (nose down) and then by ``roll`` (left side up). 1 to 8 degrees are likely (a judgement). A held robot's
+    looks like an ``encoder_offset`` in one pose, and every leg feels the same; two orientations of the trunk tell.
+    """
+
+    params = (
+        Param("roll", "rad", -0.2, 0.2, 0.0, 0.0087, "robot", "left side up"),
+        Param("pitch", "rad", -0.2, 0.2, 0.0, 0.0087, "robot", "nose down"),
+    )
+    fields = ("opt.gravity",)
+    roll: Tensor
+    pitch: Tensor
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Turn gravity about a held trunk."""
+        if self.setup.floating:
+            return
+        quat = model.nominal("body_quat")[0, model.ids("body", ("trunk",))].cpu().numpy()
+        gravity = model.field("opt.gravity")
+        held = torch.as_tensor(Rotation.from_quat(quat, scalar_first=True).as_matrix()[0]).to(gravity)
+        turned = _tilted(self.roll, self.pitch, gravity @ held) @ held.T
+        gravity.copy_(torch.where((self.roll == 0.0) & (self.pitch == 0.0), gravity, turned))
+
+    def on_sensor(self, measured: Measured) -> Measured:
+        """Turn what the IMU says; a held one feels gravity as it is."""
+        turned = ("gravity", "gyro", "acc") if self.setup.floating else ("gravity",)
+        found = {name: getattr(measured, name) for name in turned}
+        return dataclasses.replace(
+            measured, **{k: _tilted(self.roll, self.pitch, v) for k, v in found.items() if v is not None}
+        )

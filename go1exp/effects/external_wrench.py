@@ -1,0 +1,36 @@
+"""``effect=external_wrench``: something pulls at the trunk."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from go1exp.effects.base import Effect, Param
+from go1exp.registry import effect
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@effect("external_wrench")
+class ExternalWrench(Effect):
+    """A constant force (x, y, z) on the trunk's origin, in the world's frame: wind, a tether, a cable.
+
+    0 to 20 N are likely (a judgement). It adds to the acceleration of the trunk and turns with neither robot nor gait.
+    A held trunk shows none of it. On a level robot a vertical one looks like a ``payload``, a horizontal one like a
+    ``base_tilt``.
+    """
+
+    params = (
+        Param("x", "N", -50.0, 50.0, 0.0, 1.0, "robot", "force along the world's x"),
+        Param("y", "N", -50.0, 50.0, 0.0, 1.0, "robot", "along y"),
+        Param("z", "N", -50.0, 50.0, 0.0, 1.0, "robot", "along z, up"),
+    )
+    x: Tensor
+    y: Tensor
+    z: Tensor
+
+    def on_base(self, force: Tensor) -> Tensor:
+        """Add the force."""
+        return force + torch.cat([self.x, self.y, self.z], dim=1)

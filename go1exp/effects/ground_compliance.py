@@ -1,0 +1,41 @@
+"""``effect=ground_compliance``: the feet sink into the ground."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from go1exp import robot
+from go1exp.drive import ModelFields
+from go1exp.effects.base import Effect, Param
+from go1exp.registry import effect
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+FEET = tuple(f"{leg}_foot" for leg in robot.LEGS)
+
+NULL = 0.02
+"""MuJoCo's own time constant of a contact, s."""
+
+
+@effect("ground_compliance")
+class GroundCompliance(Effect):
+    """Softness of the feet's contacts, as the time constant of MuJoCo's spring-damper: a foot sinks as its square.
+
+    Stiffness is 1 / (time_constant damping_ratio)^2 per effective mass (MuJoCo, "solver parameters"); the damping ratio
+    stays, so a randomisation of ``foot_restitution``, which sets that one, acts as well. Below twice the physics step
+    MuJoCo raises it to that. It shows at touch-down and in the height of the stance, like a foot of another radius.
+    """
+
+    params = (Param("time_constant", "s", 0.004, 0.1, NULL, 0.003, "robot", "of the contact's spring-damper"),)
+    fields = ("geom_solref",)
+    time_constant: Tensor
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Set the feet's, which have priority in a contact."""
+        feet = model.ids("geom", FEET)
+        before = model.field("geom_solref")[:, feet, 0]
+        changed = self.time_constant != NULL
+        model.field("geom_solref")[:, feet, 0] = torch.where(changed, self.time_constant, before)

@@ -1,0 +1,156 @@
+"""Motions with sudden changes: steps of the target, and drives switched off. The robot is hung up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from go1exp.excitations.motion import Motion, PerKind, always_on, check, glide, room
+from go1exp.registry import Annotated, Field, Fraction, Positive, PositiveRange, excitation
+
+Joints = Annotated[int, Field(ge=1)]
+"""A number of joints."""
+
+
+@excitation("steps")
+def steps(
+    t: np.ndarray,
+    centre: np.ndarray,
+    limits: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    amplitude: PerKind = (0.25, 0.3, 0.3),
+    large: PerKind = (0.35, 0.6, 0.6),
+    hold: PositiveRange = (0.08, 0.6),
+    mixed: PositiveRange = (0.5, 1.2),
+    turn: PositiveRange = (0.25, 0.4),
+    at_once: Joints = 2,
+    overshoot: Fraction = 0.3,
+    settle: Positive = 0.3,
+) -> Motion:
+    """Jump to random levels at random times; in between, a few joints at a time jump across their whole range.
+
+    The edges show delay, lag and stiffness; the large jumps reach the limits of torque and speed (1.2 rad at a gain
+    of 20 N m/rad asks for 24 N m, a Go1 thigh gives 23.7). In a large turn the other joints rest at ``centre``, since
+    all of them jumping would ask for kilowatts, and legs could hit one another. Edges fall on any command, not only
+    on those of a policy's 50 Hz. Twelve joints need about 12 s until each has had its turn.
+
+    Args:
+        t: when commands are sent (T,), s.
+        centre: angles to jump about (J,), rad.
+        limits: lowest and highest target (J, 2), rad.
+        rng: gives levels, times and turns.
+        amplitude: farthest ordinary level to each side, rad, per kind of joint.
+        large: half of a large jump, rad, per kind of joint.
+        hold: shortest and longest time at an ordinary level, s.
+        mixed: shortest and longest stretch of ordinary steps between turns, s.
+        turn: shortest and longest time at each end of a large jump, s.
+        at_once: joints that share a turn; they are spread over the robot (Go1, two: front and rear leg of one side).
+        overshoot: free space kept beyond either end, as a share of the largest jump, so that an underdamped joint does
+            not hit its stop (a Go1 at gains of 20 and 0.5 overshoots by a third).
+        settle: rest at ``centre`` before the first edge, s.
+
+    Raises:
+        ExcitationError: if ``centre`` lies outside ``limits``.
+    """
+    duration = check(t, centre, limits)
+    joints = len(centre)
+    small, wide = (_kept_free(a, centre, limits, overshoot) for a in (amplitude, large))
+    edges: list[list[tuple[float, float]]] = [[(0.0, float(c))] for c in centre]
+    now, turns = settle, _turns(rng, joints, at_once)
+    while now <= duration:
+        end = now + rng.uniform(*mixed)
+        for joint in range(joints):
+            at = now + rng.uniform(0, hold[1])
+            while at < end:
+                level = small[0][joint] + small[1][joint] * rng.uniform(-1, 1)
+                edges[joint].append((at, float(level)))
+                at += rng.uniform(*hold)
+            edges[joint].append((end, float(centre[joint])))
+        now = end + rng.uniform(*turn)
+        mine, side = next(turns), rng.choice((-1.0, 1.0))
+        for sign in (side, -side):
+            for joint in mine:
+                edges[joint].append((now, float(wide[0][joint] + sign * wide[1][joint])))
+            now += rng.uniform(*turn)
+        for joint in mine:
+            edges[joint].append((now, float(centre[joint])))
+        now += rng.uniform(*turn)
+    target = np.empty((len(t), joints))
+    for joint, changes in enumerate(edges):
+        at, levels = np.array(changes).T
+        target[:, joint] = levels[np.searchsorted(at, t - t[0], side="right") - 1]
+    return always_on(np.clip(target, limits[:, 0], limits[:, 1]), "hung")
+
+
+def _kept_free(
+    amplitude: tuple[float, ...], centre: np.ndarray, limits: np.ndarray, overshoot: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit jumps of 2 * ``amplitude``, and what they overshoot, between the limits: middle and half jump (J,), rad."""
+    beyond = 1 + 2 * overshoot
+    middle, reach = room(np.resize(amplitude, len(centre)) * beyond, centre, limits)
+    return middle, reach / beyond
+
+
+def _turns(rng: np.random.Generator, joints: int, at_once: int) -> Iterator[list[int]]:
+    """Yield groups of ``at_once`` joints, far apart in joint order, in random order, for ever; each joint in one."""
+    count = -(-joints // at_once)
+    while True:
+        for first in rng.permutation(count):
+            yield list(range(int(first), joints, count))
+
+
+@excitation("torque_off")
+def torque_off(
+    t: np.ndarray,
+    centre: np.ndarray,
+    limits: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    amplitude: PerKind = (0.3, 0.4, 0.4),
+    off: PositiveRange = (0.8, 1.5),
+    move: Positive = 0.6,
+    settle: Positive = 0.4,
+) -> Motion:
+    """Take up a pose, switch the drives off and let the joints swing; then switch on and go to the next pose.
+
+    Without the drives only the mechanism acts, so friction is told from damping by the gain. Of two swings
+    each joint starts once on either side of ``centre``: at least one begins away from where the joint hangs. Only whole
+    swings are made; one takes up to 2 * ``move`` + ``settle`` + ``off[1]``. While the drives are off the target
+    goes to ``centre`` and waits there; :attr:`Motion.soft_start` asks for a blend from the measured angles.
+
+    Args:
+        t: when commands are sent (T,), s.
+        centre: angles between the poses (J,), rad.
+        limits: lowest and highest target (J, 2), rad.
+        rng: gives poses and times.
+        amplitude: farthest pose to each side, rad, per kind of joint; the nearest is 0.6 of it.
+        off: shortest and longest time without drives, s.
+        move: time to go to a pose, and time at ``centre`` after the drives are back, s.
+        settle: rest in the pose, s.
+
+    Raises:
+        ExcitationError: if ``centre`` lies outside ``limits``.
+    """
+    duration = check(t, centre, limits)
+    middle, half = room(amplitude, centre, limits)
+    times, poses = [0.0], [centre]
+    enabled = np.ones(len(t), dtype=bool)
+    side = np.empty(0)
+    while True:
+        side = -side if len(times) % 8 == 5 else rng.choice((-1.0, 1.0), len(centre))  # every second swing mirrors one
+        pose = middle + side * half * rng.uniform(0.6, 1, len(centre))
+        free = rng.uniform(*off)
+        leave = times[-1] + move + settle
+        back = leave + free
+        if back + move > duration:
+            break
+        times += [times[-1] + move, leave, leave + free / 2, back + move]
+        poses += [pose, pose, centre, centre]
+        enabled &= (t - t[0] < leave) | (t - t[0] >= back)
+    if len(times) == 1:  # too short for one swing: the pose at rest
+        times, poses = [0.0, 1.0], [centre, centre]
+    target = glide(t - t[0], np.array(times), np.stack(poses))
+    target = np.clip(target, limits[:, 0], limits[:, 1])
+    return Motion(target, enabled, target[0].copy(), "hung", soft_start=move / 2)

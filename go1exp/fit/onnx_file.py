@@ -1,0 +1,75 @@
+"""The net as an ONNX graph, built node by node: matrix product, sum, softsign."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+OPSET = 20
+IR_VERSION = 10
+"""The IR of that opset, which every runtime that knows the opset reads."""
+
+
+def write_onnx(
+    path: Path,
+    weights: Sequence[np.ndarray],
+    biases: Sequence[np.ndarray],
+    skip: np.ndarray,
+    about: Mapping[str, str],
+) -> None:
+    """Write ``features`` -> ``torque``: float32 (R, F) -> (R,) for one net, (K, R, F) -> (K, R) for several.
+
+    The graph is batched over K, so all nets run in one call.
+
+    Args:
+        path: file to write.
+        weights: layer by layer (K, in, out), normalisation folded in.
+        biases: layer by layer (K, out).
+        skip: linear map beside them, (K, F, 1); left out where it is zero.
+        about: the model's metadata, for whoever feeds it.
+    """
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    nets, features, _ = skip.shape
+    single = nets == 1
+    nodes, constants = [], []
+
+    def constant(name: str, values: np.ndarray) -> str:
+        constants.append(numpy_helper.from_array(np.ascontiguousarray(values, dtype=np.float32), name))
+        return name
+
+    def node(op: str, inputs: list[str], output: str) -> str:
+        nodes.append(helper.make_node(op, inputs, [output], name=output))
+        return output
+
+    value = "features"
+    for i, (w, b) in enumerate(zip(weights, biases, strict=True)):
+        w, b = (w[0], b[0]) if single else (w, b[:, None, :])
+        value = node("MatMul", [value, constant(f"weight_{i}", w)], f"product_{i}")
+        value = node("Add", [value, constant(f"bias_{i}", b)], f"sum_{i}")
+        if i < len(weights) - 1:
+            value = node("Softsign", [value], f"layer_{i}")
+    if skip.any():
+        linear = node("MatMul", ["features", constant("skip", skip[0] if single else skip)], "linear")
+        value = node("Add", [value, linear], "sum")
+    constants.append(numpy_helper.from_array(np.array([-1], dtype=np.int64), "last_axis"))
+    node("Squeeze", [value, "last_axis"], "torque")
+
+    lead: list[int | str] = ["rows"] if single else [nets, "rows"]
+    graph = helper.make_graph(
+        nodes,
+        "actuator_net",
+        [helper.make_tensor_value_info("features", TensorProto.FLOAT, [*lead, features])],
+        [helper.make_tensor_value_info("torque", TensorProto.FLOAT, lead)],
+        constants,
+    )
+    model = helper.make_model(
+        graph, producer_name="go1exp", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
+    )
+    helper.set_model_props(model, dict(about))
+    onnx.checker.check_model(model, full_check=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(model.SerializeToString())

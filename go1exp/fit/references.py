@@ -1,0 +1,59 @@
+"""What a net must beat on the same rows: the command, the PD law, a linear map of its inputs, a net half as wide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.fit.dataset import Rows
+from go1exp.fit.train import ridge
+
+NAMES = {
+    "command": "the command as torque: tau_cmd, or kp e where targets were commanded",
+    "pd": "kp e - kd qd with the recordings' gains",
+    "linear": "least squares (ridge) in the net's inputs",
+    "half_net": "a net of half the width, trained likewise",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """One reference's prediction of the held-out rows ``(R,)``, N m; or None, and why."""
+
+    name: str
+    torque: np.ndarray | None
+    reason: str = ""
+
+
+def command(rows: Rows) -> Reference:
+    """Take the commanded torque as it is; kp e where the drives were given targets."""
+    if np.isnan(rows.command).any():
+        return Reference("command", None, "no tau_cmd, and no q_target with known kp")
+    return Reference("command", rows.command)
+
+
+def pd(rows: Rows) -> Reference:
+    """Take the firmware's law at its word."""
+    if np.isnan(rows.pd).any():
+        return Reference("pd", None, "kp and kd, or q_target and qd, are not in all recordings")
+    return Reference("pd", rows.pd)
+
+
+def linear(train: Rows, train_group: np.ndarray, rows: Rows, group: np.ndarray) -> Reference:
+    """Fit one affine map per group of joints to the training rows and apply it to ``rows``.
+
+    Args:
+        train: training rows.
+        train_group: index of the net of each of them ``(R,)``.
+        rows: held-out rows.
+        group: index of the net of each of those.
+    """
+    torque = np.full(len(rows), np.nan)
+    for k in np.unique(group):
+        mine, theirs = train.take(train_group == k), group == k
+        mean, std = mine.x.mean(axis=0), mine.x.std(axis=0)
+        std = np.where(std > 0, std, 1.0)
+        weights = ridge((mine.x - mean) / std, mine.y - mine.y.mean())
+        torque[theirs] = mine.y.mean() + (rows.x[theirs] - mean) / std @ weights
+    return Reference("linear", torque)

@@ -1,0 +1,77 @@
+"""Kinds of motion that an actuator model can be good or bad at, told apart by each joint's own speed and torque."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from go1exp.fit.dataset import Rows
+
+STILL, FAST, HIGH = 0.05, 0.5, 0.7
+"""Parts of a joint's speed scale below which it is still, above which fast; part of its torque scale that is high."""
+
+QUANTILE = 0.99
+"""The scales are this quantile of |speed| and |torque| over all recordings: a rare spike sets no scale."""
+
+REVERSAL = 0.02
+"""s; rows this close to a change of the velocity's sign count as reversal."""
+
+REGIMES = ("all", "still", "slow", "fast", "reversal", "high torque")
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Limits of the regimes of one joint: speeds rad/s, torque N m, time s; None where there is no velocity."""
+
+    joint: str
+    still_below: float | None
+    fast_above: float | None
+    reversal_within: float
+    high_torque_above: float
+
+
+def thresholds(rows: Rows, joints: tuple[str, ...]) -> list[Thresholds]:
+    """Derive each joint's limits from ``rows``, which should be those of all recordings."""
+    found = []
+    for j, joint in enumerate(joints):
+        mine = rows.take(rows.joint == j)
+        known = len(mine) > 0 and bool(np.isfinite(mine.speed).all())
+        speed = float(np.quantile(np.abs(mine.speed), QUANTILE)) if known else None
+        torque = float(np.quantile(np.abs(mine.y), QUANTILE)) if len(mine) else 0.0
+        slow, fast = (None, None) if speed is None else (STILL * speed, FAST * speed)
+        found.append(Thresholds(joint, slow, fast, REVERSAL, HIGH * torque))
+    return found
+
+
+def masks(rows: Rows, limits: list[Thresholds]) -> dict[str, np.ndarray]:
+    """Return which rows belong to each regime ``(R,)``. Still, slow and fast exclude each other; the others do not."""
+
+    def per_row(values: list[float | None]) -> np.ndarray:
+        return np.array([np.nan if v is None else v for v in values])[rows.joint]
+
+    speed = np.abs(rows.speed)  # NaN where it is unknown: compares as false
+    still, fast = per_row([x.still_below for x in limits]), per_row([x.fast_above for x in limits])
+    return {
+        "all": np.ones(len(rows), bool),
+        "still": speed < still,
+        "slow": (speed >= still) & (speed < fast),
+        "fast": speed >= fast,
+        "reversal": rows.since_reversal <= REVERSAL,
+        "high torque": np.abs(rows.y) > per_row([x.high_torque_above for x in limits]),
+    }
+
+
+def as_words(limits: list[Thresholds]) -> list[str]:
+    """Say the limits in one line per joint."""
+    lines = []
+    for x in limits:
+        values = asdict(x)
+        words = "speed unknown: no still, slow, fast or reversal"
+        if x.still_below is not None:
+            words = (
+                "still below {still_below:.3g} rad/s, fast from {fast_above:.3g} rad/s, "
+                "reversal within {reversal_within:g} s of a sign change"
+            ).format(**values)
+        lines.append(f"{x.joint}: {words}; high torque above {x.high_torque_above:.3g} N m")
+    return lines

@@ -1,0 +1,283 @@
+"""The model run through windows of recordings, many variants side by side, on the plant that training uses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import go1exp.actuator
+import go1exp.effects  # noqa: F401  (registers every effect)
+from go1exp import robot
+from go1exp.drive import DriveSetup
+from go1exp.effects.base import Measured
+from go1exp.env.plant import FRICTION, Plant, drive_setup
+from go1exp.gap.windows import PAST_S, Windows, held
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import build_model
+from go1exp.randomness import EnvRandom
+from go1exp.registry import bind, members
+from go1exp.robot import RobotConfig
+from go1exp.terrain import TerrainConfig, build_terrain
+
+Key = tuple[str, str]
+"""Effect and parameter."""
+Theta = dict[Key, np.ndarray]
+"""Values by key: (J,) per joint, or (1,) of the robot."""
+
+NEEDLESS = 1 << 4 | 1 << 13
+"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air has no use for; half of the step's time."""
+
+
+class Machine(Protocol):
+    """A robot that can be replayed."""
+
+    joints: tuple[str, ...]
+    groups: tuple[tuple[int, ...], ...]
+    """Joints that move together, equally many in each group; groups do not feel each other."""
+
+    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` held robots, and their drives."""
+
+
+@dataclass(frozen=True)
+class HungGo1:
+    """A Go1 whose trunk is held, so that its legs do not feel each other."""
+
+    config: RobotConfig
+    joints: tuple[str, ...] = robot.JOINTS
+    groups: tuple[tuple[int, ...], ...] = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
+
+    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` held robots, and their drives."""
+        w, x, y, z = base_quat
+        ground = build_terrain(TerrainConfig(kind="flat"))
+        model, blocks = build_model(self.config, ground, physics_dt, held=(w, x, y, z))
+        model.opt.disableflags |= NEEDLESS
+        backend = MujocoCpu(model, blocks, num, threads)
+        return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """R simulations to make.
+
+    Attributes:
+        window: (R,) which window each replays.
+        values: of the effects, (R, J) or (R, 1).
+        q: (R, J) added to the first angles, rad; None for nothing.
+        qd: (R, J) added to the first speeds, rad/s.
+    """
+
+    window: np.ndarray
+    values: Mapping[Key, np.ndarray]
+    q: np.ndarray | None = None
+    qd: np.ndarray | None = None
+
+    def part(self, which: np.ndarray) -> Rows:
+        """Return some of them."""
+        moved = (None if v is None else v[which] for v in (self.q, self.qd))
+        return Rows(self.window[which], {k: v[which] for k, v in self.values.items()}, *moved)
+
+
+def null(effect: str) -> Theta:
+    """Return the null values of an effect as arrays (1,)."""
+    return {(effect, p.name): np.array([p.null]) for p in members("effect")[effect].target.params}  # type: ignore[attr-defined]
+
+
+@dataclass
+class Replayer:
+    """Runs the model through windows; keeps its batches of simulations for the next call.
+
+    Attributes:
+        machine: the robot.
+        windows: what to replay.
+        quats: (W, 4) attitude of the base.
+        max_rows: simulations side by side.
+        threads: of the engine.
+    """
+
+    machine: Machine
+    windows: Windows
+    quats: np.ndarray
+    max_rows: int
+    threads: int
+    made: int = 0
+    on_rows: Callable[[int], None] = lambda rows: None
+    _backends: dict[Any, tuple[Any, DriveSetup, set[str]]] = field(default_factory=dict)
+    _inputs: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)
+
+    def run(self, rows: Rows, dt: float) -> np.ndarray:
+        """Return what sensors would say (R, n, C, J) at the windows' sample times."""
+        w = self.windows
+        found = np.empty((len(rows.window), w.t.shape[1], len(w.quantities), len(w.joints)))
+        attitudes, which = np.unique(self.quats[rows.window].round(6), axis=0, return_inverse=True)
+        for k, quat in enumerate(attitudes):
+            mine = np.flatnonzero(which.ravel() == k)
+            pieces = int(np.ceil(len(mine) / self.max_rows))
+            for piece in np.array_split(mine, pieces):
+                size = -(-len(piece) // 64) * 64 if len(piece) < self.max_rows else self.max_rows
+                full = np.concatenate([piece, np.repeat(piece[-1:], size - len(piece))])
+                found[piece] = self._batch(rows.part(full), dt, tuple(float(v) for v in quat))[: len(piece)]
+                self.on_rows(len(piece))
+        return found
+
+    def _plant(self, rows: Rows, dt: float, quat: tuple[float, ...]) -> Plant:
+        """Return a plant whose effects are exactly those of ``rows``, on a backend that may be an old one."""
+        key = (len(rows.window), dt, quat)
+        if key not in self._backends:
+            self._backends[key] = (*self.machine.build(len(rows.window), dt, quat, self.threads), set())
+        backend, setup, touched = self._backends[key]
+        for name in touched:
+            backend.field(name).copy_(backend.compiled(name))
+        if touched:
+            backend.derive_constants(torch.ones(len(rows.window), dtype=torch.bool))
+        names = list(dict.fromkeys(effect for effect, _ in rows.values))
+        terms = [bind("effect", name, {}, name)[0] for name in names]
+        actuator = bind("actuator", "pd", {}, "pd")[0]
+        assert actuator is not None
+        plant = Plant(backend, setup, actuator, [term for term in terms if term is not None])
+        touched |= set(plant.effects.fields) | {FRICTION, "dof_armature"}
+        for (effect, parameter), value in rows.values.items():
+            live = getattr(plant.effects.effects[effect], parameter)
+            live.copy_(torch.as_tensor(value))
+        kp, kd = (torch.as_tensor(v[rows.window]) for v in (self.windows.kp, self.windows.kd))
+        plant.set_gains(kp, kd)
+        plant.refresh()
+        return plant
+
+    def _begin(self, plant: Plant, rows: Rows, past: Tensor, dt: float) -> None:
+        """Put the robots into their windows' first states, as the encoders see them."""
+        w = self.windows
+        q, qd = torch.as_tensor(w.q[rows.window]), torch.as_tensor(w.qd[rows.window])
+        if rows.q is not None and rows.qd is not None:
+            q, qd = q + torch.as_tensor(rows.q), qd + torch.as_tensor(rows.qd)
+        everyone = torch.ones(len(q), dtype=torch.bool)
+        effects, backend = plant.effects, plant.backend
+        plant.enabled = None
+        backend.reset(everyone, q, qd)
+        plant.reset(everyone, past[0])
+        seen, _ = effects.on_encoder(q, qd)
+        true = q - (seen - q)
+        if effects.rotors:  # the twist under the torque that the drive makes at this pose
+            torque = plant.actuator.torque(past[-1], q, qd)
+            gears = effects.gears()
+            twist = gears.compliance * torque + 0.5 * gears.gap * torque.sign()
+            true = true - twist
+        backend.reset(everyone, true, qd)
+        plant.reset(everyone, past[-1])
+        if effects.rotors:
+            effects.rotors.twist.copy_(twist)
+        for target in past:  # what a delayed command remembers
+            effects.on_target(target)
+        for effect in effects.effects.values():
+            if hasattr(effect, "_time"):
+                effect._time.copy_(torch.as_tensor(w.begin[rows.window]).unsqueeze(1))
+
+    def _signals(self, dt: float) -> tuple[Tensor, Tensor]:
+        """Return targets (K, W, J) and whether drives are on (K, W) at every step, the past included."""
+        if dt not in self._inputs:
+            w = self.windows
+            steps = np.arange(-round(PAST_S / dt), int(np.ceil(w.length / dt)) + 1) * dt
+            targets = np.stack([held(changes, steps) for changes in w.edges], axis=1)
+            enabled = np.stack([held(changes, steps) for changes in w.switches], axis=1)
+            self._inputs[dt] = torch.as_tensor(targets), torch.as_tensor(enabled)
+        return self._inputs[dt]
+
+    def _batch(self, rows: Rows, dt: float, quat: tuple[float, ...]) -> np.ndarray:
+        """Run a batch, all windows at once."""
+        w = self.windows
+        plant = self._plant(rows, dt, quat)
+        index = torch.as_tensor(rows.window)
+        targets, enabled = self._signals(dt)
+        targets, enabled = targets[:, index], enabled[:, index]
+        past = round(PAST_S / dt)
+        self._begin(plant, rows, targets[:past], dt)
+        always = bool(enabled.all())
+        steps = len(targets) - past
+        first = max(int(np.floor(w.t[:, 0].min() / dt)) - 1, 0)
+        kept = steps - first
+        shape = (kept, len(index), len(w.joints))
+        q, qd, torque = np.empty(shape), np.empty(shape), np.empty(shape) if "tau_est" in w.quantities else None
+        senses = plant.effects.senses
+        for k in range(steps):
+            if k >= first:
+                seen = Measured(plant.q, plant.speed())
+                if senses:
+                    seen = plant.effects.measure(seen)
+                q[k - first], qd[k - first] = seen.joint_pos.numpy(), seen.joint_vel.numpy()
+            if not always:
+                plant.enabled = enabled[past + k]
+            plant.step(targets[past + k])
+            if torque is not None and k >= first:
+                torque[k - first] = plant.torque.numpy()
+        self.made += len(index) * steps
+        return _sampled(q, qd, torque, w.t[rows.window] / dt - first, dt)
+
+
+def _sampled(
+    q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float
+) -> np.ndarray:
+    """Interpolate (K, R, J) to the times ``at`` (R, n), in steps: angles by cubics, the rest by lines."""
+    low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(q) - 2)
+    share = np.maximum(at - low, 0.0)[..., None]
+    row = np.arange(at.shape[0])[:, None]
+    if share.max() < 1e-4:
+        parts = [q[low, row], qd[low, row], *([torque[low, row]] if torque is not None else [])]
+        return np.stack(parts, axis=2)
+    a, b, va, vb = q[low, row], q[low + 1, row], qd[low, row] * dt, qd[low + 1, row] * dt
+    s2, s3 = share**2, share**3
+    angle = a + share * va + s2 * (3 * (b - a) - 2 * va - vb) + s3 * (2 * (a - b) + va + vb)
+    parts = [angle, (va + share * (vb - va)) / dt]
+    if torque is not None:
+        parts.append(torque[low, row] + share * (torque[low + 1, row] - torque[low, row]))
+    return np.stack(parts, axis=2)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One changed simulation beside the unchanged one.
+
+    Attributes:
+        key: parameter that is changed, or None for a first state.
+        place: which joint of each group; None for a parameter of the robot.
+        delta: (J,) or (1,) by how much, per joint.
+        also: other parameters that are set meanwhile (shapes), by key.
+    """
+
+    key: Key | str
+    place: int | None
+    delta: np.ndarray
+    also: Theta = field(default_factory=dict)
+
+
+def variants(
+    machine: Machine, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], known: Iterable[Key] = ()
+) -> Rows:
+    """Return rows, window by window: the model as it is, then each probe."""
+    joints, size = len(machine.joints), 1 + len(probes)
+    count = len(windows) * size
+    groups = np.array(machine.groups)
+    full: dict[Key, np.ndarray] = {}
+    keys = {*theta, *(p.key for p in probes if isinstance(p.key, tuple)), *(k for p in probes for k in p.also), *known}
+    for effect in dict.fromkeys(sorted(name for name, _ in keys)):
+        for key, value in null(effect).items():
+            per = {p.name: p.per for p in members("effect")[effect].target.params}[key[1]]  # type: ignore[attr-defined]
+            wide = joints if per == "joint" else 1
+            full[key] = np.tile(np.broadcast_to(theta.get(key, value), (wide,)), (count, 1))
+    q, qd = np.zeros((count, joints)), np.zeros((count, joints))
+    for k, probe in enumerate(probes):
+        mine = slice(1 + k, None, size)
+        columns = slice(None) if probe.place is None else groups[:, probe.place]
+        if isinstance(probe.key, str):
+            (q if probe.key == "q" else qd)[mine, columns] += probe.delta[columns]
+            continue
+        for key, value in probe.also.items():
+            full[key][mine] = value
+        full[probe.key][mine, columns] += probe.delta[columns]
+    return Rows(np.repeat(windows, size), full, q, qd)
+

@@ -1,0 +1,262 @@
+"""What a comparison of recordings with the model is asked for, and what it answers: the contract of the gap workflow.
+
+Scores are chi2 per sample, in units of the noise: a model that is right scores 1. The excess is what lies above that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field
+
+from go1exp.registry import STRICT, Fraction, NonNegative, Positive
+
+Verdict = Literal["no gap", "explained", "partly explained", "unexplained", "not excited", "bad log"]
+
+EXIT_CODES: dict[str, int] = {
+    "no gap": 0,
+    "explained": 10,
+    "partly explained": 11,
+    "unexplained": 12,
+    "not excited": 13,
+    "bad log": 14,
+}
+"""Verdict -> exit code of the command."""
+
+Share = Annotated[float, Field(gt=0, lt=1)]
+Count = Annotated[int, Field(ge=1)]
+
+
+@dataclass(frozen=True)
+class GapSettings:
+    """How recordings are compared with the model.
+
+    Attributes:
+        window_s: scored length of a window, s.
+        burn_s: time replayed before it and not scored, s: filters and delay lines settle.
+        stride_s: from the beginning of one window to that of the next, s.
+        physics_dt: longest physics step, s; the one used divides the logger's period.
+        torque: also score the torque that the drives report, where it was logged.
+        alpha: significance that a term needs.
+        min_share: share of the remaining excess that a term must remove.
+        max_terms: most terms that are named.
+        shortlist: candidates that are fitted in full, of all that are screened.
+        iterations: Gauss-Newton steps of a fit.
+        adequate: excess up to which the model counts as right (floor 1 is excess 0).
+        material: excess of the model within its tolerances below which there is no gap.
+        confirm_fraction: share of the episodes that is kept for the last check.
+        bags: resamplings of the episodes.
+        certified: share of the bags in which a term must be found again.
+        overlays: windows whose curves are kept for pictures.
+        max_rows: simulations side by side.
+        threads: of the physics engine.
+        seed: of splits, sign flips and bags.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    window_s: Positive = 0.3
+    burn_s: NonNegative = 0.07
+    stride_s: Positive = 0.4
+    physics_dt: Annotated[float, Field(gt=0, le=0.002)] = 0.001
+    torque: bool = False
+    alpha: Share = 0.01
+    min_share: Fraction = 0.1
+    max_terms: Count = 4
+    shortlist: Count = 5
+    iterations: Count = 3
+    adequate: Positive = 0.5
+    material: Positive = 0.1
+    confirm_fraction: Fraction = 0.2
+    bags: Annotated[int, Field(ge=0)] = 40
+    certified: Fraction = 0.8
+    overlays: Annotated[int, Field(ge=0)] = 4
+    max_rows: Count = 1024
+    threads: Annotated[int, Field(ge=0)] = 1
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+@dataclass(frozen=True)
+class Floors:
+    """What no model can get below, as standard deviations.
+
+    Attributes:
+        noise: sensor noise by quantity (``q`` rad, ``qd`` rad/s, ``tau_est`` N m), median over joints and episodes.
+        numerical: difference between replays at the step used and half of it, root mean square, by quantity.
+        repeatability: difference between repeated episodes over sqrt(2), root mean square, by quantity; None if no
+            episode was repeated.
+    """
+
+    noise: dict[str, float]
+    numerical: dict[str, float]
+    repeatability: dict[str, float] | None
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Where the model is wrong.
+
+    Attributes:
+        joints: rows.
+        regimes: columns.
+        samples: (J, R) number of samples.
+        excess: (J, R) mean excess; NaN where there is no sample.
+        p: (J, R) p-values of block permutation; NaN where nothing can be said.
+        flagged: (J, R) bool, significant at a false discovery rate of 5 %.
+    """
+
+    joints: tuple[str, ...]
+    regimes: tuple[str, ...]
+    samples: np.ndarray
+    excess: np.ndarray
+    p: np.ndarray
+    flagged: np.ndarray
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One row of the evidence.
+
+    Attributes:
+        effect: registered name.
+        joints: where it would act; empty for an effect of the whole robot.
+        params: parameter -> one value per joint of ``joints``, or one number.
+        excess_after: held-out excess with it.
+        log_gain: mean over held-out windows of the fall of log chi2.
+        p: sign-flip max-T p-value over all candidates.
+        size_over_tolerance: largest deviation from null over the tolerance.
+        alias_class: effects that do as well on these data, itself included.
+        status: what became of it.
+        reason: why, in a sentence.
+        stage: at which term of the stepwise search it was judged, from 1.
+    """
+
+    effect: str
+    joints: tuple[str, ...]
+    params: dict[str, list[float] | float]
+    excess_after: float
+    log_gain: float
+    p: float
+    size_over_tolerance: float
+    alias_class: tuple[str, ...]
+    status: Literal["accepted", "rejected", "alias", "not excited"]
+    reason: str
+    stage: int = 1
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """An effect that the data ask for.
+
+    Attributes:
+        effect: registered name.
+        joints: where it acts; empty for an effect of the whole robot.
+        params: parameter -> joint (or ``robot``) -> value.
+        interval: parameter -> joint (or ``robot``) -> 95 % interval.
+        alias_set: effects that do as well on these data, this one first.
+        status: ``certified``, or ``compensating`` if it may stand for something that no effect describes.
+    """
+
+    effect: str
+    joints: tuple[str, ...]
+    params: dict[str, dict[str, float]]
+    interval: dict[str, dict[str, tuple[float, float]]]
+    alias_set: tuple[str, ...]
+    status: Literal["certified", "compensating"]
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """One held-out window to look at: arrays over its samples, by channel (``q_FR_calf``).
+
+    Attributes:
+        episode: where it is from.
+        t: (T,) time in the episode, s.
+        measured: (T,) by channel.
+        before: (T,) of the model within its tolerances.
+        after: (T,) with what was named.
+        noise: standard deviation of the noise, by channel.
+    """
+
+    episode: str
+    t: np.ndarray
+    measured: dict[str, np.ndarray]
+    before: dict[str, np.ndarray]
+    after: dict[str, np.ndarray]
+    noise: dict[str, float]
+
+
+@dataclass(frozen=True)
+class GapResult:
+    """The answer.
+
+    Attributes:
+        verdict: one of six.
+        sentence: the answer in words, one paragraph.
+        named: what the data ask for, strongest first.
+        candidates: the evidence, best first.
+        floors: None if the log is bad.
+        excess: held-out excess of the plain model (``null``), within its tolerances (``box``), with what was named
+            (``final``), and that on the episodes kept for the last check (``confirm``).
+        closed: share of the held-out excess that the named effects removed; NaN without one.
+        before: localisation of the plain model; None if the log is bad.
+        after: localisation with what was named.
+        not_excited: effect -> excitation to record next.
+        advice: what to record to tell apart what these data cannot, a sentence each.
+        bags: effect -> share of the bags in which it was found.
+        waterfall: (label, excess) from the plain model down to what remains.
+        overlays: windows to look at.
+        box: parameters of the nominal model within their tolerances: effect -> parameter -> joint or ``robot`` -> value.
+        provenance: hashes, versions, seeds, steps.
+        warnings: what a reader must know, a sentence each.
+        seconds: time it took.
+    """
+
+    verdict: Verdict
+    sentence: str
+    named: tuple[NamedEffect, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+    floors: Floors | None = None
+    excess: dict[str, float] = field(default_factory=dict)
+    closed: float = math.nan
+    before: Localisation | None = None
+    after: Localisation | None = None
+    not_excited: dict[str, str] = field(default_factory=dict)
+    advice: tuple[str, ...] = ()
+    bags: dict[str, float] = field(default_factory=dict)
+    waterfall: tuple[tuple[str, float], ...] = ()
+    overlays: tuple[Overlay, ...] = ()
+    box: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    seconds: float = math.nan
+
+    @property
+    def exit_code(self) -> int:
+        """Of the command that found this."""
+        return EXIT_CODES[self.verdict]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain values that JSON can hold; a number that is not finite is None."""
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {"exit_code": self.exit_code, **{name: _plain(value) for name, value in plain.items()}}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

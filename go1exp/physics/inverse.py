@@ -1,0 +1,37 @@
+"""Which torques a hung robot's joints must have got, from how they moved."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from go1exp.physics.scene import build_model
+from go1exp.robot import RobotConfig
+from go1exp.terrain import TerrainConfig, build_terrain
+
+
+def joint_torques(
+    config: RobotConfig, base_quat: tuple[float, float, float, float], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> np.ndarray:
+    """Return M(q) qdd + c(q, qd) + g(q) of a robot whose trunk is held: what drive and friction together gave.
+
+    Args:
+        config: the robot; its damping and dry friction count as part of the model, so that they are not in the result.
+        base_quat: attitude of the trunk, w-x-y-z.
+        q: joint angles (T, 12), rad.
+        qd: joint speeds (T, 12), rad/s.
+        qdd: joint accelerations (T, 12), rad/s2.
+
+    Returns:
+        torques (T, 12), N m.
+    """
+    terrain = build_terrain(TerrainConfig(kind="flat"))
+    model, _ = build_model(config, terrain, physics_dt=0.002, held=base_quat)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # no stop and no ground is touched
+    data = mujoco.MjData(model)
+    found = np.zeros_like(q)
+    for row in range(len(q)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[row], qd[row], qdd[row]
+        mujoco.mj_inverse(model, data)
+        found[row] = data.qfrc_inverse
+    return found

@@ -1,0 +1,646 @@
+"""The audit names every defect that is put into a sound recording, with its channel and size, and nothing else.
+
+Sound recordings come from a joint model that lives here: twelve inertias with dry friction and gravity under the
+PD law, driven through the package's own excitations, and a base that rocks by a closed form.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from go1exp import data_root, excitations, registry
+from go1exp.audit import AuditReport, audit, audit_file, signals
+from go1exp.recording import Meta, Recording, RecordingError, joint_channels, write
+from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
+
+RATE = 500.0
+SECONDS = 6
+ROWS = 3000
+ENCODER = 3.0e-5  # rad
+META = Meta(
+    robot="go1",
+    joints=JOINTS,
+    rate_hz=RATE,
+    base="floating",
+    base_quat=None,
+    kp=(20.0,) * 12,
+    kd=(0.5,) * 12,
+    tau_limit=tuple(per_joint(EFFORT_LIMIT)),
+    excitation=None,
+    episode="synthetic",
+    repeat_of=None,
+    source="simulated",
+    tool="test",
+    versions={},
+    notes="",
+)
+
+
+STOPS = JOINT_POS_LIMITS
+
+
+def respond(
+    t: np.ndarray, motion: excitations.Motion, delay: float, limit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Joint angles, speeds and torques (T, 12) by semi-implicit Euler steps of 1 ms."""
+    h = 1e-3
+    per = round((t[1] - t[0]) / h)
+    row = np.clip(np.searchsorted(t, np.arange(len(t) * per) * h - delay + 1e-9, side="right") - 1, 0, None)
+    q, qd = motion.start.copy(), np.zeros(12)
+    out = np.empty((3, len(t), 12))
+    for i in range(len(t) * per):
+        beyond = q - np.clip(q, STOPS[:, 0], STOPS[:, 1])
+        stop = np.where(beyond != 0, 500 * beyond + 5 * qd, 0.0)
+        tau = np.clip(20 * (motion.target[row[i]] - q) - 0.5 * qd, -limit, limit) * motion.torque_enable[row[i]]
+        if i % per == 0:
+            out[:, i // per] = q, qd, tau
+        qd = qd + h / 0.03 * (tau - stop - 0.8 * np.sin(q) - 0.1 * np.tanh(qd / 0.05) - 0.01 * qd)
+        q = q + h * qd
+    return out[0], out[1], out[2]
+
+
+@cache
+def made(name: str = "steps", delay: float = 0.0, rate: float = RATE, limit: float = 1.0) -> Recording:
+    """A sound, noise-free recording; arrays are shared, so tests copy what they change."""
+    t = np.arange(round(SECONDS * rate)) / rate
+    member = registry.members("excitation")[name].target
+    motion = member(t, NOMINAL_STANCE, soft_limits(0.9), np.random.default_rng(5))
+    q, qd, tau = respond(t, motion, delay, limit * per_joint(EFFORT_LIMIT))
+    joints = {"q": q, "qd": qd, "q_target": motion.target, "tau_est": tau}
+    channels = {"t": t} | {c: v for k, x in joints.items() for c, v in zip(joint_channels(k, JOINTS), x.T, strict=True)}
+    turn = Rotation.from_euler("ZYX", np.stack([a * np.sin(w * t + p) for a, w, p in ROCKING], axis=1))
+    fine = Rotation.from_euler("ZYX", np.stack([a * np.sin(w * (t + 1e-6) + p) for a, w, p in ROCKING], axis=1))
+    gyro = (turn.inv() * fine).as_rotvec() / 1e-6
+    acc = turn.inv().apply([0, 0, 9.81]) + 0.3 * np.sin(7 * t)[:, None]
+    named = {"imu_gyro_{}": gyro, "imu_acc_{}": acc}
+    channels |= {k.format(axis): v[:, i] for k, v in named.items() for i, axis in enumerate("xyz")}
+    channels |= {f"imu_quat_{part}": v for part, v in zip("wxyz", turn.as_quat(scalar_first=True).T, strict=True)}
+    if not motion.torque_enable.all():
+        channels["torque_enable"] = motion.torque_enable
+    meta = replace(META, rate_hz=rate, excitation=name, tau_limit=tuple(limit * per_joint(EFFORT_LIMIT)))
+    return Recording(meta, {k: np.ascontiguousarray(v) for k, v in channels.items()})
+
+
+ROCKING = ((0.5, 1.1, 0.3), (0.2, 5.1, 0.0), (0.15, 7.3, 1.0))
+"""Amplitude (rad), frequency (rad/s) and phase of yaw, pitch and roll."""
+
+
+def with_(recording: Recording, **changed: np.ndarray) -> Recording:
+    return Recording(recording.meta, recording.channels | changed)
+
+
+def realistic(recording: Recording, seed: int = 0) -> Recording:
+    """Encoder steps, noise of every sensor and a jittering clock, as on a good robot."""
+    rng = np.random.default_rng(seed)
+    size = {"q_": 3e-4, "qd": 0.05, "ta": 0.1, "im": 0.02}
+    dirty = {}
+    for name, values in recording.channels.items():
+        if name == "t":
+            dirty[name] = values + rng.normal(0, 5e-5, len(values))
+        elif name.startswith("q_target") or name == "torque_enable":
+            dirty[name] = values
+        elif name.startswith("imu_quat"):
+            dirty[name] = np.round(values, 6)
+        else:
+            step = ENCODER if name.startswith("q_") else 1e-3
+            dirty[name] = step * np.round((values + rng.normal(0, size[name[:2]], len(values))) / step)
+    return with_(recording, **dirty)
+
+
+def flaws(report: AuditReport) -> set[tuple[str, str, str]]:
+    return {(f.check, f.channel, f.verdict) for f in report.flaws}
+
+
+def size(report: AuditReport, check: str, channel: str) -> float:
+    (found,) = [f.size for f in report.of(check) if f.channel == channel]
+    assert found is not None
+    return found
+
+
+# ---------------------------------------------------------------------- no false alarms
+
+
+@pytest.mark.parametrize("name", ["chirp", "multisine", "steps", "slow_ramps", "gait", "torque_off", "squat", "drop"])
+def test_clean_simulated_data_are_ok(name: str) -> None:
+    report = audit(made(name))
+    assert report.flaws == []
+    assert all(c.verdict == "ok" for c in report.channels)
+    assert [c.name for c in report.channels] == list(made(name).channels)
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0])
+@pytest.mark.parametrize("name", ["multisine", "steps", "gait"])
+def test_clean_slowly_sampled_data_are_ok(name: str, rate: float) -> None:
+    assert audit(made(name, rate=rate)).flaws == []
+
+
+@pytest.mark.parametrize("name", ["chirp", "multisine", "steps", "slow_ramps", "gait", "torque_off"])
+def test_good_real_sensors_are_ok(name: str) -> None:
+    recording = realistic(made(name))
+    report = audit(Recording(replace(recording.meta, source="measured"), recording.channels))
+    assert report.flaws == []
+    assert report.verdict == "ok"
+
+
+def test_a_fixed_base_and_missing_channels_are_no_flaws() -> None:
+    whole = made()
+    kept = {k: v for k, v in whole.channels.items() if k == "t" or k.startswith("q_")}
+    meta = replace(META, base="fixed", base_quat=(1.0, 0.0, 0.0, 0.0), kp=None, kd=None, tau_limit=None, robot="arm")
+    assert audit(Recording(meta, kept)).flaws == []
+    still = {"imu_gyro_x": np.zeros(ROWS), "imu_gyro_y": np.zeros(ROWS), "imu_gyro_z": np.zeros(ROWS)}
+    assert audit(Recording(meta, kept | still)).flaws == []
+
+
+# ---------------------------------------------------------------------- the clock
+
+
+def test_another_rate_is_found() -> None:
+    sound = made()
+    report = audit(Recording(replace(sound.meta, rate_hz=400.0), sound.channels))
+    assert flaws(report) == {("rate", "t", "bad")}
+    assert size(report, "rate", "t") == pytest.approx(500)
+    assert "500 Hz" in report.of("rate")[0].message
+    assert "rate_hz = 400" in report.of("rate")[0].message
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])
+def test_a_clock_in_other_units_is_found(factor: float, unit: str) -> None:
+    report = audit(with_(made(), t=made().t * factor))
+    assert ("rate", "t", "bad") in flaws(report)
+    assert unit in report.of("rate")[0].message
+
+
+def test_jitter_is_found_and_sized() -> None:
+    rng = np.random.default_rng(0)
+    t = made().t + rng.uniform(-4e-4, 4e-4, ROWS)
+    report = audit(with_(made(), t=t))
+    assert flaws(report) == {("jitter", "t", "suspect")}
+    assert size(report, "jitter", "t") == pytest.approx(0.8 / np.sqrt(12) * np.sqrt(2), rel=0.05)  # ms
+
+
+def test_missing_samples_are_counted() -> None:
+    keep = np.ones(ROWS, dtype=bool)
+    keep[[700, 701, 702, 2100, 2800]] = False
+    report = audit(Recording(made().meta, {k: v[keep] for k, v in made().channels.items()}))
+    assert flaws(report) == {("gaps", "t", "suspect")}
+    assert size(report, "gaps", "t") == 5
+    assert "in 3 gaps, the longest 8 ms at 1.398 s" in report.of("gaps")[0].message
+    keep[1000:1100] = False
+    assert ("gaps", "t", "bad") in flaws(
+        audit(Recording(made().meta, {k: v[keep] for k, v in made().channels.items()}))
+    )
+
+
+def test_a_clock_that_was_counted_is_told_for_measured_data_only() -> None:
+    measured = Recording(replace(META, source="measured"), made().channels)
+    assert "was counted" in audit(measured).of("jitter")[0].message
+    assert "was counted" not in audit(made()).of("jitter")[0].message
+
+
+# ---------------------------------------------------------------------- single channels
+
+
+def test_duplicated_rows_are_found_and_counted() -> None:
+    sound = realistic(made("chirp"))
+    rng = np.random.default_rng(1)
+    row = np.arange(ROWS)
+    again = rng.uniform(size=ROWS) < 0.05
+    row[again] -= 1
+    row[0] = 0
+    copied = {k: v if k == "t" else v[row] for k, v in sound.channels.items()}
+    report = audit(Recording(sound.meta, copied))
+    assert flaws(report) == {("duplicates", "all", "suspect")}
+    assert size(report, "duplicates", "all") == pytest.approx(0.05, rel=0.25)
+
+
+@pytest.mark.parametrize("quantised", [False, True])
+def test_a_channel_that_repeats_is_named(quantised: bool) -> None:
+    sound = realistic(made("gait")) if quantised else made("gait")
+    values = sound.channels["q_FL_thigh"].copy()
+    again = np.flatnonzero(np.random.default_rng(2).uniform(size=ROWS - 1) < 0.25) + 1
+    for i in again:
+        values[i] = values[i - 1]
+    report = audit(with_(sound, q_FL_thigh=values))
+    assert ("repeats", "q_FL_thigh", "bad") in flaws(report)
+    assert {f.channel for f in report.flaws} <= {"q_FL_thigh", "qd_FL_thigh"}
+    assert size(report, "repeats", "q_FL_thigh") == pytest.approx(0.25, rel=0.3)
+
+
+def test_a_channel_that_is_read_at_another_rate_is_named() -> None:
+    values = np.repeat(made("gait").channels["qd_RR_calf"][::5], 5)
+    report = audit(with_(made("gait"), qd_RR_calf=values))
+    assert ("repeats", "qd_RR_calf", "bad") in flaws(report)
+    assert size(report, "repeats", "qd_RR_calf") == pytest.approx(0.8, abs=0.03)
+    (message,) = [f.message for f in report.of("repeats")]
+    assert float(message.split()[-2]) == pytest.approx(100, rel=0.15)
+
+
+@pytest.mark.parametrize("step", [3.028e-5, 3.8147e-4, 1.534e-3, 0.01])
+def test_the_step_of_an_encoder_is_found(step: float) -> None:
+    offset = 0.12345 * step
+    values = step * np.round((made("chirp").channels["q_FR_calf"] - offset) / step) + offset
+    report = audit(with_(made("chirp"), q_FR_calf=values))
+    assert size(report, "resolution", "q_FR_calf") == pytest.approx(step, rel=1e-3)
+    assert next(c.step for c in report.channels if c.name == "q_FR_calf") == pytest.approx(step, rel=1e-3)
+    assert ("resolution", "q_FR_calf", "suspect") in flaws(report) or step < 4e-3
+    assert len(report.of("resolution")) == 1
+    assert all(c.step == 0 for c in report.channels if c.step is not None and c.name != "q_FR_calf")
+
+
+def test_known_encoders_are_called_by_name() -> None:
+    for bits, name in ((4096, "XL330"), (32768 * 6.33, "GO-M8010-6"), (16384, "14 bits a turn")):
+        step = 2 * np.pi / bits
+        values = step * np.round(made("chirp").channels["q_FR_hip"] / step)
+        assert name in audit(with_(made("chirp"), q_FR_hip=values)).of("resolution")[0].message
+
+
+def test_steps_survive_decimal_text_and_continuous_values_have_none() -> None:
+    rng = np.random.default_rng(3)
+    smooth = np.cumsum(rng.normal(0, 1e-3, 5000))
+    assert signals.quantum(smooth) == 0
+    assert signals.quantum(smooth.astype(np.float32).astype(float)) == 0
+    assert signals.quantum(np.round(3.03e-5 * np.round(smooth / 3.03e-5), 6)) == pytest.approx(3.03e-5, rel=1e-3)
+    assert signals.quantum(np.repeat([0.1, 0.25, 0.4, 0.1, 0.7], 100)) == pytest.approx(0.15)
+    assert signals.quantum(np.zeros(100)) == 0
+
+
+@pytest.mark.parametrize(("name", "sigma", "verdict"), [("q_RL_hip", 8e-3, "suspect"), ("imu_gyro_y", 3.0, "bad")])
+def test_noise_is_found_and_sized(name: str, sigma: float, verdict: str) -> None:
+    noisy = made("multisine").channels[name] + np.random.default_rng(4).normal(0, sigma, ROWS)
+    report = audit(with_(made("multisine"), **{name: noisy}))
+    assert ("noise", name, verdict) in flaws(report)
+    assert size(report, "noise", name) == pytest.approx(sigma, rel=0.05)
+    assert {f.channel for f in report.flaws} == {name}
+
+
+def test_noise_floors_are_measured_below_any_threshold() -> None:
+    report = audit(realistic(made("slow_ramps")))
+    floors = {c.name: c.noise for c in report.channels}
+    assert floors["q_FL_hip"] == pytest.approx(3e-4, rel=0.1)
+    assert floors["qd_FL_hip"] == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "value"), [("q_RR_thigh", 1.0), ("qd_FL_calf", 0.0), ("tau_est_RL_hip", 0.0)])
+def test_a_dead_joint_channel_is_named(name: str, value: float) -> None:
+    report = audit(with_(made(), **{name: np.full(ROWS, value)}))
+    assert ("dead", name, "bad") in flaws(report)
+    assert size(report, "dead", name) == value
+
+
+def test_a_dead_imu_axis_is_named() -> None:
+    report = audit(with_(made(), imu_gyro_z=np.zeros(ROWS)))
+    assert flaws(report) == {("dead", "imu_gyro_z", "bad")}
+
+
+def test_a_sensor_that_saturates_is_named() -> None:
+    report = audit(with_(made(), imu_gyro_y=np.clip(made().channels["imu_gyro_y"], -0.6, 0.6)))
+    assert ("saturation", "imu_gyro_y", "bad") in flaws(report)
+    assert "0.6" in next(f.message for f in report.of("saturation"))
+    share = np.mean(np.abs(made().channels["imu_gyro_y"]) > 0.6)
+    assert size(report, "saturation", "imu_gyro_y") == pytest.approx(share, rel=0.05)
+
+
+def test_a_drive_at_its_limit_is_a_fact_and_below_it_a_flaw() -> None:
+    limited = made(limit=0.3)
+    report = audit(limited)
+    at_limit = [f for f in report.of("saturation") if f.verdict == "ok"]
+    assert len(at_limit) >= 3
+    assert "the drive's limit" in at_limit[0].message
+    assert report.flaws == []
+    report = audit(Recording(replace(limited.meta, tau_limit=META.tau_limit), limited.channels))
+    assert {f.check for f in report.flaws} == {"saturation"}
+    assert all("sticks at" in f.message and ", but the limit is " in f.message for f in report.flaws)
+    assert any("7.11 N m" in f.message and "the limit is 23.7 N m" in f.message for f in report.flaws)
+
+
+# ---------------------------------------------------------------------- units, limits
+
+
+@pytest.mark.parametrize("robot", ["go1", "other"])
+def test_degrees_are_recognised(robot: str) -> None:
+    sound = made()
+    for name in ("q_FL_calf", "q_target_FL_calf"):
+        changed = with_(Recording(replace(sound.meta, robot=robot), sound.channels))
+        report = audit(with_(changed, **{name: np.degrees(sound.channels[name])}))
+        assert ("units", name, "bad") in flaws(report)
+        assert "degrees" in next(f.message for f in report.of("units") if f.channel == name)
+
+
+def test_speed_in_degrees_is_recognised() -> None:
+    report = audit(with_(made(), qd_RL_thigh=np.degrees(made().channels["qd_RL_thigh"])))
+    assert ("units", "qd_RL_thigh", "bad") in flaws(report)
+    assert size(report, "units", "qd_RL_thigh") == pytest.approx(57.3, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "verdict"),
+    [("gait", 1.1, "suspect"), ("steps", 1.17, "suspect"), ("gait", 1.5, "bad"), ("chirp", 0.7, "bad")],
+)
+def test_a_speed_of_wrong_scale_is_found_and_sized(name: str, factor: float, verdict: str) -> None:
+    sound = realistic(made(name))
+    report = audit(with_(sound, qd_FR_thigh=factor * sound.channels["qd_FR_thigh"]))
+    assert ("scale", "qd_FR_thigh", verdict) in flaws(report)
+    assert {f.channel for f in report.flaws} <= {"qd_FR_thigh", "tau_est_FR_thigh"}
+    assert size(report, "scale", "qd_FR_thigh") == pytest.approx(factor, rel=0.02)
+
+
+def test_a_speed_that_trails_is_found_and_sized() -> None:
+    late = np.roll(made("gait").channels["qd_FR_thigh"], 10)
+    report = audit(with_(made("gait"), qd_FR_thigh=late))
+    assert ("lag", "qd_FR_thigh", "suspect") in flaws(report)
+    assert {f.channel for f in report.flaws} <= {"qd_FR_thigh", "tau_est_FR_thigh"}
+    assert size(report, "lag", "qd_FR_thigh") == pytest.approx(20, abs=2)
+
+
+@pytest.mark.parametrize(("factor", "what"), [(1 / 9.81, "it looks like g "), (0.8, "gravity is 9.81")])
+def test_the_accelerometers_unit_is_checked(factor: float, what: str) -> None:
+    changed = {k: factor * v for k, v in made().channels.items() if k.startswith("imu_acc")}
+    report = audit(with_(made(), **changed))
+    (found,) = report.flaws
+    assert found.channel == "imu_acc"
+    assert found.verdict == "bad"
+    assert what in found.message
+    assert found.size == pytest.approx(9.81 * factor, rel=0.02)
+    assert all(c.verdict == "bad" for c in report.channels if c.name.startswith("imu_acc"))
+
+
+def test_an_accelerometer_of_wrong_sign_or_axes_is_found() -> None:
+    flipped = {k: -v for k, v in made().channels.items() if k.startswith("imu_acc")}
+    (found,) = audit(with_(made(), **flipped)).flaws
+    assert (found.check, found.channel, found.verdict) == ("gravity", "imu_acc", "bad")
+    assert "sign is flipped" in found.message
+    c = made().channels
+    (found,) = audit(with_(made(), imu_acc_x=c["imu_acc_z"], imu_acc_z=c["imu_acc_x"])).flaws
+    assert found.size == pytest.approx(90, abs=15)
+
+
+def test_joints_beyond_their_stops_and_torques_beyond_their_limits_are_found() -> None:
+    changed = with_(made(), q_FR_calf=made().channels["q_FR_calf"] + 0.3)
+    (found,) = audit(changed).of("limits")
+    assert (found.channel, found.verdict) == ("q_FR_calf", "suspect")
+    assert found.size == pytest.approx(changed.channels["q_FR_calf"].max() + 0.888, rel=1e-6)
+    assert audit(Recording(replace(META, robot="other"), changed.channels)).of("limits") == []
+    report = audit(with_(made(), tau_est_FL_hip=10 * made().channels["tau_est_FL_hip"]))
+    assert ("limits", "tau_est_FL_hip", "bad") in flaws(report)
+
+
+# ---------------------------------------------------------------------- sign and order
+
+
+def test_a_joint_of_wrong_sign_is_named() -> None:
+    for name in ("steps", "multisine", "gait"):
+        sound = made(name)
+        report = audit(with_(sound, q_FL_hip=-sound.channels["q_FL_hip"], qd_FL_hip=-sound.channels["qd_FL_hip"]))
+        assert ("sign", "q_FL_hip", "bad") in flaws(report)
+        assert {f.channel for f in report.flaws} <= {"q_FL_hip", "qd_FL_hip", "tau_est_FL_hip"}
+
+
+@pytest.mark.parametrize("name", ["qd_RR_calf", "imu_gyro_x", "tau_est_FL_thigh"])
+def test_a_speed_gyroscope_or_torque_of_wrong_sign_is_named(name: str) -> None:
+    report = audit(with_(made(), **{name: -made().channels[name]}))
+    assert ("sign", name, "bad") in flaws(report)
+    assert size(report, "sign", name) == pytest.approx(-1, abs=0.05)
+    assert {f.channel.split("_")[-1] for f in report.flaws} == {name.split("_")[-1]}
+
+
+@pytest.mark.parametrize("name", ["steps", "multisine"])
+def test_swapped_joints_are_named(name: str) -> None:
+    """Front legs by one another's names, in all that the drives report."""
+    sound = made(name)
+    other = {"FR": "FL", "FL": "FR"}
+    swapped = dict(sound.channels)
+    for key in sound.channels:
+        quantity, _, joint = key.rpartition("_F")
+        if quantity in ("q", "qd", "tau_est"):
+            leg = "F" + joint[0]
+            swapped[key] = sound.channels[key.replace(leg, other[leg])]
+    report = audit(Recording(sound.meta, swapped))
+    orders = {f.channel: f.message for f in report.of("order")}
+    assert set(orders) == {f"q_target_{leg}_{kind}" for leg in other for kind in ("hip", "thigh", "calf")}
+    assert "FR_thigh and FL_thigh are swapped" in orders["q_target_FR_thigh"]
+
+
+def test_an_order_of_three_joints_is_named() -> None:
+    sound = made("multisine")
+    leg = ("FR_hip", "FR_thigh", "FR_calf")
+    turned = {f"q_{a}": sound.channels[f"q_{b}"] for a, b in zip(leg, leg[1:] + leg[:1], strict=True)}
+    turned |= {f"qd_{a}": sound.channels[f"qd_{b}"] for a, b in zip(leg, leg[1:] + leg[:1], strict=True)}
+    report = audit(with_(sound, **turned))
+    orders = {f.channel: f.message for f in report.of("order")}
+    assert set(orders) == {f"q_target_{a}" for a in leg}
+    assert "what is called FR_hip is the joint it drives" in orders["q_target_FR_thigh"]
+
+
+def test_speeds_of_swapped_joints_are_named() -> None:
+    sound = made("multisine")
+    report = audit(with_(sound, qd_FR_hip=sound.channels["qd_RL_calf"], qd_RL_calf=sound.channels["qd_FR_hip"]))
+    assert {f.channel for f in report.of("order")} == {"qd_FR_hip", "qd_RL_calf"}
+    assert "is the speed of q_RL_calf" in report.of("order")[0].message
+
+
+def test_mixed_up_axes_of_the_gyroscope_are_named() -> None:
+    c = made().channels
+    report = audit(with_(made(), imu_gyro_x=c["imu_gyro_y"], imu_gyro_y=c["imu_gyro_x"]))
+    assert flaws(report) == {("order", "imu_gyro_x", "bad"), ("order", "imu_gyro_y", "bad")}
+
+
+def test_a_gyroscope_of_wrong_scale_is_found() -> None:
+    report = audit(with_(made(), imu_gyro_y=np.degrees(made().channels["imu_gyro_y"])))
+    assert ("units", "imu_gyro_y", "bad") in flaws(report)
+    report = audit(with_(made(), imu_gyro_y=1.2 * made().channels["imu_gyro_y"]))
+    assert flaws(report) == {("scale", "imu_gyro_y", "suspect")}
+    assert size(report, "scale", "imu_gyro_y") == pytest.approx(1.2, abs=0.01)
+
+
+def test_a_quaternion_that_is_not_of_length_one_is_named() -> None:
+    changed = {k: 0.9 * v for k, v in made().channels.items() if k.startswith("imu_quat")}
+    report = audit(with_(made(), **changed))
+    assert flaws(report) == {("norm", "imu_quat", "bad")}
+    assert size(report, "norm", "imu_quat") == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(0.8, "suspect"), (1.25, "suspect"), (0.1, "bad")])
+def test_a_torque_of_wrong_scale_is_found(factor: float, verdict: str) -> None:
+    sound = realistic(made("steps"))
+    report = audit(with_(sound, tau_est_RL_thigh=factor * sound.channels["tau_est_RL_thigh"]))
+    assert ("scale", "tau_est_RL_thigh", verdict) in flaws(report)
+    assert {f.channel for f in report.flaws} == {"tau_est_RL_thigh"}
+    assert size(report, "scale", "tau_est_RL_thigh") == pytest.approx(factor, rel=0.05)
+
+
+# ---------------------------------------------------------------------- delay
+
+
+@pytest.mark.parametrize("name", ["steps", "multisine"])
+@pytest.mark.parametrize("delay", [0.0, 0.007, 0.020])
+def test_the_delay_from_command_to_answer_is_measured(name: str, delay: float) -> None:
+    report = audit(realistic(made(name, delay)))
+    measured = {c.name: (c.delay_ms, c.delay_sd_ms) for c in report.channels if c.delay_ms is not None}
+    assert len(measured) >= 10
+    for ms, error in measured.values():
+        assert ms is not None
+        assert error is not None
+        assert error < 2
+        assert abs(ms - 1e3 * delay) < min(1.5, 4 * error)
+    late = {f.channel for f in report.of("delay") if f.verdict == "suspect"}
+    assert late == (set(measured) if delay > 0.01 else set())
+    if late:
+        assert all("delay or clock offset" in f.message for f in report.of("delay"))
+    assert {f.check for f in report.flaws} <= {"delay"}
+
+
+def test_one_late_joint_is_named() -> None:
+    sound, late = made("multisine"), made("multisine", 0.007)
+    changed = {k: late.channels[k] for k in ("q_RL_hip", "qd_RL_hip", "tau_est_RL_hip")}
+    report = audit(with_(sound, **changed))
+    assert flaws(report) == {("delay", "q_RL_hip", "suspect")}
+    assert size(report, "delay", "q_RL_hip") == pytest.approx(7, abs=0.5)
+
+
+def test_an_answer_before_the_command_is_named() -> None:
+    sound = made("multisine")
+    late = {k: np.roll(v, 10, axis=0) for k, v in sound.channels.items() if k.startswith("q_target")}
+    report = audit(with_(sound, **late))
+    found = [f for f in report.of("delay") if f.verdict == "suspect"]
+    assert len(found) >= 10
+    assert all("before it is given" in f.message for f in found)
+    assert np.median([f.size or 0 for f in found]) == pytest.approx(-20, abs=0.5)
+
+
+def test_where_the_delay_cannot_be_told_none_is_given() -> None:
+    report = audit(made("drop"))
+    assert all(c.delay_ms is None for c in report.channels)
+    assert report.of("delay") == []
+
+
+# ---------------------------------------------------------------------- the report
+
+
+def test_stretches_without_drives_and_at_rest_are_listed() -> None:
+    recording = made("torque_off")
+    report = audit(recording)
+    off = ~recording.channels["torque_enable"]
+    assert sum(b - a for a, b in report.torque_off) == pytest.approx(off.sum() / RATE, abs=0.01)
+    assert len(report.torque_off) >= 2
+    frozen = {k: np.where(np.arange(ROWS) < 1000, v[0], v) for k, v in made("chirp").channels.items() if k[:2] == "q_"}
+    (still,) = audit(with_(made("chirp"), **frozen)).still
+    assert still[0] == 0
+    assert 1.85 < still[1] < 2.05
+
+
+def test_the_report_reads_well_and_survives_json() -> None:
+    report = audit(with_(made(), qd_FR_hip=-made().channels["qd_FR_hip"]))
+    text = report.text()
+    assert text.startswith("synthetic: bad\n3000 samples, 6.00 s at 500 Hz; ")
+    assert "bad      sign        qd_FR_hip: goes against the change of q_FR_hip" in text
+    assert len([line for line in text.splitlines() if line.startswith("q_FL_calf ")]) == 1
+    assert all(len(line.rstrip()) == len(line) for line in text.splitlines())
+    back = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    assert back["verdict"] == "bad"
+    assert len(back["channels"]) == len(report.channels)
+    assert back["findings"][0]["channel"] in text
+
+
+def test_what_breaks_the_format_is_reported_not_raised() -> None:
+    values = made().channels["q_FR_hip"].copy()
+    values[7] = np.nan
+    report = audit(with_(made(), q_FR_hip=values))
+    assert report.verdict == "bad"
+    assert flaws(report) == {("format", "q_FR_hip", "bad")}
+    t = made().t.copy()
+    t[100] = t[99]
+    assert ("format", "t", "bad") in flaws(audit(with_(made(), t=t)))
+    assert "too few" in audit(Recording(META, {k: v[:5] for k, v in made().channels.items()})).text()
+    for broken in ({}, {"t": np.zeros(0)}, {"t": np.zeros((2, 2))}):
+        assert audit(Recording(META, broken)).verdict == "bad"
+        assert audit(Recording(META, broken)).text()
+
+
+def test_a_file_is_audited_as_its_recording(tmp_path: Path) -> None:
+    write(tmp_path / "a.parquet", made())
+    assert audit_file(tmp_path / "a.parquet").as_dict() == audit(made()).as_dict()
+    with pytest.raises(RecordingError, match="no such file"):
+        audit_file(tmp_path / "b.parquet")
+
+
+@pytest.mark.parametrize("length", [20, 49, 60, 120, 400, 1100, 2000])
+@pytest.mark.parametrize("name", ["gait", "slow_ramps", "squat"])
+def test_short_recordings_are_no_problem(name: str, length: int) -> None:
+    """Little motion must not be taken for a wrong sign, order, scale or delay."""
+    report = audit(Recording(META, {k: v[:length] for k, v in realistic(made(name)).channels.items()}))
+    assert [f for f in report.flaws if f.check != "still"] == []
+
+
+# ---------------------------------------------------------------------- real recordings
+
+Importer = Callable[..., list[Recording]]
+
+
+def real(importer: str, *path: str) -> list[Recording]:
+    from go1exp.importers import import_recordings
+
+    folder = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
+    if not folder.is_dir():
+        pytest.skip("the folder of measured data is not here (GO1EXP_DATA)")
+    return import_recordings(importer, folder.joinpath(importer, *path), {})
+
+
+def steps_of(report: AuditReport, prefix: str) -> list[float]:
+    return [c.step for c in report.channels if c.name.startswith(prefix) and c.step]
+
+
+def test_the_go2_reports_speeds_that_are_too_large() -> None:
+    (recording,) = real("go2_in_air")
+    report = audit(recording)
+    assert flaws(report) == {("scale", name, "suspect") for name in joint_channels("qd", recording.meta.joints)}
+    sizes = [f.size or 0 for f in report.of("scale")]
+    assert 1.10 < min(sizes) < max(sizes) < 1.18  # its README says 1.11 to 1.17
+    for step in steps_of(report, "q_"):
+        assert step == pytest.approx(2 * np.pi / 32768 / 6.33, rel=2e-3)
+
+
+def test_scaler_reports_speeds_that_are_too_large_and_late() -> None:
+    (recording,) = real("scaler_walk_mocap", "run_15.npz")
+    folder = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
+    speed = np.load(folder / "scaler_walk_mocap/run_15.npz", allow_pickle=False)["joint_vel"].reshape(-1, 12)
+    names = joint_channels("qd", recording.meta.joints)  # left out by the importer, for this very flaw
+    report = audit(with_(recording, **dict(zip(names, np.ascontiguousarray(speed.T), strict=True))))
+    assert {f.channel for f in report.of("scale") if f.verdict == "bad"} == set(names)
+    sizes = [f.size or 0 for f in report.of("scale")]
+    assert 1.5 < min(sizes) < max(sizes) < 1.85  # its README says 1.5 to 1.7
+    assert {f.channel for f in report.of("lag")} == set(names)
+    assert {f.channel for f in report.of("repeats")} >= set(joint_channels("q", recording.meta.joints))
+    assert report.of("order") == []
+
+
+@pytest.mark.parametrize("design", ["design_A_0", "design_C_0"])
+def test_the_ak80s_messages_are_recognised(design: str) -> None:
+    (recording,) = real("ak80_double_pendulum", design, "trajectory_00.npz")
+    report = audit(recording)
+    np.testing.assert_allclose(steps_of(report, "q_"), [3.8147e-4] * 2, rtol=1e-3)
+    np.testing.assert_allclose(steps_of(report, "tau_est"), [5.8608e-3] * 2, rtol=1e-3)
+    assert {"T-Motor" in f.message for f in report.of("resolution")} == {True}
+
+
+def test_the_servos_encoders_are_recognised() -> None:
+    for importer, path in (("servo_pendulum_xl330", ""), ("so101_arm", "actuator_bandwidth.npz")):
+        for recording in real(importer, path):
+            report = audit(recording)
+            found = steps_of(report, "q_")
+            np.testing.assert_allclose(found, [2 * np.pi / 4096] * len(recording.meta.joints), rtol=1e-3)
+            assert "12 bits a turn" in report.of("resolution")[0].message
+            assert "bad" not in {f.verdict for f in report.findings if f.check != "still"}
+
+
+def test_a_real_go1_snippet_is_sound() -> None:
+    (recording,) = real("go1_walk_snippet")
+    assert audit(recording).flaws == []
