@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,6 +16,7 @@ from go1exp.compose import compose
 from go1exp.config import TaskConfig, parse_task
 from go1exp.drive import DriveSetup
 from go1exp.env.core import Go1Core
+from go1exp.fit.net import ActuatorNet, NetInfo, Provenance, group_names
 from go1exp.randomness import EnvRandom
 
 torch.set_num_threads(1)  # tests run side by side
@@ -54,5 +58,54 @@ def drives() -> Callable[..., DriveSetup]:
             "dtype": torch.float64,
         }
         return DriveSetup(**{**usual, **changes})
+
+    return make
+
+
+def random_net(
+    seed: int = 0, bias: float = 0.1, skip: float = 0.0, torque: float = 10.0, **changes: Any
+) -> ActuatorNet:
+    """An actuator net of the Go1 that nobody fitted, of the size of ``torque`` N m; ``changes`` to what it says."""
+    about = Provenance({}, (), (), (), 0.0, seed, "{}", {})
+    usual: dict[str, Any] = {
+        "robot": "go1",
+        "joints": robot.JOINTS,
+        "share": "kind",
+        "inputs": ("position_error", "velocity"),
+        "history": 3,
+        "period": 0.002,
+        "hidden": (8, 6, 7),
+        "target": "tau_est",
+        "kp": None,
+        "kd": None,
+        "provenance": about,
+    }
+    said = {**usual, **changes}
+    info = NetInfo(groups=group_names(said["joints"], said["share"]), **said)
+    rng, k, f = np.random.default_rng(seed), len(info.groups), info.features
+    widths = (f, *info.hidden, 1)
+    layers = list(pairwise(widths))
+    return ActuatorNet(
+        info,
+        weights=tuple(rng.normal(0.0, 2.0 / np.sqrt(a), (k, a, b)) for a, b in layers),
+        biases=tuple(bias * rng.normal(size=(k, b)) for _, b in layers),
+        skip=skip * rng.normal(size=(k, f)),
+        input_mean=bias * rng.normal(size=(k, f)),
+        input_std=rng.uniform(0.2, 2.0, (k, f)),
+        output_mean=bias * rng.normal(size=k),
+        output_std=rng.uniform(0.5, 1.0, k) * torque,
+        input_low=np.full((k, len(info.inputs)), -1.0),
+        input_high=np.full((k, len(info.inputs)), 1.0),
+    )
+
+
+@pytest.fixture(scope="session")
+def make_net(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Write a random actuator net; keyword arguments as ``random_net``'s."""
+
+    def make(**settings: Any) -> Path:
+        path = tmp_path_factory.mktemp("net") / "net.npz"
+        random_net(**settings).save(path)
+        return path
 
     return make

@@ -384,7 +384,7 @@ def test_an_accelerometer_of_wrong_sign_or_axes_is_found() -> None:
 
 
 def test_joints_beyond_their_stops_and_torques_beyond_their_limits_are_found() -> None:
-    changed = with_(made(), q_FR_calf=made().channels["q_FR_calf"] + 0.3)
+    changed = with_(made(), q_FR_calf=made().channels["q_FR_calf"] + 0.4)
     (found,) = audit(changed).of("limits")
     assert (found.channel, found.verdict) == ("q_FR_calf", "suspect")
     assert found.size == pytest.approx(changed.channels["q_FR_calf"].max() + 0.888, rel=1e-6)

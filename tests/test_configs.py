@@ -48,8 +48,9 @@ NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
 
 
 @pytest.mark.parametrize("choice", [c for c in choices() if not c.startswith("experiment=ablation/")])
-def test_every_file_composes_and_parses(choice: str) -> None:
-    parse_train(compose("train", [choice, *NEEDS.get(choice, [])]))
+def test_every_file_composes_and_parses(choice: str, make_net: Callable[..., Path]) -> None:
+    needs = [f"actuator.file={make_net()}"] if choice == "actuator=net" else NEEDS.get(choice, [])
+    parse_train(compose("train", [choice, *needs]))
 
 
 def test_every_group_has_a_folder_and_a_choice() -> None:

@@ -126,6 +126,7 @@ def scatter(effect: Effect, seed: int) -> None:
         live = getattr(effect, p.name)
         live.copy_(p.low + (p.high - p.low) * torch.rand(live.shape, dtype=live.dtype, generator=generator))
         live[0], live[1], live[2] = p.null, p.low, p.high
+    effect.prepare()
 
 
 def noise(n: int, scale: float, seed: int) -> Tensor:

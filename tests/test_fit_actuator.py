@@ -17,6 +17,7 @@ from go1exp import data_root
 from go1exp.fit import FitError, FitResult, FitSettings, NetFileError, fit, load, plot, smooth_motion, text
 from go1exp.fit.dataset import fingerprint, split, windows
 from go1exp.fit.net import ActuatorNet, InputName
+from go1exp.fit.torch_net import TorchNet
 from go1exp.recording import Meta, Recording, RecordingError, problems
 
 JOINTS = ("FR_hip", "FR_calf")
@@ -463,6 +464,7 @@ def test_torch_and_onnx_agree_with_the_formula(
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx", providers=["CPUExecutionProvider"])
     assert session.get_modelmeta().custom_metadata_map["period_s"] == "0.005"
     module = net.torch_module()
+    assert isinstance(module, TorchNet)
     rng = np.random.default_rng(0)
     for rows in (1, 7, 2048, 5000):
         x = rng.normal(size=(nets, rows, net.info.features)) * net.input_std[:, None] + net.input_mean[:, None]
@@ -473,6 +475,8 @@ def test_torch_and_onnx_agree_with_the_formula(
         assert by_torch.shape == by_onnx.shape == given.shape[:-1]
         np.testing.assert_allclose(by_torch.reshape(nets, rows), expected, rtol=0, atol=1e-5)
         np.testing.assert_allclose(by_onnx, by_torch, rtol=0, atol=1e-5)
+        by_batch = module._batched(torch.tensor(given.reshape(nets, rows, -1))).numpy()  # the way of a GPU
+        np.testing.assert_allclose(by_batch, expected, rtol=0, atol=1e-5)
     if nets > 1:
         with pytest.raises(ValueError, match="2 nets want rows"):
             module(torch.zeros(3, net.info.features))

@@ -214,15 +214,17 @@ def _period_problems(period: float, dt: float, policy: str) -> list[str]:
     ratio = period / dt
     if math.isclose(ratio, 1.0, rel_tol=1e-6) or policy == "resample":
         return []
+    whole = ratio > 1.0 and math.isclose(ratio, round(ratio), rel_tol=1e-6)
+    if whole and policy == "hold":
+        return []
     resample = "period=resample evaluates it at every step on a history of its own spacing"
-    if policy == "exact":
-        return [
-            f"its history is spaced {period:g} s and the physics step is {dt:g} s (sim.physics_dt), at which it would "
-            f"be another actuator; period=hold evaluates it every {period:g} s and holds the torque, {resample}"
-        ]
-    if ratio < 1.0 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
+    if policy == "hold":
         return [
             f"period=hold needs its period, {period:g} s, to be a whole multiple of the physics step, {dt:g} s "
             f"(sim.physics_dt); {resample}"
         ]
-    return []
+    able = "" if whole else ", if that is a whole number of steps"
+    return [
+        f"its history is spaced {period:g} s and the physics step is {dt:g} s (sim.physics_dt), at which it would be "
+        f"another actuator; period=hold evaluates it every {period:g} s and holds the torque{able}; {resample}"
+    ]

@@ -6,7 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from go1exp.audit import commands, limits, related, signals, single
+import go1exp.audit.commands as commands
+import go1exp.audit.limits as limits
+import go1exp.audit.related as related
+import go1exp.audit.signals as signals
+import go1exp.audit.single as single
 from go1exp.audit.log import Log, finding
 from go1exp.audit.report import ORDER, AuditReport, Channel, Finding, worst
 from go1exp.recording import Recording, problems, read

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from go1exp.audit import limits, signals
+import go1exp.audit.limits as limits
+import go1exp.audit.signals as signals
 from go1exp.audit.delay import Delay, delays
 from go1exp.audit.log import Log, finding
 from go1exp.audit.report import Finding

@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import signal
 from scipy.interpolate import CubicSpline
 
-from go1exp.audit import limits
+import go1exp.audit.limits as limits
 from go1exp.audit.signals import stretches
 
 BLOCKS = 10
@@ -34,7 +34,7 @@ def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray
     Any joint under position or torque control obeys, near enough, q'' = a u(t - d) + b q + c q' + friction + gravity
     + coupling. All terms are smoothed by the same kernel (a Gaussian and its derivatives: the modulating function
     method of Shinbrot, 1957), so no derivative of a noisy signal is taken; a, b, c, ... are free for each joint and d
-    is the delay that leaves least. Its error is a jackknife over ten stretches of time, and a quarter of a sample.
+    is the delay that leaves least. Its error is a jackknife over ten stretches of time, enlarged, and part of a sample.
     What is found is dead time and fast lag together: drive, bus, or an offset between the clocks of command and state.
 
     Args:
@@ -107,7 +107,7 @@ def _best(y: np.ndarray, base: np.ndarray, commands: np.ndarray, times: np.ndarr
 
     time, share = minimum(np.ones(BLOCKS))
     left_out = np.array([minimum(np.arange(BLOCKS) != b)[0] for b in range(BLOCKS)])
-    error = float(np.std(left_out) * np.sqrt(BLOCKS - 1))
+    error = limits.DELAY_FACTOR * float(np.std(left_out) * np.sqrt(BLOCKS - 1))
     if not np.isfinite(time + error) or share < limits.DELAY_POWER or error > limits.DELAY_ERROR:
         return None
     return Delay(time, float(np.hypot(error, limits.DELAY_SAMPLES * (times[1] - times[0]) * FINE)), share)

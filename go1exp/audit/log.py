@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from go1exp.audit import limits, signals
+import go1exp.audit.limits as limits
+import go1exp.audit.signals as signals
 from go1exp.audit.report import Finding, Verdict
 from go1exp.recording import FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Recording, joint_channels
 

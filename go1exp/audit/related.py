@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from go1exp.audit import limits, signals
+import go1exp.audit.limits as limits
+import go1exp.audit.signals as signals
 from go1exp.audit.log import Log, finding, graded
 from go1exp.audit.report import Finding
 from go1exp.recording import VECTORS, joint_channel

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import linear_sum_assignment
 
-from go1exp.audit import limits
+import go1exp.audit.limits as limits
 
 MOST_GAPS = 300
 """Gaps that a step is sought in; of more, evenly ranked ones are taken."""

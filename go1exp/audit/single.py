@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from go1exp.audit import limits, signals
+import go1exp.audit.limits as limits
+import go1exp.audit.signals as signals
 from go1exp.audit.log import Log, finding, graded
 from go1exp.audit.report import Finding
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
@@ -123,9 +124,12 @@ def dead(log: Log) -> Iterator[Finding]:
                 ("bad", "while the joint moves") if moved.get(joint, False) else ("ok", "and the joint rests")
             )
         elif quantity == "q":
-            commanded = log.recording.channels.get(name.replace("q_", "q_target_", 1), values)
-            live = bool(np.ptp(commanded) > limits.STILL_ANGLE or any(moved.values()))
-            verdict, why = ("bad", "while joints move") if live else ("ok", "and no joint moves")
+            target = log.recording.channels.get(name.replace("q_", "q_target_", 1))
+            if target is None:
+                verdict, why = ("suspect", "while others move") if any(moved.values()) else ("ok", "and no joint moves")
+            else:
+                live = bool(np.ptp(target) > limits.STILL_ANGLE)
+                verdict, why = ("bad", "while its target moves") if live else ("ok", "and its target rests")
         elif meta.base == "fixed":
             verdict, why = "ok", "and the base is fixed"
             if meta.source == "measured" and quantity in ("imu_gyro", "imu_acc"):
@@ -147,7 +151,7 @@ def saturation(log: Log) -> Iterator[Finding]:
         if use.sum() < limits.ENOUGH or np.ptp(values[use]) == 0:
             continue
         share, levels = signals.clipped(values[use], log.steps[name])
-        levels = [v for v in levels if v]  # at zero it rests
+        levels = [v for v in levels if abs(v) > 1e-6 * np.ptp(values)]  # at zero it rests
         if not levels:
             continue
         at = " and ".join(f"{v:.4g}" for v in levels)

@@ -129,6 +129,9 @@ class Effect(Memory):
             full = setup.rows(given) if p.per == "joint" else setup.zeros()[:, :1] + float(given)  # type: ignore[arg-type]
             setattr(self, p.name, full.nan_to_num(nan=p.null))
 
+    def prepare(self) -> None:
+        """Work out what follows from the values; called when they have changed (``Plant.refresh``)."""
+
     # ------------------------------------------------------------------ where an effect may act
 
     def on_target(self, target: Tensor) -> Tensor:

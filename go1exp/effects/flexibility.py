@@ -20,12 +20,13 @@ class Flexibility(Effect):
     Rotor and joint swing against each other at sqrt((1 / J_rotor + 1 / J_joint) / compliance); the law is that of
     ``effects/two_mass.py``. Stiffnesses of 60 to 400 N m/rad are likely at robots of this size (a judgement). Dry
     friction stays at the joint. To a slow drive it looks like a smaller kp, below the resonance like ``lag`` or
-    ``armature``. A drive with kd > 2 J_rotor / physics step (here 4 N m s/rad, for the hips) would shake the rotor.
+    ``armature``. A drive with kd > J_rotor / physics step (2.2 N m s/rad for a hip at 2 ms)
+    shakes the rotor.
     """
 
     params = (
         Param("compliance", "rad/(N m)", 0.0, 0.02, 0.0, 5e-4, "joint", "twist per torque"),
-        Param("damping", "-", 0.0, 1.0, 0.05, math.inf, "joint", "damping ratio of the rotor on this spring"),
+        Param("damping", "-", 0.02, 1.0, 0.05, math.inf, "joint", "damping ratio of the rotor on this spring"),
     )
     compliance: Tensor
     damping: Tensor

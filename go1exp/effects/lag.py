@@ -35,14 +35,23 @@ class Lag(Effect):
         super().__init__(setup, **values)
         self._made, self._asked = setup.zeros(), setup.zeros()
         self._fresh = torch.ones(setup.num_envs, 1, dtype=torch.bool, device=setup.device)
+        self._kept, self._before, self._now = setup.zeros(), setup.zeros(), setup.zeros()
+        self._absent = torch.ones_like(self._kept, dtype=torch.bool)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Work out the weights of torque made, last demand and demand."""
+        steps = self.setup.physics_dt / self.time  # infinite at time 0, where only the demand counts
+        self._kept.copy_(torch.exp(-steps))
+        mean = -torch.expm1(-steps) / steps  # of the weight with which the past counts over the step
+        self._before.copy_(mean - self._kept)
+        self._now.copy_(1.0 - mean)
+        self._absent.copy_(self.time == 0.0)
 
     def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque made, given the demand."""
-        steps = self.setup.physics_dt / self.time  # infinite at time 0
-        kept = torch.exp(-steps)
-        mean = -torch.expm1(-steps) / steps  # of the weight with which the past counts over the step
-        made = kept * self._made + (mean - kept) * self._asked + (1.0 - mean) * torque
-        made = torch.where(self._fresh | (self.time == 0.0), torque, made)
+        made = (self._kept * self._made).addcmul_(self._before, self._asked).addcmul_(self._now, torque)
+        made = torch.where(self._fresh | self._absent, torque, made)
         self._made.copy_(made)
         self._asked.copy_(torque)
         self._fresh.zero_()

@@ -90,6 +90,11 @@ class EffectStack:
             effect.edit_model(fields)
         return fields.values  # type: ignore[attr-defined]
 
+    def prepare(self) -> None:
+        """Let every effect work out what follows from its values."""
+        for effect in self.effects.values():
+            effect.prepare()
+
     def set_gains(self, actuator: Actuator, kp: Tensor, kd: Tensor) -> None:
         """Give the actuator the gains that it really has, from those of its configuration."""
         if self._acting["on_gains"]:
@@ -178,3 +183,4 @@ class EffectStack:
         """Continue from ``state_dict``."""
         for key, effect in self.effects.items():
             effect.load_state_dict(state[key])
+        self.prepare()

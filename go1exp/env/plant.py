@@ -104,7 +104,8 @@ class Plant:
         self.refresh()
 
     def refresh(self) -> None:
-        """Put the effects' present values into the model and the drives."""
+        """Put the effects' present values into force: in their laws, the model and the drives."""
+        self.effects.prepare()
         if self.effects.fields:
             self.backend.rebase(self.effects.model_values(self.backend.compiled, self.backend.ids))
             self.backend.derive_constants(torch.ones(len(self.q), dtype=torch.bool, device=self.q.device))

@@ -168,8 +168,10 @@ class Replayer:
             gears = effects.gears()
             twist = gears.compliance * torque + 0.5 * gears.gap * torque.sign()
             true = true - twist
-        backend.reset(everyone, true, qd)
+        half = 0.5 * dt * torch.as_tensor(w.qdd[rows.window])  # the engine's speeds are half a step old
+        backend.reset(everyone, true, qd - 3.0 * half)
         plant.reset(everyone, past[-1])
+        plant.qd.copy_(qd - half)
         if effects.rotors:
             effects.rotors.twist.copy_(twist)
         for target in past:  # what a delayed command remembers

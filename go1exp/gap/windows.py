@@ -27,6 +27,9 @@ QUANTITIES = ("q", "qd", "tau_est")
 THIRD = 20.0
 """Variance of the third difference of unit white noise: 1 + 9 + 9 + 1."""
 
+BLOCK_QUANTILE = 0.907
+"""30 % quantile of the root mean square of 50 third differences of white noise over its expectation (20000 draws)."""
+
 
 @dataclass(frozen=True)
 class Windows:
@@ -40,6 +43,7 @@ class Windows:
         begin: (W,) time of the first state in the episode, s.
         q: (W, J) first state, rad.
         qd: (W, J) rad/s.
+        qdd: (W, J) rad/s2.
         q_sd: (W, J) its standard deviation.
         qd_sd: (W, J)
         kp: (W, J) gains.
@@ -60,6 +64,7 @@ class Windows:
     begin: np.ndarray
     q: np.ndarray
     qd: np.ndarray
+    qdd: np.ndarray
     q_sd: np.ndarray
     qd_sd: np.ndarray
     kp: np.ndarray
@@ -85,10 +90,8 @@ def even_clock(recording: Recording) -> np.ndarray:
     """
     t = recording.t
     period = float(np.median(np.diff(t)))
-    number = np.round((t - t[0]) / period)
-    for _ in range(2):  # the period itself, from all samples
-        period, offset = np.polyfit(number, t, 1)
-        number = np.round((t - offset) / period)
+    number = np.concatenate([[0.0], np.cumsum(np.round(np.diff(t) / period))])  # from one stamp to the next: no drift
+    period, offset = np.polyfit(number, t, 1)
     late = t - (offset + period * number)
     if len(t) < 20 or np.abs(late).max() < 1e-7 or np.any(np.diff(number) < 1) or np.abs(late).max() > 0.5 * period:
         return t
@@ -117,13 +120,13 @@ def noise(recordings: Sequence[Recording], quantity: str) -> np.ndarray:
             blocks.append(np.sqrt(np.mean(cut**2, axis=1) / THIRD))
         change = np.abs(np.diff(values, axis=0))
         steps.append([float(np.min(c[c > 1e-12], initial=np.inf)) for c in change.T])
-    found = np.quantile(np.concatenate(blocks), 0.3, axis=0) * 1.06  # the quantile's place below the mean
+    found = np.quantile(np.concatenate(blocks), 0.3, axis=0) / BLOCK_QUANTILE
     step = np.min(steps, axis=0)
     return np.maximum(found, np.where(np.isfinite(step), step, 0.0) / np.sqrt(12.0)).clip(1e-9)
 
 
 def _start(t: np.ndarray, q: np.ndarray, qd: np.ndarray, at: float, sd: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Fit a cubic to angles and speeds about an instant; return angle, speed, and the misfit in units of noise (J,)."""
+    """Fit a cubic to angles and speeds about an instant; return angle, speed, acceleration, and the misfit in units of noise (J,)."""
     near = np.abs(t - at) <= FIT_S
     x = t[near] - at
     one, zero = np.ones_like(x), np.zeros_like(x)
@@ -133,7 +136,7 @@ def _start(t: np.ndarray, q: np.ndarray, qd: np.ndarray, at: float, sd: np.ndarr
     seen = np.concatenate([q[near] * w[0], qd[near] * w[1]])
     found = np.linalg.lstsq(design, seen, rcond=None)[0]
     misfit = np.sqrt(np.mean((design @ found - seen) ** 2, axis=0))
-    return found[0], found[1], misfit
+    return found[0], found[1], 2.0 * found[2], misfit
 
 
 def _changes(t: np.ndarray, values: np.ndarray, lo: float, hi: float) -> tuple[np.ndarray, np.ndarray]:
@@ -170,8 +173,8 @@ def cut(recordings: Sequence[Recording], settings: GapSettings) -> Windows:
             tries = at + np.linspace(0.0, settings.stride_s / 3, 9)
             tries = t[np.searchsorted(t, tries)]
             fits = [_start(t, y[:, 0], y[:, 1], float(s), sd) for s in tries]
-            best = int(np.argmin([f[2].max() for f in fits]))
-            begin, (q, qd, misfit) = float(tries[best]), fits[best]
+            best = int(np.argmin([f[3].max() for f in fits]))
+            begin, (q, qd, qdd, misfit) = float(tries[best]), fits[best]
             at += settings.stride_s
             if np.any((holes > begin - PAST_S) & (holes < begin + long)):
                 continue
@@ -182,6 +185,7 @@ def cut(recordings: Sequence[Recording], settings: GapSettings) -> Windows:
                     "begin": begin,
                     "q": q,
                     "qd": qd,
+                    "qdd": qdd,
                     "q_sd": START_SD[0] * np.maximum(misfit, 1.0),
                     "qd_sd": START_SD[1] * np.maximum(misfit, 1.0),
                     "kp": np.asarray(r.meta.kp, dtype=float),
@@ -218,6 +222,6 @@ def _padded(values: np.ndarray, rows: int) -> np.ndarray:
 
 
 def held(changes: tuple[np.ndarray, np.ndarray], times: np.ndarray) -> np.ndarray:
-    """Return the values (K, ...) of a held signal in force at ``times`` (K,)."""
-    index = np.searchsorted(changes[0], times + 1e-7, side="right") - 1
+    """Return the values (K, ...) of a held signal at evenly spaced ``times`` (K,); it changes at the nearest of them."""
+    index = np.searchsorted(changes[0], times + 0.49 * (times[1] - times[0]), side="right") - 1
     return np.asarray(changes[1][index.clip(0)])

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from go1exp import __version__, robot
 from go1exp.config import BackendConfig, TaskConfig
+from go1exp.effects.rules import has_gains
 from go1exp.env.core import Go1Core, make_backend
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.joint_values import spread
@@ -83,8 +84,9 @@ def _play_alike(
     backend = make_backend(rig.backend, model, blocks, n)
     random = EnvRandom(seed, n, device=backend.qpos.device)
     plant = Plant(backend, drive_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
-    kp, kd = (torch.tensor([[getattr(e, g)] for e in episodes], dtype=plant.q.dtype) for g in ("kp", "kd"))
-    plant.set_gains(kp.expand_as(plant.q), kd.expand_as(plant.q))
+    if has_gains(rig.actuator):
+        kp, kd = (torch.tensor([[getattr(e, g)] for e in episodes], dtype=plant.q.dtype) for g in ("kp", "kd"))
+        plant.set_gains(kp.expand_as(plant.q), kd.expand_as(plant.q))
     plant.startup()
 
     targets = torch.as_tensor(np.stack([e.motion.target for e in episodes], axis=1), dtype=plant.q.dtype)

@@ -1,0 +1,159 @@
+"""Write sealed cases: ``python -m benchmarks.gap.generate out=DIR kinds=null,single n=10 seed=123``.
+
+Each case is a folder of recordings under ``out``; ``out/told.json`` says what the solver may know. The answers go to a
+file of their own, whose SHA-256 is written to ``out/SEAL`` and printed before anything is simulated: publish it, run
+the solver, then show the answers. An interrupted run is continued by the same command. ``signals=DIR`` also simulates
+each robot without its effect and writes how many times the noise the angles change; that doubles the time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import hashlib
+import json
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.gap import cases, logger, told
+from benchmarks.gap.damage import damage, truncate
+from benchmarks.gap.simulate import simulate
+from go1exp.recording import Recording
+
+
+def recordings(case: cases.Case) -> list[Recording]:
+    """Simulate a case and return what its logger wrote (damaged, if it is that kind)."""
+    world, noise, harm = ([*case.seed, k] for k in range(3))
+    samples = simulate(case.truth, case.episodes, case.dt, np.random.default_rng(world), case.on)
+    rng = np.random.default_rng(noise)
+    found = [
+        Recording(logger.meta(e), logger.log(case.logger, samples, k, e.target, e.on, rng))
+        for k, e in enumerate(case.episodes)
+    ]
+    return damage(found, case.damage, np.random.default_rng(harm)) if case.damage else found
+
+
+def write_case(case: cases.Case, out: Path, signals: Path | None = None) -> None:
+    """Write a case's folder, whole or not at all; and how much its effect shows to a file in ``signals``."""
+    if signals is not None:
+        signals.mkdir(parents=True, exist_ok=True)
+        (signals / f"{case.name}.json").write_text(json.dumps({"signal": signal(case)}) + "\n")
+    partial = out / f".{case.name}.part"
+    shutil.rmtree(partial, ignore_errors=True)
+    logger.save(partial, recordings(case))
+    if case.damage == "truncated":
+        for k, file in enumerate(sorted(partial.glob("*.parquet"))):
+            if k % 3 == 1:
+                truncate(file, 0.6)
+    partial.rename(out / case.name)
+
+
+def signal(case: cases.Case) -> float:
+    """Return how much a case's effect shows: RMS change of the angles against a robot without it, over the noise."""
+    world = [*case.seed, 0]
+    a, b = (
+        simulate(t, case.episodes, case.dt, np.random.default_rng(world), case.on) for t in (case.truth, case.without)
+    )
+    return float(np.sqrt(np.mean((a.q - b.q) ** 2)) / case.logger.q_noise)
+
+
+def seal(answers: dict[str, Any]) -> tuple[bytes, str]:
+    """Return the answers as they are written, and their SHA-256."""
+    text = (json.dumps(answers, indent=1, sort_keys=True) + "\n").encode()
+    return text, hashlib.sha256(text).hexdigest()
+
+
+def settings(arguments: Sequence[str]) -> argparse.Namespace:
+    """Read ``key=value`` arguments."""
+    usual: dict[str, Any] = {
+        "out": None,
+        "kinds": ",".join(cases.KINDS),
+        "n": 10,
+        "seed": None,
+        "episodes": 8,
+        "seconds": 5.0,
+        "effects": "",
+        "answers": None,
+        "jobs": 1,
+        "signals": None,
+    }
+    words = (
+        "usage: python -m benchmarks.gap.generate out=DIR seed=INT [kinds=null,single] [n=10] [episodes=8] "
+        f"[seconds=5] [effects=coulomb,lag] [answers=FILE] [signals=DIR] [jobs=1]\nkinds: {', '.join(cases.KINDS)}\n"
+        f"effects (of single and pair): {', '.join(told.LIBRARY)}"
+    )
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key not in usual or not value:
+            raise SystemExit(f"{argument!r}: no such setting\n{words}")
+        try:
+            usual[key] = {"n": int, "seed": int, "episodes": int, "seconds": float, "jobs": int}.get(key, str)(value)
+        except ValueError:
+            raise SystemExit(f"{argument!r}: not a number\n{words}") from None
+    if usual["out"] is None or usual["seed"] is None:
+        raise SystemExit(words)
+    found = argparse.Namespace(**usual)
+    found.out = Path(found.out)
+    found.answers = Path(found.answers) if found.answers else found.out.with_name(found.out.name + ".answers.json")
+    found.signals = Path(found.signals) if found.signals else None
+    found.kinds = tuple(found.kinds.split(","))
+    found.effects = tuple(e for e in found.effects.split(",") if e)
+    for name, known in [*((k, cases.KINDS) for k in found.kinds), *((e, told.LIBRARY) for e in found.effects)]:
+        if name not in known:
+            raise SystemExit(f"{name!r}: there are {', '.join(known)}")
+    if found.episodes < 2 or found.seconds <= 0 or found.n < 1:
+        raise SystemExit("episodes must be at least 2, seconds more than 0, n at least 1")
+    for secret in (found.answers, found.signals):
+        if secret and found.out in (secret, *secret.parents):
+            raise SystemExit(f"{secret}: must not lie beside the cases, where a solver reads")
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Draw, seal and simulate."""
+    s = settings(sys.argv[1:] if arguments is None else arguments)
+    todo = cases.plan(
+        s.kinds, s.n, lambda kind, index: cases.make(kind, index, s.seed, s.episodes, s.seconds, s.effects)
+    )
+    text, digest = seal({case.name: case.answer for case in todo})
+    mark = s.out / "SEAL"
+    if mark.is_file() and mark.read_text().split()[0] != digest:
+        raise SystemExit(f"{s.out}: holds a benchmark made with other settings; take another folder")
+    s.out.mkdir(parents=True, exist_ok=True)
+    s.answers.parent.mkdir(parents=True, exist_ok=True)
+    s.answers.write_bytes(text)
+    mark.write_text(f"{digest}  {s.answers.name}\n")
+    (s.out / "told.json").write_text(
+        json.dumps({"nominal": told.NOMINAL, "tolerances": told.TOLERANCES, "library": told.LIBRARY}, indent=1) + "\n"
+    )
+    print(f"sealed {len(todo)} cases: sha256 {digest} of {s.answers}", flush=True)
+    left = [case for case in todo if not (s.out / case.name).is_dir()]
+    begun = time.monotonic()
+    with ProcessPoolExecutor(s.jobs) if s.jobs > 1 else _InTurn() as pool:
+        for done, _ in enumerate(pool.map(functools.partial(write_case, out=s.out, signals=s.signals), left), start=1):
+            each = (time.monotonic() - begun) / done
+            print(f"case {done}/{len(left)}: {each:.1f} s each, {each * (len(left) - done):.0f} s left", flush=True)
+    print(f"{len(todo)} cases in {s.out}", flush=True)
+
+
+class _InTurn:
+    """One after the other, in this process."""
+
+    map = staticmethod(map)
+
+    def __enter__(self) -> _InTurn:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+"""The nominal model within its tolerances: which parameters may move, how far, and where they fit best.
+
+An effect counts as a gap only where the data ask for more of it than its declared tolerance, so everything that a model
+has or obviously could have moves freely inside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from go1exp.effects.base import Effect, Param
+from go1exp.gap.likelihood import Layout
+from go1exp.gap.replay import Key, Machine, Probe, Theta
+from go1exp.registry import members
+
+BOX = (
+    *("kp_scale", "kd_scale", "strength", "armature", "coulomb", "viscous"),
+    *("link_mass", "link_com", "encoder_offset", "base_tilt", "command_delay", "torque_delay"),
+)
+"""Effects that every model has a value for, if only the null one."""
+
+PRIOR = 1.0
+"""Standard deviation of a parameter within its tolerance, in tolerances: it settles what the data leave open."""
+
+WIDE = 20.0
+"""The same for a parameter that may leave it."""
+
+
+def effect_class(name: str) -> type[Effect]:
+    """Return the class of a registered effect."""
+    return members("effect")[name].target  # type: ignore[return-value]
+
+
+def param(key: Key) -> Param:
+    """Return the declaration of a parameter."""
+    return next(p for p in effect_class(key[0]).params if p.name == key[1])
+
+
+def sizes(effect: str) -> tuple[Key, ...]:
+    """Return the parameters of an effect that have a tolerance; the others are shapes."""
+    return tuple((effect, p.name) for p in effect_class(effect).params if math.isfinite(p.tolerance))
+
+
+def step(key: Key, value: float | None = None, factor: float = 1.0) -> float:
+    """Return a change of a parameter to learn its influence from, in the direction in which there is room."""
+    p = param(key)
+    at = p.null if value is None else value
+    size = p.tolerance if math.isfinite(p.tolerance) else 0.05 * min(p.high - p.low, 4.0 * max(abs(p.null), 0.1))
+    return factor * size if at + factor * size <= p.high else -factor * size
+
+
+def probes(machine: Machine, keys: Sequence[Key], theta: Mapping[Key, np.ndarray], factor: float = 1.0) -> list[Probe]:
+    """Return the probes of parameters at their present values."""
+    found = []
+    joints = len(machine.joints)
+    for key in keys:
+        p = param(key)
+        wide = joints if p.per == "joint" else 1
+        values = np.broadcast_to(theta.get(key, np.array([p.null])), (wide,))
+        delta = np.array([step(key, float(v), factor) for v in values])
+        places: list[int | None] = list(range(len(machine.groups[0]))) if p.per == "joint" else [None]
+        found += [Probe(key, place, delta) for place in places]
+    return found
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Limits and priors of unknowns, as increments on the present values; all (size,)."""
+
+    low: np.ndarray
+    high: np.ndarray
+    centre: np.ndarray
+    weight: np.ndarray
+
+
+def bounds(layout: Layout, columns: Sequence[Probe], theta: Mapping[Key, np.ndarray], free: Collection[str]) -> Bounds:
+    """Return the limits: the declared range for effects in ``free``, the tolerance for the others."""
+    low, high, centre, weight = (np.zeros(layout.size) for _ in range(4))
+    for i in range(layout.size):
+        probe = columns[layout.probe[i]]
+        assert isinstance(probe.key, tuple)
+        p = param(probe.key)
+        j = max(int(layout.joint[i]), 0)
+        value = float(np.ravel(theta.get(probe.key, np.array([p.null])))[j if probe.key in theta and theta[probe.key].size > 1 else 0])
+        wide = probe.key[0] in free or not math.isfinite(p.tolerance)
+        reach = math.inf if wide else p.tolerance
+        low[i] = max(p.low, p.null - reach) - value
+        high[i] = min(p.high, p.null + reach) - value
+        centre[i] = p.null - value
+        scale = p.tolerance if math.isfinite(p.tolerance) else p.high - p.low
+        weight[i] = 1.0 / ((WIDE if wide else PRIOR) * scale) ** 2
+    return Bounds(np.minimum(low, 0.0), np.maximum(high, 0.0), centre, weight)
+
+
+def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:
+    """Return the bounded minimum of x' A x - 2 b' x + weight (x - centre)^2.
+
+    Args:
+        matrix: A (n, n), positive semidefinite.
+        right: b (n,).
+        limits: of x.
+    """
+    scale = 1.0 / np.sqrt(np.diag(matrix) + limits.weight)
+    full = (matrix + np.diag(limits.weight)) * scale[:, None] * scale
+    root = np.linalg.cholesky(full + 1e-9 * np.eye(len(full)))
+    aim = np.linalg.solve(root, (right + limits.weight * limits.centre) * scale)
+    low, high = limits.low / scale, limits.high / scale
+    fixed = high - low < 1e-12
+    high = np.where(fixed, low + 1e-9, high)
+    return np.asarray(lsq_linear(root.T, aim, (low, high), method="bvls", max_iter=500).x * scale)
+
+
+def moved(theta: Theta, layout: Layout, columns: Sequence[Probe], x: np.ndarray, machine: Machine) -> Theta:
+    """Return ``theta`` with increments ``x`` (size,) added."""
+    found = {key: value.copy() for key, value in theta.items()}
+    for i in range(layout.size):
+        probe = columns[layout.probe[i]]
+        assert isinstance(probe.key, tuple)
+        p = param(probe.key)
+        wide = len(machine.joints) if p.per == "joint" else 1
+        full = np.broadcast_to(found.get(probe.key, np.array([p.null])), (wide,)).copy()
+        full[max(int(layout.joint[i]), 0)] += x[i]
+        found[probe.key] = full.clip(p.low, p.high)
+    return found

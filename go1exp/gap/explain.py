@@ -1,0 +1,237 @@
+"""From recordings and a model to an answer."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+
+import numpy as np
+
+from go1exp import __version__
+from go1exp.audit import audit
+from go1exp.gap import verdict as words
+from go1exp.gap.fit import residuals
+from go1exp.gap.judge import splits
+from go1exp.gap.likelihood import Scorer, scorer
+from go1exp.gap.localise import localise
+from go1exp.gap.replay import HungGo1, Machine, Replayer, Theta, variants
+from go1exp.gap.result import Floors, GapResult, GapSettings, Overlay
+from go1exp.gap.search import Progress, Search, excess, removed
+from go1exp.gap.windows import Windows, cut
+from go1exp.recording import Recording
+from go1exp.robot import RobotConfig
+
+NEEDED = ("t", "q", "qd", "q_target")
+"""Channels, or quantities, without which nothing can be replayed."""
+
+TELLING = ("delay", "torque")
+"""Checks of the audit that a missing effect may fail; they say nothing against the log."""
+
+FEWEST = 8
+"""Windows below which nothing is judged."""
+
+
+def explain(
+    recordings: Sequence[Recording],
+    config: RobotConfig | Machine,
+    settings: GapSettings | None = None,
+    on_progress: Progress = lambda what, share: None,
+) -> GapResult:
+    """Compare recordings of a held robot with the model, and name what is missing.
+
+    Args:
+        recordings: of one robot, its base fixed.
+        config: the nominal Go1, or another robot as a :class:`~go1exp.gap.replay.Machine`.
+        settings: how; the defaults if None.
+        on_progress: told what goes on and which share of the work is done.
+    """
+    start = time.perf_counter()
+    settings = settings or GapSettings()
+    machine: Machine = HungGo1(config) if isinstance(config, RobotConfig) else config
+    on_progress("auditing the logs", 0.0)
+    flaws = [line for r in recordings for line in unusable(r, machine)]
+    if flaws:
+        said = f"These logs cannot be compared with the model: {'; '.join(flaws[:3])}."
+        return GapResult("bad log", said, warnings=tuple(flaws), seconds=time.perf_counter() - start)
+    rng = np.random.default_rng(settings.seed)
+    windows = cut(recordings, settings)
+    if len(windows) < FEWEST:
+        said = f"These logs are too short: {len(windows)} windows of {settings.window_s:g} s, {FEWEST} are needed."
+        return GapResult("bad log", said, warnings=(said,), seconds=time.perf_counter() - start)
+    quats = np.array([recordings[e].meta.base_quat for e in windows.episode])
+    replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
+    dt = windows.period / np.ceil(windows.period / settings.physics_dt - 1e-6)
+    warnings: list[str] = []
+
+    on_progress("measuring the floors", 0.02)
+    scale, numerical = _with_numerics(replayer, dt)
+    score = scorer(replayer, {}, scale, 2.0 * dt)
+    parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
+    if not parts.by_episode:
+        warnings.append("Fewer than three different episodes: stretches of windows were held out instead of episodes.")
+    elif not len(parts.confirm):
+        warnings.append("Too few episodes to keep some for a last check.")
+
+    search = Search(score, parts, settings, float(dt), rng, on_progress)
+    plain = search.held_out({})
+    search.run()
+    first, final = search.steps[0][1], search.steps[-1][1]
+    on_progress("intervals", 0.88)
+    theta, drawn = words.finish(search)
+    named = words.name_terms(search, theta, drawn, final <= settings.adequate)
+    verdict = words.decide(search, first, final)
+    excesses = {"null": excess(plain), "box": first, "final": final}
+    if len(parts.confirm):
+        confirmed = excess(search.held_out(search.theta, parts.confirm))
+        excesses["confirm"] = confirmed
+        if named and verdict == "explained" and confirmed > 2.0 * settings.adequate:
+            verdict = "partly explained"
+            warnings.append(f"On episodes kept for a last check the error is {1 + confirmed:.3g} times the floor.")
+
+    on_progress("where it is wrong", 0.93)
+    shown = np.sort(np.concatenate([parts.select, parts.confirm]))
+    before, after = residuals(score, [{}, search.theta], shown, float(dt))
+    silent = words.not_excited(search.signal)
+    more = words.advice({n.effect: n.alias_set for n in named})
+    box = {key: value for key, value in theta.items() if key[0] not in search.terms}
+    result = GapResult(
+        verdict=verdict,
+        sentence=words.sentence(verdict, search, named, excesses, silent, more),
+        named=named,
+        candidates=words.evidence(search),
+        floors=Floors(
+            {name: float(np.median(windows.scale[0, c])) for c, name in enumerate(windows.quantities)},
+            numerical,
+            repeatability(recordings),
+        ),
+        excess=excesses,
+        closed=removed(first, final) if named else float("nan"),
+        before=localise(score, before, shown, rng),
+        after=localise(score, after, shown, rng),
+        not_excited=silent,
+        advice=more,
+        bags=dict(search.shares),
+        waterfall=(("model as it is", excesses["null"]), *search.steps),
+        overlays=overlays(score, recordings, search.theta, parts.select, settings.overlays, float(dt)),
+        box=_nested(box, windows.joints),
+        provenance={
+            "logs": {r.meta.episode: fingerprint(r) for r in recordings},
+            "versions": {"go1exp": __version__, "mujoco": version("mujoco-core"), "numpy": np.__version__},
+            "seed": settings.seed,
+            "physics_dt": float(dt),
+            "windows": len(windows),
+            "split": {
+                name: sorted({recordings[e].meta.episode for e in windows.episode[getattr(parts, name)]})
+                for name in ("train", "select", "confirm")
+            },
+            "simulation_steps": replayer.made,
+        },
+        warnings=tuple(warnings),
+        seconds=time.perf_counter() - start,
+    )
+    on_progress("done", 1.0)
+    return result
+
+
+def unusable(recording: Recording, machine: Machine) -> list[str]:
+    """Return why a recording cannot be compared with the model, a line each."""
+    meta, name = recording.meta, recording.meta.episode
+    found = []
+    if meta.joints != machine.joints:
+        found.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(machine.joints)}")
+        return found
+    if meta.base != "fixed":
+        found.append(f"{name}: the trunk is free; only robots with a fixed base can be compared so far")
+    if meta.kp is None or meta.kd is None:
+        found.append(f"{name}: says no gains (kp, kd)")
+    found += [f"{name}: no {q}" for q in ("q", "qd", "q_target") if not recording.has(q)]
+    if not found:
+        for flaw in audit(recording).flaws:
+            needed = flaw.channel in (*NEEDED, "all") or flaw.channel.startswith(("q_", "qd_"))
+            if flaw.verdict == "bad" and needed and flaw.check not in TELLING:
+                found.append(f"{name}: {flaw.channel}: {flaw.message}")
+    return found
+
+
+def _with_numerics(replayer: Replayer, dt: float) -> tuple[np.ndarray, dict[str, float]]:
+    """Return the noise (W, C, J) with the error of the physics step in it, and that error by quantity."""
+    w = replayer.windows
+    everything = np.arange(len(w))
+    rows = variants(replayer.machine, {}, everything, [])
+    coarse, fine = (replayer.run(rows, step) for step in (dt, 0.5 * dt))
+    error = np.sqrt(np.mean((coarse - fine) ** 2 * w.valid[..., None, None], axis=1))  # W C J
+    typical = np.median(error, axis=0)
+    scale = np.sqrt(w.scale**2 + typical**2)
+    return scale, {name: float(np.sqrt(np.mean(error[:, c] ** 2))) for c, name in enumerate(w.quantities)}
+
+
+def repeatability(recordings: Sequence[Recording]) -> dict[str, float] | None:
+    """Return how much repeated episodes differ, over sqrt(2), root mean square by quantity; None without any."""
+    by_name = {r.meta.episode: r for r in recordings}
+    pairs = [(r, by_name[r.meta.repeat_of]) for r in recordings if r.meta.repeat_of in by_name]
+    if not pairs:
+        return None
+    found = {}
+    for name in ("q", "qd"):
+        square = []
+        for a, b in pairs:
+            rows = min(len(a.t), len(b.t))
+            square.append(np.mean((a.joint(name)[:rows] - b.joint(name)[:rows]) ** 2))
+        found[name] = float(np.sqrt(np.mean(square) / 2.0))
+    return found
+
+
+def overlays(
+    score: Scorer, recordings: Sequence[Recording], theta: Theta, windows: np.ndarray, count: int, dt: float
+) -> tuple[Overlay, ...]:
+    """Return curves of some held-out windows, from the worst to the median of the plain model."""
+    w, machine = score.windows, score.replayer.machine
+    if not count or not len(windows):
+        return ()
+    before = score.replayer.run(variants(machine, {}, windows, []), dt)
+    off = (((before - w.y[windows]) / w.scale[windows][:, None]) ** 2).mean((1, 2, 3))
+    order = np.argsort(-off)
+    picked = order[np.unique(np.linspace(0, len(order) // 2, count).astype(int))]
+    after = score.replayer.run(variants(machine, theta, windows[picked], []), dt)
+    found = []
+    for row, k in enumerate(picked):
+        window = windows[k]
+        valid = w.valid[window]
+
+        def curves(y: np.ndarray, valid: np.ndarray = valid) -> dict[str, np.ndarray]:
+            return {f"{q}_{j}": y[valid, c, i] for c, q in enumerate(w.quantities) for i, j in enumerate(w.joints)}
+
+        noise = {f"{q}_{j}": float(w.scale[window, c, i]) for c, q in enumerate(w.quantities) for i, j in enumerate(w.joints)}
+        found.append(
+            Overlay(
+                recordings[w.episode[window]].meta.episode,
+                w.begin[window] + w.t[window, valid],
+                curves(w.y[window]),
+                curves(before[k]),
+                curves(after[row]),
+                noise,
+            )
+        )
+    return tuple(found)
+
+
+def _nested(theta: Theta, joints: Sequence[str]) -> dict[str, dict[str, dict[str, float]]]:
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for (effect, name), value in theta.items():
+        names = joints if len(value) == len(joints) else ("robot",)
+        found.setdefault(effect, {})[name] = {n: float(v) for n, v in zip(names, value, strict=True)}
+    return found
+
+
+def fingerprint(recording: Recording) -> str:
+    """Return a SHA-256 over a recording's columns, independent of how a file packs them."""
+    digest = hashlib.sha256()
+    for name in sorted(recording.channels):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(recording.channels[name]).tobytes())
+    return digest.hexdigest()
+
+
+__all__ = ["Windows", "explain", "fingerprint", "overlays", "repeatability", "unusable"]

@@ -1,0 +1,208 @@
+"""How well the model explains windows of data: Gaussian noise, with what is not known of the first state averaged out.
+
+A window's residual r and its change J per parameter, both in units of the noise, have the covariance I + S S', where S
+is the change per standard deviation of the first state. All that fits and scores need is the Gram matrix of [J r] in
+the metric of that covariance, window by window and group of joints by group.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.gap.replay import Machine, Probe, Replayer, Rows, Theta, variants
+from go1exp.gap.windows import Windows
+
+STATE_PROBE = (1.0e-3, 0.05)
+"""Change of a first angle, rad, and speed, rad/s, by which its influence is measured."""
+
+
+def grouped(machine: Machine, y: np.ndarray) -> np.ndarray:
+    """Sort (R, n, C, J) by groups of joints into (R, G, m), m = n C K."""
+    split = y[..., np.array(machine.groups)]  # R n C G K
+    return np.moveaxis(split, 3, 1).reshape(len(y), len(machine.groups), -1)
+
+
+def gram(columns: np.ndarray, state: np.ndarray) -> np.ndarray:
+    """Return A' (I + S S')^-1 A (..., p, p) of columns A (..., m, p) and state sensitivities S (..., m, k).
+
+    By Woodbury's identity: A'A - A'S (I + S'S)^-1 S'A.
+    """
+    shape, k = columns.shape, state.shape[-1]
+    wide = np.concatenate([columns, state], axis=-1).reshape(-1, shape[-2], shape[-1] + k)
+    # One product of matrices at a time goes to BLAS; NumPy's stacked product of transposed arrays does not.
+    inner = np.stack([a.T @ a for a in wide]).astype(np.float64)
+    plain, cross = inner[:, :-k, :-k], inner[:, -k:, :-k]
+    metric = inner[:, -k:, -k:] + np.eye(k)
+    found = plain - np.swapaxes(cross, -1, -2) @ np.linalg.solve(metric, cross)
+    return np.asarray(found.reshape(*shape[:-2], shape[-1], shape[-1]))
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """Scores replays of windows.
+
+    Attributes:
+        replayer: the model.
+        scale: (W, C, J) standard deviation of noise and numerical error.
+        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the first state.
+    """
+
+    replayer: Replayer
+    scale: np.ndarray
+    state: np.ndarray
+
+    @property
+    def windows(self) -> Windows:
+        """What is scored."""
+        return self.replayer.windows
+
+    @property
+    def size(self) -> np.ndarray:
+        """(W,) number of values in a window and group."""
+        w = self.windows
+        return np.asarray(w.valid.sum(1) * len(w.quantities) * len(self.replayer.machine.groups[0]))
+
+    def unit(self, y: np.ndarray, window: np.ndarray) -> np.ndarray:
+        """Return readings, or differences of them, (R, n, C, J) in units of the noise as (R, G, m)."""
+        scaled = y / self.scale[window][:, None] * self.windows.valid[window][:, :, None, None]
+        return grouped(self.replayer.machine, scaled.astype(np.float32))
+
+    def residual(self, rows: Rows, dt: float) -> np.ndarray:
+        """Return what was measured minus what each row says, (R, G, m) in units of the noise."""
+        return self.unit(self.windows.y[rows.window] - self.replayer.run(rows, dt), rows.window)
+
+    def chi2(self, residual: np.ndarray, window: np.ndarray) -> np.ndarray:
+        """Return chi2 per value (R, G) of residuals (R, G, m)."""
+        whole = gram(residual[..., None], self.state[window])[..., 0, 0]
+        return np.asarray(whole / self.size[window][:, None])
+
+
+def state_probes(machine: Machine) -> list[Probe]:
+    """Return the probes of the first state: angles, then speeds, of each place in the groups."""
+    places, joints = range(len(machine.groups[0])), len(machine.joints)
+    return [
+        Probe(kind, place, np.full(joints, size))
+        for kind, size in zip(("q", "qd"), STATE_PROBE, strict=True)
+        for place in places
+    ]
+
+
+def scorer(replayer: Replayer, theta: Theta, scale: np.ndarray, dt: float) -> Scorer:
+    """Measure how the first states act on the readings, with the model at ``theta``."""
+    w, machine = replayer.windows, replayer.machine
+    probes = state_probes(machine)
+    everything = np.arange(len(w))
+    rows = variants(machine, theta, everything, probes)
+    empty = Scorer(replayer, scale, np.empty(0))
+    y = replayer.run(rows, dt).reshape(len(w), 1 + len(probes), *w.y.shape[1:])
+    columns = []
+    for k, probe in enumerate(probes):
+        sd = (w.q_sd if probe.key == "q" else w.qd_sd)[:, np.array(machine.groups)[:, probe.place]]  # W G
+        per = empty.unit(y[:, 1 + k] - y[:, 0], everything)
+        columns.append(per * (sd / STATE_PROBE[probe.key == "qd"])[..., None].astype(np.float32))
+    return dataclasses.replace(empty, state=np.stack(columns, axis=-1))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which unknown each column of each group belongs to.
+
+    Attributes:
+        index: (G, p) unknown of column p in group g: parameters per joint have one for each group, those of the robot one.
+        size: number of unknowns.
+        joint: (size,) joint of each unknown, -1 for the robot.
+        probe: (size,) column of each.
+    """
+
+    index: np.ndarray
+    size: int
+    joint: np.ndarray
+    probe: np.ndarray
+
+    @staticmethod
+    def of(machine: Machine, probes: Sequence[Probe]) -> Layout:
+        """Number the unknowns, column by column."""
+        groups = len(machine.groups)
+        index = np.zeros((groups, len(probes)), dtype=int)
+        joint: list[int] = []
+        column: list[int] = []
+        for p, probe in enumerate(probes):
+            own = [-1] if probe.place is None else [machine.groups[g][probe.place] for g in range(groups)]
+            index[:, p] = len(joint) + (np.zeros(groups, dtype=int) if probe.place is None else np.arange(groups))
+            joint += own
+            column += [p] * len(own)
+        return Layout(index, len(joint), np.array(joint, dtype=int), np.array(column, dtype=int))
+
+    def total(self, grams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sum Grams (W, G, p+1, p+1) into the normal equations: matrix (size, size), right side (size,)."""
+        summed = grams.sum(0)
+        matrix, right = np.zeros((self.size, self.size)), np.zeros(self.size)
+        for g, at in enumerate(self.index):
+            np.add.at(matrix, (at[:, None], at[None]), summed[g, :-1, :-1])
+            np.add.at(right, at, summed[g, :-1, -1])
+        return matrix, right
+
+    def part(self, columns: np.ndarray) -> np.ndarray:
+        """Return the unknowns of some columns (bool mask or numbers)."""
+        wanted = np.zeros(self.index.shape[1], dtype=bool)
+        wanted[columns] = True
+        return np.flatnonzero(wanted[self.probe])
+
+
+@dataclass(frozen=True)
+class Table:
+    """A linear model of some windows about ``theta``.
+
+    Attributes:
+        windows: (V,) which.
+        probes: the p columns.
+        residual: (V, G, m) in units of the noise.
+        columns: (V, G, m, p) fall of the residual per unit of each parameter.
+    """
+
+    windows: np.ndarray
+    probes: tuple[Probe, ...]
+    residual: np.ndarray
+    columns: np.ndarray
+
+    def grams(self, scorer: Scorer, others: np.ndarray | None = None) -> np.ndarray:
+        """Return the Gram matrices (V, G, p+1, p+1) of columns and residual; ``others``: further columns between."""
+        parts = [self.columns, *([] if others is None else [others]), self.residual[..., None]]
+        return gram(np.concatenate(parts, axis=-1), scorer.state[self.windows])
+
+
+def differences(scorer: Scorer, y: np.ndarray, window: np.ndarray, probes: Sequence[Probe]) -> np.ndarray:
+    """Return columns (V, G, m, p) from readings (V, 1 + p, n, C, J): changes per unit of the parameters."""
+    groups = np.array(scorer.replayer.machine.groups)
+    columns = []
+    for k, probe in enumerate(probes):
+        per = scorer.unit(y[:, 1 + k] - y[:, 0], window)
+        delta = probe.delta.reshape(-1) if probe.place is None else probe.delta[groups[:, probe.place]]
+        columns.append(per / delta.astype(np.float32)[:, None])
+    shape = (*scorer.unit(y[:, 0], window).shape, 0)
+    return np.stack(columns, axis=-1) if columns else np.zeros(shape, np.float32)
+
+
+def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], dt: float) -> Table:
+    """Replay windows with every probe.
+
+    Residuals are taken at the step ``dt``; changes, of which only the size matters, at twice that.
+    """
+    machine, replayer = scorer.replayer.machine, scorer.replayer
+    residual = scorer.residual(variants(machine, theta, windows, []), dt)
+    y = replayer.run(variants(machine, theta, windows, probes), 2.0 * dt)
+    y = y.reshape(len(windows), 1 + len(probes), *scorer.windows.y.shape[1:])
+    return Table(windows, tuple(probes), residual, differences(scorer, y, windows, probes))
+
+
+def predicted(grams: np.ndarray, layout: Layout, x: np.ndarray) -> np.ndarray:
+    """Return the chi2 sum (V, G) that the linear model promises for the unknowns ``x``."""
+    found = np.empty(grams.shape[:2])
+    for g, at in enumerate(layout.index):
+        full = np.append(-x[at], 1.0)
+        found[:, g] = np.einsum("i,wij,j->w", full, grams[:, g], full)
+    return found

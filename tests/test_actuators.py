@@ -1,0 +1,551 @@
+"""The laws of the actuators: against values by hand, slow loops, and the ways in which each may be misused."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.actuator.delay import Delay
+from go1exp.actuator.grouped_mlp import FEWEST, GroupedMLP
+from go1exp.actuator.net import Net
+from go1exp.config import TaskConfig
+from go1exp.drive import DriveSetup
+from go1exp.effects.stack import EffectStack
+from go1exp.env.core import Go1Core
+from go1exp.fit.net import ActuatorNet, NetFileError, load
+from go1exp.randomness import EnvRandom
+from go1exp.registry import ConfigError, Term, members
+
+Drives = Callable[..., DriveSetup]
+EFFORT = np.array([23.7, 23.7, 35.55] * 4)
+
+
+def motor(setup: DriveSetup, **parameters: Any) -> Any:
+    return members("actuator")["dc_motor"].target(setup, **parameters)
+
+
+def rows(values: float | list[float] | np.ndarray) -> Tensor:
+    """One robot: the same value in every joint, or one each."""
+    return torch.as_tensor(np.broadcast_to(np.asarray(values, dtype=float), (1, 12)).copy())
+
+
+# ---------------------------------------------------------------------- dc_motor
+
+
+@pytest.mark.parametrize(
+    ("speed", "most"), [(0, 23.7), (10, 15.8), (15, 11.85), (20, 7.9), (30, 0), (45, -11.85), (-10, 23.7), (-60, 23.7)]
+)
+def test_the_most_that_a_hip_can_do_at_a_speed(speed: float, most: float, drives: Drives) -> None:
+    """Values of Isaac Lab's motor: 23.7 N m and 30 rad/s; the calf has 1.5 times the torque at 1 / 1.5 of the speed."""
+    drive = motor(drives(1), kp=1000.0, kd=0.0, speed=[30.0, 30.0, 20.0])
+    qd = np.tile([speed, speed, speed / 1.5], 4)
+    for sign in (1.0, -1.0):
+        tau = drive.torque(rows(sign * 9.0), rows(0.0), rows(sign * qd))
+        np.testing.assert_allclose(tau[0], sign * np.tile([most, most, 1.5 * most], 4), atol=1e-9)
+
+
+def test_a_stronger_line_has_a_corner(drives: Drives) -> None:
+    drive = motor(drives(1), kp=1000.0, kd=0.0, stall=30.0, speed=30.0)
+    for speed, most in [(0.0, 23.7), (6.3, 23.7), (10.0, 20.0), (30.0, 0.0)]:  # corner at 30 (1 - 23.7 / 30)
+        tau = drive.torque(rows(9.0), rows(0.0), rows(speed))[0]
+        assert tau[:2].tolist() == pytest.approx([most, most])
+        assert tau[2] == pytest.approx(30.0 * (1.0 - speed / 30.0))  # the line lies below the calf's 35.55
+
+
+def test_a_dc_motor_is_pd_within_its_line(drives: Drives) -> None:
+    def slow(target: float, q: float, qd: float, joint: int, kp: float, kd: float) -> float:
+        effort, speed = ([23.7, 23.7, 35.55][joint % 3], [30.1, 30.1, 20.06][joint % 3])
+        stall = 33.0 if joint == 4 else effort
+        high = max(-effort, min(effort, stall * (1.0 - qd / speed)))
+        low = min(effort, max(-effort, -stall * (1.0 + qd / speed)))
+        return max(low, min(high, kp * (target - q) - kd * qd))
+
+    rng = np.random.default_rng(0)
+    drive = motor(drives(50), kp=[20.0, 25.0, 30.0], kd=0.6, stall={"FL_thigh": 33.0})
+    target, q, qd = rng.normal(size=(50, 12)), rng.normal(size=(50, 12)), rng.normal(0.0, 15.0, (50, 12))
+    got = drive.torque(*map(torch.as_tensor, (target, q, qd)))
+    for i in range(50):
+        for j in range(12):
+            expected = slow(target[i, j], q[i, j], qd[i, j], j, [20.0, 25.0, 30.0][j % 3], 0.6)
+            assert got[i, j].item() == pytest.approx(expected, abs=1e-12), (i, j)
+
+
+def test_a_motor_without_numbers_has_the_robots(drives: Drives) -> None:
+    drive = motor(drives(1), kp=1000.0)
+    still = drive.torque(rows(9.0), rows(0.0), rows(0.0))[0]
+    assert still.tolist() == pytest.approx(EFFORT.tolist())
+    fast = drive.torque(rows(9.0), rows(0.0), rows([30.1, 30.1, 20.06] * 4))[0]
+    assert fast.tolist() == pytest.approx([0.0] * 12, abs=1e-9)
+
+
+# ---------------------------------------------------------------------- delay
+
+
+def repeater(setup: DriveSetup, shortest: float, longest: float) -> Delay:
+    """A delayed drive whose torque is its target."""
+    delay = Delay(setup, command=(shortest, longest), drive={"term": "pd", "kp": 1.0, "kd": 0.0})
+    delay.reset(torch.ones(setup.num_envs, dtype=torch.bool))
+    return delay
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.002, 0.006, 0.005, 0.0137])
+def test_the_target_is_that_of_a_while_ago_and_feedback_is_not(delay: float, drives: Drives) -> None:
+    rng = np.random.default_rng(0)
+    late = Delay(drives(1), command=(delay, delay), drive={"term": "pd", "kp": 2.0, "kd": 0.5})
+    late.reset(torch.ones(1, dtype=torch.bool))
+    times, targets = 0.002 * np.arange(40), rng.normal(size=(40, 12))
+    for k in range(40):
+        q, qd = rng.normal(size=12), rng.normal(size=12)
+        tau = late.torque(rows(targets[k]), rows(q), rows(qd))[0]
+        then = [np.interp(times[k] - delay, times[: k + 1], targets[: k + 1, j]) for j in range(12)]
+        np.testing.assert_allclose(tau, 2.0 * (np.array(then) - q) - 0.5 * qd, atol=1e-6)
+
+
+def test_each_robot_draws_its_delay_anew_for_each_episode(drives: Drives) -> None:
+    setup = drives(400)
+    late = repeater(setup, 0.004, 0.012)
+    first = late.delay.clone()
+    assert first.shape == (400, 1)
+    assert ((first >= 0.004) & (first <= 0.012)).all()
+    assert first.mean().item() == pytest.approx(0.008, abs=0.0005)  # 4 standard errors
+    assert first.std().item() == pytest.approx(0.008 / 12**0.5, rel=0.1)
+    again = torch.arange(400) % 3 == 0
+    late.reset(again)
+    assert torch.equal(late.delay[~again], first[~again])
+    assert (late.delay[again] != first[again]).all()
+
+
+def test_a_robots_delays_are_its_own_and_follow_from_the_seed(drives: Drives) -> None:
+    batch, alone = (repeater(drives(n, random=EnvRandom(3, n, i)), 0.0, 0.02) for n, i in ((8, 0), (1, 5)))
+    assert torch.equal(batch.delay[5:6], alone.delay)
+    other = repeater(drives(8, random=EnvRandom(4, 8)), 0.0, 0.02)
+    assert not torch.equal(other.delay, batch.delay)
+
+
+def test_an_environment_that_is_seeded_again_draws_the_same_delays(make_core: Callable[..., Go1Core]) -> None:
+    core = make_core("actuator=delay", num_envs=3)
+    core.reset()
+    first = core.plant.actuator.delay.clone()  # type: ignore[attr-defined]
+    core.step(torch.zeros(3, 12))
+    core.reset()
+    assert not torch.equal(core.plant.actuator.delay, first)  # type: ignore[attr-defined]
+    core.reseed(0)
+    core.reset()
+    assert torch.equal(core.plant.actuator.delay, first)  # type: ignore[attr-defined]
+
+
+def test_a_drive_without_delay_is_that_drive(make_core: Callable[..., Go1Core]) -> None:
+    """In the environment, and so with its resets; bit for bit."""
+
+    def run(*overrides: str) -> Tensor:
+        core = make_core("sim.episode_s=0.1", *overrides)
+        core.reset()
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(12):
+            core.step(torch.randn(4, 12, generator=generator))
+        return core.backend.qpos.clone()
+
+    wrapped = ("actuator=delay", "actuator@actuator.drive=dc_motor")
+    plain = run("actuator=dc_motor")
+    assert torch.equal(run(*wrapped, "actuator.command=[0.0,0.0]"), plain)
+    assert not torch.equal(run(*wrapped, "actuator.command=[0.0,0.02]"), plain)
+
+
+@pytest.mark.parametrize("inner", ["pd", "dc_motor"])
+def test_effects_on_gains_reach_the_drive_inside(inner: str, drives: Drives) -> None:
+    setup = drives(2)
+    late = Delay(setup, command=(0.0, 0.0), drive={"term": inner})
+    terms = [
+        Term("kp_scale", members("effect")["kp_scale"], {"scale": 0.5}, {"spread": {}}),
+        Term("kd_scale", members("effect")["kd_scale"], {"scale": 2.0}, {"spread": {}}),
+    ]
+    EffectStack(terms, setup).set_gains(late, late.kp.clone(), late.kd.clone())
+    tau = late.torque(setup.zeros() + 0.1, setup.zeros(), setup.zeros() + 1.0)
+    assert tau.flatten().tolist() == pytest.approx([10.0 * 0.1 - 1.0 * 1.0] * 24)
+
+
+def test_effects_on_gains_act_through_a_delay_in_the_environment(make_core: Callable[..., Go1Core]) -> None:
+    kp: list[Tensor] = []
+    for drive in ("pd", "delay"):
+        core = make_core(f"actuator={drive}", "effect=[kp_scale]")
+        core.reset()
+        inside: Any = getattr(core.plant.actuator, "drive", core.plant.actuator)
+        kp.append(inside.kp)
+    assert torch.equal(*kp)
+    assert (kp[0] != 20.0).all()
+
+
+# ---------------------------------------------------------------------- net: the form of the file
+
+
+@pytest.fixture
+def shares(make_net: Callable[..., Path]) -> dict[str, Path]:
+    return {share: make_net(share=share, seed=k) for k, share in enumerate(("all", "kind", "none"))}
+
+
+def motion(steps: int, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Target, angle and speed (steps, n, 12)."""
+    rng = np.random.default_rng(seed)
+    return (
+        rng.normal(0.0, 0.3, (steps, n, 12)),
+        rng.normal(0.0, 0.3, (steps, n, 12)),
+        rng.normal(0.0, 3.0, (steps, n, 12)),
+    )
+
+
+def played(actuator: Net, series: tuple[np.ndarray, ...], restarts: dict[int, list[int]] | None = None) -> np.ndarray:
+    """Torques (steps, n, 12); at the steps of ``restarts`` an episode begins for the robots that it names."""
+    found = []
+    for k, inputs in enumerate(zip(*series, strict=True)):
+        if restarts and k in restarts:
+            actuator.reset(torch.tensor([i in restarts[k] for i in range(inputs[0].shape[0])]))
+        found.append(actuator.torque(*map(torch.as_tensor, inputs)).numpy().copy())
+    return np.array(found)
+
+
+def slow(
+    net: ActuatorNet,
+    period: str,
+    dt: float,
+    series: tuple[np.ndarray, ...],
+    restarts: dict[int, list[int]] | None = None,
+) -> np.ndarray:
+    """One robot, one joint, one step at a time, with the file's own function in float64."""
+    target, q, qd = series
+    signals = {"position_error": target - q, "velocity": qd, "position": q}
+    steps, n, _ = q.shape
+    every = round(net.info.period / dt) if period == "hold" else 1
+    tau = np.zeros_like(q)
+    for i in range(n):
+        begin = 0
+        for t in range(steps):
+            if t in (restarts or {}) and i in (restarts or {})[t]:
+                begin = t
+            now = t - (t - begin) % every
+            ago = dt * (now - begin) - net.info.period * np.arange(net.info.history)
+            for j in range(12):
+                row = []
+                for name in net.info.inputs:
+                    seen = signals[name][begin : t + 1, i, j]
+                    row += [np.interp(a, dt * np.arange(len(seen)), seen) for a in ago]
+                group = net.info.groups.index(
+                    {"all": "all", "kind": robot.JOINTS[j][3:], "none": robot.JOINTS[j]}[net.info.share]
+                )
+                tau[t, i, j] = np.clip(net.torque(np.array([row]), group)[0], -EFFORT[j], EFFORT[j])
+    return tau
+
+
+@pytest.mark.parametrize("share", ["all", "kind", "none"])
+def test_a_net_is_the_function_in_its_file(share: str, shares: dict[str, Path], drives: Drives) -> None:
+    series, restarts = motion(12, 3), {5: [1], 8: [0, 2]}
+    expected = slow(load(shares[share]), "exact", 0.002, series, restarts)
+    np.testing.assert_allclose(
+        played(Net(drives(3), file=str(shares[share])), series, restarts), expected, atol=2e-5, rtol=0
+    )
+    assert np.abs(expected).mean() > 3.0
+    assert len(np.unique(expected.round(6))) > 0.9 * expected.size
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"inputs": ("velocity", "position_error")},
+        {"inputs": ("position", "velocity", "position_error"), "history": 2},
+        {"inputs": ("position_error",), "history": 1},
+        {"hidden": (64, 64, 64)},
+        {"hidden": (5,)},
+        {"hidden": (9, 3)},
+        {"hidden": (3, 9, 3)},
+        {"skip": 0.5},
+        {"joints": tuple(sorted(robot.JOINTS))},
+        {"joints": (*robot.JOINTS[::-1], "tail"), "share": "none"},
+    ],
+    ids=lambda settings: " ".join(f"{k}={v}" for k, v in settings.items())[:40],
+)
+def test_a_net_may_have_other_inputs_layers_and_joints(
+    settings: dict[str, Any], make_net: Callable[..., Path], drives: Drives
+) -> None:
+    path, series = make_net(**settings), motion(6, 2)
+    expected = slow(load(path), "exact", 0.002, series)
+    np.testing.assert_allclose(played(Net(drives(2), file=str(path)), series), expected, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("share", ["all", "kind", "none"])
+def test_a_big_batch_is_its_robots(share: str, shares: dict[str, Path], drives: Drives) -> None:
+    """More columns than a block; to the bit where the matrix library allows it."""
+    n = 701
+    series = motion(4, n)
+    together = played(Net(drives(n), file=str(shares[share])), series)
+    for i in (0, 1, 350, 351, 700):
+        alone = played(Net(drives(1), file=str(shares[share])), tuple(x[:, i : i + 1] for x in series))
+        atol = 0.0 if torch.backends.mkl.is_available() else 1e-5
+        np.testing.assert_allclose(alone[:, 0], together[:, i], atol=atol, rtol=0)
+
+
+@pytest.mark.parametrize("columns", [[2], [5000], [4096, 4096], [3000, 2, 3000], [4097, 2], [2] * 12])
+def test_blocks_cover_every_column_once(columns: list[int]) -> None:
+    rng = np.random.default_rng(0)
+    nets = [
+        [(rng.normal(size=(3, 4)), rng.normal(size=4)), (rng.normal(size=(4, 1)), rng.normal(size=1))] for _ in columns
+    ]
+    skips = [rng.normal(size=3) for _ in columns]
+    mlp = GroupedMLP(nets, skips, columns, torch.device("cpu"))
+    x = rng.normal(size=(3, sum(columns)))
+    mlp.inputs.copy_(torch.as_tensor(x))
+    for _ in range(2):  # nothing is left behind
+        got, start = mlp().numpy(), 0
+        for net, skip, count in zip(nets, skips, columns, strict=True):
+            part = x[:, start : start + count]
+            h = net[0][0].T @ part + net[0][1][:, None]
+            expected = net[1][0][:, 0] @ (h / (1 + np.abs(h))) + net[1][1] + skip @ part
+            np.testing.assert_allclose(got[start : start + count], expected, atol=1e-5)
+            start += count
+
+
+def test_a_run_of_one_column_is_refused() -> None:
+    with pytest.raises(ValueError, match=f"at least {FEWEST}"):
+        GroupedMLP([[(np.ones((1, 1)), np.ones(1))]], [np.zeros(1)], [1], torch.device("cpu"))
+
+
+# ---------------------------------------------------------------------- net: its period
+
+
+@pytest.mark.parametrize(
+    ("period", "native", "dt"),
+    [
+        ("exact", 0.005, 0.005),
+        ("hold", 0.005, 0.005),
+        ("resample", 0.005, 0.005),
+        ("hold", 0.01, 0.002),
+        ("resample", 0.01, 0.002),
+        ("resample", 0.005, 0.002),
+        ("resample", 0.02, 0.003),
+        ("resample", 0.002, 0.005),
+    ],
+)
+def test_the_history_is_spaced_as_the_period_says(
+    period: str, native: float, dt: float, make_net: Callable[..., Path], drives: Drives
+) -> None:
+    path = make_net(period=native, seed=7)
+    series, restarts = motion(40, 3), {13: [1], 22: [0, 2], 23: [2]}
+    net = Net(drives(3, physics_dt=dt), file=str(path), period=period)  # type: ignore[arg-type]
+    expected = slow(load(path), period, dt, series, restarts)
+    np.testing.assert_allclose(played(net, series, restarts), expected, atol=5e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("period", "native"), [("hold", 0.01), ("resample", 0.007)])
+def test_with_a_period_of_its_own_a_net_keeps_what_every_actuator_promises(
+    period: str, native: float, make_net: Callable[..., Path], drives: Drives
+) -> None:
+    """Saved state, and a robot alone as in a batch."""
+
+    def build(n: int) -> Net:
+        return Net(drives(n), file=str(path), period=period)  # type: ignore[arg-type]
+
+    path, series, restarts = make_net(period=native), motion(40, 3), {13: [1], 14: [0, 2]}
+    full = played(build(3), series, restarts)
+    for i in range(3):
+        mine = {k: [0] for k, who in restarts.items() if i in who}
+        alone = played(build(1), tuple(x[:, i : i + 1] for x in series), mine)
+        atol = 0.0 if torch.backends.mkl.is_available() else 1e-5
+        np.testing.assert_allclose(alone[:, 0], full[:, i], atol=atol, rtol=0)
+    first, second = build(3), build(3)
+    played(first, tuple(x[:17] for x in series), restarts)
+    second.load_state_dict(first.state_dict())
+    assert np.array_equal(played(second, tuple(x[17:] for x in series)), full[17:])
+
+
+def firmware_at_20ms(path: Path, like: ActuatorNet, period: float) -> Path:
+    """Write a net such as walk-these-ways published: tau = 20 e(t - P) - 0.5 qd(t), the firmware one sample late.
+
+    Its own P is 20 ms. Written down with another ``period`` it is what one gets who counts samples.
+    """
+    skip = np.zeros_like(like.skip)
+    skip[:, 1], skip[:, 3] = 20.0, -0.5  # features: e(t), e(t-P), e(t-2P), qd(t), ...
+    plain = {"input_mean": np.zeros_like(like.input_mean), "input_std": np.ones_like(like.input_std)}
+    made = dataclasses.replace(
+        like,
+        info=dataclasses.replace(like.info, period=period),
+        weights=tuple(np.zeros_like(w) for w in like.weights),
+        biases=tuple(np.zeros_like(b) for b in like.biases),
+        skip=skip,
+        output_mean=np.zeros_like(like.output_mean),
+        output_std=np.ones_like(like.output_std),
+        **plain,
+    )
+    made.save(path)
+    return path
+
+
+def test_a_net_stepped_faster_than_it_was_recorded_is_another_drive_unless_its_period_is_kept(
+    tmp_path: Path, make_net: Callable[..., Path], drives: Drives
+) -> None:
+    like = load(make_net())
+    own = firmware_at_20ms(tmp_path / "own.npz", like, 0.02)
+    by_taps = firmware_at_20ms(tmp_path / "taps.npz", like, 0.005)
+    times = 0.005 * np.arange(200)
+
+    def smooth(frequency: float) -> np.ndarray:
+        return np.broadcast_to(0.2 * np.sin(2 * np.pi * frequency * times)[:, None, None], (200, 1, 12))
+
+    q = smooth(2.0)
+    series = smooth(3.0), q, np.gradient(q, 0.005, axis=0)
+    error = series[0] - q
+    setup = drives(1, physics_dt=0.005)
+
+    def law(lag: int) -> np.ndarray:
+        past = np.concatenate([np.repeat(error[:1], lag, axis=0), error[:-lag]])
+        return 20.0 * past - 0.5 * series[2]
+
+    with pytest.raises(ConfigError, match=r"spaced 0\.02 s and the physics step is 0\.005 s"):
+        Net(setup, file=str(own))
+    resampled = played(Net(setup, file=str(own), period="resample"), series)
+    np.testing.assert_allclose(resampled, law(4), atol=1e-5)
+    held = played(Net(setup, file=str(own), period="hold"), series)
+    np.testing.assert_allclose(held, np.repeat(law(4)[::4], 4, axis=0), atol=1e-5)
+    trapped = played(Net(setup, file=str(by_taps)), series)
+    np.testing.assert_allclose(trapped, law(1), atol=1e-5)
+    assert np.abs(trapped - resampled).max() > 1.0
+
+
+def overshoot(drive: Callable[[float, float, float], float], dt: float) -> float:
+    """Of a joint of 0.03 kg m2 on a step of 0.2 rad from rest, as a share of the step; ``drive(target, q, qd)``."""
+    q = qd = highest = 0.0
+    drive(0.0, q, qd)
+    for _ in range(round(0.5 / dt)):
+        tau = drive(0.2, q, qd)
+        for _ in range(10):
+            qd += tau / 0.03 * dt / 10
+            q += qd * dt / 10
+        highest = max(highest, q)
+    return highest / 0.2 - 1.0
+
+
+def test_counting_samples_hides_most_of_the_overshoot_of_the_recorded_drive(
+    tmp_path: Path, make_net: Callable[..., Path], drives: Drives
+) -> None:
+    like, dt = load(make_net()), 0.005
+
+    def net(spacing: float, period: str) -> float:
+        path = firmware_at_20ms(tmp_path / "net.npz", like, spacing)
+        made = Net(drives(1, physics_dt=dt), file=str(path), period=period)  # type: ignore[arg-type]
+        return overshoot(lambda *inputs: made.torque(*map(rows, inputs))[0, 0].item(), dt)
+
+    def law(lag: int) -> float:
+        errors: list[float] = []
+
+        def drive(target: float, q: float, qd: float) -> float:
+            errors.append(target - q)
+            return float(np.clip(20.0 * errors[max(0, len(errors) - 1 - lag)] - 0.5 * qd, -23.7, 23.7))
+
+        return overshoot(drive, dt)
+
+    assert net(0.02, "resample") == pytest.approx(law(4), abs=1e-4)
+    assert net(0.005, "exact") == pytest.approx(law(1), abs=1e-4)
+    assert net(0.02, "hold") > net(0.02, "resample") > 1.5 * net(0.005, "exact")
+
+
+# ---------------------------------------------------------------------- net: refusals
+
+
+def refusal(setup: DriveSetup, path: Path, **parameters: Any) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        Net(setup, file=str(path), **parameters)
+    assert all(p.startswith(f"actuator net {path}: ") for p in caught.value.problems)
+    return [p.removeprefix(f"actuator net {path}: ") for p in caught.value.problems]
+
+
+def test_another_spacing_is_refused_with_the_ways_out(make_net: Callable[..., Path], drives: Drives) -> None:
+    (said,) = refusal(drives(1), make_net(period=0.02))
+    for part in ("0.02 s", "0.002 s", "sim.physics_dt", "period=hold", "period=resample"):
+        assert part in said
+    Net(drives(1), file=str(make_net(period=0.002 * (1 + 1e-9))))
+
+
+@pytest.mark.parametrize(("native", "dt"), [(0.005, 0.002), (0.002, 0.005)])
+def test_holding_needs_a_whole_number_of_steps(
+    native: float, dt: float, make_net: Callable[..., Path], drives: Drives
+) -> None:
+    (said,) = refusal(drives(1, physics_dt=dt), make_net(period=native), period="hold")
+    assert "whole multiple" in said
+    assert "period=resample" in said
+
+
+def test_a_net_for_something_else_is_refused(make_net: Callable[..., Path], drives: Drives) -> None:
+    (said,) = refusal(drives(1), make_net(robot="so101", joints=("shoulder", "elbow"), share="all"))
+    assert said == "is for 'so101' with joints shoulder, elbow; there is none for FR_hip"
+    (said,) = refusal(drives(1), make_net(robot="go2"))
+    assert said == "is for robot 'go2', not for 'go1'"
+    both = refusal(drives(1), make_net(inputs=("position_error", "tau_cmd"), period=0.02))
+    assert both[0].startswith("wants tau_cmd, which a drive that is told positions does not have")
+    assert len(both) == 2
+
+
+def test_a_damaged_file_is_refused(tmp_path: Path, drives: Drives) -> None:
+    path = tmp_path / "net.npz"
+    path.write_bytes(b"PK nonsense")
+    with pytest.raises(NetFileError, match="not an actuator net"):
+        Net(drives(1), file=str(path))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["actuator=net"], "actuator.file: required, but not given"),
+        (["actuator=net", "actuator.file=a/b.npz"], "actuator.file = 'a/b.npz': no such file"),
+        (["actuator=net", "actuator.file=pyproject.toml"], "actuator.file = 'pyproject.toml': must be an .npz"),
+        (["actuator=delay", "actuator@actuator.drive=net"], "actuator.drive.file: required, but not given"),
+        (["actuator=delay", "actuator.drive.kp=-1.0"], "actuator.drive.kp = -1.0: "),
+        (
+            ["actuator=delay", "actuator.drive.term=pid"],
+            "actuator.drive: unknown actuator term 'pid'; did you mean 'pd'?",
+        ),
+        (["actuator=delay", "~actuator.drive.term"], "actuator.drive.term: required, but not given"),
+        (["actuator=delay", "+actuator.drive.ki=1.0"], "actuator.drive.ki: unknown key 'ki'"),
+        (["actuator=delay", "actuator.drive.kp={FX: 1.0}"], "actuator.drive.kp = {'FX': 1.0}: no joint is called 'FX'"),
+        (["actuator=delay", "actuator.drive.kp={FR: 1.0}"], "actuator.drive.kp = {'FR': 1.0}: gives FL_hip, "),
+        (
+            ["actuator=delay", "actuator.command=[0.02,0.01]"],
+            "actuator.command = [0.02, 0.01]: low must not exceed high",
+        ),
+        (["actuator=delay", "actuator.command=[0.0,0.5]"], "actuator.command.1 = 0.5: "),
+        (["actuator=dc_motor", "actuator.stall=0.0"], "actuator.stall = 0.0: every value must be between 1 and 500"),
+        (["actuator=dc_motor", "actuator.kd={hip: 1.0}"], "actuator.kd = {'hip': 1.0}: gives FR_thigh, "),
+    ],
+)
+def test_a_mistake_is_named_by_its_key(overrides: list[str], line: str, make_task: Callable[..., TaskConfig]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make_task(*overrides)
+    assert [p for p in caught.value.problems if p.startswith(line)], caught.value.problems
+
+
+def test_effects_on_gains_need_a_drive_that_has_them(
+    make_task: Callable[..., TaskConfig], make_net: Callable[..., Path]
+) -> None:
+    effect, file = "effect=[kp_scale]", make_net()
+    make_task(effect, "actuator=delay")
+    for drive in (
+        ["actuator=net", f"actuator.file={file}"],
+        ["actuator=delay", "actuator@actuator.drive=net", f"actuator.drive.file={file}"],
+    ):
+        with pytest.raises(ConfigError, match=r"effect\.kp_scale: changes kp or kd"):
+            make_task(effect, *drive)
+
+
+def test_a_net_drives_the_robot(make_core: Callable[..., Go1Core], make_net: Callable[..., Path]) -> None:
+    core = make_core("actuator=net", f"actuator.file={make_net()}")
+    core.reset()
+    seen = []
+    for _ in range(3):
+        core.step(torch.zeros(4, 12))
+        seen.append(core.plant.torque.clone())
+    assert all(torch.isfinite(tau).all() for tau in seen)
+    assert not torch.equal(seen[0], seen[1])
