@@ -1,6 +1,6 @@
-"""The paper's loop in simulation: a drive that the trainer has not seen, recorded, learnt, and met again on new motions.
+"""The paper's loop in simulation: a drive that the trainer has not seen is recorded, learnt and met on new motions.
 
-    python benchmarks/paper_loop.py run=RUN [out=DIR] [seconds=20]
+    python benchmarks/paper_loop.py run=RUN [out=DIR] [seconds=15]
 
 RUN is a run folder trained with ideal drives (``go1exp train experiment=demo``). Prints how far the joints of a hung
 robot are from those of the hidden drive under the same targets, in closed loop, for ideal PD drives and for the net.
@@ -58,19 +58,21 @@ def trajectories(overrides: list[str]) -> dict[str, np.ndarray]:
 def main() -> None:
     """Record, fit, compare."""
     given = dict(a.split("=", 1) for a in sys.argv[1:])
-    out, run, seconds = Path(given.get("out", "runs/paper_loop")), given["run"], given.get("seconds", "20")
-    common = [*HIDDEN, f"seconds={seconds}", "physics_dt=0.001"]
-    walk = ["excitation=[policy]", f"run={run}", "support=hung", "episodes=8"]
-    command("record", *common, *walk, f"out={out / 'recordings'}")
-    command("record", *common, "excitation=[multisine,steps,slow_ramps]", "seeds=[1,2,3]", f"out={out / 'recordings'}")
+    out, run, seconds = Path(given.get("out", "runs/paper_loop")), given["run"], given.get("seconds", "15")
+    common = [*HIDDEN, f"seconds={seconds}", "physics_dt=0.001", f"out={out / 'recordings'}"]
+    walk = ["excitation=[policy]", f"run={run}", "support=hung", "episodes=4"]
+    command("record", *common, *walk)
+    command("record", *common, "excitation=[multisine,steps,chirp,slow_ramps]", "seeds=[1,2,3,4,5]")
+    taps = ["history=8", "period=0.004", "smoothing=0.02", "epochs=40", "half_net=false", "plots=false"]
     for target in ("tau_est", "joint_torque"):
-        fit = [f"recordings={out / 'recordings'}", f"target={target}", f"out={out / target}", "plots=false"]
-        command("fit-actuator", *fit)
-    hidden, pd = trajectories(HIDDEN), trajectories([])
-    found = {"pd": pd}
+        command("fit-actuator", f"recordings={out / 'recordings'}", f"target={target}", f"out={out / target}", *taps)
+    hidden = trajectories(HIDDEN)
+    found = {"pd": trajectories([])}
     for target in ("tau_est", "joint_torque"):
-        found[target] = trajectories(["actuator=net", f"actuator.file={out / target / 'net.npz'}", "actuator.period=hold"])
-    print(f"\nRMSE of the joint angles to the hidden drive's, mrad\n{'motion':16}" + "".join(f"{n:>14}" for n in found))
+        net = out / target / "net.npz"
+        found[target] = trajectories(["actuator=net", f"actuator.file={net}", "actuator.period=resample"])
+    heads = "".join(f"{name:>14}" for name in found)
+    print(f"\nRMSE of the joint angles to the hidden drive's, mrad\n{'motion':16}{heads}")
     total = {name: 0.0 for name in found}
     for motion, truth in hidden.items():
         errors = {name: float(np.sqrt(np.mean((q[motion] - truth) ** 2))) for name, q in found.items()}

@@ -28,16 +28,17 @@ def _read(places: str | tuple[str, ...]) -> list[Recording]:
     return [r for path in paths for r in (read_folder(path) if path.is_dir() else [read(path)])]
 
 
-def _inverse_dynamics(config: RobotConfig) -> Callable[[Recording], np.ndarray]:
+def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[[Recording], np.ndarray]:
     """Return the function from a recording of a hung Go1 to the torques (T, 12) at its joints, N m."""
     from go1exp.fit import FitError, smooth_motion
+    from go1exp.fit.smoothing import WINDOW
     from go1exp.physics.inverse import joint_torques
 
     def joint_torque(recording: Recording) -> np.ndarray:
         base = recording.meta.base_quat
         if recording.meta.robot != GO1 or base is None:
             raise FitError(f"{recording.meta.episode}: target=joint_torque needs a Go1 whose trunk is held")
-        motion = smooth_motion(recording)
+        motion = smooth_motion(recording, smoothing or WINDOW)
         return joint_torques(config, base, motion.q, motion.qd, motion.qdd)
 
     return joint_torque
@@ -68,7 +69,7 @@ def _task(container: dict[str, Any]) -> None:
             print(f"fitting {what} ...", flush=True)
         bar(done, total)
 
-    inverse = _inverse_dynamics(parts["robot"]) if settings.target == "joint_torque" else None
+    inverse = _inverse_dynamics(parts["robot"], settings.smoothing) if settings.target == "joint_torque" else None
     result = fit.fit(recordings, fit.FitSettings(**own), progress, inverse)
     out = Path(settings.out)
     out.mkdir(parents=True, exist_ok=True)

@@ -143,6 +143,7 @@ class FitActuatorSettings:
     skip: bool
     share: Literal["all", "kind", "none"]
     target: Literal["tau_est", "joint_torque"]
+    smoothing: Positive | None
     epochs: Count
     batch: Count
     learning_rate: Positive

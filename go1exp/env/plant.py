@@ -85,6 +85,7 @@ class Plant:
         self._inertia = setup.zeros()
         self._dry = self.effects.acts("on_friction") or FRICTION in self.effects.fields
         self._dry |= bool(backend.compiled(FRICTION).any())
+        self._beside = self._dry or self._rotors is not None or self.effects.acts("on_joint")
         self._ease = setup.physics_dt * backend.compiled("dof_invweight0")[self._joints]
         live = [*self.effects.fields, *([FRICTION] if self._dry else []), *([ARMATURE] if self._rotors else [])]
         for name in live:
@@ -136,7 +137,7 @@ class Plant:
         if self.observer:
             self.observer(target)
         effects, q, qd = self.effects, self.q, self.speed()
-        turn = self.qd - self._before
+        turn = self.qd - self._before if self._dry else None
         self._before.copy_(self.qd)
         command = effects.on_target(torch.lerp(self._target, target, 0.5))
         self._target.copy_(target)
@@ -144,24 +145,30 @@ class Plant:
         self.torque.copy_(effects.on_drive(self.actuator.torque(command, *encoder), *encoder))
         if self.enabled is not None:
             self.torque.mul_(self.enabled.unsqueeze(1))
-        geared, beside = effects.on_transmission(self.torque, q, qd), effects.on_joint(q, qd)
         if effects.acts("on_friction"):
             self.backend.field(FRICTION)[:, self._joints] = effects.on_friction(self._bound, self.torque, qd)
-        if self._dry:
-            beside = beside + self._late_friction(turn)
-        if self._rotors:
-            rigid, through, carried = self._rotors.transmit(effects.gears(), geared, self._inertia)
-            self.backend.field(ARMATURE)[:, self._joints] = carried
-            # The motor's torque limit is not the gears'.
-            geared, beside = torch.where(rigid, geared, 0.0), torch.where(rigid, beside, beside + through)
-        if self._dry or self._rotors or effects.acts("on_joint"):
-            self.backend.applied()[:, self._joints] = beside
+        geared = effects.on_transmission(self.torque, q, qd)
+        if self._beside:
+            geared = self._act_beside(geared, q, qd, turn)
         if self._floating and effects.acts("on_base"):
             force = self.backend.applied()[:, :3]
             force.copy_(effects.on_base(torch.zeros_like(force)))
         self.backend.step(geared)
         if self._rotors:
             self._rotors.follow(self.joint_acceleration())
+
+    def _act_beside(self, geared: Tensor, q: Tensor, qd: Tensor, turn: Tensor | None) -> Tensor:
+        """Apply what acts on the joints beside the drive's torque ``geared``, and return what is left of that."""
+        beside = self.effects.on_joint(q, qd)
+        if turn is not None:
+            beside = beside + self._late_friction(turn)
+        if self._rotors:
+            rigid, through, carried = self._rotors.transmit(self.effects.gears(), geared, self._inertia)
+            self.backend.field(ARMATURE)[:, self._joints] = carried
+            # The motor's torque limit is not the gears'.
+            geared, beside = torch.where(rigid, geared, 0.0), torch.where(rigid, beside, beside + through)
+        self.backend.applied()[:, self._joints] = beside
+        return geared
 
     def _late_friction(self, turn: Tensor) -> Tensor:
         """Return the torque by which dry friction differs from MuJoCo's, which changes its sign too early.

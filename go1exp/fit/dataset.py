@@ -8,7 +8,7 @@ linearly between the two samples around a tap, commands are those in force at it
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 
 import numpy as np
@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 
 from go1exp.fit.net import InputName, Target
 from go1exp.fit.settings import FitError
+from go1exp.fit.smoothing import smooth_motion
 from go1exp.recording import Meta, Recording
 from go1exp.registry import unknown_name
 
@@ -76,8 +77,12 @@ def windows(
     period: float,
     target: Target = "tau_est",
     joint_torque: JointTorque | None = None,
+    smoothing: float | None = None,
 ) -> Rows:
     """Cut recordings into rows; see the module for how.
+
+    With ``smoothing`` (s) the inputs' angle and speed come from ``smooth_motion`` over that window. A simulation shows
+    a net motion without noise: one that was trained on noisy speeds has learnt to trust them less, and blurs friction.
 
     Left out are rows whose window reaches before the recording's start, over a gap of its clock or to where
     ``torque_enable`` is false, and rows without a finite target.
@@ -96,12 +101,22 @@ def windows(
             torque = joint_torque(recording)
         else:
             torque = recording.joint("tau_est")
-        parts.append(_episode(recording, index, inputs, history, period, torque))
+        measured = {q: recording.joint(q) for q in ("q", "qd") if recording.has(q)}
+        if smoothing is not None:
+            motion = smooth_motion(recording, smoothing)
+            measured |= {"q": motion.q, "qd": motion.qd}
+        parts.append(_episode(recording, measured, index, inputs, history, period, torque))
     return concatenate(parts)
 
 
 def _episode(
-    recording: Recording, index: int, inputs: tuple[InputName, ...], history: int, period: float, torque: np.ndarray
+    recording: Recording,
+    measured: Mapping[str, np.ndarray],
+    index: int,
+    inputs: tuple[InputName, ...],
+    history: int,
+    period: float,
+    torque: np.ndarray,
 ) -> Rows:
     t, joints = recording.t, len(recording.meta.joints)
     if torque.shape != (len(t), joints):
@@ -111,14 +126,14 @@ def _episode(
     whole = np.flatnonzero(_whole(recording, t - period * (history - 1), period))
     taps = t[whole, None] - period * np.arange(history)
     held = np.maximum(np.searchsorted(t, taps + EDGE, side="right") - 1, 0)
-    signals = [_signal(recording, name, taps, held) for name in inputs]  # each (W, H, J)
+    signals = [_signal(recording, measured, name, taps, held) for name in inputs]  # each (W, H, J)
     x = np.concatenate(signals, axis=1)  # (W, F, J): input by input, newest tap first
     qd = recording.joint("qd") if recording.has("qd") else np.full((len(t), joints), np.nan)
     reversal = np.stack([_since_reversal(t, qd[:, j]) for j in range(joints)], axis=1)
     command, pd = _references(recording)
     parts = []
     for j in range(joints):
-        known = np.isfinite(torque[whole, j])
+        known = np.isfinite(torque[whole, j]) & np.isfinite(x[:, :, j]).all(axis=1)
         keep = whole[known]
         joint, episode = np.full(len(keep), j), np.full(len(keep), index)
         y, speed, since, com, ideal = (values[keep, j] for values in (torque, qd, reversal, command, pd))
@@ -126,18 +141,16 @@ def _episode(
     return concatenate(parts)
 
 
-def _signal(recording: Recording, name: InputName, taps: np.ndarray, held: np.ndarray) -> np.ndarray:
+def _signal(
+    recording: Recording, measured: Mapping[str, np.ndarray], name: InputName, taps: np.ndarray, held: np.ndarray
+) -> np.ndarray:
     """One input at every tap, (T, H, J)."""
     if name == "tau_cmd":
         return recording.joint("tau_cmd")[held]
-    if name == "position_error":
-        return recording.joint("q_target")[held] - _measured(recording, "q", taps)
-    return _measured(recording, {"velocity": "qd", "position": "q"}[name], taps)
-
-
-def _measured(recording: Recording, quantity: str, taps: np.ndarray) -> np.ndarray:
-    values = recording.joint(quantity)
-    return np.stack([np.interp(taps, recording.t, column) for column in values.T], axis=2)
+    quantity = {"velocity": "qd", "position": "q", "position_error": "q"}[name]
+    values = measured[quantity] if quantity in measured else recording.joint(quantity)
+    at_taps = np.stack([np.interp(taps, recording.t, column) for column in values.T], axis=2)
+    return recording.joint("q_target")[held] - at_taps if name == "position_error" else at_taps
 
 
 def _whole(recording: Recording, oldest: np.ndarray, period: float) -> np.ndarray:

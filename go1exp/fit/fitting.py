@@ -11,9 +11,9 @@ from importlib.metadata import version
 import numpy as np
 
 from go1exp import __version__
-from go1exp.fit import references
 from go1exp.fit.dataset import JointTorque, Rows, fingerprint, split, windows
 from go1exp.fit.net import ActuatorNet, NetInfo, Provenance, group_names
+from go1exp.fit.references import Reference, command, linear, pd
 from go1exp.fit.regimes import thresholds
 from go1exp.fit.report import Report, report, rmse
 from go1exp.fit.settings import FitError, FitSettings
@@ -70,7 +70,9 @@ def fit(
     kp, kd = _gains(recordings, settings)
     parts = split(recordings, settings.holdout, settings.validation, settings.seed)
     episodes = tuple(r.meta.episode for r in recordings)
-    rows = windows(recordings, settings.inputs, settings.history, period, settings.target, joint_torque)
+    rows = windows(
+        recordings, settings.inputs, settings.history, period, settings.target, joint_torque, settings.smoothing
+    )
     picked = {
         part: rows.take(np.isin(rows.episode, [episodes.index(name) for name in getattr(parts, part)]))
         for part in ("train", "validation", "held_out")
@@ -116,15 +118,15 @@ def fit(
     net = _assemble(info, trained, picked["train"], in_group["train"])
     torque = _predict(net, held_out, group)
     others = [
-        references.command(held_out),
-        references.pd(held_out),
-        references.linear(picked["train"], in_group["train"], held_out, group),
-        references.Reference("half_net", None, "half_net is off"),
+        command(held_out),
+        pd(held_out),
+        linear(picked["train"], in_group["train"], held_out, group),
+        Reference("half_net", None, "half_net is off"),
     ]
     if settings.half_net:
         hidden = tuple(max(1, width // 2) for width in settings.hidden)
         half = _assemble(replace(info, hidden=hidden), networks("half net", hidden), picked["train"], in_group["train"])
-        others[-1] = references.Reference("half_net", _predict(half, held_out, group))
+        others[-1] = Reference("half_net", _predict(half, held_out, group))
     found = report(held_out, torque, others, thresholds(rows, joints), episodes, parts, settings.target)
     provenance = replace(provenance, held_out_rmse=rmse(torque - held_out.y))
     net = replace(net, info=replace(info, provenance=provenance))

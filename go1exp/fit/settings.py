@@ -33,6 +33,7 @@ class FitSettings:
         skip: whether a linear map goes beside them.
         share: one net for all joints (the paper's way), for each kind, or for each joint.
         target: ``tau_est``, what the drive reports, or ``joint_torque``, which the caller computes.
+        smoothing: window over which the inputs' angle and speed are smoothed first, s; None takes them as measured.
         epochs: passes over the training rows, at most; the learning rate falls to zero over them (cosine).
         batch: rows per step.
         learning_rate: Adam's, at the start.
@@ -51,6 +52,7 @@ class FitSettings:
     skip: bool = True
     share: Share = "all"
     target: Target = "tau_est"
+    smoothing: Positive | None = None
     epochs: Count = 60
     batch: Count = 256
     learning_rate: Positive = 5e-3

@@ -29,9 +29,8 @@ class TorchNet(torch.nn.Module):
             self.register_buffer(f"weight_{i}", torch.tensor(w, dtype=torch.float32))
             self.register_buffer(f"bias_{i}", torch.tensor(b[:, None, :], dtype=torch.float32))
         self.register_buffer("skip", torch.tensor(skip, dtype=torch.float32) if skip.any() else None)
-        widths = [w.shape[2] for w in weights[:-1]]
-        self._layers = [torch.empty(CHUNK, width) for width in widths]
-        self._scales = [torch.empty(CHUNK, width) for width in widths]
+        widest = max((w.shape[2] for w in weights[:-1]), default=0)
+        self._scratch = [torch.empty(CHUNK * widest) for _ in range(3)]  # no more: with six the cache overflows
 
     @torch.no_grad()
     def forward(self, rows: Tensor) -> Tensor:
@@ -44,18 +43,22 @@ class TorchNet(torch.nn.Module):
             return self._batched(rows)
         out = rows.new_empty(*rows.shape[:2], 1)
         for k in range(self.nets):
+            layers = [(self._weight(i)[k], self._bias(i)[k, 0]) for i in range(self.depth)]
             for start in range(0, rows.shape[1], CHUNK):
-                self._chunk(k, rows[k, start : start + CHUNK], out[k, start : start + CHUNK])
+                x, tau = rows[k, start : start + CHUNK], out[k, start : start + CHUNK]
+                self._chunk(layers, x, tau)
+                if self.skip is not None:
+                    tau.addmm_(x, self.skip[k])
         return out[..., 0]
 
-    def _chunk(self, k: int, x: Tensor, out: Tensor) -> None:
-        h, n = x, len(x)
-        for i in range(self.depth - 1):
-            h = torch.addmm(self._bias(i)[k], h, self._weight(i)[k], out=self._layers[i][:n])
-            h.div_(torch.abs(h, out=self._scales[i][:n]).add_(1))  # softsign
-        torch.addmm(self._bias(self.depth - 1)[k], h, self._weight(self.depth - 1)[k], out=out)
-        if self.skip is not None:
-            out.addmm_(x, self.skip[k])
+    def _chunk(self, layers: list[tuple[Tensor, Tensor]], x: Tensor, out: Tensor) -> None:
+        h, rows = x, len(x)
+        for i, (weight, bias) in enumerate(layers[:-1]):
+            width = weight.shape[1]
+            layer, scale = (self._scratch[j][: rows * width].view(rows, width) for j in (i % 2, 2))
+            h = torch.addmm(bias, h, weight, out=layer)
+            h.div_(torch.abs(h, out=scale).add_(1))  # softsign
+        torch.addmm(layers[-1][1], h, layers[-1][0], out=out)
 
     def _batched(self, x: Tensor) -> Tensor:
         h = x

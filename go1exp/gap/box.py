@@ -24,7 +24,7 @@ BOX = (
 )
 """Effects that every model has a value for, if only the null one."""
 
-PRIOR = 1.0
+PRIOR = 0.5
 """Standard deviation of a parameter within its tolerance, in tolerances: it settles what the data leave open."""
 
 WIDE = 20.0

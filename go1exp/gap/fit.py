@@ -9,7 +9,13 @@ import numpy as np
 
 from go1exp.gap import box
 from go1exp.gap.likelihood import Layout, Scorer, Table, differences
-from go1exp.gap.replay import Key, Rows, Theta, variants
+from go1exp.gap.replay import Key, Probe, Rows, Theta, null, variants
+
+STEPS = (1.0, 0.3)
+"""Lengths of a Gauss-Newton step that are tried."""
+
+HOPELESS = 0.4
+"""Share of the best gain below which a candidate is not fitted further."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +28,7 @@ class Model:
         free: effects that may leave their tolerances.
         keys: parameters whose columns are refreshed in every step; the rest keep those of the common table.
         chi2: (V, G) per value, on the windows of the fit.
-        error: standard errors by key, of the linear model with chi2 as it is.
+        residual: (V, G, m) there, in units of the noise.
     """
 
     name: str
@@ -30,13 +36,11 @@ class Model:
     free: frozenset[str]
     keys: tuple[Key, ...]
     chi2: np.ndarray | None = None
-    error: Theta | None = None
+    residual: np.ndarray | None = None
 
 
 def stacked(parts: Sequence[Rows]) -> Rows:
     """Put rows one below the other; effects that one has not are null there."""
-    from go1exp.gap.replay import null
-
     effects = dict.fromkeys(effect for rows in parts for effect, _ in rows.values)
     keys = {key: value for effect in effects for key, value in null(effect).items()}
     values = {}
@@ -65,45 +69,84 @@ def scores(scorer: Scorer, thetas: Sequence[Theta], windows: np.ndarray, dt: flo
 def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int, dt: float) -> list[Model]:
     """Fit models on the windows of ``common``, whose columns they share but for those of their own ``keys``.
 
-    Minimises the sum of log chi2 over windows and groups, so that a few violent windows do not decide. A step that
-    does not help is cut.
+    Minimises the sum of log chi2 over windows and groups, so that a few violent windows do not decide. Every group of
+    joints takes the length of step that suits it. Models that gain less than ``HOPELESS`` of the best one's gain after
+    their first step are given up.
     """
-    machine, windows = scorer.replayer.machine, common.windows
-    best: list[Model] = list(models)
-    goal = np.full(len(models), np.inf)
-    tries, steps = [m.theta for m in models], [np.empty(0)] * len(models)
-    columns: list[tuple[list, Layout]] = [([], Layout.of(machine, []))] * len(models)
-    for turn in range(iterations + 1):
+    windows = common.windows
+    first = common.residual[None] if len(models) == 1 and models[0].theta is common.theta else None
+    found = residuals(scorer, [m.theta for m in models], windows, dt) if first is None else first
+    best = [_scored(scorer, m, r, windows) for m, r in zip(models, found, strict=True)]
+    origin = np.log(scorer.chi2(common.residual, windows)).sum()
+    alive = list(range(len(models)))
+    for turn in range(iterations):
+        moves = _moves(scorer, [best[k] for k in alive], common, dt)
+        tries = [_moved(scorer, best[k], move, length) for k, move in zip(alive, moves, strict=True) for length in STEPS]
         found = residuals(scorer, tries, windows, dt)
-        chi2 = [scorer.chi2(one, windows) for one in found]
-        values = [np.log(c).sum() for c in chi2]
-        better = [k for k in range(len(models)) if values[k] < goal[k] - 1e-3]
-        last = turn == iterations
-        for k in better:
-            goal[k] = values[k]
-            best[k] = replace(models[k], theta=tries[k], chi2=chi2[k])
-        if better:
-            own = _refreshed(scorer, [best[k] for k in better], windows, dt)
-            for k, (probes, fresh) in zip(better, own, strict=True):
-                kept = [i for i, p in enumerate(common.probes) if p.key not in models[k].keys]
-                every = [*(common.probes[i] for i in kept), *probes]
-                layout = Layout.of(machine, every)
-                whole = np.concatenate([common.columns[..., kept], fresh], axis=-1)
-                grams = Table(windows, tuple(every), found[k], whole).grams(scorer)
-                weight = 1.0 / np.maximum(chi2[k], 1.0)
-                matrix, right = layout.total(grams * weight[..., None, None])
-                limits = box.bounds(layout, every, best[k].theta, models[k].free)
-                steps[k], columns[k] = box.solve(matrix, right, limits), (every, layout)
-                if last or not np.any(steps[k]):
-                    continue
-            if last:
-                pass
-        for k in range(len(models)):
-            if k not in better:
-                steps[k] = 0.35 * steps[k]
-            if len(steps[k]):
-                tries[k] = box.moved(best[k].theta, columns[k][1], columns[k][0], steps[k], machine)
+        for n, k in enumerate(alive):
+            mine = slice(n * len(STEPS), (n + 1) * len(STEPS))
+            best[k] = _longest(scorer, best[k], moves[n], tries[mine], found[mine], windows)
+        if turn == 0 and len(models) > 1:
+            gain = {k: origin - np.log(_chi2(best[k])).sum() for k in alive}
+            alive = [k for k in alive if gain[k] >= HOPELESS * max(gain.values())]
     return best
+
+
+Move = tuple[list[Probe], Layout, np.ndarray]
+"""Columns, whose unknowns they are, and by how much those move."""
+
+
+def _chi2(model: Model) -> np.ndarray:
+    assert model.chi2 is not None
+    return model.chi2
+
+
+def _scored(scorer: Scorer, model: Model, residual: np.ndarray, windows: np.ndarray) -> Model:
+    return replace(model, residual=residual, chi2=scorer.chi2(residual, windows))
+
+
+def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) -> list[Move]:
+    """Return a Gauss-Newton step for each model."""
+    windows, machine = common.windows, scorer.replayer.machine
+    found = []
+    for model, (probes, fresh) in zip(models, _refreshed(scorer, models, windows, dt), strict=True):
+        kept = [i for i, p in enumerate(common.probes) if p.key not in model.keys]
+        every = [*(common.probes[i] for i in kept), *probes]
+        layout = Layout.of(machine, every)
+        assert model.residual is not None
+        columns = common.columns if len(kept) == len(common.probes) else common.columns[..., kept]
+        whole = np.concatenate([columns, fresh], axis=-1) if probes else columns
+        grams = Table(windows, tuple(every), model.residual, whole, model.theta).grams(scorer)
+        weight = 1.0 / np.maximum(_chi2(model), 1.0)
+        matrix, right = layout.total(grams * weight[..., None, None])
+        found.append((every, layout, box.solve(matrix, right, box.bounds(layout, every, model.theta, model.free))))
+    return found
+
+
+def _moved(scorer: Scorer, model: Model, move: Move, length: float | np.ndarray) -> Theta:
+    columns, layout, x = move
+    return box.moved(model.theta, layout, columns, x * length, scorer.replayer.machine)
+
+
+def _longest(
+    scorer: Scorer, model: Model, move: Move, tries: Sequence[Theta], found: np.ndarray, windows: np.ndarray
+) -> Model:
+    """Return the model moved so far that each group of joints does best; what all share goes where most like it."""
+    machine, layout = scorer.replayer.machine, move[1]
+    chi2 = np.stack([_chi2(model), *(scorer.chi2(r, windows) for r in found)])  # L V G
+    value = np.log(chi2).sum(axis=1)  # L G
+    which = value.argmin(axis=0)
+    lengths = np.array([0.0, *STEPS])
+    shared = int(value.sum(axis=1).argmin())
+    own = np.full(len(machine.joints), lengths[shared])
+    for g, joints in enumerate(machine.groups):
+        own[list(joints)] = lengths[which[g]]
+    theta = _moved(scorer, model, move, np.where(layout.joint < 0, lengths[shared], own[layout.joint.clip(0)]))
+    assert model.residual is not None
+    stacked_residuals = np.concatenate([model.residual[None], found])
+    groups = np.arange(len(machine.groups))
+    residual = np.moveaxis(stacked_residuals[which, :, groups], 0, 1)
+    return replace(model, theta=theta, residual=residual, chi2=np.moveaxis(chi2[which, :, groups], 0, 1))
 
 
 def _refreshed(scorer: Scorer, models: Sequence[Model], windows: np.ndarray, dt: float) -> list[tuple[list, np.ndarray]]:
@@ -111,7 +154,7 @@ def _refreshed(scorer: Scorer, models: Sequence[Model], windows: np.ndarray, dt:
     machine, replayer = scorer.replayer.machine, scorer.replayer
     lots = [box.probes(machine, m.keys, m.theta) for m in models]
     if not any(lots):
-        return [([], differences(scorer, np.repeat(scorer.windows.y[windows][:, None], 1, axis=1), windows, [])) for _ in models]
+        return [([], np.empty(0)) for _ in models]
     parts = [variants(machine, m.theta, windows, probes) for m, probes in zip(models, lots, strict=True)]
     y = replayer.run(stacked(parts), 2.0 * dt)
     found, at = [], 0
@@ -119,22 +162,4 @@ def _refreshed(scorer: Scorer, models: Sequence[Model], windows: np.ndarray, dt:
         mine = y[at : at + len(rows.window)].reshape(len(windows), 1 + len(probes), *y.shape[1:])
         at += len(rows.window)
         found.append((probes, differences(scorer, mine, windows, probes)))
-    return found
-
-
-def errors(scorer: Scorer, model: Model, full: Table) -> Theta:
-    """Return standard errors of a model's parameters from the curvature at its fit, noise as large as the misfit."""
-    machine = scorer.replayer.machine
-    layout = Layout.of(machine, full.probes)
-    grams = full.grams(scorer)
-    chi2 = grams[..., -1, -1] / scorer.size[full.windows][:, None]
-    matrix, _ = layout.total(grams / np.maximum(chi2, 1.0)[..., None, None])
-    limits = box.bounds(layout, full.probes, model.theta, model.free)
-    spread = np.sqrt(np.diag(np.linalg.inv(matrix + np.diag(limits.weight))))
-    found: Theta = {}
-    for i in range(layout.size):
-        key = full.probes[layout.probe[i]].key
-        assert isinstance(key, tuple)
-        wide = len(machine.joints) if box.param(key).per == "joint" else 1
-        found.setdefault(key, np.zeros(wide))[max(int(layout.joint[i]), 0)] = spread[i]
     return found

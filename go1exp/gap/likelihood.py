@@ -162,17 +162,24 @@ class Table:
         probes: the p columns.
         residual: (V, G, m) in units of the noise.
         columns: (V, G, m, p) fall of the residual per unit of each parameter.
+        theta: where.
     """
 
     windows: np.ndarray
     probes: tuple[Probe, ...]
     residual: np.ndarray
     columns: np.ndarray
+    theta: Theta
 
-    def grams(self, scorer: Scorer, others: np.ndarray | None = None) -> np.ndarray:
-        """Return the Gram matrices (V, G, p+1, p+1) of columns and residual; ``others``: further columns between."""
-        parts = [self.columns, *([] if others is None else [others]), self.residual[..., None]]
-        return gram(np.concatenate(parts, axis=-1), scorer.state[self.windows])
+    def part(self, which: np.ndarray) -> Table:
+        """Return the model of some of the windows (numbers within it)."""
+        return dataclasses.replace(
+            self, windows=self.windows[which], residual=self.residual[which], columns=self.columns[which]
+        )
+
+    def grams(self, scorer: Scorer) -> np.ndarray:
+        """Return the Gram matrices (V, G, p+1, p+1) of columns and residual."""
+        return gram(np.concatenate([self.columns, self.residual[..., None]], axis=-1), scorer.state[self.windows])
 
 
 def differences(scorer: Scorer, y: np.ndarray, window: np.ndarray, probes: Sequence[Probe]) -> np.ndarray:
@@ -196,7 +203,7 @@ def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Pr
     residual = scorer.residual(variants(machine, theta, windows, []), dt)
     y = replayer.run(variants(machine, theta, windows, probes), 2.0 * dt)
     y = y.reshape(len(windows), 1 + len(probes), *scorer.windows.y.shape[1:])
-    return Table(windows, tuple(probes), residual, differences(scorer, y, windows, probes))
+    return Table(windows, tuple(probes), residual, differences(scorer, y, windows, probes), theta)
 
 
 def predicted(grams: np.ndarray, layout: Layout, x: np.ndarray) -> np.ndarray:

@@ -148,7 +148,7 @@ def screen(
     columns = _columns(scorer, theta, own.windows, every, dt)
     size = scorer.size[own.windows][:, None]
     found = []
-    full = Table(own.windows, (*own.probes, *every), own.residual, np.concatenate([own.columns, columns], axis=-1))
+    full = Table(own.windows, (*own.probes, *every), own.residual, np.concatenate([own.columns, columns], axis=-1), theta)
     grams = full.grams(scorer)
     before = grams[..., -1, -1] / size
     weight = 1.0 / np.maximum(before, 1.0)
@@ -167,12 +167,24 @@ def screen(
         x = box.solve(matrix, right, limits)
         after = predicted(part, layout, x) / size
         gain = float(np.mean(np.log(before.sum(1) / np.maximum(after, 0.3).sum(1))))
-        start = box.moved(theta, Layout.of(machine, own.probes), own.probes, x[: Layout.of(machine, own.probes).size], machine)
-        extra = Layout.of(machine, variant.probes)
-        start = variant.start(start, extra, x[layout.size - extra.size :], machine)
+        start = _start(theta, variant, own.probes, layout, x, machine)
         mine = added or [k for k, p in enumerate(own.probes) if p.key[0] == variant.effect]
         found.append(Screened(variant, start, gain, _signal(grams, full.probes, mine, size)))
     return sorted(found, key=lambda s: -s.gain)
+
+
+def _start(
+    theta: Theta, variant: Variant, known: Sequence[Probe], layout: Layout, x: np.ndarray, machine: Machine
+) -> Theta:
+    """Return where a fit begins: the present values with the variant's effect alone moved.
+
+    What else the linear model would move, it would move too far: with the effect so large, it is no longer right.
+    """
+    if variant.probes:
+        extra = Layout.of(machine, variant.probes)
+        return variant.start(theta, extra, x[layout.size - extra.size :], machine)
+    own = np.array([known[k].key[0] == variant.effect for k in layout.probe])
+    return box.moved(theta, layout, known, np.where(own, x, 0.0), machine)
 
 
 def _signal(grams: np.ndarray, probes: Sequence[Probe], mine: Sequence[int], size: np.ndarray) -> float:

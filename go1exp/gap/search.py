@@ -20,6 +20,9 @@ Progress = Callable[[str, float], None]
 SILENT = 0.02
 """An effect that adds less than this to the chi2 of every window, at twice its tolerance, is not excited."""
 
+SCREENED = 20
+"""Windows in which candidates are screened, at most."""
+
 
 def excess(chi2: np.ndarray) -> float:
     """Return the mean excess of chi2 per value (V, G)."""
@@ -49,6 +52,7 @@ class Search:
         candidates: the evidence.
         signal: effect -> how loud it would be at twice its tolerance.
         steps: (what, held-out excess) after every accepted term.
+        own: the linear model of what may move, with the residuals at ``theta`` and changes near it.
     """
 
     scorer: Scorer
@@ -64,6 +68,7 @@ class Search:
     candidates: list[Candidate] = field(default_factory=list)
     signal: dict[str, float] = field(default_factory=dict)
     steps: list[tuple[str, float]] = field(default_factory=list)
+    own: Table | None = None
 
     @property
     def keys(self) -> tuple[Key, ...]:
@@ -80,12 +85,11 @@ class Search:
         """Fit all that may move, on the windows for training; return chi2 (V, G) there."""
         for _ in range(rounds):
             own = self.linear(self.theta, self.splits.train)
-            model = Model("", self.theta, frozenset(self.terms), ())
-            (best,) = fit(self.scorer, [model], own, 2, self.dt)
-            before, self.theta = self.theta, best.theta
-            if before is self.theta:
-                break
+            (best,) = fit(self.scorer, [Model("", self.theta, frozenset(self.terms), ())], own, 2, self.dt)
+            self.theta = best.theta
+        assert best.residual is not None
         assert best.chi2 is not None
+        self.own = replace(own, residual=best.residual, theta=best.theta)
         return best.chi2
 
     def held_out(self, theta: Theta, windows: np.ndarray | None = None) -> np.ndarray:
@@ -124,10 +128,15 @@ class Search:
             self._eliminate(now)
 
     def _screened(self) -> tuple[list[Screened], Table]:
-        own = self.linear(self.theta, self.splits.train)
+        assert self.own is not None
         mean = self.scorer.windows.y[:, :, 0].mean((0, 1))
         ways = library(self.scorer.replayer.machine, mean, self.terms)
-        return screen(self.scorer, self.theta, own, self.terms, ways, self.dt), own
+        count = len(self.own.windows)
+        # Half of the windows that are looked at are the worst, half are spread evenly.
+        worst = np.argsort(-self.scorer.chi2(self.own.residual, self.own.windows).sum(1))[: SCREENED // 2]
+        evenly = np.linspace(0, count - 1, min(SCREENED // 2, count)).astype(int)
+        some = self.own.part(np.unique([*worst, *evenly]))
+        return screen(self.scorer, self.theta, some, self.terms, ways, self.dt), self.own
 
     def _listen(self, found: Sequence[Screened]) -> None:
         for s in found:

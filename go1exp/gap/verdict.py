@@ -63,14 +63,14 @@ def not_excited(signal: Mapping[str, float]) -> dict[str, str]:
 
 
 def finish(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
-    """Fit once more on all windows, and resample them.
+    """Fit once more, on all windows but those for the last check, and resample them.
 
     Returns:
         The values, and by parameter of the terms their resampled values (B, J) or (B, 1).
     """
     scorer, machine = search.scorer, search.scorer.replayer.machine
-    everything = np.arange(len(scorer.windows))
-    own = search.linear(search.theta, everything)
+    fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
+    own = search.linear(search.theta, fitted)
     model = Model("", search.theta, frozenset(search.terms), ())
     (best,) = fit(scorer, [model], own, 1, search.dt)
     assert best.chi2 is not None
@@ -81,7 +81,7 @@ def finish(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
     grams = own.grams(scorer)
     grams = grams / np.maximum(best.chi2, 1.0)[..., None, None]
     limits = box.bounds(layout, own.probes, search.theta, search.terms)
-    episode = scorer.windows.episode
+    episode = scorer.windows.episode[fitted]
     drawn: dict[Key, list[np.ndarray]] = {}
     whole, right = layout.total(grams)
     root = np.linalg.cholesky(np.linalg.inv(whole + np.diag(limits.weight)))
