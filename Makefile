@@ -58,11 +58,13 @@ check: setup ## formatting, lint and types; changes nothing
 	@echo "check 3/3: mypy"
 	@$(BIN)/mypy
 
-bench: setup ## measure the speed of the environment and of training
-	@echo "bench 1/2: environment"
+bench: setup ## measure the speed of the environment, of training, of nets and effects
+	@echo "bench 1/3: environment"
 	@$(BIN)/go1exp bench suite=env
-	@echo "bench 2/2: training"
+	@echo "bench 2/3: training"
 	@$(BIN)/go1exp bench suite=train
+	@echo "bench 3/3: nets, effects, recording"
+	@$(BIN)/go1exp bench suite=actuator
 
 # An override that never applies takes torch, and with it the CUDA packages, out of the resolution.
 lock: ## resolve requirements/base.in into requirements/lock.txt, keeping the pins that still fit

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.drive import DriveSetup
 from go1exp.config import TaskConfig
+from go1exp.drive import DriveSetup
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.physics.mujoco_cpu import MujocoCpu

@@ -44,6 +44,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "terrain.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "config.py": (*FOREIGN, "omegaconf", "go1exp.compose", *UP),
     "joint_values.py": (*FOREIGN, "torch", "go1exp"),
+    "rotation.py": (*FOREIGN, "go1exp"),
     "delay_line.py": (*FOREIGN, "go1exp.registry", "go1exp.robot", "go1exp.mdp", *UP),
     "drive.py": (*FOREIGN, "go1exp.registry", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
     # recordings, which need no robot and no engine

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 import go1exp.excitations
 import go1exp.record.policy  # noqa: F401  (registers every excitation)
@@ -174,6 +175,19 @@ def test_a_hidden_effect_moves_the_robot_and_leaves_no_name_in_the_file(tmp_path
     assert hidden.meta == plain.meta
     for word in (b"coulomb", b"encoder_offset", b"effect"):
         assert word not in file.read_bytes()
+
+
+def test_a_tilt_that_nobody_knows_of_shows_in_the_attitude_that_the_imu_tells() -> None:
+    tilt = ["+effect.base_tilt={roll: 0.1, pitch: -0.15}", "sensors.truth=true", "seconds=1.0"]
+    for motion in ("slow_ramps", "squat"):  # hung and free
+        (r,) = make(f"excitation=[{motion}]", *tilt)
+        attitude = Rotation.from_quat(r.block(*(f"imu_quat_{a}" for a in "wxyz")), scalar_first=True)
+        up = attitude.inv().apply([0.0, 0.0, 1.0]).mean(0)
+        acc = r.block("imu_acc_x", "imu_acc_y", "imu_acc_z").mean(0)
+        np.testing.assert_allclose(up, acc / np.linalg.norm(acc), atol=0.02)
+        if motion == "slow_ramps":
+            assert r.meta.base_quat == (1.0, 0.0, 0.0, 0.0)
+            assert np.arccos(up[2]) == pytest.approx(np.arccos(np.cos(0.1) * np.cos(0.15)), abs=1e-3)
 
 
 def test_recordings_of_a_clean_robot_pass_the_audit(hung: list[Recording]) -> None:

@@ -135,8 +135,8 @@ class Net(Memory):
     def _evaluate(self) -> Tensor:
         """(N, J) the nets' torques for the present taps."""
         _, _, joints, n = self._taps.shape
-        columns = self._mlp().unflatten(0, (joints, -1))[:, :n]
-        tau = columns.index_select(0, self._back).t().to(self._limit.dtype)
+        columns = self._mlp().unflatten(0, (joints, -1))[:, :n].index_select(0, self._back)
+        tau = columns.t().to(self._limit.dtype, memory_format=torch.contiguous_format)
         return torch.clamp(tau, -self._limit, self._limit)
 
     def _read(self, into: Tensor, target: Tensor, q: Tensor, qd: Tensor) -> None:

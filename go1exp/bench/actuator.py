@@ -34,7 +34,7 @@ def small_net(rig: simulate.Rig, sensors: SensorConfig, folder: Path) -> Path:
     wishes = plan.Wishes(((20.0, 0.5),), 10.0, (0, 1, 2), 0, "hung", ((0.0, 0.0),), 0, sensors)
     motion = Term("multisine", members("excitation")["multisine"], {})
     made = simulate.play(rig, plan.episodes([motion], wishes), sensors, 0, lambda done, total: None)
-    result = fit(made, FitSettings(epochs=15), lambda *_: None)
+    result = fit(made, FitSettings(share="kind", epochs=15, half_net=False))
     file = folder / "net.npz"
     result.net.save(file)
     return file

@@ -20,6 +20,7 @@ from go1exp.bench.measure import Subject, rates, ratio
 from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.gym_env import Go1Env
+from go1exp.joint_values import spread
 from go1exp.physics.scene import build_model
 from go1exp.terrain import build_terrain
 
@@ -54,12 +55,13 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
     origins = terrain.tile_origins.reshape(-1, 3)
     qpos[:, :3] += origins[np.arange(num_envs) % len(origins)]
     limit = robot.per_joint(task.robot.effort_limit)
-    gains = task.actuator.parameters
+    kp, kd = (task.actuator.parameters.get(name, usual) for name, usual in (("kp", 20.0), ("kd", 0.5)))
+    kp, kd = spread(kp, robot.JOINTS), spread(kd, robot.JOINTS)
     rng = np.random.default_rng(0)
 
     def work() -> int:
         target = robot.NOMINAL_STANCE + task.action.scale * ACTION_SCALE * rng.normal(size=(num_envs, 12))
-        torque = gains["kp"] * (target - qpos[:, 7:]) - gains["kd"] * qvel[:, 6:]
+        torque = kp * (target - qpos[:, 7:]) - kd * qvel[:, 6:]
         np.clip(torque, -limit, limit, out=ctrl)
         batch.step(nstep=task.sim.decimation)
         return num_envs

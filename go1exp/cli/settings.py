@@ -173,7 +173,7 @@ class BenchSettings:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    suite: Literal["env", "train"]
+    suite: Literal["env", "train", "actuator"]
     num_envs: Count
     rounds: Count
     seconds: Positive

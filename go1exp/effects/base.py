@@ -66,6 +66,7 @@ class Measured:
         gravity: (N, 3) direction of gravity in the IMU's frame, unit length.
         gyro: (N, 3) rad/s in the IMU's frame.
         acc: (N, 3) specific force in the IMU's frame, m/s2.
+        quat: (N, 4) orientation of the IMU in the world, w-x-y-z.
     """
 
     joint_pos: Tensor
@@ -73,6 +74,7 @@ class Measured:
     gravity: Tensor | None = None
     gyro: Tensor | None = None
     acc: Tensor | None = None
+    quat: Tensor | None = None
 
 
 @dataclass

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Measured, Param
 from go1exp.registry import effect
+from go1exp.rotation import quat_multiply
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -53,9 +54,17 @@ class BaseTilt(Effect):
         gravity.copy_(torch.where((self.roll == 0.0) & (self.pitch == 0.0), gravity, turned))
 
     def on_sensor(self, measured: Measured) -> Measured:
-        """Turn what the IMU says; a held one feels gravity as it is."""
+        """Turn what the IMU says; a held one feels gravity as it is, and tells an attitude to match."""
         turned = ("gravity", "gyro", "acc") if self.setup.floating else ("gravity",)
         found = {name: getattr(measured, name) for name in turned}
-        return dataclasses.replace(
-            measured, **{k: _tilted(self.roll, self.pitch, v) for k, v in found.items() if v is not None}
-        )
+        seen = {k: _tilted(self.roll, self.pitch, v) for k, v in found.items() if v is not None}
+        if measured.quat is not None:
+            seen["quat"] = self._attitude(measured.quat)
+        return dataclasses.replace(measured, **seen)
+
+    def _attitude(self, quat: Tensor) -> Tensor:
+        """Return the orientation (N, 4) of a frame that is tilted in the one of orientation ``quat``."""
+        roll, pitch = 0.5 * self.roll.to(quat.dtype), 0.5 * self.pitch.to(quat.dtype)
+        (sr, cr), (sp, cp) = (torch.sin(roll), torch.cos(roll)), (torch.sin(pitch), torch.cos(pitch))
+        turned = quat_multiply(quat, torch.cat([cp * cr, cp * sr, sp * cr, -sp * sr], dim=1))  # pitch, then roll
+        return torch.where((self.roll == 0.0) & (self.pitch == 0.0), quat, turned)

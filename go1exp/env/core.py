@@ -17,7 +17,6 @@ from go1exp import robot
 from go1exp.config import BackendConfig, TaskConfig
 from go1exp.env.faults import NumericalFault
 from go1exp.env.plant import Plant, drive_setup
-from go1exp.mdp.derived import rotate_inverse
 from go1exp.mdp.foot_timers import FootTimers
 from go1exp.mdp.ground import GroundHeight
 from go1exp.mdp.kinematics import KinematicState
@@ -25,6 +24,7 @@ from go1exp.physics.backend import PhysicsBackend
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
 from go1exp.randomness import EnvRandom
+from go1exp.rotation import rotate_inverse
 from go1exp.terrain import build_terrain
 from go1exp.types import Snapshot, StepResult
 

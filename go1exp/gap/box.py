@@ -86,7 +86,11 @@ def bounds(layout: Layout, columns: Sequence[Probe], theta: Mapping[Key, np.ndar
         assert isinstance(probe.key, tuple)
         p = param(probe.key)
         j = max(int(layout.joint[i]), 0)
-        value = float(np.ravel(theta.get(probe.key, np.array([p.null])))[j if probe.key in theta and theta[probe.key].size > 1 else 0])
+        value = float(
+            np.ravel(theta.get(probe.key, np.array([p.null])))[
+                j if probe.key in theta and theta[probe.key].size > 1 else 0
+            ]
+        )
         wide = probe.key[0] in free or not math.isfinite(p.tolerance)
         reach = math.inf if wide else p.tolerance
         low[i] = max(p.low, p.null - reach) - value

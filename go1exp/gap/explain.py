@@ -16,7 +16,7 @@ from go1exp.gap.fit import residuals
 from go1exp.gap.judge import splits
 from go1exp.gap.likelihood import Scorer, scorer
 from go1exp.gap.localise import localise
-from go1exp.gap.replay import HungGo1, Machine, Replayer, Theta, variants
+from go1exp.gap.replay import Machine, Replayer, Theta, hung, variants
 from go1exp.gap.result import Floors, GapResult, GapSettings, Overlay
 from go1exp.gap.search import Progress, Search, excess, removed
 from go1exp.gap.windows import Windows, cut
@@ -52,7 +52,7 @@ def explain(
     """
     start = time.perf_counter()
     settings = settings or GapSettings()
-    machine: Machine = HungGo1(config) if isinstance(config, RobotConfig) else config
+    machine = hung(config) if isinstance(config, RobotConfig) else config
     on_progress("auditing the logs", 0.0)
     flaws = [line for r in recordings for line in unusable(r, machine)]
     if flaws:
@@ -206,7 +206,9 @@ def overlays(
         def curves(y: np.ndarray, valid: np.ndarray = valid) -> dict[str, np.ndarray]:
             return {f"{q}_{j}": y[valid, c, i] for c, q in enumerate(w.quantities) for i, j in enumerate(w.joints)}
 
-        noise = {f"{q}_{j}": float(w.scale[window, c, i]) for c, q in enumerate(w.quantities) for i, j in enumerate(w.joints)}
+        noise = {
+            f"{q}_{j}": float(w.scale[window, c, i]) for c, q in enumerate(w.quantities) for i, j in enumerate(w.joints)
+        }
         found.append(
             Overlay(
                 recordings[w.episode[window]].meta.episode,

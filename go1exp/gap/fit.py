@@ -80,15 +80,19 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
     origin = np.log(scorer.chi2(common.residual, windows)).sum()
     alive = list(range(len(models)))
     for turn in range(iterations):
+        if not alive:
+            break
         moves = _moves(scorer, [best[k] for k in alive], common, dt)
-        tries = [_moved(scorer, best[k], move, length) for k, move in zip(alive, moves, strict=True) for length in STEPS]
+        tries = [
+            _moved(scorer, best[k], move, length) for k, move in zip(alive, moves, strict=True) for length in STEPS
+        ]
         found = residuals(scorer, tries, windows, dt)
         for n, k in enumerate(alive):
             mine = slice(n * len(STEPS), (n + 1) * len(STEPS))
             best[k] = _longest(scorer, best[k], moves[n], tries[mine], found[mine], windows)
         if turn == 0 and len(models) > 1:
             gain = {k: origin - np.log(_chi2(best[k])).sum() for k in alive}
-            alive = [k for k in alive if gain[k] >= HOPELESS * max(gain.values())]
+            alive = [k for k in alive if gain[k] > 0.0 and gain[k] >= HOPELESS * max(gain.values())]
     return best
 
 
@@ -149,7 +153,9 @@ def _longest(
     return replace(model, theta=theta, residual=residual, chi2=np.moveaxis(chi2[which, :, groups], 0, 1))
 
 
-def _refreshed(scorer: Scorer, models: Sequence[Model], windows: np.ndarray, dt: float) -> list[tuple[list, np.ndarray]]:
+def _refreshed(
+    scorer: Scorer, models: Sequence[Model], windows: np.ndarray, dt: float
+) -> list[tuple[list, np.ndarray]]:
     """Return probes and columns (V, G, m, p) of the models' own keys at their values."""
     machine, replayer = scorer.replayer.machine, scorer.replayer
     lots = [box.probes(machine, m.keys, m.theta) for m in models]

@@ -112,7 +112,7 @@ class Layout:
     """Which unknown each column of each group belongs to.
 
     Attributes:
-        index: (G, p) unknown of column p in group g: parameters per joint have one for each group, those of the robot one.
+        index: (G, p) unknown of column p in group g: one for each group, but one in all for a parameter of the robot.
         size: number of unknowns.
         joint: (size,) joint of each unknown, -1 for the robot.
         probe: (size,) column of each.

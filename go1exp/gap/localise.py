@@ -83,7 +83,7 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     larger = np.zeros(count.shape)
     for _ in range(SHUFFLES):
         larger += _means(score, there[:, rng.permutation(len(windows))], count) >= seen
-    enough = (count > 20) & (there.any((2)).sum(1) > 2)
+    enough = (count > 20) & (there.any(2).sum(1) > 2)
     p[enough] = ((1 + larger) / (SHUFFLES + 1))[enough]
     flagged = np.zeros(count.shape, dtype=bool)
     if enough.any():

@@ -30,15 +30,19 @@ Theta = dict[Key, np.ndarray]
 """Values by key: (J,) per joint, or (1,) of the robot."""
 
 NEEDLESS = 1 << 4 | 1 << 13
-"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air has no use for; half of the step's time."""
+"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
 
 
 class Machine(Protocol):
     """A robot that can be replayed."""
 
-    joints: tuple[str, ...]
-    groups: tuple[tuple[int, ...], ...]
-    """Joints that move together, equally many in each group; groups do not feel each other."""
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints."""
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Joints that move together, equally many in each group; groups do not feel each other."""
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
@@ -60,6 +64,11 @@ class HungGo1:
         model.opt.disableflags |= NEEDLESS
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+
+
+def hung(config: RobotConfig) -> Machine:
+    """Return a Go1 whose trunk is held."""
+    return HungGo1(config)
 
 
 @dataclass(frozen=True)
@@ -221,9 +230,7 @@ class Replayer:
         return _sampled(q, qd, torque, w.t[rows.window] / dt - first, dt)
 
 
-def _sampled(
-    q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float
-) -> np.ndarray:
+def _sampled(q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float) -> np.ndarray:
     """Interpolate (K, R, J) to the times ``at`` (R, n), in steps: angles by cubics, the rest by lines."""
     low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(q) - 2)
     share = np.maximum(at - low, 0.0)[..., None]
@@ -282,4 +289,3 @@ def variants(
             full[key][mine] = value
         full[probe.key][mine, columns] += probe.delta[columns]
     return Rows(np.repeat(windows, size), full, q, qd)
-

@@ -210,7 +210,7 @@ class GapResult:
         bags: effect -> share of the bags in which it was found.
         waterfall: (label, excess) from the plain model down to what remains.
         overlays: windows to look at.
-        box: parameters of the nominal model within their tolerances: effect -> parameter -> joint or ``robot`` -> value.
+        box: parameters within their tolerances: effect -> parameter -> joint or ``robot`` -> value.
         provenance: hashes, versions, seeds, steps.
         warnings: what a reader must know, a sentence each.
         seconds: time it took.

@@ -69,7 +69,10 @@ class Variant:
             sine, cosine = np.zeros(len(machine.joints)), np.zeros(len(machine.joints))
             for i in range(layout.size):
                 (sine if layout.probe[i] < len(self.probes) // 2 else cosine)[layout.joint[i]] = x[i]
-            found = {(self.effect, "amplitude"): np.hypot(sine, cosine), (self.effect, "phase"): np.arctan2(cosine, sine)}
+            found = {
+                (self.effect, "amplitude"): np.hypot(sine, cosine),
+                (self.effect, "phase"): np.arctan2(cosine, sine),
+            }
             return {**theta, **found}
         return box.moved({**theta, **self.shapes}, layout, self.probes, x, machine)
 
@@ -99,7 +102,8 @@ def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -
             continue
         for given in SHAPES.get(effect, ({},)):
             shapes: Theta = {
-                (effect, name): (mean.copy() if math.isnan(value) else np.array([value])) for name, value in given.items()
+                (effect, name): (mean.copy() if math.isnan(value) else np.array([value]))
+                for name, value in given.items()
             }
             for level in LEVELS.get(effect, ({},)):
                 wanted = [key for key in keys if not level or key[1] in level]
@@ -148,7 +152,9 @@ def screen(
     columns = _columns(scorer, theta, own.windows, every, dt)
     size = scorer.size[own.windows][:, None]
     found = []
-    full = Table(own.windows, (*own.probes, *every), own.residual, np.concatenate([own.columns, columns], axis=-1), theta)
+    full = Table(
+        own.windows, (*own.probes, *every), own.residual, np.concatenate([own.columns, columns], axis=-1), theta
+    )
     grams = full.grams(scorer)
     before = grams[..., -1, -1] / size
     weight = 1.0 / np.maximum(before, 1.0)
@@ -168,7 +174,7 @@ def screen(
         after = predicted(part, layout, x) / size
         gain = float(np.mean(np.log(before.sum(1) / np.maximum(after, 0.3).sum(1))))
         start = _start(theta, variant, own.probes, layout, x, machine)
-        mine = added or [k for k, p in enumerate(own.probes) if p.key[0] == variant.effect]
+        mine = [*added, *(k for k, p in enumerate(own.probes) if p.key[0] == variant.effect)]
         found.append(Screened(variant, start, gain, _signal(grams, full.probes, mine, size)))
     return sorted(found, key=lambda s: -s.gain)
 
@@ -223,4 +229,3 @@ def _columns(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence
 def _sizes(scorer: Scorer) -> tuple[int]:
     w = scorer.windows
     return (w.t.shape[1] * len(w.quantities) * len(scorer.replayer.machine.groups[0]),)
-

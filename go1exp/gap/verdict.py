@@ -14,7 +14,7 @@ from go1exp.gap.likelihood import Layout
 from go1exp.gap.replay import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.screen import GROUND
-from go1exp.gap.search import SILENT, Search, excess
+from go1exp.gap.search import SILENT, Search
 
 RECORD: dict[str, str] = {
     "coulomb": "slow_ramps",
@@ -39,7 +39,10 @@ RECORD: dict[str, str] = {
 
 TELL: tuple[tuple[frozenset[str], str], ...] = (
     (frozenset({"kd_scale", "viscous"}), "record torque_off swings, or two values of kd (gains=[[20,0.5],[20,1.0]])"),
-    (frozenset({"base_tilt", "encoder_offset", "link_com"}), "record two attitudes of the trunk (hang=[[0,0],[0,0.5]])"),
+    (
+        frozenset({"base_tilt", "encoder_offset", "link_com"}),
+        "record two attitudes of the trunk (hang=[[0,0],[0,0.5]])",
+    ),
     (frozenset({"torque_delay", "lag"}), "record steps, whose edges tell a delay from a lag"),
     (frozenset({"strength", "kp_scale", "armature", "link_mass"}), "record slow_ramps and a chirp at two gain sets"),
 )
@@ -83,12 +86,14 @@ def finish(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
     limits = box.bounds(layout, own.probes, search.theta, search.terms)
     episode = scorer.windows.episode[fitted]
     drawn: dict[Key, list[np.ndarray]] = {}
-    whole, right = layout.total(grams)
-    root = np.linalg.cholesky(np.linalg.inv(whole + np.diag(limits.weight)))
+    spread = 1.0 / np.sqrt(limits.weight)
     for _ in range(max(search.settings.bags, 20)):
         matrix, right = layout.total(grams[judge.resampled(episode, search.rng)])
-        # Few episodes resample too little: the noise that the curvature promises comes on top.
-        x = box.solve(matrix, right, limits) + 0.5 * root @ search.rng.standard_normal(layout.size)
+        # The nominal values are themselves uncertain by their tolerances, and motion fixes many of them only relative
+        # to each other: drawing where they lie makes the interval say so.
+        x = box.solve(
+            matrix, right, replace(limits, centre=limits.centre + spread * search.rng.standard_normal(layout.size))
+        )
         values = box.moved(search.theta, layout, own.probes, x, machine)
         for key, value in values.items():
             if key[0] in search.terms:
@@ -96,7 +101,9 @@ def finish(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
     return theta, {key: np.stack([np.ravel(v) for v in values]) for key, values in drawn.items()}
 
 
-def name_terms(search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], adequate: bool) -> tuple[NamedEffect, ...]:
+def name_terms(
+    search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], adequate: bool
+) -> tuple[NamedEffect, ...]:
     """Return what was found, with intervals; the joints are those where it leaves its tolerance beyond doubt."""
     joints = search.scorer.windows.joints
     found = []
@@ -121,9 +128,7 @@ def name_terms(search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], ad
             low, high = (np.broadcast_to(v, len(names)) for v in (low, high))
             kept = [k for k, n in enumerate(names) if n == "robot" or n in where]
             params[p.name] = {names[k]: float(value[k]) for k in kept}
-            interval[p.name] = {
-                names[k]: (float(min(low[k], value[k])), float(max(high[k], value[k]))) for k in kept
-            }
+            interval[p.name] = {names[k]: (float(min(low[k], value[k])), float(max(high[k], value[k]))) for k in kept}
         stable = search.shares.get(effect, 0.0) >= search.settings.certified
         certified = stable and (adequate or number == 0)
         status = "certified" if certified else "compensating"
@@ -134,7 +139,7 @@ def name_terms(search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], ad
 
 
 def decide(search: Search, first: float, final: float) -> Verdict:
-    """Return the verdict; ``first`` and ``final`` are the held-out excesses within the tolerances and with the terms."""
+    """Return the verdict from the held-out excesses within the tolerances, and with the terms."""
     settings = search.settings
     loud = [effect for effect, s in search.signal.items() if s >= SILENT]
     if search.terms:
@@ -169,12 +174,15 @@ def sentence(
     first, final = 1.0 + excesses["box"], 1.0 + excesses["final"]
     parts = []
     if verdict == "no gap":
-        parts.append(f"The model agrees with these logs within its tolerances: error {first:.3g} times the noise floor.")
+        parts.append(
+            f"The model agrees with these logs within its tolerances: error {first:.3g} times the noise floor."
+        )
     elif verdict == "not excited":
         parts.append("These logs move too little to compare the model with.")
     elif verdict == "unexplained":
         parts.append(
-            f"The model is wrong, with an error of {first:.3g} times the noise floor, and no effect of the library explains it."
+            f"The model is wrong, with an error of {first:.3g} times the noise floor, and no effect of the library "
+            "explains it."
         )
     for effect in named:
         sizes = [key[1] for key in box.sizes(effect.effect)]
@@ -191,7 +199,9 @@ def sentence(
         doubt = "" if effect.status == "certified" else " (compensating, not certified)"
         parts.append(f"{effect.effect} is missing{at}: {'; '.join(texts)}{doubt}.")
     if named:
-        parts.append(f"With that the held-out error falls from {first:.3g} to {final:.3g} times the noise floor (floor 1).")
+        parts.append(
+            f"With that the held-out error falls from {first:.3g} to {final:.3g} times the noise floor (floor 1)."
+        )
     if verdict == "partly explained":
         parts.append("The rest is explained by nothing in the library, so what is named may stand for something else.")
     rejected = [c.effect for c in search.candidates if c.status == "rejected" and c.stage == 1][:2]
@@ -207,7 +217,9 @@ def evidence(search: Search) -> tuple[Candidate, ...]:
     """Return the candidates, best first, with those that the data cannot show."""
     seen = {c.effect for c in search.candidates}
     quiet = [
-        Candidate(effect, (), {}, math.nan, 0.0, 1.0, 0.0, (effect,), "not excited", "twice its tolerance would not show")
+        Candidate(
+            effect, (), {}, math.nan, 0.0, 1.0, 0.0, (effect,), "not excited", "twice its tolerance would not show"
+        )
         for effect, loud in search.signal.items()
         if loud < SILENT and effect not in seen
     ]

@@ -126,7 +126,7 @@ def noise(recordings: Sequence[Recording], quantity: str) -> np.ndarray:
 
 
 def _start(t: np.ndarray, q: np.ndarray, qd: np.ndarray, at: float, sd: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Fit a cubic to angles and speeds about an instant; return angle, speed, acceleration, and the misfit in units of noise (J,)."""
+    """Fit a cubic about an instant; return angle, speed, acceleration, and the misfit in units of noise (J,)."""
     near = np.abs(t - at) <= FIT_S
     x = t[near] - at
     one, zero = np.ones_like(x), np.zeros_like(x)
@@ -158,12 +158,12 @@ def cut(recordings: Sequence[Recording], settings: GapSettings) -> Windows:
     joints = recordings[0].meta.joints
     quantities = QUANTITIES if settings.torque and all(r.has("tau_est") for r in recordings) else QUANTITIES[:2]
     sd = np.stack([noise(recordings, name) for name in quantities])
-    period = float(np.median([np.median(np.diff(r.t)) for r in recordings]))
+    clocks = [even_clock(r) for r in recordings]
+    period = float(np.median([np.median(np.diff(t)) for t in clocks]))
     rows: list[dict[str, Any]] = []
     long = settings.burn_s + settings.window_s
     most = int(np.ceil(settings.window_s / period)) + 1
-    for number, r in enumerate(recordings):
-        t = even_clock(r)
+    for number, (r, t) in enumerate(zip(recordings, clocks, strict=True)):
         y = np.stack([r.joint(name) for name in quantities], axis=1)
         target = r.joint("q_target")
         on = r.channels.get("torque_enable", np.ones(len(t), dtype=bool)).astype(bool)
@@ -222,6 +222,6 @@ def _padded(values: np.ndarray, rows: int) -> np.ndarray:
 
 
 def held(changes: tuple[np.ndarray, np.ndarray], times: np.ndarray) -> np.ndarray:
-    """Return the values (K, ...) of a held signal at evenly spaced ``times`` (K,); it changes at the nearest of them."""
+    """Return the values (K, ...) of a held signal at even ``times`` (K,); it changes at the nearest of them."""
     index = np.searchsorted(changes[0], times + 0.49 * (times[1] - times[0]), side="right") - 1
     return np.asarray(changes[1][index.clip(0)])

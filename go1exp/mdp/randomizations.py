@@ -16,10 +16,10 @@ from pydantic import AfterValidator, Field
 
 from go1exp import robot
 from go1exp.drive import ModelFields
-from go1exp.mdp.derived import quat_from_rotvec, quat_multiply
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.randomness import Stream
 from go1exp.registry import PositiveRange, Range, ordered, randomization
+from go1exp.rotation import quat_from_rotvec, quat_multiply
 
 if TYPE_CHECKING:
     from torch import Tensor

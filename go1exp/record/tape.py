@@ -53,10 +53,13 @@ class Tape:
         readings = plant.backend.sensordata
         quat = readings[:, blocks.imu_quat]
         seen = plant.effects.measure(
-            Measured(plant.q, plant.speed(), gyro=readings[:, blocks.imu_gyro], acc=readings[:, blocks.imu_acc])
+            Measured(
+                plant.q, plant.speed(), gyro=readings[:, blocks.imu_gyro], acc=readings[:, blocks.imu_acc], quat=quat
+            )
         )
         assert seen.gyro is not None
         assert seen.acc is not None
+        assert seen.quat is not None
         contact = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))
         found = {
             "q": seen.joint_pos,
@@ -65,7 +68,7 @@ class Tape:
             "tau_est": plant.torque,
             "gyro": seen.gyro,
             "acc": seen.acc,
-            "quat": quat,
+            "quat": seen.quat,
             "foot_force": contact[..., 1:].norm(dim=-1),
             "torque_enable": self.enabled,
         }

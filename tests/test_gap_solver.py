@@ -1,0 +1,214 @@
+"""``go1exp.gap``: the statistics against brute force, and the solver on a robot whose secret we know."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+import go1exp.excitations  # noqa: F401  (registers every excitation)
+from go1exp.cli.record import RIG
+from go1exp.cli.settings import RecordSettings, parse
+from go1exp.compose import compose
+from go1exp.config import parse_parts
+from go1exp.gap import EXIT_CODES, GapResult, GapSettings, explain
+from go1exp.gap.box import Bounds, solve
+from go1exp.gap.judge import max_t, splits
+from go1exp.gap.likelihood import Layout, gram, predicted
+from go1exp.gap.replay import HungGo1, Probe
+from go1exp.gap.windows import even_clock, held, noise
+from go1exp.record import plan, simulate
+from go1exp.recording import Meta, Recording
+from go1exp.registry import bind
+
+QUICK = GapSettings(stride_s=0.6, window_s=0.2, shortlist=2, iterations=2, bags=20, overlays=1)
+
+
+def robot(*overrides: str) -> tuple[simulate.Rig, list[Recording]]:
+    """Record a hung robot: three gain sets, a chirp each, 2.5 s."""
+    gains = "gains=[[20,0.5],[35,0.6],[35,1.2]]"
+    container = compose(
+        "record",
+        ["backend.threads=1", "physics_dt=0.0005", "seconds=2.5", "excitation=[chirp]", gains, *overrides],
+    )
+    parts, problems = parse_parts(container, RIG)
+    assert problems == []
+    terms = [bind("excitation", name, {}, name)[0] for name in container["excitation"]]
+    settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*RIG, "excitation")})
+    rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
+    episodes = plan.episodes([t for t in terms if t], settings)
+    return rig, simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None)
+
+
+# ---------------------------------------------------------------------- statistics
+
+
+def test_a_gram_matrix_is_that_of_the_full_covariance() -> None:
+    rng = np.random.default_rng(0)
+    columns, state = rng.standard_normal((2, 3, 40, 4)), 5.0 * rng.standard_normal((2, 3, 40, 6))
+    found = gram(columns, state)
+    for w in range(2):
+        for g in range(3):
+            a, s = columns[w, g], state[w, g]
+            expected = a.T @ np.linalg.inv(np.eye(40) + s @ s.T) @ a
+            np.testing.assert_allclose(found[w, g], expected, atol=1e-10)
+
+
+def test_a_wrong_first_state_costs_nothing_where_it_is_uncertain() -> None:
+    rng = np.random.default_rng(1)
+    state = 1e3 * rng.standard_normal((1, 1, 200, 6))
+    residual = rng.standard_normal((1, 1, 200, 1))
+    off = residual + 1e-3 * state @ rng.standard_normal((6, 1))
+    np.testing.assert_allclose(gram(off, state), gram(residual, state), rtol=1e-4)
+    plain = np.zeros_like(state)
+    assert gram(off, plain)[0, 0, 0, 0] > 1.5 * gram(residual, plain)[0, 0, 0, 0]
+
+
+def test_normal_equations_promise_what_the_model_gives() -> None:
+    rng = np.random.default_rng(2)
+    joints = np.ones(12)
+    probes = [Probe(("coulomb", "bound"), 0, joints), Probe(("base_tilt", "roll"), None, np.ones(1))]
+    machine = HungGo1(simulate_config())
+    layout = Layout.of(machine, probes)
+    assert layout.size == 5
+    np.testing.assert_array_equal(layout.joint, [0, 3, 6, 9, -1])
+    columns, state = rng.standard_normal((3, 4, 30, 2)), np.zeros((3, 4, 30, 1))
+    residual = rng.standard_normal((3, 4, 30))
+    grams = gram(np.concatenate([columns, residual[..., None]], axis=-1), state)
+    x = rng.standard_normal(5)
+    left = residual - np.einsum("wgmp,gp->wgm", columns, x[layout.index])
+    np.testing.assert_allclose(predicted(grams, layout, x), (left**2).sum(-1))
+    matrix, right = layout.total(grams)
+    total = x @ matrix @ x - 2 * right @ x + (residual**2).sum()
+    assert total == pytest.approx((left**2).sum())
+
+
+def simulate_config() -> Any:
+    parts, _ = parse_parts(compose("record", []), RIG)
+    return parts["robot"]
+
+
+def test_a_bounded_fit_is_a_minimum_within_its_bounds() -> None:
+    rng = np.random.default_rng(3)
+    a = rng.standard_normal((30, 6))
+    matrix, right = a.T @ a, a.T @ rng.standard_normal(30)
+    limits = Bounds(-0.1 * np.ones(6), 0.1 * np.ones(6), rng.standard_normal(6), 0.5 * np.ones(6))
+    x = solve(matrix, right, limits)
+    slope = 2 * (matrix @ x - right + limits.weight * (x - limits.centre))
+    inside = np.abs(x) < 0.1 - 1e-9
+    np.testing.assert_allclose(slope[inside], 0.0, atol=1e-6)
+    assert np.all(slope[x > 0.1 - 1e-9] <= 1e-6)
+    assert np.all(slope[x < -0.1 + 1e-9] >= -1e-6)
+    assert (~inside).any()
+    free = Bounds(-np.full(6, np.inf), np.full(6, np.inf), limits.centre, limits.weight)
+    expected = np.linalg.solve(matrix + 0.5 * np.eye(6), right + 0.5 * limits.centre)
+    np.testing.assert_allclose(solve(matrix, right, free), expected, atol=1e-6)
+
+
+def test_max_t_calls_nothing_significant_more_often_than_it_says() -> None:
+    rng = np.random.default_rng(4)
+    shared = rng.standard_normal((400, 1, 24))  # candidates resemble each other
+    gains = shared + rng.standard_t(3, size=(400, 8, 24))
+    smallest = np.array([max_t(gain, rng, flips=400).min() for gain in gains])
+    assert np.mean(smallest < 0.05) < 0.08
+    assert np.mean(smallest < 0.5) == pytest.approx(0.5, abs=0.1)
+    moved = gains[0] + 3.0 * (np.arange(8) == 2)[:, None]
+    found = max_t(moved, rng)
+    assert found[2] < 0.001
+    assert np.all(np.delete(found, 2) > 0.01)
+
+
+def meta(episode: str, excitation: str, kd: float, repeat_of: str | None = None) -> Meta:
+    usual: dict[str, Any] = {"robot": "go1", "joints": ("a",), "rate_hz": 500.0, "base": "fixed"}
+    usual |= {"base_quat": (1.0, 0.0, 0.0, 0.0), "kp": (20.0,), "tau_limit": None, "source": "simulated"}
+    about: dict[str, Any] = {"tool": "test", "versions": {}, "notes": "", "repeat_of": repeat_of}
+    return Meta(kd=(kd,), excitation=excitation, episode=episode, **usual, **about)
+
+
+def test_splits_are_whole_episodes_that_resemble_each_other() -> None:
+    names = [(e, kd) for e in ("chirp", "steps") for kd in (0.5, 1.0, 2.0)]
+    metas = [meta(f"{e}{kd}", e, kd) for e, kd in names] + [meta("again", "chirp", 0.5, "chirp0.5")]
+    episode = np.repeat(np.arange(7), 5)
+    found = splits(metas, episode, 0.2, np.random.default_rng(0))
+    assert found.by_episode
+    parts = [set(episode[p]) for p in (found.train, found.select, found.confirm)]
+    assert set.union(*parts) == set(range(7))
+    assert sum(len(p) for p in parts) == 7
+    assert any({0, 6} <= p for p in parts)
+    assert len({metas[e].excitation for e in parts[0]}) == 2
+    assert len({metas[e].excitation for e in parts[1]}) == 2
+    few = splits(metas[:1], np.zeros(30, dtype=int), 0.2, np.random.default_rng(0))
+    assert not few.by_episode
+    assert len(few.train) + len(few.select) + len(few.confirm) == 30
+
+
+# ---------------------------------------------------------------------- windows
+
+
+def test_a_held_signal_changes_at_the_nearest_step() -> None:
+    changes = (np.array([0.0, 0.0100004, 0.02]), np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(held(changes, np.array([0.0, 0.005, 0.01, 0.015, 0.02])), [1, 1, 2, 2, 3])
+
+
+@pytest.fixture(scope="module")
+def plain() -> tuple[simulate.Rig, list[Recording]]:
+    return robot()
+
+
+def test_noise_and_clock_are_those_of_the_logger(plain: tuple[simulate.Rig, list[Recording]]) -> None:
+    _, recordings = plain
+    np.testing.assert_allclose(noise(recordings, "q"), 2e-4, rtol=0.08)
+    np.testing.assert_allclose(noise(recordings, "qd"), 0.02, rtol=0.08)
+    assert np.std(np.diff(recordings[0].t)) > 5e-5  # its stamps are late, its samples are not
+    even = np.diff(even_clock(recordings[0]))
+    np.testing.assert_allclose(even, 0.002, atol=1e-6)
+
+
+# ---------------------------------------------------------------------- from end to end
+
+
+def run(rig: simulate.Rig, recordings: list[Recording]) -> GapResult:
+    told: list[float] = []
+    result = explain(recordings, rig.robot, QUICK, lambda what, share: told.append(share))
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    json.dumps(result.as_dict(), allow_nan=False)
+    assert result.exit_code == EXIT_CODES[result.verdict]
+    return result
+
+
+def test_a_model_that_is_right_has_no_gap(plain: tuple[simulate.Rig, list[Recording]]) -> None:
+    result = run(*plain)
+    assert result.verdict == "no gap"
+    assert result.named == ()
+    assert abs(result.excess["null"]) < 0.05
+    assert result.floors is not None
+    assert result.floors.numerical["q"] < 1e-4
+
+
+def test_hidden_friction_is_named_where_it_is() -> None:
+    rig, recordings = robot("effect=coulomb", "effect.coulomb.bound=[0.0,0.0,0.3]")
+    plain, _ = parse_parts(compose("record", []), RIG)
+    assert plain["robot"] == rig.robot  # the model is not told
+    result = run(rig, recordings)
+    assert result.verdict == "explained"
+    (found,) = result.named
+    assert found.effect == "coulomb"
+    assert set(found.joints) == {f"{leg}_calf" for leg in ("FR", "FL", "RR", "RL")}
+    np.testing.assert_allclose(list(found.params["bound"].values()), 0.3, rtol=0.1)
+    assert result.excess["box"] > 1.0
+    assert result.excess["final"] < 0.2
+    assert result.closed > 0.95
+    assert "coulomb" in result.sentence
+    (row,) = [c for c in result.candidates if c.status == "accepted"]
+    assert row.p < 0.01
+
+
+def test_logs_that_cannot_be_compared_are_refused(plain: tuple[simulate.Rig, list[Recording]]) -> None:
+    rig, recordings = plain
+    channels = {k: v for k, v in recordings[0].channels.items() if not k.startswith("qd_")}
+    result = explain([Recording(recordings[0].meta, channels)], rig.robot, QUICK)
+    assert result.verdict == "bad log"
+    assert "no qd" in result.sentence
