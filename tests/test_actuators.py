@@ -549,3 +549,23 @@ def test_a_net_drives_the_robot(make_core: Callable[..., Go1Core], make_net: Cal
         seen.append(core.plant.torque.clone())
     assert all(torch.isfinite(tau).all() for tau in seen)
     assert not torch.equal(seen[0], seen[1])
+
+
+def test_a_run_folder_has_a_copy_of_its_net_even_of_one_that_a_delay_wraps(make_net: Any, tmp_path: Path) -> None:
+    from go1exp.train import run_folder
+
+    net = make_net()
+    for name, actuator in (
+        ("plain", {"term": "net", "file": str(net)}),
+        ("wrapped", {"term": "delay", "command": [0.0, 0.01], "drive": {"term": "net", "file": str(net)}}),
+    ):
+        run = tmp_path / name
+        container = {"actuator": actuator, "seed": 0}
+        run_folder.write(run, container)
+        assert run_folder.read_as_written(run) == container
+        own = run_folder.read_config(run)["actuator"]
+        file = Path(own.get("file") or own["drive"]["file"])
+        assert file.parent == run
+        assert file.read_bytes() == net.read_bytes()
+        run_folder.write(run, run_folder.read_config(run))  # as a run that goes on does
+        assert file.read_bytes() == net.read_bytes()

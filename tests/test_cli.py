@@ -17,7 +17,8 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from go1exp import data_root, registry
-from go1exp.cli import VERBS
+from go1exp.cli import SUBVERBS, VERBS, _by_name
+from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.evaluate.camera import RenderingUnavailable, choose_gl
@@ -68,7 +69,7 @@ def assert_refused(tmp_path: Path, arguments: list[str], *said: str) -> None:
     first, *others = done.stderr.splitlines()
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
-    assert re.match(r"go1exp( \w+)?: ", first)
+    assert re.match(r"go1exp( [\w-]+){0,2}: ", first)
     assert all(line.startswith("  ") for line in others), done.stderr
     assert not [text for text in said if text not in done.stderr], done.stderr
     assert not HEAVY & set(json.loads(modules.read_text()))
@@ -115,13 +116,31 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train event.push.interval=[3,1]", ("event.push.interval = [3, 1]", "low must not exceed high")),
         ("eval run=x episodes=0", ("episodes = 0", "greater than or equal to 1")),
         ("eval run=x settle_s=30", ("settle_s = 30.0", "duration_s = 20.0")),
-        ("bench suite=fast", ("suite = 'fast'", "'env' or 'train'")),
+        ("bench suite=fast", ("suite = 'fast'", "'env', 'train' or 'actuator'")),
         # a misspelt choice
         ("train rand=tabel1", ("rand=tabel1", "did you mean 'table1'?")),
         ("train experiment=ablation/no_gat", ("experiment=ablation/no_gat", "did you mean 'ablation/no_gait'")),
         ("list group=rewrd", ("'rewrd'", "did you mean 'reward'?")),
         ("train logger=null", ("logger=null",)),
         ("train terrain=5", ("terrain=5",)),
+        # recordings and fits
+        ("record excitation=[chrip]", ("excitation.chrip", "did you mean 'chirp'?")),
+        ("record excitation=[{chirp:{bnd:[1,2]}}]", ("excitation.chirp.bnd", "did you mean 'band'?")),
+        ("record excitation=chirp", ("excitation = 'chirp'", "must be a list")),
+        ("record excitation=[policy]", ("run: required",)),
+        ("record gains=[] physics_dt=0.0015", ("2 problems", "gains = []", "physics_dt = 0.0015", "multiple")),
+        ("record effect=[coulomb,stribek]", ("effect=stribek", "did you mean 'stribeck'")),
+        ("record +sensors.q.bias=1", ("sensors.q.bias: unknown key",)),
+        ("record audit", ("go1exp record audit: files: required",)),
+        ("record audit a b +depth=3", ("depth: unknown key",)),
+        ("record import", ("go1exp record import: ", "source: required", "path: required")),
+        ("record import go2_in_air", ("path: required",)),
+        ("record import go2_in_aire x", ("unknown importer 'go2_in_aire'", "did you mean 'go2_in_air'?")),
+        ("record import go2_in_air x options={rate:3}", ("rate: unknown key", "rate_hz")),
+        ("fit-actuator", ("recordings: required",)),
+        ("fit-actuator recordings=x epoch=3", ("epoch=3", "did you mean 'epochs'")),
+        ("fit-actuator recordings=x history=0 share=leg", ("history = 0", "share = 'leg'", "'all', 'kind' or 'none'")),
+        ("list efects", ("'efects'", "did you mean 'effect'")),
         # others
         ("train seed=4294967296", ("seed = 4294967296", "4294967295")),
         ("trian seed=1", ("unknown verb 'trian'", "did you mean 'train'?")),
@@ -140,6 +159,73 @@ def test_a_key_that_the_chosen_group_does_not_have_is_not_proposed_for_itself(tm
     assert_refused(tmp_path, arguments, "rand.foot_friction.range=[0,1]: no such key")
     done = cli(tmp_path, *arguments)
     assert "did you mean 'rand.foot_friction" not in done.stderr
+
+
+FILES = {
+    "mine.yaml": "coulomb: {bound: 0.3}",
+    "bad.yaml": "coulomb: [0.1",
+    "list.yaml": "- coulomb",
+    "typo.yaml": "coulmb: {}",
+}
+
+
+@pytest.mark.parametrize(
+    ("choice", "said"),
+    [
+        ("nowhere.yaml", "effect={folder}/nowhere.yaml: no such file"),
+        ("[payload,{folder}/nowhere.yaml]", "effect={folder}/nowhere.yaml: no such file"),
+        ("bad.yaml", "effect={folder}/bad.yaml: no YAML"),
+        ("list.yaml", "effect={folder}/list.yaml: must be a mapping"),
+        ("[{folder}/mine.yaml,{folder}/list.yaml]", "effect={folder}/list.yaml: must be a mapping"),
+        ("typo.yaml", "effect.coulmb: unknown effect term 'coulmb'; did you mean 'coulomb'?"),
+        ("[{folder}/mine.yaml,payloat]", "effect=payloat: unknown choice of effect 'payloat'; did you mean 'payload'?"),
+    ],
+)
+@pytest.mark.parametrize("verb", ["train", "record"])
+def test_an_effect_from_a_file_that_is_none_is_refused(verb: str, choice: str, said: str, tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for name, content in FILES.items():
+        (folder / name).write_text(content)
+    choice = choice if choice.startswith("[") else f"{{folder}}/{choice}"
+    assert_refused(tmp_path, [verb, f"effect={choice.format(folder=folder)}"], said.format(folder=folder))
+
+
+def test_effects_come_from_files_by_any_path_and_from_names(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub/mine.yaml").write_text(FILES["mine.yaml"])
+    (tmp_path / "other.yaml").write_text("payload: {mass: 2.0}")
+    for given, expected in {
+        "effect=sub/mine.yaml": {"coulomb": {"bound": 0.3}},
+        f"effect={tmp_path}/other.yaml": {"payload": {"mass": 2.0}},
+        "effect=[sub/mine.yaml,other.yaml]": {"coulomb": {"bound": 0.3}, "payload": {"mass": 2.0}},
+        "effect=[viscous,./other.yaml]": {**compose("train", ["effect=viscous"])["effect"], "payload": {"mass": 2.0}},
+    }.items():
+        done = cli(tmp_path, "train", "--cfg", "job", given)
+        assert done.returncode == 0, done.stderr
+        assert OmegaConf.create(done.stdout).effect == expected, given
+
+
+def test_what_only_the_fit_knows_is_refused_in_words_too(tmp_path: Path) -> None:
+    done = cli(tmp_path, "fit-actuator", "recordings=nowhere", "inputs=[speed]")
+    assert done.returncode == 2
+    assert "inputs.0 = 'speed': input should be 'position_error', 'velocity'" in done.stderr
+    done = cli(tmp_path, "fit-actuator", "recordings=nowhere", "holdout=[a]", "validation=[a,b]")
+    assert (done.returncode, done.stderr) == (2, "go1exp fit-actuator: validation: a cannot be held out too\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("record audit nowhere.parquet", "go1exp record audit: nowhere.parquet: no such file"),
+        ("record audit .", "go1exp record audit: .: no *.parquet in it"),
+        ("record import go2_in_air nowhere", "go1exp record import: nowhere: no such file or folder"),
+        ("fit-actuator recordings=nowhere", "go1exp fit-actuator: nowhere: no such file"),
+    ],
+)
+def test_a_recording_that_is_not_there_is_named(arguments: str, said: str, tmp_path: Path) -> None:
+    done = cli(tmp_path, *arguments.split())
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"{said}\n")
 
 
 @pytest.mark.parametrize("argument", ["eval run=nowhere", "play run=nowhere", "train resume=nowhere"])
@@ -175,15 +261,23 @@ def test_the_general_help_names_every_verb_and_loads_nothing(arguments: list[str
     assert not (HEAVY | {"hydra", "numpy", "pydantic", "torch"}) & loaded
 
 
-@pytest.mark.parametrize("verb", VERBS)
+EVERY = [*VERBS, *(f"{verb} {word}" for verb, words in SUBVERBS.items() for word in words)]
+
+
+def name(verb: str) -> str:
+    """Of a verb's module and configuration: ``record_audit`` for ``record audit``."""
+    return verb.replace(" ", "_")
+
+
+@pytest.mark.parametrize("verb", EVERY)
 def test_the_help_of_every_verb_says_what_it_does_its_settings_and_examples(verb: str, tmp_path: Path) -> None:
-    done = cli(tmp_path, verb, "--help")
+    done = cli(tmp_path, *verb.split(), "--help")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert done.stdout.startswith(f"go1exp {verb}: ")
     settings, examples = done.stdout.split("Examples:")
     assert len(re.findall(rf"^  go1exp {verb}\b", examples, re.MULTILINE)) >= 2
-    for key in map(str, OmegaConf.load(data_root() / f"conf/{verb}.yaml")):
+    for key in map(str, OmegaConf.load(data_root() / f"conf/{name(verb)}.yaml")):
         if key not in ("defaults", "hydra"):
             assert re.search(rf"^{key}:", settings, re.MULTILINE), key
     assert list(tmp_path.iterdir()) == []
@@ -191,20 +285,58 @@ def test_the_help_of_every_verb_says_what_it_does_its_settings_and_examples(verb
 
 EXAMPLES = [
     line.strip()
-    for verb in VERBS
-    for line in (data_root() / f"conf/{verb}.yaml").read_text().split("Examples:")[-1].splitlines()
+    for verb in EVERY
+    for line in (data_root() / f"conf/{name(verb)}.yaml").read_text().split("Examples:")[-1].splitlines()
     if line.strip().startswith("go1exp ")
 ]
 
 
-@pytest.mark.parametrize("example", EXAMPLES)
-def test_the_examples_of_the_help_are_commands_that_exist(example: str) -> None:
-    _, verb, *overrides = shlex.split(example)
+@pytest.mark.parametrize("example", dict.fromkeys(EXAMPLES))
+def test_the_examples_of_the_help_are_commands_that_exist(
+    example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in map(Path, re.findall(r"=([\w/]+\.yaml)", example)):
+        file.parent.mkdir(parents=True)
+        file.write_text("coulomb: {bound: 0.3}")
+    _, verb, *overrides = shlex.split(re.split(r" {3,}", example)[0])
     assert verb in VERBS
-    for override in overrides:
-        if override != "-m":
-            first_of_a_sweep = override if "-m" not in overrides else override.split(",")[0]
-            compose(verb, [first_of_a_sweep])
+    if overrides and overrides[0] in SUBVERBS.get(verb, ()):
+        verb, overrides = f"{verb}_{overrides[0]}", overrides[1:]
+    if "-m" in overrides:
+        overrides = [override.split(",")[0] for override in overrides if override != "-m"]
+    compose(verb, choices_from_files(_by_name(verb, overrides)))
+
+
+@pytest.mark.parametrize(
+    ("verb", "given", "named"),
+    [
+        ("list", ["effects"], ["group='effects'"]),
+        ("list", ["what=terms", "effects"], ["what=terms", "group='effects'"]),
+        ("record_audit", ["a.parquet", "b.parquet", "out=x"], ["out=x", "files=['a.parquet','b.parquet']"]),
+        ("record_audit", ["files=[a]", "--cfg", "job"], ["files=[a]", "--cfg", "job"]),
+        ("record_import", ["go2_in_air", "logs/it's.csv"], ["source='go2_in_air'", r"path='logs/it\'s.csv'"]),
+        ("record_import", ["go2_in_air", "a", "b"], ["source='go2_in_air'", "path='a'", "b"]),
+        ("train", ["reward=paper", "word"], ["reward=paper", "word"]),
+        ("record", [], []),
+    ],
+)
+def test_words_by_position_become_settings(verb: str, given: list[str], named: list[str]) -> None:
+    assert _by_name(verb, given) == named
+
+
+def test_a_path_by_position_may_hold_anything(tmp_path: Path) -> None:
+    folder = tmp_path / "it's [a] {folder}, $x"
+    done = cli(tmp_path, "record", "audit", str(folder), "second one")
+    said = f"go1exp record audit: {folder}: no such file\nsecond one: no such file\n"
+    assert (done.returncode, done.stderr) == (1, said)
+
+
+def test_the_value_of_an_option_is_no_setting(tmp_path: Path) -> None:
+    done = cli(tmp_path, "record", "import", "--cfg", "job", "go2_in_air", "logs", "options={rate_hz: 100.0}")
+    assert done.returncode == 0, done.stderr
+    expected = {"source": "go2_in_air", "path": "logs", "options": {"rate_hz": 100.0}, "out": "recordings"}
+    assert OmegaConf.create(done.stdout) == expected
 
 
 def leaves(settings: dict[str, Any], path: str = "") -> list[tuple[str, Any]]:
@@ -214,7 +346,7 @@ def leaves(settings: dict[str, Any], path: str = "") -> list[tuple[str, Any]]:
     return found
 
 
-@pytest.mark.parametrize("verb", [v for v in VERBS if v != "train"])
+@pytest.mark.parametrize("verb", [name(v) for v in EVERY if v != "train"])
 def test_every_setting_of_a_verb_can_be_given_on_the_command_line(verb: str) -> None:
     """A folder of conf/ with the name of a key would make Hydra take the key for a choice of files."""
     refused = []
@@ -255,6 +387,12 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
         ("go1exp train rand=table1 ppo.iterat", {"ppo.iterations="}),
         ("go1exp eval epis", {"episodes="}),
         ("go1exp trian rand=ta", set()),
+        ("go1exp record au", {"audit"}),
+        ("go1exp record seco", {"seconds="}),
+        ("go1exp record effect=cou", {"effect=coulomb"}),
+        ("go1exp record audit ou", {"out="}),
+        ("go1exp record import opt", {"options="}),
+        ("go1exp fit-actuator epo", {"epochs=", "epoch_rows="}),
     ],
 )
 def test_tab_completes(line: str, offered: set[str], tmp_path: Path) -> None:
@@ -262,6 +400,12 @@ def test_tab_completes(line: str, offered: set[str], tmp_path: Path) -> None:
     assert done.returncode == 0
     assert set(done.stdout.split()) == offered
     assert done.stderr == ""
+
+
+def test_tab_offers_words_and_settings_after_a_verb_that_has_both(tmp_path: Path) -> None:
+    line = "go1exp record "
+    done = cli(tmp_path, "-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
+    assert {*SUBVERBS["record"], "seconds=", "effect="} <= set(done.stdout.split())
 
 
 def test_tab_completes_in_a_real_bash(tmp_path: Path) -> None:
@@ -303,6 +447,45 @@ def test_list_prints_every_registered_term_with_its_first_line_and_every_choice(
     assert any(line.startswith("  rand=table1 ") for line in sections["rand"])
     assert any(line.startswith("  experiment=ablation/no_gait ") for line in sections["experiment"])
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("word", ["effect", "effects", "group=effect"])
+def test_list_takes_a_group_by_position_in_singular_and_plural(word: str, tmp_path: Path) -> None:
+    done = cli(tmp_path, "list", word)
+    assert done.returncode == 0, done.stderr
+    first, *lines = done.stdout.splitlines()
+    assert first == "effect"
+    assert [line for line in lines if line and not line.startswith(" ")] == []
+    named = {line.split()[0] for line in lines if line}
+    assert {"coulomb", "effect=coulomb"} <= named
+
+
+def test_a_recording_is_made_imported_audited_and_refused(tmp_path: Path) -> None:
+    quick = ("seconds=1.0", "physics_dt=0.002", "backend.threads=1", "excitation=[gait]", "out=logs")
+    done = cli(tmp_path, "record", *quick)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert done.stdout.startswith("1 recordings, 1 s, in logs\n")
+    (file,) = (tmp_path / "logs").iterdir()
+    done = cli(tmp_path, "record", "audit", f"logs/{file.name}", "out=audit/found.json")
+    (name,) = found = json.loads((tmp_path / "audit/found.json").read_text())
+    assert name == f"logs/{file.name}"
+    assert done.returncode == {"ok": 0, "suspect": 3, "bad": 4}[found[name]["verdict"]], done.stderr
+    assert done.stdout.splitlines()[0] == name
+    columns = [f"{q}{i}{end}" for i in range(12) for q, end in (("jpos", ""), ("jvel", ""), ("jpos", "_des"))]
+    rows = "\n".join(",".join(["20", "0.5", *["0.1"] * len(columns)]) for _ in range(9))
+    (tmp_path / "go2.csv").write_text(f"kp,kd,{','.join(columns)}\n{rows}\n")
+    done = cli(tmp_path, "record", "import", "go2_in_air", "go2.csv", "out=theirs")
+    assert done.returncode == 0, done.stderr
+    assert [p.name for p in (tmp_path / "theirs").iterdir()] == ["go2.parquet"]
+    again = cli(tmp_path, "record", "import", "go2_in_air", "go2.csv", "options={rate_hz: 4.0}", "out=slow")
+    assert again.stdout.startswith("1 recordings, 2 s, in slow\n"), again.stderr
+    assert done.stdout.startswith("1 recordings, ")
+    assert "note: " in done.stdout
+    file.write_bytes(file.read_bytes()[:1000])
+    done = cli(tmp_path, "record", "audit", "logs")
+    assert done.returncode == 1
+    assert re.fullmatch(r"go1exp record audit: logs/\S+\.parquet: .*\n", done.stderr), done.stderr
 
 
 def test_a_sweep_writes_one_run_folder_for_each_job(tmp_path: Path) -> None:

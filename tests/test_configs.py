@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,17 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from go1exp import data_root, registry
+import go1exp.importers
+import go1exp.record.policy  # noqa: F401  (registers every importer and excitation)
+from go1exp import cli, data_root, registry
+from go1exp.cli import listing, settings
+from go1exp.cli.files import choices_from_files
+from go1exp.cli.record import RIG
+from go1exp.cli.record import _motions as motions
 from go1exp.compose import compose, config_folder
-from go1exp.config import TrainConfig, parse_train
+from go1exp.config import TrainConfig, parse_parts, parse_train
 from go1exp.env.core import Go1Core
+from go1exp.fit import FitSettings
 from go1exp.mdp import rewards
 from go1exp.registry import ConfigError, Term
 
@@ -309,15 +317,34 @@ def test_defaults_in_the_code_are_the_papers(paper: TrainConfig) -> None:
 # ---------------------------------------------------------------------- examples in the documentation
 
 
+PAGES = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))]
+
+
 def fences(language: str) -> list[str]:
-    """Fenced blocks of that language in the pages about configuration."""
-    text = "\n".join((DOCS / page).read_text() for page in ("paper.md", "configuration.md"))
-    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    """Fenced blocks of that language in all pages."""
+    text = "\n".join(page.read_text() for page in PAGES)
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [content for name, content in blocks if name == language]
 
 
 COMMANDS = [
-    line for block in fences("bash") for line in block.splitlines() if line.startswith("go1exp") and " --" not in line
+    line
+    for block in fences("bash") + fences("")
+    for line in block.splitlines()
+    if re.match(r"go1exp [\w-]+( |$)", line) and " --" not in line
 ]
+VERBS: dict[str, type] = {
+    "eval": settings.EvalSettings,
+    "play": settings.PlaySettings,
+    "record": settings.RecordSettings,
+    "record_audit": settings.AuditSettings,
+    "record_import": settings.ImportSettings,
+    "gap": settings.GapVerb,
+    "fit-actuator": settings.FitActuatorSettings,
+    "list": settings.ListSettings,
+    "bench": settings.BenchSettings,
+}
+"""Verbs besides ``train``, and the schema of each."""
 COMPLAINTS = [block for block in fences("console") if block.startswith("$ go1exp train ")]
 
 
@@ -342,16 +369,60 @@ def test_the_page_on_the_paper_has_every_row() -> None:
     assert weights == TABLE_3
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_commands_in_the_documentation_compose_and_parse(command: str) -> None:
+def parse(verb: str, container: dict[str, Any]) -> None:
+    """Raise if the verb would refuse its settings."""
+    if verb == "train":
+        parse_train(container)
+        return
+    own = {f.name for f in fields(VERBS[verb])}
+    parsed = settings.parse(VERBS[verb], {k: v for k, v in container.items() if k in own})
+    others = container.keys() - own
+    assert others <= {*RIG, "excitation"}
+    problems = parse_parts(container, tuple(others - {"excitation"}))[1]
+    if "excitation" in others:
+        problems += motions(container["excitation"])[1]
+    if verb == "fit-actuator":
+        FitSettings(**{f.name: getattr(parsed, f.name) for f in fields(FitSettings)})
+    if verb == "record_import":
+        assert parsed.source in registry.members("importer")
+    if verb == "list":
+        listing.APP.task(container)
+    assert problems == []
+
+
+@pytest.fixture
+def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_net: Callable[..., Path]) -> Callable[[str], None]:
+    """Puts the files that a command names into the folder that it is typed in."""
+    monkeypatch.chdir(tmp_path)
+
+    def lay(command: str) -> None:
+        for name in re.findall(r"[\w/]+\.(?:npz|yaml)", command):
+            file = tmp_path / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(make_net().read_bytes() if file.suffix == ".npz" else b"coulomb: {bound: 0.3}")
+
+    return lay
+
+
+def test_the_pages_show_every_verb() -> None:
+    shown = {" ".join(command.split()[1:3]) for command in COMMANDS}
+    words = [*cli.VERBS, *(f"{verb} {sub}" for verb, subs in cli.SUBVERBS.items() for sub in subs)]
+    missing = [word for word in words if not any(f"{s} ".startswith(f"{word} ") for s in shown)]
+    assert missing == []
+
+
+@pytest.mark.parametrize("command", dict.fromkeys(COMMANDS))
+def test_commands_in_the_documentation_compose_and_parse(command: str, beside: Callable[[str], None]) -> None:
+    beside(command)
     verb, *overrides = shlex.split(command, comments=True)[1:]
-    assert verb == "train"
-    runs = [overrides]
+    if overrides[:1] and overrides[0] in cli.SUBVERBS.get(verb, ()):
+        verb, overrides = f"{verb}_{overrides[0]}", overrides[1:]
+    runs = [choices_from_files(cli._by_name(verb, overrides))]
     if overrides[:1] == ["-m"]:
         runs = jobs(overrides[1:])
         assert len(runs) > 1
     for run in (runs[0], runs[-1]):
-        parse_train(compose("train", run))
+        parse(verb, compose(verb, run))
 
 
 @pytest.mark.parametrize("block", COMPLAINTS)
@@ -366,7 +437,7 @@ def test_complaints_in_the_documentation_are_true(block: str) -> None:
 def test_the_documented_reward_works(monkeypatch: pytest.MonkeyPatch, make_core: Callable[..., Go1Core]) -> None:
     members = {group: dict(registry.members(group)) for group in registry.groups()}
     monkeypatch.setattr(registry, "_REGISTRY", members)
-    (code,) = fences("python")
+    (code,) = (block for block in fences("python") if "joint_power" in block)
     (line,) = (block for block in fences("yaml") if block.startswith("joint_power"))
     exec(code, dict(vars(rewards)))
     settings = line.split("#")[0].partition(":")[2].strip()

@@ -36,6 +36,12 @@ LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 
 
 @cache
+def engine(plant: Plant) -> MujocoCpu:
+    """The plant's physics, to look into."""
+    assert isinstance(plant.backend, MujocoCpu)
+    return plant.backend
+
+
 def task() -> TaskConfig:
     return parse_task(compose("train", ["rand=none", "backend.threads=1"]))
 
@@ -157,7 +163,7 @@ def somewhere(model: mujoco.MjModel) -> mujoco.MjData:
 
 @pytest.mark.parametrize("name", EDITS)
 def test_inertia_and_weight_are_those_of_the_links_written_down_anew(name: str) -> None:
-    edited = rig({name: EDITS[name]}, held=None).backend.env_model(0)
+    edited = engine(rig({name: EDITS[name]}, held=None)).env_model(0)
     compiled = build_model(task().robot, build_terrain(task().terrain), 0.002)[0]
     body, rotor = expected(name, compiled)
     plain = by_jacobians(compiled, somewhere(compiled), links_of(compiled), compiled.dof_armature)
@@ -186,7 +192,7 @@ def with_box(mass: float, at: tuple[float, float, float]) -> mujoco.MjModel:
 @pytest.mark.parametrize(("mass", "at"), [(3.0, (0.1, -0.05, 0.12)), (0.4, (-0.2, 0.0, -0.1))])
 def test_a_payload_is_a_body_on_the_trunk(mass: float, at: tuple[float, float, float]) -> None:
     values = {"mass": mass, **dict(zip("xyz", at, strict=True))}
-    edited, real = rig({"payload": values}, held=None).backend.env_model(0), with_box(mass, at)
+    edited, real = engine(rig({"payload": values}, held=None)).env_model(0), with_box(mass, at)
     a, b = somewhere(edited), somewhere(real)
     assert edited.body_mass.sum() == pytest.approx(real.body_mass.sum(), rel=1e-12)
     assert edited.body_subtreemass[1] == pytest.approx(real.body_subtreemass[1], rel=1e-12)
@@ -203,11 +209,11 @@ def test_a_payload_taken_away_undoes_one_and_leaves_an_inertia() -> None:
         "first": {"term": "payload", "mass": 0.8, "z": 0.05},
         "second": {"term": "payload", "mass": -0.8, "z": 0.05},
     }
-    edited, plain = rig(both, held=None).backend.env_model(0), rig({}, held=None).backend.model
+    edited, plain = engine(rig(both, held=None)).env_model(0), rig({}, held=None).backend.model
     a, b = somewhere(edited), somewhere(plain)
     assert np.allclose(mass_matrix(edited, a), mass_matrix(plain, b), atol=1e-9)
     corner = {"payload": {"mass": -1.0, "x": 0.3, "y": 0.2, "z": 0.3}}
-    assert rig(corner, held=None).backend.env_model(0).body_inertia[1].min() > 0.09 * plain.body_inertia[1].min()
+    assert engine(rig(corner, held=None)).env_model(0).body_inertia[1].min() > 0.09 * plain.body_inertia[1].min()
 
 
 def test_a_shifted_calf_hangs_lower_by_the_torque_of_its_weight() -> None:
@@ -259,7 +265,7 @@ def test_a_wrench_accelerates_the_whole_robot_by_force_over_mass() -> None:
     force = np.array([6.0, -3.0, 20.0])
     plant = rig({"external_wrench": dict(zip("xyz", force, strict=True))}, held=None, height=2.0)
     settle(plant, seconds=0.1)
-    model, data = plant.backend.env_model(0), plant.backend.env_data(0)
+    model, data = engine(plant).env_model(0), engine(plant).env_data(0)
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
     mass = model.body_subtreemass[1]
@@ -291,7 +297,7 @@ def test_feet_slip_beyond_friction_times_weight(scale: float) -> None:
 
 
 def test_the_foot_has_the_say_in_a_contact() -> None:
-    model = rig({"foot_friction": {"scale": 0.5}}, held=None).backend.env_model(0)
+    model = engine(rig({"foot_friction": {"scale": 0.5}}, held=None)).env_model(0)
     data = mujoco.MjData(model)
     data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.318, 1.0, 0.0, 0.0, 0.0), robot.NOMINAL_STANCE
     mujoco.mj_forward(model, data)
@@ -324,7 +330,7 @@ def test_a_restitution_that_is_randomised_acts_on_soft_ground_too() -> None:
     plant = rig({"ground_compliance": {"time_constant": 0.05}}, held=None, n=2)
     stream = EnvRandom(1, 2).stream("x")
     foot_restitution(plant.backend, stream, torch.ones(2, dtype=torch.bool), range=(0.3, 0.5))
-    model = plant.backend.env_model(1)
+    model = engine(plant).env_model(1)
     foot = model.geom("FL_foot").id
     assert model.geom_solref[foot, 0] == 0.05
     assert model.geom_solref[foot, 1] < 1.0
@@ -451,7 +457,7 @@ def kinetic(plant: Plant) -> Tensor:
     assert plant.effects.rotors is not None
     found = []
     for env in range(len(plant.q)):
-        model, data = plant.backend.env_model(env), plant.backend.env_data(env)
+        model, data = engine(plant).env_model(env), engine(plant).env_data(env)
         model.dof_armature[:] = 0.0
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_energyVel(model, data)

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 import torch
 from hydra import compose as hydra_compose
@@ -37,8 +38,9 @@ from omegaconf import OmegaConf
 from go1exp import data_root, registry
 from go1exp.cli import settings
 from go1exp.cli.app import App
+from go1exp.cli.record import RIG
 from go1exp.compose import config_folder, register_groups
-from go1exp.config import MANY_TERMS, ONE_TERM, parse_train
+from go1exp.config import MANY_TERMS, ONE_TERM, parse_parts, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.registry import ConfigError, Range
 from go1exp.train import run_folder, trainer
@@ -55,6 +57,8 @@ EXEMPT = {
     "backend/cpu.yaml:backend.name": "there is no other engine to choose",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
+    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
+    "fit-actuator.yaml:hydra": "Hydra's own settings",
 }
 """Leaf, or mapping of leaves, that need not be shown to act, and the reason."""
 
@@ -94,6 +98,18 @@ SMALL: dict[str, dict[str, Any]] = {
         "train_ground": True,
     },
     "play": {"seconds": 0.4, "noise": True, "randomize": True, "push": True, "train_ground": True, "viewer": "clip"},
+    "record": {"excitation": ["gait"], "seconds": 0.2, "physics_dt": 0.002, "episodes": 2},
+    "record_audit": {},
+    "record_import": {},
+    "fit-actuator": {
+        "hidden": [6, 5, 4],
+        "epochs": 4,
+        "batch": 64,
+        "learning_rate": 0.2,
+        "patience": 1,
+        "epoch_rows": 400,
+        "plots": False,
+    },
     "list": {},
     "bench": {"num_envs": 4, "rounds": 1, "seconds": 0.1, "threads": 1},
 }
@@ -107,6 +123,18 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "train:resume": lambda walk: [str(walk.trained("resumed"))],
     "train:actuator.file": lambda walk: [str(walk.net(1))],
     "train:actuator.period": lambda walk: ["resample"],
+    "train:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],
+    "record:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],
+    "record:excitation": lambda walk: [["steps"]],
+    "record:run": lambda walk: [str(walk.trained("other", "seed=5"))],
+    "record_audit:files": lambda walk: [[str(walk.recorded("lossy", {"sensors.dropped": 0.3}))]],
+    "record_import:source": lambda walk: ["so101_arm"],
+    "record_import:path": lambda walk: [str(walk.logs(1))],
+    "record_import:options": lambda walk: [{"rate_hz": 100.0}],
+    "fit-actuator:recordings": lambda walk: [str(walk.recorded("noisy", {**FIVE, "sensors.qd.noise": 0.3}))],
+    "fit-actuator:inputs": lambda walk: [["position_error"]],
+    "fit-actuator:period": lambda walk: [0.004],
+    "fit-actuator:smoothing": lambda walk: [0.02],
     "eval:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "play:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "eval:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
@@ -115,6 +143,10 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "bench:overrides": lambda walk: [["sim.physics_dt=0.004"]],
 }
 """Other values of leaves where ``other_values`` could not guess one."""
+
+
+FIVE = {"seeds": [0, 1, 2, 3, 4], "physics_dt": 0.002}
+"""What a fit needs to be made of: episodes enough to train with, to stop by and to report on."""
 
 
 # ---------------------------------------------------------------------- the leaves
@@ -229,7 +261,25 @@ def parse(program: str, container: dict[str, Any]) -> Any:
     """What the program makes of its configuration; ConfigError if that is not valid."""
     if program == "train":
         return parse_train(container)
-    return settings.parse(getattr(settings, f"{program.capitalize()}Settings"), container)
+    if program == "record":
+        _, problems = parse_parts(container, RIG)
+        if problems:
+            raise ConfigError(problems)
+    kind, elsewhere = SETTINGS[program]
+    return settings.parse(kind, {k: v for k, v in container.items() if k not in elsewhere})
+
+
+SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
+    "eval": (settings.EvalSettings, ()),
+    "play": (settings.PlaySettings, ()),
+    "record": (settings.RecordSettings, (*RIG, "excitation")),
+    "record_audit": (settings.AuditSettings, ()),
+    "record_import": (settings.ImportSettings, ()),
+    "fit-actuator": (settings.FitActuatorSettings, ("robot",)),
+    "list": (settings.ListSettings, ()),
+    "bench": (settings.BenchSettings, ()),
+}
+"""Program -> its schema, and the keys that are checked elsewhere."""
 
 
 def complaints(program: str, container: dict[str, Any]) -> list[str]:
@@ -255,6 +305,14 @@ def other_values(value: Any) -> list[Any]:
     return []
 
 
+def other_lists(name: str, value: list[Any]) -> Iterator[tuple[str, list[list[Any]]]]:
+    """Name of each number in a list, which may hold lists, and the lists with another number there."""
+    for k, v in enumerate(value):
+        here = f"{name}[{k}]"
+        for inner, others in other_lists(here, v) if isinstance(v, list) else [(here, other_values(v))]:
+            yield inner, [[*value[:k], other, *value[k + 1 :]] for other in others]
+
+
 def with_other_term(container: dict[str, Any], key: str) -> Iterator[dict[str, Any]]:
     """Configurations in which ``term`` names another term, with its own defaults for parameters."""
     group, path = key.split(".")[0], key.rpartition(".")[0]
@@ -275,11 +333,7 @@ def variants(program: str, container: dict[str, Any], key: str, walk: Walk) -> d
     if key.endswith(".term") and key.split(".")[0] in (*MANY_TERMS, *ONE_TERM):
         return {key: list(with_other_term(container, key))}
     if isinstance(value, list):
-        elements = {f"{key}[{k}]": (k, v) for k, v in enumerate(value)}
-        return {
-            name: [put(container, key, [*value[:k], other, *value[k + 1 :]]) for other in other_values(v)]
-            for name, (k, v) in elements.items()
-        }
+        return {name: [put(container, key, v) for v in changed] for name, changed in other_lists(key, value)}
     if isinstance(value, str):  # the schema's complaint lists what may stand there
         allowed = [m for line in complaints(program, put(container, key, "?")) for m in re.findall(r"'(\w+)'", line)]
         return {key: [put(container, key, v) for v in [*allowed, f"{value}_other"] if v != value]}
@@ -343,12 +397,52 @@ class Walk:
             self._nets[seed] = self._make_net(seed=seed, period=2 * SMALL["train"]["sim.physics_dt"])
         return self._nets[seed]
 
+    def recorded(self, name: str, changes: Mapping[str, Any]) -> Path:
+        """A folder of recordings of the simulated robot."""
+        if name not in self._runs:
+            folder = self._scratch / name
+            container = small("record", compose("record", ("backend.threads=1", f"out={folder}")))
+            for key, value in changes.items():
+                container = put(container, key, value)
+            list(record_trace(resolved(container), self))
+            self._runs[name] = folder
+        return self._runs[name]
+
+    def logs(self, seed: int) -> Path:
+        """A folder with a log of each of two other robots."""
+        folder, rng = self._scratch / f"logs{seed}", np.random.default_rng(seed)
+        if not folder.exists():
+            folder.mkdir()
+            names = [name.format(i) for i in range(12) for name in ("jpos{}", "jvel{}", "jpos{}_des")]
+            rows = np.column_stack([np.tile([20.0, 0.5], (9, 1)), rng.normal(size=(9, 36))])
+            np.savetxt(folder / "go2.csv", rows, delimiter=",", header=",".join(["kp", "kd", *names]), comments="")
+            moved = {key: rng.normal(size=(9, 2)) for key in ("pos", "vel", "cmd_pos")}
+            np.savez(folder / "arm.npz", t=np.arange(9) / 50.0, joint_names=["Base", "Jaw"], **moved)
+        return folder
+
+    def needs(self, leaf: Leaf) -> list[str]:
+        """Overrides without which the program of a leaf does nothing, or nothing that the leaf could change."""
+        if leaf.program in ("eval", "play"):
+            return [f"run={self.trained('run')}"]
+        if leaf.program == "record":
+            walk = ["excitation=[policy]", f"run={self.trained('run')}"] if leaf.key in ("run", "episodes") else []
+            stand = ["support=ground"] if leaf.key == "sensors.truth" else []  # a held trunk does not move
+            return ["backend.threads=1", *walk, *stand]
+        if leaf.program == "record_audit":
+            return [f"files=[{self.recorded('whole', {})}]"]
+        if leaf.program == "record_import":
+            return ["source=go2_in_air", f"path={self.logs(0)}"]
+        if leaf.program == "fit-actuator":
+            return [f"recordings={self.recorded('five', FIVE)}"]
+        return []
+
     def setup(self, leaf: Leaf) -> dict[str, Any]:
         """The configuration, interpolations unresolved, in which a leaf is tried."""
-        needs = [f"run={self.trained('run')}"] if leaf.program in ("eval", "play") else []
+        needs = self.needs(leaf)
         if leaf.file == "actuator/net":  # its period is not the simulation's, so that it matters what is done then
             needs = [f"actuator.file={self.net(0)}", "actuator.period=hold"]
-        return small(leaf.program, compose(leaf.program, (*leaf.choice, *needs)))
+        container = small(leaf.program, compose(leaf.program, (*leaf.choice, *needs)))
+        return put(container, "excitation", ["policy"]) if "excitation=[policy]" in needs else container
 
     def trace(self, program: str, container: dict[str, Any], key: str) -> Trace:
         how = resume_trace if key == "resume" else TRACES[program]
@@ -516,16 +610,19 @@ def resume_trace(container: dict[str, Any], walk: Walk) -> Trace:
     yield "folder", folders
 
 
-def outcome(app: App, container: dict[str, Any], walk: Walk) -> tuple[str, dict[str, bytes]]:
-    """Run a verb without its Hydra application; return what it printed and the files it wrote."""
+def outcome(
+    app: App, container: dict[str, Any], walk: Walk, statuses: tuple[int, ...] = (0,)
+) -> tuple[str, dict[str, bytes]]:
+    """Run a verb without its Hydra application; return what it printed, and the files it wrote by path."""
     said, here = io.StringIO(), walk.folder()
     places = [here, *(Path(run) for run in [container.get("run")] if run)]
     before = {p for place in places for p in place.rglob("*")}
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
         patch.chdir(here)
-        assert not app.task(container)
-    files = [p for place in places for p in place.rglob("*") if p not in before and p.is_file()]
-    written = {p.name: p.read_bytes() for p in files}
+        status = app.task(container) or 0
+    assert status in statuses
+    files = {p: place for place in places for p in place.rglob("*") if p not in before and p.is_file()}
+    written = {p.relative_to(place).as_posix(): p.read_bytes() for p, place in files.items()}
     for file in files:
         file.unlink()
     return said.getvalue(), written
@@ -575,6 +672,64 @@ def play_trace(container: dict[str, Any], walk: Walk) -> Trace:
     yield "files", files
 
 
+def record_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """Where the recordings lie and what their channels hold; their names and metadata repeat the settings."""
+    from go1exp.cli.record import APP
+    from go1exp.record import simulate
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "SETTLE_S", 0.02)
+        _, files = outcome(APP, container, walk)
+    yield from recorded(files)
+
+
+def recorded(files: Mapping[str, bytes]) -> Trace:
+    yield "folders", [Path(name).parent.as_posix() for name in files]
+    for content in files.values():
+        columns = parquet.read_table(io.BytesIO(content)).to_pydict()
+        yield "channels", {name: np.asarray(column, dtype=float) for name, column in columns.items()}
+
+
+def audit_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """What is said of the recordings, without their names, and where it is written."""
+    from go1exp.cli.record_audit import APP, STATUS
+
+    said, files = outcome(APP, container, walk, tuple(STATUS.values()))
+    yield "findings", [line for line in said.splitlines() if ".parquet" not in line and "written to" not in line]
+    yield "files", sorted(files)
+
+
+def import_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    from go1exp.cli.record_import import APP
+
+    yield from recorded(outcome(APP, container, walk)[1])
+
+
+def fit_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """Errors in the report, the net's numbers, and for how long it was trained; not what the net says of itself."""
+    from go1exp import fit
+    from go1exp.cli import fit_actuator
+    from go1exp.fit.net import load
+
+    def plot(result: fit.FitResult, folder: Path) -> list[Path]:
+        (folder / "picture.png").touch()
+        return [folder / "picture.png"]
+
+    epochs: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "plot", plot)
+        patch.setattr(fit_actuator, "spinner", lambda total, what: lambda done, total: epochs.append(done))
+        _, files = outcome(fit_actuator.APP, container, walk)
+    yield "files", sorted(files)
+    found = {Path(name).name: content for name, content in files.items()}
+    report = json.loads(found["report.json"])
+    yield "report", {k: report[k] for k in ("cells", "episodes", "missing", "thresholds")}
+    file = walk.folder() / "net.npz"
+    file.write_bytes(found["net.npz"])
+    yield "net", load(file).arrays()
+    yield "epochs", epochs
+
+
 def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
     from go1exp.cli.listing import APP
 
@@ -616,6 +771,10 @@ TRACES: dict[str, Callable[[dict[str, Any], Walk], Trace]] = {
     "train": train_trace,
     "eval": eval_trace,
     "play": play_trace,
+    "record": record_trace,
+    "record_audit": audit_trace,
+    "record_import": import_trace,
+    "fit-actuator": fit_trace,
     "list": list_trace,
     "bench": bench_trace,
 }

@@ -204,7 +204,7 @@ from go1exp.env.core import Go1Core
 reward = Go1Core._reward
 def broken(self, s):
     if int(self.steps[3]) == 12:
-        self.torque[3, 5] = float("nan")
+        s.joint_torque[3, 5] = float("nan")
     return reward(self, s)
 Go1Core._reward = broken
 sys.exit(main())

@@ -13,25 +13,36 @@ from go1exp.cli.record import RIG
 from go1exp.cli.settings import RecordSettings, parse
 from go1exp.compose import compose
 from go1exp.config import parse_parts
-from go1exp.gap import EXIT_CODES, GapResult, GapSettings, explain
 from go1exp.gap.box import Bounds, solve
+from go1exp.gap.explain import explain
 from go1exp.gap.judge import max_t, splits
 from go1exp.gap.likelihood import Layout, gram, predicted
 from go1exp.gap.replay import HungGo1, Probe
+from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
 from go1exp.gap.windows import even_clock, held, noise
 from go1exp.record import plan, simulate
 from go1exp.recording import Meta, Recording
 from go1exp.registry import bind
 
-QUICK = GapSettings(stride_s=0.6, window_s=0.2, shortlist=2, iterations=2, bags=20, overlays=1)
+QUICK = GapSettings(
+    stride_s=0.4,
+    window_s=0.2,
+    physics_dt=0.002,
+    effects=("coulomb", "viscous", "stribeck", "command_delay"),
+    shortlist=3,
+    iterations=2,
+    max_terms=1,
+    bags=20,
+    overlays=1,
+)
 
 
 def robot(*overrides: str) -> tuple[simulate.Rig, list[Recording]]:
-    """Record a hung robot: three gain sets, a chirp each, 2.5 s."""
+    """Record a hung robot: three gain sets, a chirp each, 3.5 s."""
     gains = "gains=[[20,0.5],[35,0.6],[35,1.2]]"
     container = compose(
         "record",
-        ["backend.threads=1", "physics_dt=0.0005", "seconds=2.5", "excitation=[chirp]", gains, *overrides],
+        ["backend.threads=1", "physics_dt=0.0005", "seconds=3.5", "excitation=[chirp]", gains, *overrides],
     )
     parts, problems = parse_parts(container, RIG)
     assert problems == []

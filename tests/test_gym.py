@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
+from go1exp import data_root
 from go1exp.config import TaskConfig
 from go1exp.env import register
 from go1exp.env.core import Go1Core
@@ -50,6 +53,13 @@ def actions(n: int, steps: int, scale: float = 1.0, seed: int = 0) -> np.ndarray
 
 
 # Gymnasium
+
+
+def test_the_example_of_the_readme_works_in_a_fresh_interpreter() -> None:
+    code = (data_root() / "README.md").read_text().split("```python")[1].split("```")[0]
+    more = "\nobservation, _ = env.reset(seed=0)\nprint(observation.shape, env.spec.id)"
+    done = subprocess.run([sys.executable, "-c", code + more], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "(48,) Go1-v0", done.stderr
 
 
 def test_gymnasiums_own_checker_is_content() -> None:

@@ -164,9 +164,42 @@ def test_drives_that_are_off_make_no_torque_and_come_back_gently() -> None:
         np.testing.assert_allclose(r.joint("q_target")[row], r.joint("q")[row], atol=0.02)
 
 
+def test_all_recordings_of_a_set_are_of_one_robot_even_if_robots_differ() -> None:
+    spread = "+effect.encoder_offset={offset: 0.0, spread: {offset: 0.05}}"
+    still = ["excitation=[slow_ramps]", "seconds=0.4", "hang=[[0.0,0.0],[0.0,0.3]]", "repeats=1", *NOISELESS]
+    found = make(*still, spread)
+    plain = make(*still)
+    offsets = [np.mean(a.joint("q") - b.joint("q_target"), axis=0) for a, b in zip(found, plain, strict=True)]
+    # The drive closes on its own reading, so that what the readings of two poses share is not the offset alone.
+    level = [offsets[0], offsets[2]]
+    np.testing.assert_allclose(level[0], level[1], atol=1e-9)
+    torques = [r.joint("tau_est").mean(0) for r in (found[0], found[2])]
+    np.testing.assert_allclose(torques[0], torques[1], atol=1e-9)
+    other = make(*still, spread, "seed=1")
+    assert np.abs(other[0].joint("tau_est").mean(0) - torques[0]).max() > 0.01
+
+
+def test_recordings_of_one_name_and_folders_that_cannot_be_written_are_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    cases = {
+        ("seeds=[0,0]", f"out={tmp_path / 'a'}"): "chirp_kp20_kd0.5_0: two recordings of this name",
+        (f"out={tmp_path / 'file'}",): f"out = '{tmp_path / 'file'}': cannot be written to",
+        ("excitation=[policy]", "run=nowhere", "repeats=2", f"out={tmp_path / 'a'}"): "are for motions",
+    }
+    for arguments, message in cases.items():
+        sys.argv = ["go1exp", "record", "seconds=0.2", *arguments]
+        assert main() == 2, arguments
+        assert message in capsys.readouterr().err
+
+
 def test_a_hidden_effect_moves_the_robot_and_leaves_no_name_in_the_file(tmp_path: Path) -> None:
     arguments = ["record", "excitation=[slow_ramps]", "seconds=2.0", "physics_dt=0.001"]
-    for name, more in (("with", ["effect=[coulomb,encoder_offset]"]), ("without", [])):
+    for name, more in (
+        ("with", ["effect=[coulomb,encoder_offset]", "effect.encoder_offset.offset=0.03"]),
+        ("without", []),
+    ):
         sys.argv = ["go1exp", *arguments, *more, f"out={tmp_path / name}"]
         assert main() == 0
     (file,) = (tmp_path / "with").iterdir()
@@ -272,10 +305,13 @@ def test_a_recording_can_be_audited_and_a_damaged_one_is_named(
     assert main() in (0, 3)
     assert "q_FR_hip" in (tmp_path / "audit.json").read_text()
     assert file.name in capsys.readouterr().out
-    file.write_bytes(file.read_bytes()[:2000])
-    sys.argv = ["go1exp", "record", "audit", str(file)]
+    damaged = tmp_path / "another.parquet"
+    damaged.write_bytes(file.read_bytes()[:2000])
+    sys.argv = ["go1exp", "record", "audit", str(tmp_path)]
     assert main() == 1
-    assert f"{file}: not a whole Parquet file" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert f"{damaged}: not a whole Parquet file" in said.err
+    assert file.name in said.out  # the other one is judged all the same
 
 
 def test_channels_without_noise_or_steps_are_left_as_they_are() -> None:

@@ -14,6 +14,7 @@ VERBS = {
     "eval": "run a trained policy through a grid of commands: errors, falls, a table and JSON",
     "play": "watch a trained policy: a clip without a display, a live viewer with one",
     "record": "drive the simulated robot and log it; audit recordings, import others",
+    "gap": "find where simulation and recordings disagree, name the missing effect, add it",
     "fit-actuator": "learn an actuator net from recordings",
     "list": "list terms, groups and their choices, one line each",
     "bench": "measure speed as ratios in one run",
@@ -29,9 +30,13 @@ SUBVERBS = {"record": ("audit", "import")}
 POSITIONAL: dict[str, tuple[str, ...]] = {
     "record_audit": ("files",),
     "record_import": ("source", "path"),
+    "gap": ("stage",),
     "list": ("group",),
 }
 """Settings that may be given by position alone; ``files`` takes all that are left."""
+
+VALUED = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn")
+"""Options of Hydra whose value is the word after them."""
 
 HELP = """usage: go1exp VERB [key=value ...]
 
@@ -75,8 +80,11 @@ def main() -> int:
 def _by_name(verb: str, arguments: list[str]) -> list[str]:
     """Turn arguments by position into ``key=value``: those that are no override, no option and no option's value."""
     keys = list(POSITIONAL.get(verb, ()))
-    words = [a for a in arguments if keys and "=" not in a and not a.startswith(("-", "~"))]
-    rest = [a for a in arguments if a not in words]
+    words: list[str] = []
+    rest: list[str] = []
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        own = "=" in word or word.startswith(("-", "~")) or before in VALUED
+        (rest if own or not keys else words).append(word)
     named = []
     for key in keys:
         if key == "files" and words:
@@ -103,10 +111,15 @@ def _complete(request: str) -> int:
     if action == "query" and len(words) <= 2:
         print("\n".join(v for v in VERBS if v.startswith(words[-1] if len(words) == 2 else "")))
         return 0
-    verb = words[1] if action == "query" else "train"
+    verb, after = words[1] if action == "query" else "train", words[2:]
     if verb not in VERBS:
         return 0
     if action == "query":
-        os.environ["COMP_LINE"] = " ".join([words[0], *words[2:]])
+        second = SUBVERBS.get(verb, ())
+        if len(after) > 1 and after[0] in second:
+            verb, after = f"{verb}_{after[0]}", after[1:]
+        elif len(after) == 1:
+            print("".join(f"{word}\n" for word in second if word.startswith(after[0])), end="", flush=True)
+        os.environ["COMP_LINE"] = " ".join([words[0], *after])
         os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
     return _module(verb).APP.run(["-sc", f"{action}={shell}"])

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.registry import ConfigError
 
@@ -13,6 +14,7 @@ from go1exp.registry import ConfigError
 def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.settings import EvalSettings, checkpoint_file, parse, run_folder
 
+    other, container = other_robot.split(container)
     settings = parse(EvalSettings, container)
     run = run_folder(settings.run)
     checkpoint = checkpoint_file(run, settings.checkpoint)
@@ -28,7 +30,12 @@ def _task(container: dict[str, Any]) -> None:
     trained, policy, about = load_run(run, checkpoint)
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
     config = EvalConfig.of(settings, commands=commands)
-    report = {"policy": about, **evaluate(trained.task, policy, config, spinner(1, "evaluating"))}
+    task = other_robot.replaced(trained.task, other)
+    report = {
+        "policy": about,
+        "robot": other_robot.described(other),
+        **evaluate(task, policy, config, spinner(1, "evaluating")),
+    }
     out = Path(settings.out) if settings.out else run / "eval.json"
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(report, indent=2) + "\n")

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
-from go1exp.registry import ConfigError
+from go1exp.registry import ConfigError, explain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,14 +17,6 @@ if TYPE_CHECKING:
     from go1exp.robot import RobotConfig
 
 GO1 = "go1"
-
-
-def _read(places: str | tuple[str, ...]) -> list[Recording]:
-    """Read the recordings of folders and files."""
-    from go1exp.recording import read, read_folder
-
-    paths = [Path(p) for p in ([places] if isinstance(places, str) else places)]
-    return [r for path in paths for r in (read_folder(path) if path.is_dir() else [read(path)])]
 
 
 def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[[Recording], np.ndarray]:
@@ -56,10 +47,18 @@ def _task(container: dict[str, Any]) -> None:
     if problems:
         raise ConfigError(problems)
 
+    from pydantic import ValidationError
+
     from go1exp import fit
+    from go1exp.cli.logs import read_all, writable
 
     own = {f.name: getattr(settings, f.name) for f in fields(fit.FitSettings)}
-    recordings = _read(settings.recordings)
+    try:
+        how = fit.FitSettings(**own)
+    except ValidationError as error:
+        raise ConfigError(explain(error, "", own)) from None
+    out = writable(settings.out)
+    recordings = read_all(settings.recordings)
     bar = spinner(settings.epochs, "fitting")
     stage = [""]
 
@@ -69,10 +68,10 @@ def _task(container: dict[str, Any]) -> None:
             print(f"fitting {what} ...", flush=True)
         bar(done, total)
 
+    if settings.target == "joint_torque" and settings.smoothing is None:
+        print("note: smoothing=0.02 usually serves target=joint_torque better (docs/actuators.md)")
     inverse = _inverse_dynamics(parts["robot"], settings.smoothing) if settings.target == "joint_torque" else None
-    result = fit.fit(recordings, fit.FitSettings(**own), progress, inverse)
-    out = Path(settings.out)
-    out.mkdir(parents=True, exist_ok=True)
+    result = fit.fit(recordings, how, progress, inverse)
     result.net.save(out / "net.npz")
     result.net.export_onnx(out / "net.onnx")
     (out / "report.json").write_text(json.dumps(result.report.as_dict(), indent=2) + "\n")

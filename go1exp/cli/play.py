@@ -6,12 +6,14 @@ import os
 from pathlib import Path
 from typing import Any
 
+from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
 
 
 def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.settings import PlaySettings, checkpoint_file, parse, run_folder
 
+    other, container = other_robot.split(container)
     settings = parse(PlaySettings, container)
     run = run_folder(settings.run)
     checkpoint = checkpoint_file(run, settings.checkpoint)
@@ -26,7 +28,8 @@ def _task(container: dict[str, Any]) -> None:
     trained, policy, _ = load_run(run, checkpoint)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
     shown = EvalConfig.of(settings, commands=(settings.velocity,), **whole)
-    core = Go1Core(evaluation_task(trained.task, shown), 1, settings.seed, noise=settings.noise)
+    task = other_robot.replaced(trained.task, other)
+    core = Go1Core(evaluation_task(task, shown), 1, settings.seed, noise=settings.noise)
     if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
         video.live(core, policy)
         return

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
 from go1exp.registry import ConfigError, Term, bind
+
+if TYPE_CHECKING:
+    from go1exp.cli.settings import RecordSettings
 
 RIG = ("robot", "actuator", "effect", "terrain", "backend")
 """Groups of the configuration that describe the robot to be recorded."""
@@ -23,6 +25,16 @@ def _motions(given: Any) -> tuple[list[Term], list[str]]:
     items = [pair for item in given for pair in (item.items() if isinstance(item, Mapping) else [(item, {})])]
     bound = [bind("excitation", str(key), value, f"excitation.{key}") for key, value in items]
     return [term for term, _ in bound if term], [p for _, problems in bound for p in problems]
+
+
+def _unused(settings: RecordSettings) -> list[str]:
+    """Return complaints about settings of motions that a policy does not heed."""
+    wrong = []
+    if len(settings.gains) > 1 or settings.repeats or len(settings.seeds) > 1:
+        wrong.append("gains, seeds, repeats: are for motions; a policy's gains are actuator.kp and actuator.kd")
+    if len(settings.hang) > 1:
+        wrong.append("hang: a policy hangs one way at a time")
+    return wrong
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -50,19 +62,24 @@ def _task(container: dict[str, Any]) -> None:
     else:
         if any(m.entry.name == POLICY for m in motions) and settings.run is None:
             problems.append("run: required for excitation=[policy], such as run=runs/NAME")
+        if motions and all(m.entry.name == POLICY for m in motions):
+            problems += _unused(settings)
     if problems:
         raise ConfigError(problems)
     walk = run_folder(settings.run) if settings.run else None
 
     from go1exp import recording
+    from go1exp.cli.logs import writable
     from go1exp.record import plan, simulate
 
     rig = simulate.Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
-    out = Path(settings.out)
     driven = [m for m in motions if m.entry.name != POLICY]
     recordings = []
-    if driven:
-        episodes = plan.episodes(driven, settings)
+    episodes = plan.episodes(driven, settings)
+    out = writable(settings.out)
+    if there := sorted(p.name for p in out.glob("*.parquet")):
+        print(f"note: {out} holds {len(there)} recordings already; they stay, those of the same name are replaced")
+    if episodes:
         show = spinner(1, f"recording {len(episodes)} episodes")
         recordings += simulate.play(rig, episodes, settings.sensors, settings.seed, show)
     if walk and len(driven) < len(motions):

@@ -13,27 +13,35 @@ STATUS = {"ok": 0, "suspect": 3, "bad": 4}
 
 
 def _task(container: dict[str, Any]) -> int:
-    from go1exp.audit import audit_file
+    from go1exp.cli.logs import files_of
     from go1exp.cli.settings import AuditSettings, parse
     from go1exp.recording import RecordingError
 
     settings = parse(AuditSettings, container)
-    files: list[Path] = []
-    for name in settings.files:
-        path = Path(name)
-        inside = sorted(path.glob("*.parquet"))
-        if path.is_dir() and not inside:
-            raise RecordingError(f"{path}: no *.parquet in it")
-        files += inside if path.is_dir() else [path]
-    reports = {str(file): audit_file(file) for file in files}
-    for name, report in reports.items():
-        print(f"{name}\n{report.text()}\n")
+
+    from go1exp.audit import audit_file
+
+    found: dict[str, Any] = {}
+    unreadable: list[str] = []
+    status = 0
+    for file in files_of(settings.files):
+        try:
+            report = audit_file(file)
+        except RecordingError as error:
+            unreadable.append(str(error))
+            found[str(file)] = {"verdict": "unreadable", "message": str(error)}
+            continue
+        print(f"{file}\n{report.text()}\n")
+        found[str(file)] = report.as_dict()
+        status = max(status, STATUS[report.verdict])
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps({name: r.as_dict() for name, r in reports.items()}, indent=2) + "\n")
+        out.write_text(json.dumps(found, indent=2) + "\n")
         print(f"written to {out}")
-    return max(STATUS[r.verdict] for r in reports.values())
+    if unreadable:  # the others have been judged all the same
+        raise RecordingError("\n".join(unreadable))
+    return status
 
 
 APP = App("record_audit", _task, title="record audit")

@@ -14,7 +14,7 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.importers import import_recordings
 
     settings = parse(ImportSettings, container)
-    recordings = import_recordings(settings.source, Path(settings.path), settings.options)
+    recordings = import_recordings(settings.source, Path(settings.path), settings.options or {})
     out = Path(settings.out)
     for r in recordings:
         recording.write(out / f"{r.meta.episode}.parquet", r)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from go1exp.gap.result import GapSettings
 from go1exp.record.plan import Wishes
 from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
 
@@ -125,7 +126,7 @@ class ImportSettings:
 
     source: str
     path: str
-    options: dict[str, Any]
+    options: dict[str, Any] | None
     out: str
 
 
@@ -155,6 +156,20 @@ class FitActuatorSettings:
     seed: Annotated[int, Field(ge=0)]
     plots: bool
     out: str
+
+
+@dataclass(frozen=True)
+class GapVerb:
+    """``conf/gap.yaml``."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    logs: str | tuple[str, ...]
+    model: Literal["go1"]
+    stage: Literal["all", "check", "localise", "explain", "apply", "report"]
+    out: str
+    train_dt: Annotated[float, Field(gt=0, le=0.02)]
+    search: GapSettings
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from go1exp.cli.app import STOPPED, App, discard, run_dir
 from go1exp.cli.settings import run_folder as existing
 from go1exp.compose import key_values
-from go1exp.registry import ConfigError
+from go1exp.registry import ConfigError, Expected
 
 RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "backend.threads", "device")
 """Settings that a resumed run may change: none of them changes what was computed so far (the last three may change
@@ -23,7 +23,7 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
     """Return the run's own configuration with the changes that resuming allows."""
     from go1exp.train import run_folder
 
-    config = OmegaConf.create(run_folder.read_config(run))
+    config = OmegaConf.create(run_folder.read_as_written(run))
     refused = []
     for override in overrides:
         key, _, value = override.partition("=")
@@ -46,7 +46,7 @@ def _refuse_other(run: Path, container: dict[str, Any]) -> None:
 
     if not (run / "config.yaml").is_file():
         return
-    old, new = OmegaConf.create(run_folder.read_config(run)), OmegaConf.create(container)
+    old, new = OmegaConf.create(run_folder.read_as_written(run)), OmegaConf.create(container)
     for key in RESUMABLE:
         OmegaConf.update(old, key, OmegaConf.select(new, key))
     before, after = (key_values(OmegaConf.to_container(c)) for c in (old, new))
@@ -75,6 +75,12 @@ def _task(container: dict[str, Any]) -> int | None:
 
     from go1exp.train import run_folder, trainer
 
+    try:
+        trainer.try_out(config)
+    except (Expected, ConfigError):
+        if not config.process.resume:
+            discard(run)
+        raise
     run_folder.write(run, container)
     print(f"run folder {run}")
     try:

@@ -168,9 +168,12 @@ class Effect(Memory):
         """Return the bound of the joint's dry friction under the drive's ``torque``; ``bound`` is that so far."""
         return bound
 
-    def on_base(self, force: Tensor) -> Tensor:
-        """Return the external force (N, 3) on the trunk's origin, world frame, N; ``force`` is that so far."""
-        return force
+    def on_base(self, wrench: Tensor) -> Tensor:
+        """Return the external wrench (N, 6) on the trunk; ``wrench`` is that so far.
+
+        A force on the trunk's origin in the world's frame, N, then a torque in the trunk's frame, N m.
+        """
+        return wrench
 
     def on_sensor(self, measured: Measured) -> Measured:
         """Change what the robot's sensors say, as policy and logger see it (encoders are ``on_encoder``'s)."""

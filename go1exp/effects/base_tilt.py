@@ -6,7 +6,6 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 import torch
-from scipy.spatial.transform import Rotation
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Measured, Param
@@ -47,6 +46,8 @@ class BaseTilt(Effect):
         """Turn gravity about a held trunk."""
         if self.setup.floating:
             return
+        from scipy.spatial.transform import Rotation  # slow to import, and settings are checked first
+
         quat = model.nominal("body_quat")[0, model.ids("body", ("trunk",))].cpu().numpy()
         gravity = model.field("opt.gravity")
         held = torch.as_tensor(Rotation.from_quat(quat, scalar_first=True).as_matrix()[0]).to(gravity)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @effect("external_wrench")
 class ExternalWrench(Effect):
-    """A constant force (x, y, z) on the trunk's origin, in the world's frame: wind, a tether, a cable.
+    """A constant force (world frame) and torque (trunk frame) on the trunk: wind, a tether, a cable.
 
     0 to 20 N are likely (a judgement). It adds to the acceleration of the trunk and turns with neither robot nor gait.
     A held trunk shows none of it. On a level robot a vertical one looks like a ``payload``, a horizontal one like a
@@ -26,11 +26,17 @@ class ExternalWrench(Effect):
         Param("x", "N", -50.0, 50.0, 0.0, 1.0, "robot", "force along the world's x"),
         Param("y", "N", -50.0, 50.0, 0.0, 1.0, "robot", "along y"),
         Param("z", "N", -50.0, 50.0, 0.0, 1.0, "robot", "along z, up"),
+        Param("roll", "N m", -10.0, 10.0, 0.0, 0.2, "robot", "torque about the trunk's x"),
+        Param("pitch", "N m", -10.0, 10.0, 0.0, 0.2, "robot", "about y"),
+        Param("yaw", "N m", -10.0, 10.0, 0.0, 0.2, "robot", "about z"),
     )
     x: Tensor
     y: Tensor
     z: Tensor
+    roll: Tensor
+    pitch: Tensor
+    yaw: Tensor
 
-    def on_base(self, force: Tensor) -> Tensor:
-        """Add the force."""
-        return force + torch.cat([self.x, self.y, self.z], dim=1)
+    def on_base(self, wrench: Tensor) -> Tensor:
+        """Add force and torque."""
+        return wrench + torch.cat([self.x, self.y, self.z, self.roll, self.pitch, self.yaw], dim=1)

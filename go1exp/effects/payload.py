@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING
 
 import torch
-from scipy.spatial.transform import Rotation
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
@@ -22,11 +21,15 @@ LEAST = 0.1
 
 def _axes(quat: Tensor) -> Tensor:
     """Return the rotation matrices (N, 3, 3) of quaternions (N, 4), w-x-y-z."""
+    from scipy.spatial.transform import Rotation  # slow to import, and settings are checked first
+
     return torch.as_tensor(Rotation.from_quat(quat.cpu().numpy(), scalar_first=True).as_matrix()).to(quat)
 
 
 def _quat(axes: Tensor) -> Tensor:
     """Return the quaternions (N, 4), w-x-y-z, of rotation matrices (N, 3, 3)."""
+    from scipy.spatial.transform import Rotation  # slow to import, and settings are checked first
+
     return torch.as_tensor(Rotation.from_matrix(axes.cpu().numpy()).as_quat(scalar_first=True)).to(axes)
 
 

@@ -149,11 +149,11 @@ class EffectStack:
             bound = effect.on_friction(bound, torque, qd)
         return bound
 
-    def on_base(self, force: Tensor) -> Tensor:
-        """Return the external force (N, 3) on the trunks."""
+    def on_base(self, wrench: Tensor) -> Tensor:
+        """Return the external wrench (N, 6) on the trunks."""
         for effect in self._acting["on_base"]:
-            force = effect.on_base(force)
-        return force
+            wrench = effect.on_base(wrench)
+        return wrench
 
     def measure(self, true: Measured) -> Measured:
         """Return what the robots' sensors say; the joint readings come from ``on_encoder``."""

@@ -2,7 +2,7 @@
 
 
 def register() -> None:
-    """Make ``Go1-v0`` known to Gymnasium, which calls this itself when it is imported (an entry point).
+    """Make ``Go1-v0`` known to Gymnasium. ``import go1exp.gym`` calls it; some versions call entry points themselves.
 
     There is no time limit to declare: the configuration has its own.
     """

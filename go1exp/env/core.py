@@ -52,6 +52,7 @@ class Go1Core:
         spread_starts: let first episodes begin at random times (training only).
         imu: simulate the IMU's sensors too, for a logger.
         held: attitude w-x-y-z in which the trunks are held in the air; None lets them go.
+        alike: draw the effects and drives once, for all robots: one robot, many times (for a logger).
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class Go1Core:
         spread_starts: bool = False,
         imu: bool = False,
         held: tuple[float, float, float, float] | None = None,
+        alike: bool = False,
     ) -> None:
         self.task, self.num_envs, self.noise = task, num_envs, noise
         self._spread_starts = spread_starts
@@ -76,7 +78,7 @@ class Go1Core:
         self._held = held
         self._state = KinematicState.of(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
-        self._build_terms()
+        self._build_terms(EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random)
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
@@ -119,10 +121,10 @@ class Go1Core:
         start = self.task.curriculum[0]().start_level_max if self.task.curriculum else self._max_level
         self._start_levels = min(start, self._max_level) + 1
 
-    def _build_terms(self) -> None:
+    def _build_terms(self, drives: EnvRandom) -> None:
         """Turn the configured terms into callables, and make per-environment the model fields that will vary."""
         task, sim = self.task, self.task.sim
-        setup = drive_setup(task.robot, sim.physics_dt, self.backend, self.random)
+        setup = drive_setup(task.robot, sim.physics_dt, self.backend, drives)
         self.plant = Plant(self.backend, setup, task.actuator, task.effect)
         self.command = task.command(self.random.stream("command"))
         self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}

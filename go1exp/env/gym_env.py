@@ -17,7 +17,7 @@ from go1exp.env.sb3_env import spaces
 class Go1Env(gym.Env[np.ndarray, np.ndarray]):
     """A Go1 from configuration; registered as ``Go1-v0``.
 
-    ``gymnasium.make("Go1-v0", overrides=["reward=paper", "rand=none"])`` takes the command line's overrides.
+    ``gymnasium.make("go1exp.gym:Go1-v0", overrides=["reward=paper", "rand=none"])`` takes the command line's overrides.
 
     Args:
         overrides: as after ``go1exp train``; the run-time settings among them are ignored.

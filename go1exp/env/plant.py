@@ -151,10 +151,12 @@ class Plant:
         if self._beside:
             geared = self._act_beside(geared, q, qd, turn)
         if self._floating and effects.acts("on_base"):
-            force = self.backend.applied()[:, :3]
-            force.copy_(effects.on_base(torch.zeros_like(force)))
+            wrench = self.backend.applied()[:, :6]
+            wrench.copy_(effects.on_base(torch.zeros_like(wrench)))
         self.backend.step(geared)
         if self._rotors:
+            # What is carried is this step's; constants that a reset derives from the model are the whole rotor's.
+            self.backend.field(ARMATURE)[:, self._joints] = self._inertia
             self._rotors.follow(self.joint_acceleration())
 
     def _act_beside(self, geared: Tensor, q: Tensor, qd: Tensor, turn: Tensor | None) -> Tensor:

@@ -6,7 +6,6 @@ Joints move by different phases, frequencies and levels, so that what one does t
 from __future__ import annotations
 
 import numpy as np
-from scipy import signal
 
 from go1exp.excitations.motion import Motion, PerKind, always_on, check, ease, spread, swing
 from go1exp.registry import Annotated, Field, Fraction, NonNegative, Positive, PositiveRange, excitation
@@ -45,6 +44,8 @@ def chirp(
     Raises:
         ExcitationError: if the command rate cannot carry the band, or ``centre`` lies outside ``limits``.
     """
+    from scipy import signal  # slow to import, and settings are checked first
+
     duration = check(t, centre, limits, band[1]) or 1.0
     joints = len(centre)
     octaves = np.log(band[1] / band[0])

@@ -291,6 +291,7 @@ def load(path: Path) -> ActuatorNet:
             arrays = {name: np.asarray(archive[name]) for name in archive.files}
     except Exception as error:  # a flipped bit makes the zip and header parsers raise a dozen types, IndexError too
         reason = (str(error).splitlines() or [""])[0] or type(error).__name__
+        reason = "no zip archive of plain arrays" if "pickle" in reason else reason  # NumPy advises to unpickle it
         raise NetFileError(f"{path}: not an actuator net, or a damaged one ({reason})") from error
     info = _read_info(path, arrays.pop("header", np.array(0)))
     expected = _shapes(info)

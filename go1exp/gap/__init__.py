@@ -1,16 +1,5 @@
-"""Find where simulation and measurement disagree, and name the effect that is missing."""
+"""Find where simulation and measurement disagree, and name the effect that is missing.
 
-from go1exp.gap.explain import explain
-from go1exp.gap.result import EXIT_CODES, Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
-
-__all__ = [
-    "EXIT_CODES",
-    "Candidate",
-    "Floors",
-    "GapResult",
-    "GapSettings",
-    "Localisation",
-    "NamedEffect",
-    "Overlay",
-    "explain",
-]
+``explain.explain`` is the way in, ``result.GapResult`` the answer; ``apply`` writes it for training, ``report`` for
+people.
+"""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 
 import numpy as np
+import torch
 
 from go1exp import __version__
 from go1exp.audit import audit
@@ -50,8 +52,18 @@ def explain(
         settings: how; the defaults if None.
         on_progress: told what goes on and which share of the work is done.
     """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # its arrays are small here: more threads wait for each other longer than they work
+    try:
+        return _explain(recordings, config, settings or GapSettings(), on_progress)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _explain(
+    recordings: Sequence[Recording], config: RobotConfig | Machine, settings: GapSettings, on_progress: Progress
+) -> GapResult:
     start = time.perf_counter()
-    settings = settings or GapSettings()
     machine = hung(config) if isinstance(config, RobotConfig) else config
     on_progress("auditing the logs", 0.0)
     flaws = [line for r in recordings for line in unusable(r, machine)]
@@ -65,11 +77,11 @@ def explain(
         return GapResult("bad log", said, warnings=(said,), seconds=time.perf_counter() - start)
     quats = np.array([recordings[e].meta.base_quat for e in windows.episode])
     replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
-    dt = windows.period / np.ceil(windows.period / settings.physics_dt - 1e-6)
+    dt = windows.period / np.ceil(windows.period / settings.physics_dt - 1e-3)
     warnings: list[str] = []
 
     on_progress("measuring the floors", 0.02)
-    scale, numerical = _with_numerics(replayer, dt)
+    scale, numerical = numerical_scale(replayer, dt)
     score = scorer(replayer, {}, scale, 2.0 * dt)
     parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
     if not parts.by_episode:
@@ -122,6 +134,7 @@ def explain(
         provenance={
             "logs": {r.meta.episode: fingerprint(r) for r in recordings},
             "versions": {"go1exp": __version__, "mujoco": version("mujoco-core"), "numpy": np.__version__},
+            "settings": asdict(settings),
             "seed": settings.seed,
             "physics_dt": float(dt),
             "windows": len(windows),
@@ -158,7 +171,7 @@ def unusable(recording: Recording, machine: Machine) -> list[str]:
     return found
 
 
-def _with_numerics(replayer: Replayer, dt: float) -> tuple[np.ndarray, dict[str, float]]:
+def numerical_scale(replayer: Replayer, dt: float) -> tuple[np.ndarray, dict[str, float]]:
     """Return the noise (W, C, J) with the error of the physics step in it, and that error by quantity."""
     w = replayer.windows
     some = np.unique(np.linspace(0, len(w) - 1, NUMERICAL).astype(int))

@@ -9,7 +9,7 @@ import numpy as np
 
 from go1exp.gap import box
 from go1exp.gap.likelihood import Layout, Scorer, Table, differences
-from go1exp.gap.replay import Key, Probe, Rows, Theta, null, variants
+from go1exp.gap.replay import Key, Machine, Probe, Rows, Theta, null, variants
 
 STEPS = (1.0, 0.3)
 """Lengths of a Gauss-Newton step that are tried."""
@@ -96,8 +96,8 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
     return best
 
 
-Move = tuple[list[Probe], Layout, np.ndarray]
-"""Columns, whose unknowns they are, and by how much those move."""
+Move = tuple[list[Probe], Layout, np.ndarray, box.Bounds]
+"""Columns, whose unknowns they are, by how much those move, and their limits and priors."""
 
 
 def _chi2(model: Model) -> np.ndarray:
@@ -123,13 +123,22 @@ def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) ->
         grams = Table(windows, tuple(every), model.residual, whole, model.theta).grams(scorer)
         weight = 1.0 / np.maximum(_chi2(model), 1.0)
         matrix, right = layout.total(grams * weight[..., None, None])
-        found.append((every, layout, box.solve(matrix, right, box.bounds(layout, every, model.theta, model.free))))
+        limits = box.bounds(layout, every, model.theta, model.free)
+        found.append((every, layout, box.solve(matrix, right, limits), limits))
     return found
 
 
 def _moved(scorer: Scorer, model: Model, move: Move, length: float | np.ndarray) -> Theta:
-    columns, layout, x = move
+    columns, layout, x, _ = move
     return box.moved(model.theta, layout, columns, x * length, scorer.replayer.machine)
+
+
+def _prior(machine: Machine, move: Move, length: float) -> np.ndarray:
+    """Return what the priors say against a move so far, by group of joints (G,); what all share costs each its part."""
+    _, layout, x, limits = move
+    cost = limits.weight * (length * x - limits.centre) ** 2
+    shared = cost[layout.joint < 0].sum() / len(machine.groups)
+    return np.array([cost[np.isin(layout.joint, joints)].sum() for joints in machine.groups]) + shared
 
 
 def _longest(
@@ -138,9 +147,10 @@ def _longest(
     """Return the model moved so far that each group of joints does best; what all share goes where most like it."""
     machine, layout = scorer.replayer.machine, move[1]
     chi2 = np.stack([_chi2(model), *(scorer.chi2(r, windows) for r in found)])  # L V G
-    value = np.log(chi2).sum(axis=1)  # L G
-    which = value.argmin(axis=0)
     lengths = np.array([0.0, *STEPS])
+    value = (scorer.size[windows][:, None] * np.log(chi2)).sum(axis=1)  # L G
+    value += np.stack([_prior(machine, move, length) for length in lengths])
+    which = value.argmin(axis=0)
     shared = int(value.sum(axis=1).argmin())
     own = np.full(len(machine.joints), lengths[shared])
     for g, joints in enumerate(machine.groups):

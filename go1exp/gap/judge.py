@@ -72,8 +72,15 @@ def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.r
 
 
 def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the fall of log chi2 per window (M, V) of models: ``before`` (V, G) and ``after`` (M, V, G) per value."""
-    return np.asarray(np.log(before.sum(-1)) - np.log(after.sum(-1)))
+    """Return the fall of log chi2 (M, V G) of models in every window and group of joints.
+
+    Groups do not feel each other, so each is a judgement of its own; an effect that few windows show needs them all.
+
+    Args:
+        before: chi2 per value (V, G).
+        after: the same of each model (M, V, G).
+    """
+    return np.asarray(np.log(before) - np.log(after)).reshape(len(after), -1)
 
 
 def max_t(gain: np.ndarray, rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:

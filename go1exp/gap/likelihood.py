@@ -188,7 +188,7 @@ def differences(scorer: Scorer, y: np.ndarray, window: np.ndarray, probes: Seque
     columns = []
     for k, probe in enumerate(probes):
         per = scorer.unit(y[:, 1 + k] - y[:, 0], window)
-        delta = probe.delta.reshape(-1) if probe.place is None else probe.delta[groups[:, probe.place]]
+        delta = probe.delta[:1] if probe.place is None else probe.delta[groups[:, probe.place]]
         columns.append(per / delta.astype(np.float32)[:, None])
     shape = (*scorer.unit(y[:, 0], window).shape, 0)
     return np.stack(columns, axis=-1) if columns else np.zeros(shape, np.float32)
@@ -201,7 +201,7 @@ def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Pr
     """
     machine, replayer = scorer.replayer.machine, scorer.replayer
     residual = scorer.residual(variants(machine, theta, windows, []), dt)
-    y = replayer.run(variants(machine, theta, windows, probes), 2.0 * dt)
+    y = replayer.run(variants(machine, theta, windows, probes), dt)
     y = y.reshape(len(windows), 1 + len(probes), *scorer.windows.y.shape[1:])
     return Table(windows, tuple(probes), residual, differences(scorer, y, windows, probes), theta)
 

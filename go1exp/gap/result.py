@@ -44,6 +44,7 @@ class GapSettings:
         alpha: significance that a term needs.
         min_share: share of the remaining excess that a term must remove.
         max_terms: most terms that are named.
+        effects: names of the effects to consider; all that the recordings could show if empty.
         shortlist: candidates that are fitted in full, of all that are screened.
         iterations: Gauss-Newton steps of a fit.
         adequate: excess up to which the model counts as right (floor 1 is excess 0).
@@ -67,6 +68,7 @@ class GapSettings:
     alpha: Share = 0.01
     min_share: Fraction = 0.1
     max_terms: Count = 4
+    effects: tuple[str, ...] = ()
     shortlist: Count = 5
     iterations: Count = 3
     adequate: Positive = 0.5

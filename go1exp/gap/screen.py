@@ -38,6 +38,7 @@ FREE_SHAPES: dict[str, tuple[str, ...]] = {
     "stribeck": ("speed",),
     "parallel_stiffness": ("rest",),
     "cogging": ("phase", "count"),
+    "torque_speed_limit": ("stall",),
 }
 """Shapes that a full fit may change."""
 
@@ -79,8 +80,7 @@ class Variant:
     @property
     def free(self) -> tuple[Key, ...]:
         """Parameters that a full fit changes."""
-        probed = dict.fromkeys(p.key for p in self.probes if isinstance(p.key, tuple))
-        return (*probed, *((self.effect, name) for name in FREE_SHAPES.get(self.effect, ())))
+        return (*box.sizes(self.effect), *((self.effect, name) for name in FREE_SHAPES.get(self.effect, ())))
 
 
 def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -> list[Variant]:

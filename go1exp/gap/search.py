@@ -23,6 +23,12 @@ SILENT = 0.02
 SCREENED = 20
 """Windows in which candidates are screened, at most."""
 
+FEW = 0.5
+"""A candidate that removes more than this share of the excess without being significant is seen in too few windows."""
+
+SETTLED = 0.01
+"""Fall of log chi2 in a round of fitting, and log chi2 itself, below which more rounds are not worth their time."""
+
 
 def excess(chi2: np.ndarray) -> float:
     """Return the mean excess of chi2 per value (V, G)."""
@@ -83,10 +89,15 @@ class Search:
 
     def settle(self, rounds: int) -> np.ndarray:
         """Fit all that may move, on the windows for training; return chi2 (V, G) there."""
+        reached = np.inf
         for _ in range(rounds):
             own = self.linear(self.theta, self.splits.train)
             (best,) = fit(self.scorer, [Model("", self.theta, frozenset(self.terms), ())], own, 2, self.dt)
             self.theta = best.theta
+            assert best.chi2 is not None
+            before, reached = reached, float(np.log(best.chi2).mean())
+            if reached > before - SETTLED or (reached < SETTLED and not self.terms):
+                break
         assert best.residual is not None
         assert best.chi2 is not None
         self.own = replace(own, residual=best.residual, theta=best.theta)
@@ -100,7 +111,7 @@ class Search:
         """Search."""
         settings = self.settings
         self.progress("fitting the model within its tolerances", 0.1)
-        train = self.settle(2)
+        train = self.settle(3)
         now = self.held_out(self.theta)
         self.steps.append(("within tolerances", excess(now)))
         for stage in range(1, settings.max_terms + 1):
@@ -121,16 +132,24 @@ class Search:
             self.terms.append(accepted.name)
             self.theta = accepted.theta
             self.progress(f"fitting the model with {accepted.name}", share + 0.12)
-            train = self.settle(2)
+            train = self.settle(4)
             now = self.held_out(self.theta)
             self.steps.append((accepted.name, excess(now)))
         if len(self.terms) > 1:
             self._eliminate(now)
 
+    def listen(self) -> None:
+        """Only find out how loud each effect would be (``signal``)."""
+        self.settle(1)
+        found, _ = self._screened()
+        self._listen(found)
+
     def _screened(self) -> tuple[list[Screened], Table]:
         assert self.own is not None
         mean = self.scorer.windows.y[:, :, 0].mean((0, 1))
         ways = library(self.scorer.replayer.machine, mean, self.terms)
+        if self.settings.effects:
+            ways = [v for v in ways if v.effect in self.settings.effects]
         count = len(self.own.windows)
         # Half of the windows that are looked at are the worst, half are spread evenly.
         worst = np.argsort(-self.scorer.chi2(self.own.residual, self.own.windows).sum(1))[: SCREENED // 2]
@@ -149,7 +168,7 @@ class Search:
                 chosen.setdefault(s.variant.effect, s)
         models = []
         for effect, s in chosen.items():
-            keys = s.variant.free or box.sizes(effect)
+            keys = s.variant.free
             models.append(Model(effect, s.theta, frozenset([*self.terms, effect]), keys))
         return fit(self.scorer, models, own, self.settings.iterations, self.dt) if models else []
 
@@ -207,6 +226,7 @@ class Search:
     def _bag(self, gain: np.ndarray, chosen: int, alias: np.ndarray) -> float:
         """Return the share of resampled windows in which the chosen candidate, or its equal, gains most."""
         episode = self.scorer.windows.episode[np.concatenate([self.splits.train, self.splits.select])]
+        episode = np.repeat(episode, len(self.scorer.replayer.machine.groups))
         wins = 0
         for _ in range(self.settings.bags):
             picked = judge.resampled(episode, self.rng)
@@ -233,6 +253,8 @@ class Search:
             return "alias", f"does as well as {fitted[chosen].name}: these data cannot tell them apart"
         if sizes[k] <= 1.0:
             return "rejected", f"fits within its tolerance ({sizes[k]:.2g} of it)"
+        if p[k] >= settings.alpha and share[k] > FEW and gain[k].mean() > 0:
+            return "rejected", f"removes {share[k]:.1%} of the excess, but too few windows show it (p = {p[k]:.2g})"
         if p[k] >= settings.alpha or gain[k].mean() <= 0:
             return "rejected", f"no significant gain on held-out windows (p = {p[k]:.2g})"
         if share[k] <= settings.min_share:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from go1exp.importers.source import Arrays, columns, files, joint_columns, load_npz, rate, recording, reorder
 from go1exp.recording import VECTORS, Recording, RecordingError
@@ -45,6 +44,8 @@ def go1_walk_snippet(path: Path) -> list[Recording]:
 
 
 def _one(path: Path) -> Recording:
+    from scipy.spatial.transform import Rotation  # slow to import, and settings are checked first
+
     data = load_npz(path)
     _check_gains(data)
     t = data.numbers("t")

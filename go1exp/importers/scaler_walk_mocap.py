@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from go1exp.importers.source import Arrays, columns, files, joint_columns, load_npz, rate, recording
 from go1exp.recording import FOOT_FORCE, VECTORS, Recording, RecordingError
@@ -93,6 +92,8 @@ def _foot_forces(data: Arrays) -> tuple[dict[str, np.ndarray], list[str]]:
 
 def _truth(data: Arrays, t: np.ndarray, tolerance: float) -> tuple[dict[str, np.ndarray], str]:
     """Position and attitude of the base by the nearest motion-capture sample, if every row has one."""
+    from scipy.spatial.transform import Rotation  # slow to import, and settings are checked first
+
     clock, valid = data.numbers("mocap_t"), data.numbers("mocap_valid") > 0
     position, xyzw = data.numbers("mocap_pos", 3), data.numbers("mocap_quat_xyzw", 4)
     to_body = data.numbers("mocap_to_body_rot", 3)

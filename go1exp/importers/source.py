@@ -87,7 +87,8 @@ def load_npz(path: Path) -> Arrays:
                 raise ValueError("one bare array")
             return Arrays(path, {key: archive[key] for key in archive.files})
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise RecordingError(f"{path}: not a whole .npz of plain arrays ({error})") from error
+        reason = "no zip archive of them" if "pickle" in str(error) else error  # NumPy advises to unpickle it
+        raise RecordingError(f"{path}: not a whole .npz of plain arrays ({reason})") from error
 
 
 def rate(path: Path, t: np.ndarray) -> float:

@@ -53,7 +53,7 @@ class PhysicsBackend(Protocol):
     def applied(self) -> Tensor:
         """Live generalised forces (N, nv) beside the drives' torques, N and N m; kept until they are written anew.
 
-        The first three of a floating trunk are a force on its origin in the world frame.
+        The first six of a floating trunk are a force on its origin in the world frame and a torque in its own.
         """
 
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from go1exp import robot
 from go1exp.physics.scene import build_model
 from go1exp.robot import RobotConfig
 from go1exp.terrain import TerrainConfig, build_terrain
@@ -16,7 +17,7 @@ def joint_torques(
     """Return M(q) qdd + c(q, qd) + g(q) of a robot whose trunk is held: what drive and friction together gave.
 
     Args:
-        config: the robot; its damping and dry friction count as part of the model, so that they are not in the result.
+        config: the robot; its damping and dry friction are the model's own, so that they are not in the result.
         base_quat: attitude of the trunk, w-x-y-z.
         q: joint angles (T, 12), rad.
         qd: joint speeds (T, 12), rad/s.
@@ -34,4 +35,4 @@ def joint_torques(
         data.qpos[:], data.qvel[:], data.qacc[:] = q[row], qd[row], qdd[row]
         mujoco.mj_inverse(model, data)
         found[row] = data.qfrc_inverse
-    return found
+    return found + robot.per_joint(config.friction_loss) * np.sign(qd)

@@ -89,6 +89,11 @@ def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
                     if base is not None and len(wishes.hang) > 1:
                         name += f"_roll{base[0]:g}_pitch{base[1]:g}"
                     found.append(Episode(name, term.entry.name, motion, kp, kd, base, None, _seed(wishes, len(found))))
+    twice = sorted({e.name for e in found if [f.name for f in found].count(e.name) > 1})
+    if twice:
+        raise ConfigError(
+            [f"{name}: two recordings of this name; leave out one, or record them into two folders" for name in twice]
+        )
     sets = dict.fromkeys((e.kp, e.kd) for e in found)
     firsts = [next(e for e in found if (e.kp, e.kd) == gains) for gains in sets]
     for e in firsts:

@@ -58,8 +58,11 @@ class SensorConfig:
 
 
 def _spoil(true: np.ndarray, channel: Channel, rng: np.random.Generator) -> np.ndarray:
-    noisy = true + channel.noise * rng.standard_normal(true.shape)
-    return np.round(noisy / channel.step) * channel.step if channel.step else noisy
+    return _stepped(true + channel.noise * rng.standard_normal(true.shape), channel)
+
+
+def _stepped(values: np.ndarray, channel: Channel) -> np.ndarray:
+    return np.round(values / channel.step) * channel.step if channel.step else values
 
 
 def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -87,7 +90,8 @@ def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Gen
         found |= dict(zip(VECTORS[f"imu_{name}"], _spoil(true[name], getattr(config, name), rng).T, strict=True))
     error = Rotation.from_rotvec(config.attitude.noise * rng.standard_normal((rows, 3)))
     attitude = Rotation.from_quat(true["quat"], scalar_first=True) * error
-    found |= dict(zip(VECTORS["imu_quat"], attitude.as_quat(canonical=True, scalar_first=True).T, strict=True))
+    quat = _stepped(attitude.as_quat(canonical=True, scalar_first=True), config.attitude)
+    found |= dict(zip(VECTORS["imu_quat"], quat.T, strict=True))
     forces = np.maximum(_spoil(true["foot_force"], config.foot_force, rng), 0.0)
     found |= {f"foot_force_{leg}": forces[:, k] for k, leg in enumerate(robot.LEGS)}
     if not true["torque_enable"].all():

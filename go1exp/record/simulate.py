@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -13,8 +14,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from go1exp import __version__, robot
-from go1exp.config import BackendConfig, TaskConfig
-from go1exp.effects.rules import has_gains
+from go1exp.config import BackendConfig, TaskConfig, time_rules
+from go1exp.effects.rules import drives, has_gains
 from go1exp.env.core import Go1Core, make_backend
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.joint_values import spread
@@ -24,7 +25,7 @@ from go1exp.record.plan import Episode
 from go1exp.record.sensors import SensorConfig, log
 from go1exp.record.tape import Tape
 from go1exp.recording import Meta, Recording
-from go1exp.registry import Term
+from go1exp.registry import ConfigError, Term
 from go1exp.robot import RobotConfig
 from go1exp.terrain import TerrainConfig, build_terrain
 
@@ -82,7 +83,7 @@ def _play_alike(
         held=None if hang is None else held_quat(hang),
     )
     backend = make_backend(rig.backend, model, blocks, n)
-    random = EnvRandom(seed, n, device=backend.qpos.device)
+    random = EnvRandom(seed, n, device=backend.qpos.device, alike=True)  # one robot, in all its recordings
     plant = Plant(backend, drive_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
     if has_gains(rig.actuator):
         kp, kd = (torch.tensor([[getattr(e, g)] for e in episodes], dtype=plant.q.dtype) for g in ("kp", "kd"))
@@ -154,11 +155,17 @@ def meta(config: RobotConfig, sensors: SensorConfig, **changes: Any) -> Meta:
 
 
 def policy_task(rig: Rig, trained: TaskConfig, seconds: float) -> TaskConfig:
-    """Return the task in which a policy is recorded: the rig's robot under the commands of training, on flat ground."""
+    """Return the task in which a policy is recorded: the rig's robot under the commands of training, on flat ground.
+
+    Raises:
+        ConfigError: if the periods do not divide each other.
+    """
     period = trained.sim.policy_dt
     sim = dataclasses.replace(
         trained.sim, physics_dt=rig.physics_dt, episode_s=(round(seconds / period) + 2) * period, spread_starts=False
     )
+    if problems := time_rules(sim):
+        raise ConfigError(problems)
     parts = {f.name: getattr(rig, f.name) for f in dataclasses.fields(rig) if f.name != "physics_dt"}
     return dataclasses.replace(trained, sim=sim, rand=(), event=(), curriculum=(), **parts)
 
@@ -188,10 +195,15 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
     A robot that falls is recorded up to its fall.
     """
     held = None if walk.hang is None else held_quat(walk.hang)
-    core = Go1Core(policy_task(rig, walk.trained, walk.seconds), len(walk.names), seed, imu=True, held=held)
+    core = Go1Core(policy_task(rig, walk.trained, walk.seconds), len(walk.names), seed, imu=True, held=held, alike=True)
     observation = core.reset()
     per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
     samples_per_step = round(core.task.sim.policy_dt * sensors.rate_hz)
+    if not math.isclose(samples_per_step, core.task.sim.policy_dt * sensors.rate_hz, rel_tol=1e-6):
+        period = core.task.sim.policy_dt
+        raise ConfigError(
+            [f"sensors.rate_hz = {sensors.rate_hz:g}: must sample the policy's {period:g} s a whole number of times"]
+        )
     steps = round(walk.seconds / core.task.sim.policy_dt)
     tape = Tape(core.plant, per_sample, steps * samples_per_step)
     rows = np.full(len(walk.names), steps * samples_per_step)
@@ -224,5 +236,5 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
 
 def _configured(actuator: Term, gain: str) -> tuple[float, ...] | None:
     """Return a gain as it is configured (not as effects make it), per joint; None if the actuator has none."""
-    value = actuator.parameters.get(gain)
+    value = next((term.parameters[gain] for term, _ in drives(actuator) if gain in term.parameters), None)
     return None if value is None else tuple(float(v) for v in spread(value, robot.JOINTS))

@@ -1,7 +1,8 @@
 """The run folder: what was run, with what, and where its results are.
 
 ``config.yaml`` (resolved), ``meta.json`` (git commit, versions, machine, hashes of assets), ``metrics.csv``,
-``timing.csv``, ``checkpoints/``. Whatever comes later reads the run's own configuration, never today's ``conf/``.
+``timing.csv``, ``checkpoints/``, ``actuator.npz`` (a copy of the actuator net, if there is one). Whatever comes later
+reads the run's own configuration, never today's ``conf/``.
 """
 
 from __future__ import annotations
@@ -11,13 +12,19 @@ import importlib.metadata
 import json
 import os
 import platform
+import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
 from go1exp import __version__, data_root
+from go1exp.actuator.net import find
+
+NET = "actuator.npz"
+"""A run's own copy of its actuator net."""
 
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco-core", "numpy", "hydra-core")
 
@@ -32,12 +39,38 @@ def write(run: Path, container: dict[str, Any]) -> None:
         run.mkdir(parents=True, exist_ok=True)
         (run / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(container)))
         (run / "meta.json").write_text(json.dumps(_meta(container), indent=2) + "\n")
+        for settings in _with_files(container.get("actuator")):
+            source = find(settings["file"])
+            if not (run / NET).exists() or not (run / NET).samefile(source):
+                shutil.copyfile(source, run / NET)
     except OSError as error:
         raise OSError(error.errno, f"run folder cannot be written: {error.strerror}", str(run)) from error
 
 
+def _with_files(actuator: Any) -> Iterator[dict[str, Any]]:
+    """The settings of an actuator, or of one that it wraps, which name a file."""
+    if isinstance(actuator, dict):
+        if isinstance(actuator.get("file"), str):
+            yield actuator
+        for inner in actuator.values():
+            yield from _with_files(inner)
+
+
 def read_config(run: Path) -> dict[str, Any]:
-    """Return the run's own resolved configuration.
+    """Return the run's own resolved configuration; an actuator's file is the run's own copy.
+
+    Raises:
+        FileNotFoundError: if ``run`` is not a run folder.
+    """
+    container = read_as_written(run)
+    for settings in _with_files(container.get("actuator")):
+        if (run / NET).is_file():
+            settings["file"] = str(run / NET)
+    return container
+
+
+def read_as_written(run: Path) -> dict[str, Any]:
+    """Return the configuration that the run was started with.
 
     Raises:
         FileNotFoundError: if ``run`` is not a run folder.

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from go1exp.config import TrainConfig
+from go1exp.effects.rules import drives
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
@@ -40,6 +41,17 @@ def build(config: TrainConfig) -> AdaptivePPO:
         torch.set_num_threads(config.process.torch_threads)
     core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=config.task.sim.spread_starts)
     return AdaptivePPO(config.ppo, Go1VecEnv(core), config.process.seed, config.process.device)
+
+
+def try_out(config: TrainConfig) -> None:
+    """Build one robot, where that can fail for what a file holds: before a run folder says that this run began.
+
+    Raises:
+        ConfigError: if an actuator net does not fit the robot or the physics step.
+        go1exp.registry.Expected: if its file is damaged.
+    """
+    if any("file" in term.parameters for term, _ in drives(config.task.actuator)):
+        Go1Core(config.task, 1)
 
 
 def train(config: TrainConfig, container: dict[str, Any], run: Path) -> AdaptivePPO:

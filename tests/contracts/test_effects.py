@@ -286,6 +286,23 @@ def test_all_effects_absent_together_change_no_bit() -> None:
     assert all(torch.equal(a, b) for a, b in zip(plain_core(), found, strict=True))
 
 
+@pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if overrides(e, "on_gears") or overrides(e, "reset")])
+def test_an_environment_that_is_reseeded_begins_as_if_it_were_new(name: str) -> None:
+    """Masses are drawn anew at every reset, which has MuJoCo derive its constants again from the model as it is."""
+    assert task().rand
+    effects = (term(name, probes(EFFECTS[name])),)
+    core = Go1Core(dataclasses.replace(task(), effect=effects), 2, seed=5)
+
+    def begin() -> list[Tensor]:
+        core.reseed(5)
+        core.reset()
+        actions = (4.0 * torch.sin(0.9 * k + torch.arange(24.0).reshape(2, 12)) for k in range(8))
+        return [core.step(action).observation.clone() for action in actions]
+
+    first = begin()
+    assert all(torch.equal(a, b) for a, b in zip(first, begin(), strict=True))
+
+
 # ---------------------------------------------------------------------- presence
 
 

@@ -1,0 +1,139 @@
+"""``go1exp gap``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import OmegaConf
+
+from go1exp.cli.app import App, spinner
+from go1exp.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.cli.settings import GapVerb
+    from go1exp.gap.result import GapResult
+    from go1exp.recording import Recording
+    from go1exp.robot import RobotConfig
+
+DOES_NOT_HOLD = 15
+"""Exit status if what was found is not as good at the step of training."""
+
+
+def _task(container: dict[str, Any]) -> int:
+    from go1exp.cli.settings import GapVerb, parse
+    from go1exp.config import parse_parts
+
+    parts, problems = parse_parts(container, ("robot",))
+    try:
+        settings = parse(GapVerb, {k: v for k, v in container.items() if k != "robot"})
+    except ConfigError as error:
+        raise ConfigError([*problems, *error.problems]) from None
+    if problems:
+        raise ConfigError(problems)
+    config: RobotConfig = parts["robot"]
+    out = Path(settings.out)
+
+    from go1exp.cli.logs import read_all, writable
+    from go1exp.gap import files
+
+    if settings.stage == "report":
+        return _report(files.load(out), out)
+    recordings = read_all(settings.logs)
+    if settings.stage in ("all", "explain", "apply"):
+        writable(settings.out)
+    if settings.stage == "check":
+        return _check(recordings, config, settings)
+    if settings.stage == "localise":
+        return _localise(recordings, config, settings)
+    if settings.stage == "apply":
+        result = files.load(out)
+        return _apply(result, recordings, config, settings) or result.exit_code
+
+    from go1exp.gap.explain import explain
+
+    result = explain(recordings, config, settings.search, _progress())
+    print(f"\n{result.sentence}\n\nwritten to {files.save(result, out)}")
+    status = result.exit_code
+    if settings.stage == "all" and result.verdict != "bad log":
+        status = _apply(result, recordings, config, settings) or status
+    if settings.stage == "all":
+        _report(result, out)
+    return status
+
+
+def _progress() -> Callable[[str, float], None]:
+    """Return a callback that shows how far the work is, and in a file says each stage once."""
+    bar, said = spinner(100, "gap"), [""]
+
+    def show(what: str, share: float) -> None:
+        if what != said[0]:
+            said[0] = what
+            print(f"{what} ...", flush=True)
+        bar(round(100 * share), 100)
+
+    return show
+
+
+def _check(recordings: list[Recording], config: RobotConfig, settings: GapVerb) -> int:
+    """Say whether the logs are fit to be compared, their floors, and which effects they could not show."""
+    from go1exp.audit import audit
+    from go1exp.gap.survey import survey
+
+    for recording in recordings:
+        report = audit(recording)
+        print(f"{recording.meta.episode}: {report.verdict}")
+        for flaw in report.flaws:
+            print(f"  {flaw.verdict:8} {flaw.channel}: {flaw.message}")
+    found = survey(recordings, config, settings.search, _progress())
+    print(f"\n{found.text()}")
+    return found.exit_code
+
+
+def _localise(recordings: list[Recording], config: RobotConfig, settings: GapVerb) -> int:
+    """Print where the plain model is wrong."""
+    from go1exp.gap.report import localisation_text
+    from go1exp.gap.survey import survey
+
+    found = survey(recordings, config, settings.search, _progress(), screen=False)
+    if found.where is not None:
+        print(f"\n{localisation_text(found.where)}")
+    return found.exit_code
+
+
+def _apply(result: GapResult, recordings: list[Recording], config: RobotConfig, settings: GapVerb) -> int:
+    """Write the effect files, read them back as training does, and score them at training's step."""
+    from go1exp.gap import apply
+
+    out = Path(settings.out)
+    written = apply.write(result, out)
+    contents = {path.name: OmegaConf.to_container(OmegaConf.load(path)) for path in written}
+    proof = apply.prove(recordings, config, settings.search, result, contents, settings.train_dt)  # type: ignore[arg-type]
+    about = {**asdict(proof), "files": [path.name for path in written]}
+    (out / "applied.json").write_text(json.dumps(about, indent=2) + "\n")
+    print(f"\nwritten to {', '.join(str(path) for path in written)}")
+    print(
+        f"at training's step of {1e3 * proof.physics_dt:g} ms the held-out error is {1 + proof.after:.3g} times the "
+        f"floor ({1 + proof.before:.3g} without; {1 + proof.effect_only:.3g} with {apply.EFFECT} alone)"
+    )
+    if not proof.holds:
+        print(f"NOT applied: it was {1 + proof.reported:.3g} in the search; do not train with it at this step")
+        return DOES_NOT_HOLD
+    if result.named:
+        print(f"now: go1exp train effect={out / apply.EFFECT}")
+    return 0
+
+
+def _report(result: GapResult, out: Path) -> int:
+    """Write the report."""
+    from go1exp.gap.report import text, write_report
+
+    print(f"\n{text(result)}")
+    print(f"\nwritten to {', '.join(str(path) for path in write_report(result, out))}")
+    return result.exit_code
+
+
+APP = App("gap", _task)

@@ -1,0 +1,53 @@
+"""Judging a policy on another robot than the one that it was trained on."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from go1exp.config import TaskConfig
+
+CHOICES = ("actuator", "effect")
+"""Groups that a run's own choice can be replaced in; null or absent keeps it."""
+
+
+def split(container: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the checked choices of another robot, by group, and what is left of the configuration.
+
+    Raises:
+        ConfigError: with every problem of the choices.
+    """
+    from go1exp.config import parse_parts
+    from go1exp.registry import ConfigError
+
+    chosen = {name: container[name] for name in CHOICES if container.get(name) is not None}
+    parts, problems = parse_parts(chosen, tuple(chosen))
+    if problems:
+        raise ConfigError(problems)
+    return parts, {name: value for name, value in container.items() if name not in CHOICES}
+
+
+def replaced(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
+    """Return the task with the other robot in it.
+
+    Raises:
+        ConfigError: if actuator and effects do not go together.
+    """
+    from go1exp import robot
+    from go1exp.effects.rules import drive_problems
+    from go1exp.registry import ConfigError
+
+    changed = dataclasses.replace(task, **parts)
+    if problems := drive_problems(changed.actuator, changed.effect, robot.JOINTS):
+        raise ConfigError(problems)
+    return changed
+
+
+def described(parts: dict[str, Any]) -> dict[str, Any]:
+    """Return the choices as plain data, for a report."""
+
+    def plain(term: Any) -> dict[str, Any]:
+        return {"term": term.entry.name, **term.parameters}
+
+    return {name: [plain(t) for t in part] if isinstance(part, tuple) else plain(part) for name, part in parts.items()}

@@ -1,0 +1,200 @@
+"""From what was found to a choice of ``effect`` that training takes, and the proof that it holds there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from go1exp.config import parse_parts
+from go1exp.effects.base import Effect
+from go1exp.gap.explain import numerical_scale
+from go1exp.gap.fit import scores
+from go1exp.gap.judge import splits
+from go1exp.gap.likelihood import scorer
+from go1exp.gap.replay import Replayer, Theta, hung
+from go1exp.gap.result import GapResult, GapSettings, NamedEffect
+from go1exp.gap.search import excess, removed
+from go1exp.gap.windows import cut
+from go1exp.joint_values import spread
+from go1exp.recording import Recording
+from go1exp.registry import Term, members
+from go1exp.robot import RobotConfig
+
+EFFECT, CALIBRATION, COMPENSATING = "effect.yaml", "calibration.yaml", "compensating.yaml"
+"""What is missing; the nominal parameters within their tolerances; what only makes up for something unknown."""
+
+ROBOT = "robot"
+"""Key of a value that belongs to no joint."""
+
+Values = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""Effect -> parameter -> joint or ``robot`` -> value."""
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What the written files do in replay at the step of training.
+
+    Attributes:
+        files: that were written.
+        physics_dt: the step, s.
+        before: held-out excess of the plain model at that step.
+        after: with ``effect.yaml`` and ``calibration.yaml`` as training reads them.
+        effect_only: with ``effect.yaml`` alone.
+        reported: excess that the search reported at its own step.
+        closed: share of the excess that the files remove.
+        holds: whether the model with the files is as good at this step as was reported.
+    """
+
+    files: tuple[Path, ...]
+    physics_dt: float
+    before: float
+    after: float
+    effect_only: float
+    reported: float
+    closed: float
+    holds: bool
+
+
+def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
+    """Write the effect files of a result and return those that there are."""
+    folder.mkdir(parents=True, exist_ok=True)
+    certified = [n for n in result.named if n.status == "certified"]
+    rest = [n for n in result.named if n.status != "certified"]
+    found = []
+    for name, about, lines in (
+        (EFFECT, "What the model lacks.", _named_lines(certified)),
+        (CALIBRATION, "The model's own parameters, within their tolerances.", _box_lines(result.box)),
+        (COMPENSATING, "Makes up for something that no effect describes. Not for training.", _named_lines(rest)),
+    ):
+        path = folder / name
+        path.unlink(missing_ok=True)
+        if lines or name == EFFECT:
+            head = [f"# {about}", *_provenance(result)]
+            path.write_text("\n".join([*head, *(lines or ["{}"])]) + "\n")
+            found.append(path)
+    return tuple(found)
+
+
+def _named_lines(named: Sequence[NamedEffect]) -> list[str]:
+    lines = []
+    for n in named:
+        params = {p.name: p for p in _kind(n.effect).params}
+        others = [a for a in n.alias_set if a != n.effect]
+        known = f"; these logs cannot tell it from {', '.join(others)}" if others else ""
+        lines += [f"{n.effect}:  # {n.status}{known}"]
+        widths: dict[str, float] = {}
+        for name, places in n.params.items():
+            lines.append(f"  {name}: {_value(places)}  # {params[name].unit}")
+            for place, (low, high) in n.interval.get(name, {}).items():
+                lines.append(
+                    f"    # {place}: {places.get(place, params[name].null):.4g}, 95 % within {low:.4g} to {high:.4g}"
+                )
+            halves = [0.5 * (high - low) for low, high in n.interval.get(name, {}).values() if np.isfinite(high - low)]
+            if halves:  # an alias may be the truth: twice as wide
+                widths[name] = float(f"{max(halves) * (2.0 if others else 1.0):.3g}")
+        if widths:
+            lines.append(f"  spread: {json.dumps(widths)}  # each robot's own, from the bootstrap")
+    return lines
+
+
+def _box_lines(box: Values) -> list[str]:
+    lines = []
+    for effect, params in box.items():
+        kind = {p.name: p for p in _kind(effect).params}
+        body = [
+            f"  {name}: {_value(places)}  # {kind[name].unit}"
+            for name, places in params.items()
+            if any(abs(v - kind[name].null) > 1e-3 * kind[name].tolerance for v in places.values())
+        ]
+        lines += [f"{effect}:", *body] if body else []
+    return lines
+
+
+def _value(places: Mapping[str, float]) -> str:
+    """Write values per joint, or one number."""
+    rounded = {place: float(f"{value:.5g}") for place, value in places.items()}
+    if set(places) == {ROBOT}:
+        return json.dumps(rounded[ROBOT])
+    return json.dumps(rounded)
+
+
+def _kind(effect: str) -> type[Effect]:
+    kind = members("effect")[effect].target
+    assert isinstance(kind, type)
+    return kind
+
+
+def _provenance(result: GapResult) -> list[str]:
+    about = result.provenance
+    lines = [f"# Found by go1exp gap, {date.today().isoformat()}: {result.verdict}.", f"# {result.sentence}"]
+    lines.append(f"# versions {json.dumps(about.get('versions', {}))}")
+    lines.append(f"# seed {about.get('seed')}, step {about.get('physics_dt')} s")
+    return lines + [f"# log {name}: sha256 {digest}" for name, digest in about.get("logs", {}).items()]
+
+
+# ---------------------------------------------------------------------- the proof
+
+
+def terms_of(plain: Mapping[str, Any]) -> tuple[Term, ...]:
+    """Return the effects of a file's content, as training reads them.
+
+    Raises:
+        ValueError: if training would refuse it.
+    """
+    parts, problems = parse_parts({"effect": plain}, ("effect",))
+    if problems:
+        raise ValueError("\n".join(problems))
+    terms: tuple[Term, ...] = parts["effect"]
+    return terms
+
+
+def theta_of(terms: Sequence[Term], joints: Sequence[str]) -> Theta:
+    """Return the values of effects per joint (J,), or (1,) for one of the robot, by (effect, parameter)."""
+    found: Theta = {}
+    for term in terms:
+        for p in _kind(term.entry.name).params:
+            given = term.parameters[p.name]
+            full = np.array([float(given)]) if p.per == ROBOT else np.nan_to_num(spread(given, joints), nan=p.null)
+            found[term.entry.name, p.name] = full
+    return found
+
+
+def prove(
+    recordings: Sequence[Recording],
+    config: RobotConfig,
+    settings: GapSettings,
+    result: GapResult,
+    contents: Mapping[str, Mapping[str, Any]],
+    physics_dt: float,
+) -> Applied:
+    """Score written files on the held-out windows of the search, at the step of training.
+
+    Args:
+        recordings: those of the search.
+        config: the nominal robot.
+        settings: those of the search.
+        result: its outcome.
+        contents: file name -> content, as read back from the files.
+        physics_dt: training's step, s.
+    """
+    machine, windows = hung(config), cut(recordings, settings)
+    quats = np.array([recordings[e].meta.base_quat for e in windows.episode])
+    replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
+    dt = float(windows.period / np.ceil(windows.period / physics_dt - 1e-3))
+    scale, _ = numerical_scale(replayer, dt)
+    judge = scorer(replayer, {}, scale, dt)
+    rng = np.random.default_rng(settings.seed)
+    held = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng).select
+    effect = theta_of(terms_of(contents.get(EFFECT, {})), machine.joints)
+    both = {**theta_of(terms_of(contents.get(CALIBRATION, {})), machine.joints), **effect}
+    found = scores(judge, [{}, effect, both], held, dt)
+    before, alone, after = (excess(x) for x in found)
+    reported = result.excess.get("final", float("nan"))
+    holds = after <= max(settings.adequate, 1.5 * reported + 0.1)
+    return Applied((), dt, before, after, alone, reported, removed(before, after), bool(holds))

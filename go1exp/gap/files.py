@@ -1,0 +1,98 @@
+"""A result as a file, so that every stage of the workflow can be run again by itself."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from go1exp.gap.result import Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
+from go1exp.registry import Expected
+
+RESULT = "result.json"
+"""Name of the file in the output folder."""
+
+
+class GapFileError(Expected):
+    """A result file that is missing or not whole."""
+
+
+def save(result: GapResult, folder: Path) -> Path:
+    """Write a result and return its file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / RESULT
+    path.write_text(json.dumps(result.as_dict(), indent=1) + "\n")
+    return path
+
+
+def load(folder: Path) -> GapResult:
+    """Read the result in a folder.
+
+    Raises:
+        GapFileError: if there is none, or it is not one.
+    """
+    path = folder / RESULT
+    if not path.is_file():
+        raise GapFileError(f"{path}: no such file; run go1exp gap explain first")
+    try:
+        return from_dict(json.loads(path.read_text()))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise GapFileError(f"{path}: not a result of go1exp gap ({error})") from None
+
+
+def from_dict(plain: Mapping[str, Any]) -> GapResult:
+    """Turn what ``GapResult.as_dict`` returned, and JSON kept, into a result; None is NaN where a number belongs."""
+    known = {f.name for f in fields(GapResult)}
+    values = {key: value for key, value in plain.items() if key in known}
+    values["named"] = tuple(_named(item) for item in plain["named"])
+    values["candidates"] = tuple(_candidate(item) for item in plain["candidates"])
+    values["floors"] = None if plain["floors"] is None else Floors(**plain["floors"])
+    values["before"], values["after"] = (_localisation(plain[key]) for key in ("before", "after"))
+    values["overlays"] = tuple(_overlay(item) for item in plain["overlays"])
+    values["waterfall"] = tuple((str(label), _number(value)) for label, value in plain["waterfall"])
+    values["excess"] = {name: _number(value) for name, value in plain["excess"].items()}
+    for name in ("closed", "seconds"):
+        values[name] = _number(plain[name])
+    for name in ("advice", "warnings"):
+        values[name] = tuple(plain[name])
+    return GapResult(**values)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _named(item: Mapping[str, Any]) -> NamedEffect:
+    interval = {
+        param: {joint: (_number(low), _number(high)) for joint, (low, high) in places.items()}
+        for param, places in item["interval"].items()
+    }
+    tuples = {name: tuple(item[name]) for name in ("joints", "alias_set")}
+    return NamedEffect(**{**item, **tuples, "interval": interval})
+
+
+def _candidate(item: Mapping[str, Any]) -> Candidate:
+    numbers = {name: _number(item[name]) for name in ("excess_after", "log_gain", "p", "size_over_tolerance")}
+    tuples = {name: tuple(item[name]) for name in ("joints", "alias_class")}
+    return Candidate(**{**item, **numbers, **tuples})
+
+
+def _localisation(item: Mapping[str, Any] | None) -> Localisation | None:
+    if item is None:
+        return None
+    excess, p = (np.array(item[name], dtype=float) for name in ("excess", "p"))
+    samples, flagged = np.array(item["samples"], dtype=int), np.array(item["flagged"], dtype=bool)
+    return Localisation(tuple(item["joints"]), tuple(item["regimes"]), samples, excess, p, flagged)
+
+
+def _overlay(item: Mapping[str, Any]) -> Overlay:
+    curves = {name: {k: np.array(v, dtype=float) for k, v in item[name].items()} for name in _CURVES}
+    return Overlay(item["episode"], np.array(item["t"], dtype=float), **curves, noise=dict(item["noise"]))
+
+
+_CURVES = ("measured", "before", "after")

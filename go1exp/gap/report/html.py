@@ -1,0 +1,87 @@
+"""The page and the file of numbers."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+import go1exp.gap.report.figures as figures
+import go1exp.gap.report.tables as tables
+import go1exp.gap.report.words as words
+from go1exp.gap.result import GapResult
+
+MOST_WINDOWS = 6
+"""Windows that are drawn, so that the page stays small; the file of numbers has all."""
+
+MOST_FORESTS = 16
+"""Parameters that are drawn; the table beside has all."""
+
+
+def write_report(result: GapResult, folder: Path) -> list[Path]:
+    """Write ``report.html`` and ``report.json`` into ``folder``, which is made if need be; return the two files.
+
+    The page needs nothing beside it: no network, no script, its figures are inside. The other file holds
+    ``GapResult.as_dict``, numbers that are not finite as null.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    said = json.dumps(result.as_dict(), indent=1, allow_nan=False, default=str)
+    files = []
+    for name, content in (("report.html", page(result)), ("report.json", said + "\n")):
+        file = folder / name
+        partial = folder / f".{name}.partial"
+        partial.write_text(content, encoding="utf-8")
+        os.replace(partial, file)  # a reader never sees half a file
+        files.append(file)
+    return files
+
+
+def page(result: GapResult) -> str:
+    """Return the page, one HTML document."""
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template("template.html.j2").render(_context(result))
+
+
+def _context(result: GapResult) -> dict[str, Any]:
+    forests = [(n, name) for n in result.named for name, values in n.params.items() if values]
+    return {
+        "result": result,
+        "words": words,
+        "cards": [
+            {
+                "named": n,
+                "meaning": words.meaning(n.effect),
+                "where": words.place(n.effect, n.joints, words.everyone(result)),
+                "sizes": words.sizes(n),
+                "rivals": words.rivals(n),
+                "bags": result.bags.get(n.effect),
+            }
+            for n in result.named
+        ],
+        "adequate": words.limit(result, "adequate"),
+        "errors": words.errors(result),
+        "changes": words.would_change(result),
+        "next": words.next_recordings(result),
+        "heats": tables.heat_maps(result),
+        "scale": tables.scale(result),
+        "evidence": tables.evidence(result),
+        "values": tables.values(result),
+        "floors": tables.floors(result),
+        "provenance": tables.provenance(result),
+        "windows": [
+            (window, figures.overlay(window, f"window{k}"))
+            for k, window in enumerate(result.overlays[:MOST_WINDOWS])
+            if len(window.t) and window.measured
+        ],
+        "waterfall": figures.waterfall(result) if any(v == v for _, v in result.waterfall) else None,
+        "forests": [figures.forest(n, name, k) for k, (n, name) in enumerate(forests[:MOST_FORESTS])],
+        "box": figures.box(result),
+        "bags": figures.bags(result),
+    }

@@ -1,0 +1,261 @@
+"""Numbers, units, places and commands, worded alike in the page, its figures and the terminal."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import go1exp.effects
+import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
+from go1exp.effects.base import Param
+from go1exp.gap.result import GapResult, GapSettings, Localisation, NamedEffect
+from go1exp.gap.verdict import where
+from go1exp.registry import members
+
+NOTHING = "–"
+"""Stands for a number that there is not."""
+
+UNITS: dict[str, str] = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
+"""Logged quantity -> unit."""
+
+ERRORS: dict[str, str] = {
+    "null": "model as it is",
+    "box": "within its tolerances",
+    "final": "with what is named",
+    "confirm": "on the episodes kept for the last check",
+}
+"""Key of ``GapResult.excess`` -> what it is of."""
+
+GROUND = ("squat", "drop")
+"""Excitations of a robot that stands; all others hang it up."""
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number with ``digits`` significant digits, without an exponent where it can be read without."""
+    if value is None or math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    rounded = float(f"{value:.{digits - 1}e}") + 0.0  # no minus zero
+    if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
+        return f"{rounded:.12f}".rstrip("0").rstrip(".")
+    digit, _, power = f"{rounded:.{digits - 1}e}".partition("e")
+    return f"{digit.rstrip('0').rstrip('.') if '.' in digit else digit}e{int(power)}"
+
+
+def share(value: float) -> str:
+    """Return a share as a percentage, its distance from 100 % kept visible."""
+    if math.isnan(value):
+        return NOTHING
+    return f"{number(100.0 * value, 4 if value > 0.99 else 3)} %"
+
+
+def error(excess: float) -> str:
+    """Return an excess as what a reader is told: the error, whose floor is 1."""
+    return number(1.0 + excess)
+
+
+def errors(result: GapResult) -> list[tuple[str, str]]:
+    """Return (of what, error) of the held-out errors that there are."""
+    keys = [k for k in ERRORS if k in result.excess and (result.named or k != "final")]
+    return [(ERRORS[k], error(result.excess[k])) for k in keys]
+
+
+def param(effect: str, name: str) -> Param | None:
+    """Return the declaration of a parameter, None for one that is not registered (any more)."""
+    entry = members("effect").get(effect)
+    declared: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
+    return next((p for p in declared if p.name == name), None)
+
+
+def unit(effect: str, name: str) -> str:
+    """Return the unit of a parameter, empty for none."""
+    found = param(effect, name)
+    return "" if found is None or found.unit == "-" else found.unit
+
+
+def meaning(effect: str) -> str:
+    """Return what an effect is, in its own words."""
+    entry = members("effect").get(effect)
+    return entry.doc.replace("``", "") if entry else ""
+
+
+def is_size(effect: str, name: str) -> bool:
+    """Return whether a parameter says how much of the effect there is, as opposed to its shape."""
+    found = param(effect, name)
+    return found is None or math.isfinite(found.tolerance)
+
+
+def of_robot(effect: str) -> bool:
+    """Return whether an effect has one value for the whole robot."""
+    entry = members("effect").get(effect)
+    declared: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
+    return bool(declared) and all(p.per == "robot" for p in declared)
+
+
+def everyone(result: GapResult) -> tuple[str, ...]:
+    """Return all joints that were compared, as far as the result knows them."""
+    return result.before.joints if result.before else ()
+
+
+def place(effect: str, joints: Sequence[str], all_joints: Sequence[str]) -> str:
+    """Say where an effect acts."""
+    if not joints:
+        return "the whole robot" if of_robot(effect) else NOTHING
+    if not set(joints) <= set(all_joints):
+        return ", ".join(joints)
+    return where(joints, all_joints)
+
+
+@dataclass(frozen=True)
+class Size:
+    """One parameter of a named effect in short.
+
+    Attributes:
+        name: of the parameter.
+        value: mean over its joints.
+        half: mean half width of their 95 % intervals.
+        low: smallest value over the joints.
+        high: largest.
+        count: how many joints.
+        unit: empty for none.
+    """
+
+    name: str
+    value: float
+    half: float
+    low: float
+    high: float
+    count: int
+    unit: str
+
+    @property
+    def short(self) -> str:
+        """``0.42 ± 0.05 N m``."""
+        return f"{number(self.value)} ± {number(self.half, 2)} {self.unit}".strip()
+
+    @property
+    def spread(self) -> str:
+        """``0.38 to 0.47 N m over 4 joints``, empty for one value."""
+        if self.count < 2:
+            return ""
+        return f"{number(self.low)} to {number(self.high)} {self.unit}".strip() + f" over {self.count} joints"
+
+
+def sizes(named: NamedEffect) -> list[Size]:
+    """Return the parameters that say how much of a named effect there is."""
+    found = []
+    for name, by_joint in named.params.items():
+        values = np.array(list(by_joint.values()), dtype=float)
+        if not len(values) or not is_size(named.effect, name):
+            continue
+        widths = [0.5 * (b - a) for a, b in named.interval.get(name, {}).values()]
+        half = float(np.mean(widths)) if widths else math.nan
+        low, high = float(values.min()), float(values.max())
+        found.append(Size(name, float(values.mean()), half, low, high, len(values), unit(named.effect, name)))
+    return found
+
+
+def rivals(named: NamedEffect) -> tuple[str, ...]:
+    """Return the effects that do as well as this one."""
+    return tuple(name for name in named.alias_set if name != named.effect)
+
+
+def limit(result: GapResult, name: str) -> float:
+    """Return a limit of the settings (``adequate``, ``certified``), from the provenance if it says them."""
+    said = result.provenance.get("settings")
+    value = said.get(name) if isinstance(said, Mapping) else None
+    return float(value if isinstance(value, int | float) else getattr(GapSettings(), name))
+
+
+def worst(cells: Localisation | None) -> str:
+    """Return the joint and regime of the largest flagged excess, empty if there is none."""
+    if cells is None or not cells.flagged.any():
+        return ""
+    left = np.where(cells.flagged & np.isfinite(cells.excess), cells.excess, -np.inf)
+    row, column = np.unravel_index(int(np.argmax(left)), left.shape)
+    return f"{cells.joints[row]}, {cells.regimes[column]}" if np.isfinite(left[row, column]) else ""
+
+
+def would_change(result: GapResult) -> list[str]:
+    """Return what would change the verdict, a sentence each."""
+    allowed = number(1.0 + limit(result, "adequate"))
+    final, box = (result.excess.get(k, math.nan) for k in ("final", "box"))
+    rest = worst(result.after)
+    found = []
+    if result.verdict == "bad log":
+        found.append("Recordings without these flaws; the command go1exp record audit FILE says whether they are gone.")
+    elif result.verdict == "not excited":
+        found.append("Recordings that move more: the last section says which.")
+    elif result.verdict == "no gap":
+        found.append(f"A held-out error above {allowed} that the tolerances cannot take up; it is {error(box)}.")
+    elif result.verdict == "explained":
+        found.append(f"A held-out error above {allowed} in spite of what is named; it is {error(final)}.")
+    else:
+        at = f", largest at {rest}" if rest else ""
+        found.append(
+            f"An effect that takes the held-out error to {allowed} or less; {error(final)} is left{at}. "
+            "No effect of the library does."
+        )
+    for named in result.named:
+        if rivals(named):
+            found.append(f"Data that separate {named.effect} from {' and '.join(rivals(named))} may change the name.")
+        if named.status == "compensating":
+            bar = share(limit(result, "certified"))
+            found.append(f"{named.effect} is certified only if it is found in {bar} of the bags and little is left.")
+    if result.verdict == "unexplained" and result.candidates:
+        near = max(result.candidates, key=lambda c: c.log_gain)
+        if near.status == "rejected":
+            found.append(f"The nearest was {near.effect}: {near.reason}.")
+    if result.verdict in ("no gap", "explained") and result.not_excited:
+        found.append("Motions that show what these logs cannot (last section) may reveal more.")
+    return found
+
+
+@dataclass(frozen=True)
+class Next:
+    """A recording to make next.
+
+    Attributes:
+        why: what it is for.
+        command: to paste into a shell.
+        effects: what it shows.
+    """
+
+    why: str
+    command: str
+    effects: tuple[str, ...] = ()
+
+
+def record(names: Sequence[str], *more: str, out: str) -> str:
+    """Return the command that records excitations, quoted for a shell."""
+    words = ["go1exp", "record", f"excitation=[{','.join(names)}]", *more, f"out={out}"]
+    return " ".join(shlex.quote(word) for word in words)
+
+
+def next_recordings(result: GapResult) -> list[Next]:
+    """Return what to record next: first what tells apart equals, then what shows effects that these logs cannot."""
+    known = members("excitation")
+    found: list[Next] = []
+    for sentence in result.advice:
+        names = [name for name in known if re.search(rf"\b{re.escape(name)}\b", sentence)]
+        more = re.findall(r"\b((?:gains|hang)=\[\[[-\d.,\[\]]*\]\])", sentence)
+        if names or more:
+            out = f"recordings/apart{len(found) + 1 if found else ''}"
+            found.append(Next(sentence, record(names or ["chirp", "steps"], *more, out=out)))
+    by_name: dict[str, list[str]] = {}
+    for effect, name in result.not_excited.items():
+        if name in known:
+            by_name.setdefault(name, []).append(effect)
+    for ground, out in ((False, "recordings/next"), (True, "recordings/ground")):
+        names = [name for name in by_name if (name in GROUND) == ground]
+        if names:
+            effects = tuple(effect for name in names for effect in by_name[name])
+            why = "Shows what a robot feels only on its feet." if ground else "Shows what these logs cannot."
+            found.append(Next(why, record(names, out=out), effects))
+    return found

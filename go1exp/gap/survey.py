@@ -1,0 +1,104 @@
+"""A first look: how good can any model be on these logs, where is ours wrong, and what could they not tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.gap import verdict as words
+from go1exp.gap.explain import FEWEST, numerical_scale, repeatability, unusable
+from go1exp.gap.fit import residuals
+from go1exp.gap.judge import splits
+from go1exp.gap.likelihood import scorer
+from go1exp.gap.localise import localise
+from go1exp.gap.replay import Replayer, hung
+from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
+from go1exp.gap.search import Progress, Search, excess
+from go1exp.gap.windows import cut
+from go1exp.recording import Recording
+from go1exp.robot import RobotConfig
+
+UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a first look found.
+
+    Attributes:
+        flaws: why the logs cannot be compared; empty if they can.
+        floors: what no model can get below.
+        windows: number of windows.
+        excess: of the plain model, over all windows (floor 0).
+        where: it is wrong.
+        not_excited: effect -> excitation to record next.
+    """
+
+    flaws: tuple[str, ...]
+    floors: Floors | None = None
+    windows: int = 0
+    excess: float = float("nan")
+    where: Localisation | None = None
+    not_excited: dict[str, str] | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """0, or that of a bad log."""
+        return EXIT_CODES["bad log"] if self.flaws else 0
+
+    def text(self) -> str:
+        """Say it in lines."""
+        if self.flaws or self.floors is None:
+            return "\n".join(["these logs cannot be compared with the model:", *(f"  {f}" for f in self.flaws)])
+        lines = [f"{self.windows} windows; the plain model's error is {1 + self.excess:.3g} times the floor"]
+        for name, value in self.floors.noise.items():
+            line = f"  {name}: noise {value:.2g} {UNITS[name]}, error of the step {self.floors.numerical[name]:.2g}"
+            if self.floors.repeatability and name in self.floors.repeatability:
+                line += f", repetitions differ by {self.floors.repeatability[name]:.2g}"
+            lines.append(line)
+        if self.not_excited:
+            lines.append("not excited, so not to be judged from these logs; record next:")
+            lines += [f"  {effect}: {more}" for effect, more in self.not_excited.items()]
+        return "\n".join(lines)
+
+
+def survey(
+    recordings: Sequence[Recording],
+    config: RobotConfig,
+    settings: GapSettings,
+    on_progress: Progress = lambda what, share: None,
+    screen: bool = True,
+) -> Survey:
+    """Take a first look at recordings of a held robot; ``screen`` also asks what they could not tell."""
+    machine = hung(config)
+    on_progress("auditing the logs", 0.0)
+    flaws = tuple(line for r in recordings for line in unusable(r, machine))
+    if flaws:
+        return Survey(flaws)
+    windows = cut(recordings, settings)
+    if len(windows) < FEWEST:
+        return Survey((f"{len(windows)} windows of {settings.window_s:g} s; {FEWEST} are needed",))
+    quats = np.array([recordings[e].meta.base_quat for e in windows.episode])
+    replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
+    dt = float(windows.period / np.ceil(windows.period / settings.physics_dt - 1e-3))
+    on_progress("measuring the floors", 0.1)
+    scale, numerical = numerical_scale(replayer, dt)
+    score = scorer(replayer, {}, scale, 2.0 * dt)
+    rng = np.random.default_rng(settings.seed)
+    everything = np.arange(len(windows))
+    noise = {name: float(np.median(windows.scale[0, c])) for c, name in enumerate(windows.quantities)}
+    floors = Floors(noise, numerical, repeatability(recordings))
+    on_progress("where it is wrong", 0.4)
+    plain = residuals(score, [{}], everything, dt)[0]
+    where = localise(score, plain, everything, rng)
+    silent = None
+    if screen:
+        on_progress("what these logs can tell", 0.6)
+        parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
+        search = Search(score, parts, settings, dt, rng, lambda what, share: None)
+        search.listen()
+        silent = words.not_excited(search.signal)
+    on_progress("done", 1.0)
+    return Survey((), floors, len(windows), excess(score.chi2(plain, everything)), where, silent)

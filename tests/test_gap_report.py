@@ -1,0 +1,546 @@
+"""``go1exp.gap.report``: the page is whole, says every number, loads nothing and believes no name."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from markupsafe import escape
+
+import go1exp.excitations  # noqa: F401  (registers every excitation)
+from go1exp import robot
+from go1exp.cli.settings import RecordSettings, parse
+from go1exp.compose import compose
+from go1exp.gap.report import localisation_text, text, words, write_report
+from go1exp.gap.report.figures import shown_joints, split_channel
+from go1exp.gap.report.html import page
+from go1exp.gap.report.tables import Cell, heat_maps, short
+from go1exp.gap.result import Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay, Verdict
+from go1exp.registry import bind, members
+
+CALVES = tuple(j for j in robot.JOINTS if j.endswith("calf"))
+REGIMES = ("stick", "reversal", "slow", "fast", "high torque", "after an edge", "drives off", "small angle")
+VERDICTS: tuple[str, ...] = get_args(Verdict)
+VOID = {"meta", "col", "br", "link", "hr", "img"}
+MOST_BYTES = 3_000_000
+SECTIONS = {
+    "overlays",
+    "localisation",
+    "evidence",
+    "waterfall-section",
+    "parameters",
+    "stability",
+    "next",
+    "provenance",
+}
+
+
+# ---------------------------------------------------------------------- made-up answers
+
+
+def localisation(rng: np.random.Generator, level: float, joints: tuple[str, ...] = robot.JOINTS) -> Localisation:
+    shape = (len(joints), len(REGIMES))
+    calf = np.array([[30.0 if j.endswith("calf") else 1.0] for j in joints])
+    excess = level * calf * rng.lognormal(0.0, 0.7, shape) - 0.02
+    samples = rng.integers(30, 4000, shape)
+    samples[:, REGIMES.index("drives off")] = 0
+    excess[samples == 0] = math.nan
+    p = np.where(samples == 0, math.nan, rng.uniform(0.0, 1.0, shape) ** (1.0 + calf))
+    return Localisation(joints, REGIMES, samples, excess, p, np.nan_to_num(p, nan=1.0) < 1e-3)
+
+
+def overlay(rng: np.random.Generator, episode: str, joints: tuple[str, ...], start: float, n: int = 150) -> Overlay:
+    t = start + 0.002 * np.arange(n)
+    noise = {"q": 3e-4, "qd": 0.02, "tau_est": 0.1}
+    measured, before, after, sd = {}, {}, {}, {}
+    for quantity, level in noise.items():
+        for k, joint in enumerate(joints):
+            truth = 1000.0 * level * np.sin(2 * np.pi * (2.0 + 0.1 * k) * t + k)
+            off = level * (60.0 if joint.endswith("calf") else 3.0) * np.cos(9.0 * t + k)
+            name = f"{quantity}_{joint}"
+            measured[name] = truth + level * rng.standard_normal(n)
+            before[name], after[name], sd[name] = truth + off, truth + 0.02 * off, level
+    return Overlay(episode, t, measured, before, after, sd)
+
+
+def candidates() -> tuple[Candidate, ...]:
+    several = {"forward": [0.22, 0.23, 0.24, 0.25, 0.26], "backward": [0.2, 0.21, 0.22, 0.23, 0.24]}
+    stribeck: dict[str, list[float] | float] = {"strength": [0.3, 0.31], "speed": 0.13}
+    return (
+        Candidate("kd_scale", CALVES, {"scale": [1.43, 1.44, 1.41, 1.4]}, 6.4, 2.96, 2.5e-4, 2.93,
+                  ("kd_scale", "viscous"), "accepted", "removes 84.1% of the excess on held-out windows, p = 0.00025"),
+        Candidate("viscous", CALVES, {"damping": [0.21, 0.22, 0.19, 0.2]}, 6.5, 2.95, 2.5e-4, 11.0,
+                  ("kd_scale", "viscous"), "alias", "does as well as kd_scale: these data cannot tell them apart"),
+        Candidate("asymmetric_friction", (*CALVES, "FR_hip"), several, 11.0, 1.7, 0.0031, 5.2, ("asymmetric_friction",),  # type: ignore[arg-type]
+                  "rejected", "explains less than kd_scale (excess falls by 71.5%)"),
+        Candidate("torque_delay", (), {"delay": []}, 40.1, -0.002, 0.93, 0.4, ("torque_delay",), "rejected",
+                  "fits within its tolerance (0.4 of it)"),
+        Candidate("coulomb", CALVES[:2], {"bound": [0.417, 0.428]}, 0.31, 1.2, 2.5e-4, 8.6, ("coulomb",), "accepted",
+                  "removes 95.2% of the excess on held-out windows, p = 0.00025", stage=2),
+        Candidate("stribeck", CALVES[:2], stribeck, 0.9, 1.0, 0.001, 6.2, ("stribeck",), "rejected",
+                  "explains less than coulomb (excess falls by 85.9%)", stage=2),
+        Candidate("torque_speed_limit", (), {}, math.nan, 0.0, 1.0, 0.0, ("torque_speed_limit",), "not excited",
+                  "twice its tolerance would not show"),
+    )  # fmt: skip
+
+
+def named(final: str = "certified") -> tuple[NamedEffect, ...]:
+    rng = np.random.default_rng(5)
+    scale = {j: 1.421 + 0.011 * k for k, j in enumerate(CALVES)}
+    bound = {CALVES[0]: 0.417, CALVES[1]: 0.428}
+    return (
+        NamedEffect("kd_scale", CALVES, {"scale": scale},
+                    {"scale": {j: (v - 0.051, v + 0.049) for j, v in scale.items()}},
+                    ("kd_scale", "viscous"), "certified"),
+        NamedEffect("coulomb", CALVES[:2], {"bound": bound},
+                    {"bound": {j: (v - 0.03, v + 0.02 + 0.01 * rng.random()) for j, v in bound.items()}},
+                    ("coulomb",), final),  # type: ignore[arg-type]
+        NamedEffect("base_tilt", (), {"roll": {"robot": 0.021}, "pitch": {"robot": -0.0134}},
+                    {"roll": {"robot": (0.018, 0.0241)}, "pitch": {"robot": (-0.0151, -0.0119)}},
+                    ("base_tilt",), "certified"),
+        NamedEffect("viscous", (), {"damping": {}}, {"damping": {}}, ("viscous",), "compensating"),
+    )  # fmt: skip
+
+
+PROVENANCE: dict[str, Any] = {
+    "logs": {f"chirp_kp{kp}_kd0.5_0": f"{kp:02x}" * 32 for kp in (20, 35, 50)},
+    "versions": {"go1exp": "0.1.0", "mujoco": "4.0.0"},
+    "seed": 7,
+    "physics_dt": np.float64(0.001),
+    "split": {"train": ["chirp_kp20_kd0.5_0"], "select": ["chirp_kp35_kd0.5_0"], "confirm": []},
+    "settings": {"adequate": 0.4, "certified": 0.75},
+}
+
+FULL: dict[str, Any] = {
+    "candidates": candidates(),
+    "floors": Floors({"q": 3.1e-4, "qd": 0.021}, {"q": 2.1e-5, "qd": 0.0011}, None),
+    "excess": {"null": 56.3, "box": 40.2, "final": 0.312, "confirm": 0.288},
+    "closed": 0.9922,
+    "not_excited": {
+        "torque_speed_limit": "steps",
+        "cogging": "slow_ramps",
+        "foot_friction": "squat",
+        "payload": "squat",
+    },
+    "advice": (
+        "These logs cannot tell kd_scale from viscous; record torque_off swings, or two values of kd "
+        "(gains=[[20,0.5],[20,1.0]]) to separate them.",
+        "These logs cannot tell base_tilt from link_com; record two attitudes of the trunk (hang=[[0,0],[0,0.5]]) "
+        "to separate them.",
+    ),
+    "bags": {"kd_scale": 0.95, "coulomb": 0.7, "base_tilt": 0.8},
+    "waterfall": (("model as it is", 56.3), ("within tolerances", 40.2), ("kd_scale", 6.4), ("coulomb", 0.312)),
+    "box": {
+        "strength": {"scale": {j: 1.0 + 0.05 * np.sin(k) for k, j in enumerate(robot.JOINTS)}},
+        "link_mass": {"scale": dict.fromkeys(robot.JOINTS, 0.95)},
+        "base_tilt": {"roll": {"robot": 0.004}},
+    },
+    "provenance": PROVENANCE,
+    "seconds": 93.4,
+}
+
+
+def answer(verdict: str, **changes: Any) -> GapResult:
+    """A realistic answer with this verdict; a bad log has little to say."""
+    rng = np.random.default_rng(3)
+    usual: dict[str, Any] = {
+        "verdict": verdict,
+        "sentence": f"This is {verdict}: error 41.2 times the floor (floor 1).",
+    }
+    if verdict == "bad log":
+        usual |= {"warnings": ("day1: q_FR_calf: stuck for 0.9 s", "day1: says no gains (kp, kd)"), "seconds": 0.2}
+        return GapResult(**{**usual, **changes})
+    usual |= FULL
+    usual["before"] = localisation(rng, 3.0)
+    usual["after"] = localisation(rng, 0.003 if verdict == "explained" else 0.5)
+    if verdict == "explained":
+        starts = (("chirp_kp35_kd0.5_0", 1.2), ("steps_kp35_kd0.5_0", 3.4))
+        usual["overlays"] = tuple(overlay(rng, episode, robot.JOINTS, start) for episode, start in starts)
+    if verdict in ("explained", "partly explained"):
+        usual["named"] = named("certified" if verdict == "explained" else "compensating")
+        usual["warnings"] = ("Too few episodes to keep some for a last check.",)
+    else:
+        level = 40.2 if verdict == "unexplained" else -0.013
+        why = f"removes only {0.041:.1%} of the excess on held-out windows"
+        usual["candidates"] = tuple(
+            replace(c, status="rejected", reason=why, excess_after=0.96 * level, log_gain=0.04, stage=1)
+            if c.status != "not excited"
+            else c
+            for c in candidates()
+        )
+        usual["closed"], usual["bags"], usual["advice"] = math.nan, {}, ()
+        usual["excess"] = {"null": 1.4 * level, "box": level, "final": level}
+        usual["waterfall"] = (("model as it is", 1.4 * level), ("within tolerances", level))
+    return GapResult(**{**usual, **changes})
+
+
+# ---------------------------------------------------------------------- reading pages
+
+
+class Reader(HTMLParser):
+    """Checks that elements nest, and collects ids, attributes and text."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.stack: list[str] = []
+        self.tags: Counter[str] = Counter()
+        self.ids: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.words: list[str] = []
+        self.feed(source)
+        self.close()
+        assert self.stack == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        self.ids += [value or "" for name, value in attrs if name == "id"]
+        if tag not in VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.stack.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.stack, f"</{tag}> closes nothing"
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.stack:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    """The page of each verdict."""
+    return {verdict: page(answer(verdict)) for verdict in VERDICTS}
+
+
+def own(value: float) -> str:
+    """Three significant digits, by another way than the report's."""
+    return np.format_float_positional(float(f"{value:.3g}"), trim="-")
+
+
+# ---------------------------------------------------------------------- the page
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_page_is_whole_and_loads_nothing(pages: dict[str, str], verdict: str) -> None:
+    source = pages[verdict]
+    found = Reader(source)
+    assert set(found.ids) >= SECTIONS
+    assert [i for i, n in Counter(found.ids).items() if n > 1] == []
+    assert found.tags["h1"] == 1
+    assert found.tags.keys().isdisjoint({"script", "link", "iframe", "object", "embed", "img", "base", "form"})
+    assert re.findall(r"https?:|//www|@import|@font-face|javascript:|\bsrc=", source) == []
+    inner = [value for _, name, value in found.attributes if name in ("href", "xlink:href", "src", "action")]
+    assert all(value.startswith("#") and value[1:] in found.ids for value in inner)
+    assert [n for _, n, _ in found.attributes if n.startswith("on")] == []
+    for target in re.findall(r"url\(#([^)]*)\)", source):
+        assert target in found.ids
+    assert len(source.encode()) < MOST_BYTES
+    assert verdict in found.text.lower()
+    assert answer(verdict).sentence in found.text
+    assert all(warning in found.text for warning in answer(verdict).warnings)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_number_of_the_verdict_appears(pages: dict[str, str], verdict: str) -> None:
+    result, said = answer(verdict), Reader(pages[verdict]).text
+    tokens = set(re.split(r"[\s,;()\[\]]+", said))
+    numbers = [1.0 + v for k, v in result.excess.items() if result.named or k != "final"]
+    for n in result.named:
+        for name, by_joint in n.params.items():
+            for joint, value in by_joint.items():
+                numbers += [value, *n.interval[name][joint]]
+    for c in result.candidates:
+        numbers += [v for v in (c.excess_after,) if math.isfinite(v)]
+        numbers += [] if c.status == "not excited" else [c.log_gain, c.size_over_tolerance]
+    if result.floors:
+        numbers += [*result.floors.noise.values(), result.floors.numerical["qd"]]
+    assert {own(v) for v in numbers} - tokens == set()
+    for n in result.named:
+        assert n.effect in tokens
+        assert n.status in tokens
+        assert set(n.alias_set) <= tokens
+        assert set(n.joints) <= tokens
+    for c in result.candidates:
+        assert c.reason in said
+    for log, digest in result.provenance.get("logs", {}).items():
+        assert log in said
+        assert digest in said
+    if result.named:
+        for shown in ("99.22 %", "95 %", "N m", "rad", "1.44 ± 0.05", "0.422 ± 0.02", "seed 7"):
+            assert shown in said
+
+
+def test_a_page_copes_with_an_answer_that_says_nothing() -> None:
+    for verdict in VERDICTS:
+        empty = GapResult(verdict, "")  # type: ignore[arg-type]
+        assert set(Reader(page(empty)).ids) >= SECTIONS
+        assert text(empty).startswith(verdict.upper())
+
+
+def test_a_page_copes_with_numbers_that_are_none() -> None:
+    full = answer("explained")
+    assert full.before is not None
+    hollow = replace(
+        full.before, excess=np.full_like(full.before.excess, math.nan), flagged=full.before.flagged & False
+    )
+    window = full.overlays[0]
+    silent = {k: np.full_like(v, math.nan) for k, v in window.before.items()}
+    cut = replace(window, before=silent, noise=dict.fromkeys(window.noise, math.nan))
+    gone = replace(window, t=window.t[:0], measured={}, before={}, after={}, noise={})
+    odd = replace(full.named[0], params={"scale": {"FR_calf": math.inf, "FL_calf": math.nan}}, interval={"scale": {}})
+    strange = replace(full.named[0], effect="of_another_version", params={"size": {"robot": 2.0}}, interval={})
+    changed = replace(
+        full,
+        before=hollow,
+        after=replace(hollow),
+        overlays=(cut, gone),
+        named=(odd, strange),
+        excess={"null": math.inf, "box": math.nan},
+        waterfall=(("model as it is", math.nan), ("within tolerances", 2.0), ("odd", -1.5)),
+        bags={"kd_scale": math.nan},
+        closed=math.nan,
+    )
+    said = Reader(page(changed)).text
+    assert "of_another_version" in said
+    assert "nan" not in said.lower().split()
+    assert "of_another_version" in text(changed)
+    json.dumps(changed.as_dict(), allow_nan=False)
+
+
+def test_names_of_others_stay_text(tmp_path: Path) -> None:
+    nasty = "<script>alert('x')</script>&\"$\\frac{1}$"
+    full = answer("explained")
+    assert full.before is not None
+    assert full.after is not None
+    joints = (nasty, *robot.JOINTS[1:])
+    rng, interval = np.random.default_rng(0), {"scale": {nasty: (1.4, 1.6)}}
+    hurt = replace(
+        full,
+        sentence=f"The fault is {nasty}.",
+        before=replace(full.before, joints=joints, regimes=(nasty, *REGIMES[1:])),
+        after=replace(full.after, joints=joints, regimes=(nasty, *REGIMES[1:])),
+        named=(replace(full.named[0], joints=(nasty,), params={"scale": {nasty: 1.5}}, interval=interval),),
+        candidates=(replace(full.candidates[0], joints=(nasty,), reason=nasty, alias_class=("kd_scale", nasty)),),
+        overlays=(overlay(rng, nasty, (nasty, "膝_左"), 0.0),),
+        bags={nasty: 0.5},
+        waterfall=((nasty, 4.0), (nasty, 1.0)),
+        warnings=(nasty,),
+        not_excited={nasty: nasty},
+        advice=(nasty, f"record steps; gains=[[1,2]];{nasty}"),
+        provenance={nasty: nasty, "logs": {nasty: nasty}},
+    )  # fmt: skip
+    source = write_report(hurt, tmp_path)[0].read_text(encoding="utf-8")
+    found = Reader(source)
+    assert found.tags["script"] == 0
+    assert "<script" not in source
+    assert str(escape(nasty)) in source
+    assert found.text.count("alert('x')") > 10
+    for todo in words.next_recordings(hurt):
+        assert "alert" not in todo.command
+        assert shlex.split(todo.command)[:2] == ["go1exp", "record"]
+    assert json.loads((tmp_path / "report.json").read_text())["warnings"] == [nasty]
+
+
+@pytest.mark.parametrize("verdict", ["explained", "no gap", "bad log"])
+def test_the_files_are_the_result(tmp_path: Path, verdict: str, pages: dict[str, str]) -> None:
+    result = answer(verdict)
+    files = write_report(result, tmp_path / "a/b")
+    assert files == [tmp_path / "a/b/report.html", tmp_path / "a/b/report.json"]
+    assert sorted((tmp_path / "a/b").iterdir()) == files
+    assert json.loads(files[1].read_text(encoding="utf-8")) == result.as_dict()
+    assert files[0].read_text(encoding="utf-8") == pages[verdict]  # the same twice: no date, no random id
+
+
+# ---------------------------------------------------------------------- what is in it
+
+
+def test_heat_maps_hold_the_tables_cell_by_cell() -> None:
+    result = answer("partly explained")
+    assert result.before is not None
+    assert result.after is not None
+    before, after, fall, samples = heat_maps(result)
+    for j in range(len(robot.JOINTS)):
+        for r in range(len(REGIMES)):
+            b, a = result.before.excess[j, r], result.after.excess[j, r]
+            cells = [m.rows[j][1][r] for m in (before, after, fall, samples)]
+            assert [c.text for c in cells] == [short(v) for v in (b, a, b - a, result.before.samples[j, r])]
+            assert cells[0].flagged == result.before.flagged[j, r]
+            assert cells[1].flagged == result.after.flagged[j, r]
+            assert f"{result.before.samples[j, r]} samples" in cells[0].title
+    assert before.rows[2][1][REGIMES.index("drives off")].text == words.NOTHING
+    assert sum(c.flagged for _, row in before.rows for c in row) > 3
+
+
+def test_colours_grow_darker_with_the_excess_and_words_stay_legible() -> None:
+    levels = np.array([[0.0, 0.2, 1.0, 5.0, 30.0, 200.0, 999.0, 1000.0]])
+    before = Localisation(("a",), REGIMES, np.ones((1, 8)), levels, np.ones((1, 8)), np.zeros((1, 8), dtype=bool))
+    result = GapResult("unexplained", "", before=before, after=replace(before, excess=levels[:, ::-1]))
+    maps = heat_maps(result)
+
+    def light(colour: str) -> float:
+        linear = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in linear]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    def contrast(cell: Cell) -> float:
+        a, b = sorted((light(cell.fill), light(cell.ink)))
+        return (b + 0.05) / (a + 0.05)
+
+    cells = maps[0].rows[0][1]
+    assert [c.fill for c in cells] == [c.fill for c in reversed(maps[1].rows[0][1])]  # one scale for both
+    brightness = [light(c.fill) for c in cells]
+    assert brightness == sorted(brightness, reverse=True)
+    assert brightness[0] > brightness[-2] + 0.5
+    every = [c for m in maps for _, row in m.rows for c in row]
+    assert min(contrast(c) for c in every) > 3.5
+
+
+def test_windows_show_the_worst_joints() -> None:
+    window = answer("explained").overlays[0]
+    assert set(shown_joints(window)) < set(CALVES)
+    assert [split_channel(c) for c in ("q_FR_calf", "qd_a", "tau_est_b_c", "odd")] == [
+        ("q", "FR_calf"),
+        ("qd", "a"),
+        ("tau_est", "b_c"),
+        ("", "odd"),
+    ]
+
+
+def test_every_command_is_one_that_record_takes() -> None:
+    every = {effect: name for name in members("excitation") if name != "policy" for effect in (f"of {name}",)}
+    for result in (answer("explained"), GapResult("not excited", "", not_excited=every)):
+        recordings = words.next_recordings(result)
+        assert recordings
+        for todo in recordings:
+            verb = shlex.split(todo.command)
+            assert verb[:2] == ["go1exp", "record"]
+            container = compose("record", verb[2:])
+            for name in container["excitation"]:
+                assert bind("excitation", name, {}, name)[1] == []
+            skipped = ("robot", "actuator", "effect", "terrain", "backend", "excitation")
+            assert parse(RecordSettings, {k: v for k, v in container.items() if k not in skipped}).out
+    asked = [todo.command for todo in words.next_recordings(answer("explained"))]
+    assert asked[0] == "go1exp record 'excitation=[torque_off]' 'gains=[[20,0.5],[20,1.0]]' out=recordings/apart"
+    assert "'hang=[[0,0],[0,0.5]]'" in asked[1]
+    assert asked[2:] == [
+        "go1exp record 'excitation=[steps,slow_ramps]' out=recordings/next",
+        "go1exp record 'excitation=[squat]' out=recordings/ground",
+    ]
+
+
+def test_what_would_change_the_verdict_holds_its_limits() -> None:
+    said = {verdict: " ".join(words.would_change(answer(verdict))) for verdict in VERDICTS}
+    assert all(said.values())
+    assert "above 1.4" in said["explained"]  # 1 + adequate, as the provenance has it
+    assert "1.31" in said["explained"]
+    assert "kd_scale from viscous" in said["explained"]
+    assert "75 %" in said["partly explained"]
+    assert "go1exp record audit" in said["bad log"]
+    plain = replace(answer("explained"), provenance={})
+    assert "above 1.5" in " ".join(words.would_change(plain))
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (0.42, "0.42"),
+        (41.23, "41.2"),
+        (0.0, "0"),
+        (-0.0, "0"),
+        (1234.5, "1230"),
+        (123456.0, "123000"),
+        (2.14e-5, "2.14e-5"),
+        (2.5e-4, "0.00025"),
+        (3e9, "3e9"),
+        (math.nan, "–"),
+        (None, "–"),
+        (-math.inf, "-∞"),
+    ],
+)
+def test_numbers_are_easy_to_read(value: float | None, said: str) -> None:
+    assert words.number(value) == said
+
+
+def test_narrow_cells_hold_any_number() -> None:
+    said = [short(v) for v in (0.004, -0.026, 9.96, 412.0, 999.0, 12345.0, 3.2e6, math.nan)]
+    assert said == ["0", "-0.03", "10", "410", "1k", "12k", "3.2M", "–"]
+
+
+def test_the_terminal_gets_a_sentence_and_a_small_table() -> None:
+    said = text(answer("explained"))
+    lines = said.splitlines()
+    assert lines[0] == "EXPLAINED (exit code 10)"
+    assert all(len(line) <= 120 for line in lines if "go1exp record" not in line)
+    rows = [line for line in lines if line.startswith("  ")]
+    assert any(
+        all(w in row for w in ("kd_scale or viscous", "calf", "1.44 ± 0.05", "certified", "95 %")) for row in rows
+    )
+    assert any("bound 0.422 ±" in row and "N m" in row for row in rows)
+    assert any(row.split() == ["with", "what", "is", "named", "1.31"] for row in rows)
+    assert "99.22 % of the excess is gone." in said
+    assert "Warning: Too few episodes" in said
+    assert "go1exp record 'excitation=[torque_off]'" in said
+    bad = text(answer("bad log"))
+    assert "stuck for 0.9 s" in bad
+    assert "excess" not in bad
+
+
+def test_the_terminal_gets_the_table_of_where_it_is_wrong() -> None:
+    where = answer("unexplained").before
+    assert where is not None
+    lines = localisation_text(where).splitlines()
+    rows = {line.split()[0]: line.split()[1:] for line in lines[-len(robot.JOINTS) :]}
+    assert tuple(rows) == robot.JOINTS
+    filled = [r for r, name in enumerate(REGIMES) if name != "drives off"]
+    for j, joint in enumerate(robot.JOINTS):
+        said = [short(where.excess[j, r]) + "*" * bool(where.flagged[j, r]) for r in filled]
+        assert rows[joint] == said
+    assert "drives" not in " ".join(lines)
+    assert all(len(line) <= 120 for line in lines)
+
+
+# ---------------------------------------------------------------------- in a browser
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_a_browser_draws_the_page_from_its_file(tmp_path: Path) -> None:
+    import imageio.v3 as imageio
+
+    file = write_report(answer("explained"), tmp_path)[0]
+    picture = tmp_path / "page.png"
+    with tempfile.TemporaryDirectory() as profile:
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--hide-scrollbars"]
+        where = [f"--user-data-dir={profile}", f"--screenshot={picture}", "--window-size=1200,3000", file.as_uri()]
+        done = subprocess.run(["chromium", *flags, *where], capture_output=True, text=True, timeout=60)
+    assert picture.is_file(), done.stderr
+    image = imageio.imread(picture)[..., :3].astype(float)
+    assert image.shape == (3000, 1200, 3)
+    grey = image.mean(axis=2)
+    inked = (grey < 200).mean(axis=1)
+    for part in np.array_split(inked, 10):  # something is drawn on every tenth of the page
+        assert part.max() > 0.01
+    assert (np.abs(image - [0x00, 0x72, 0xB2]).sum(axis=2) < 30).sum() > 500  # curves of the model after
+    assert (np.abs(image - [0xD5, 0x5E, 0x00]).sum(axis=2) < 30).sum() > 500  # and before
+    assert (grey[:, -15:] < 200).mean() < 0.001  # nothing runs over the right edge
