@@ -375,16 +375,16 @@ def parse(verb: str, container: dict[str, Any]) -> None:
         parse_train(container)
         return
     own = {f.name for f in fields(VERBS[verb])}
-    parsed = settings.parse(VERBS[verb], {k: v for k, v in container.items() if k in own})
+    checked: Any = settings.parse(VERBS[verb], {k: v for k, v in container.items() if k in own})
     others = container.keys() - own
     assert others <= {*RIG, "excitation"}
     problems = parse_parts(container, tuple(others - {"excitation"}))[1]
     if "excitation" in others:
         problems += motions(container["excitation"])[1]
     if verb == "fit-actuator":
-        FitSettings(**{f.name: getattr(parsed, f.name) for f in fields(FitSettings)})
+        FitSettings(**{f.name: getattr(checked, f.name) for f in fields(FitSettings)})
     if verb == "record_import":
-        assert parsed.source in registry.members("importer")
+        assert checked.source in registry.members("importer")
     if verb == "list":
         listing.APP.task(container)
     assert problems == []

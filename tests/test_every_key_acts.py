@@ -145,7 +145,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
 """Other values of leaves where ``other_values`` could not guess one."""
 
 
-FIVE = {"seeds": [0, 1, 2, 3, 4], "physics_dt": 0.002}
+FIVE: dict[str, Any] = {"seeds": [0, 1, 2, 3, 4], "physics_dt": 0.002}
 """What a fit needs to be made of: episodes enough to train with, to stop by and to report on."""
 
 
@@ -416,7 +416,7 @@ class Walk:
             names = [name.format(i) for i in range(12) for name in ("jpos{}", "jvel{}", "jpos{}_des")]
             rows = np.column_stack([np.tile([20.0, 0.5], (9, 1)), rng.normal(size=(9, 36))])
             np.savetxt(folder / "go2.csv", rows, delimiter=",", header=",".join(["kp", "kd", *names]), comments="")
-            moved = {key: rng.normal(size=(9, 2)) for key in ("pos", "vel", "cmd_pos")}
+            moved: dict[str, Any] = {key: rng.normal(size=(9, 2)) for key in ("pos", "vel", "cmd_pos")}
             np.savez(folder / "arm.npz", t=np.arange(9) / 50.0, joint_names=["Base", "Jaw"], **moved)
         return folder
 

@@ -27,7 +27,6 @@ from go1exp.registry import bind
 QUICK = GapSettings(
     stride_s=0.4,
     window_s=0.2,
-    physics_dt=0.002,
     effects=("coulomb", "viscous", "stribeck", "command_delay"),
     shortlist=3,
     iterations=2,

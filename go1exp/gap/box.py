@@ -67,7 +67,9 @@ COMMON = ("torque_speed_limit",)
 """Effects with one value for all joints: few joints ever reach a limit, and one supply feeds them all."""
 
 
-def probes(machine: Machine, keys: Sequence[Key], theta: Mapping[Key, np.ndarray], factor: float = SMALL) -> list[Probe]:
+def probes(
+    machine: Machine, keys: Sequence[Key], theta: Mapping[Key, np.ndarray], factor: float = SMALL
+) -> list[Probe]:
     """Return the probes of parameters at their present values."""
     found = []
     joints = len(machine.joints)

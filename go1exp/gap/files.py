@@ -14,7 +14,7 @@ import numpy as np
 from go1exp.gap.result import Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
 from go1exp.registry import Expected
 
-RESULT = "result.json"
+RESULT = "verdict.json"
 """Name of the file in the output folder."""
 
 

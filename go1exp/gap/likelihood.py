@@ -197,7 +197,7 @@ def differences(scorer: Scorer, y: np.ndarray, window: np.ndarray, probes: Seque
 def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], dt: float) -> Table:
     """Replay windows with every probe.
 
-    Residuals are taken at the step ``dt``; changes, of which only the size matters, at twice that.
+    Changes are taken at the same step as residuals: at twice that they no longer cancel where they should.
     """
     machine, replayer = scorer.replayer.machine, scorer.replayer
     residual = scorer.residual(variants(machine, theta, windows, []), dt)

@@ -130,7 +130,8 @@ class Search:
             if accepted is None:
                 break
             self.terms.append(accepted.name)
-            self.theta = accepted.theta
+            # What the box had taken on in place of the effect it gives back: it starts from the nominal values.
+            self.theta = {key: value for key, value in accepted.theta.items() if key[0] in self.terms}
             self.progress(f"fitting the model with {accepted.name}", share + 0.12)
             train = self.settle(4)
             now = self.held_out(self.theta)
