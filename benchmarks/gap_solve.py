@@ -1,7 +1,7 @@
 """Run ``go1exp gap explain`` on every case of a folder, unattended: ``python benchmarks/gap_solve.py CASES``.
 
-Writes ``CASES/<case>/verdict.json``, which ``benchmarks.gap.score`` reads. Knows the nominal model and the logs, nothing
-else; a case that has its verdict is skipped, so that an interrupted run goes on.
+Writes ``CASES/<case>/verdict.json``, which ``benchmarks.gap.score`` reads. Knows the nominal model and the logs, no
+answer; a case that has its verdict is skipped, so that an interrupted run goes on.
 """
 
 from __future__ import annotations

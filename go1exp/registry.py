@@ -14,6 +14,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -74,12 +75,20 @@ def as_json(settings: Any) -> str:
     return json.dumps(settings)
 
 
+_UNION_MEMBER = re.compile(r"(str|int|float|bool|none)$|.+\[.+\]$")
+"""What pydantic puts between the keys where a value may be of several types: the type that it tried."""
+
+
 def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str]:
     """Translate a pydantic error into lines ``key.path = value: what is wrong``."""
-    lines = []
+    lines: list[str] = []
     for e in error.errors():
-        key = ".".join([path, *map(str, e["loc"])]).strip(".")
-        if e["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        places = [str(place) for place in e["loc"]]
+        unknown = e["type"] in ("extra_forbidden", "unexpected_keyword_argument")
+        last = len(places) - 1
+        own = [p for i, p in enumerate(places) if (unknown and i == last) or not _UNION_MEMBER.match(p)]
+        key = ".".join([path, *own]).strip(".")
+        if unknown:
             lines.append(unknown_name(key, str(e["loc"][-1]), known, "key") + f" (given: {e['input']!r})")
         elif e["type"] == "value_error" and not e["loc"]:  # a dataclass's own rules, one "key: rule" per line
             lines += [f"{path}.{line}".strip(".") for line in e["msg"].removeprefix("Value error, ").splitlines()]
@@ -88,7 +97,11 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
         elif e["type"] in ("missing", "missing_argument"):
             lines.append(f"{key}: required, but not given")
         else:
-            lines.append(f"{key} = {e['input']!r}: {e['msg'].removeprefix('Value error, ').lower()}")
+            value, what = f"{key} = {e['input']!r}: ", e["msg"].removeprefix("Value error, ").lower()
+            if len(own) < len(places) and lines and lines[-1].startswith(value):  # the next type that it may be of
+                lines[-1] += f" or {what.removeprefix('input should be ')}"
+            else:
+                lines.append(value + what)
     return lines
 
 

@@ -140,6 +140,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("fit-actuator", ("recordings: required",)),
         ("fit-actuator recordings=x epoch=3", ("epoch=3", "did you mean 'epochs'")),
         ("fit-actuator recordings=x history=0 share=leg", ("history = 0", "share = 'leg'", "'all', 'kind' or 'none'")),
+        ("gap", ("logs: required",)),
+        ("gap logs=5", ("gap: logs = 5: ", "valid string or a valid array")),
+        ("gap logs=x stage=fit search.alpha=2", ("2 problems", "stage = 'fit'", "'localise'", "search.alpha = 2")),
+        ("gap logs=x +search.int=3", ("search.int: unknown key",)),
         ("list efects", ("'efects'", "did you mean 'effect'")),
         # others
         ("train seed=4294967296", ("seed = 4294967296", "4294967295")),
@@ -204,6 +208,17 @@ def test_effects_come_from_files_by_any_path_and_from_names(tmp_path: Path) -> N
         done = cli(tmp_path, "train", "--cfg", "job", given)
         assert done.returncode == 0, done.stderr
         assert OmegaConf.create(done.stdout).effect == expected, given
+
+
+def test_a_file_can_be_added_where_a_verb_has_no_choice_of_the_group(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(FILES["mine.yaml"])
+    assert "effect" not in compose("gap", [])
+    for given in (f"+effect={file}", f"+effect=[{file}]"):
+        assert compose("gap", choices_from_files([given]))["effect"] == {"coulomb": {"bound": 0.3}}
+    assert_refused(
+        tmp_path, ["gap", f"+effect={tmp_path}/nowhere.yaml"], f"effect={tmp_path}/nowhere.yaml: no such file"
+    )
 
 
 def test_what_only_the_fit_knows_is_refused_in_words_too(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ TOLERANCES: dict[str, dict[str, float]] = {
     "command_delay": {"delay": 0.001},
     "coulomb": {"bound": 0.05},
     "encoder_offset": {"offset": 0.003},
-    "external_wrench": {"x": 1.0, "y": 1.0, "z": 1.0},
+    "external_wrench": {"x": 1.0, "y": 1.0, "z": 1.0, "roll": 0.2, "pitch": 0.2, "yaw": 0.2},
     "flexibility": {"compliance": 5e-4},
     "foot_friction": {"scale": 0.1},
     "ground_compliance": {"time_constant": 0.003},

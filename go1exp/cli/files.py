@@ -12,7 +12,7 @@ from yaml import YAMLError
 
 from go1exp.registry import ConfigError
 
-GROUP_IS_FILE = re.compile(r"^(?P<group>[a-z_]+)=(?P<value>\[?.*\.ya?ml\b.*)$")
+GROUP_IS_FILE = re.compile(r"^(?P<add>\+?)(?P<group>[a-z_]+)=(?P<value>\[?.*\.ya?ml\b.*)$")
 
 
 def choices_from_files(arguments: Sequence[str]) -> list[str]:
@@ -32,7 +32,8 @@ def choices_from_files(arguments: Sequence[str]) -> list[str]:
         group, value = match["group"], match["value"]
         items = [item.strip() for item in value.strip("[]").split(",")]
         names = [_choice(group, item) if re.search(r"\.ya?ml$", item) else item for item in items]
-        found.append(f"{group}=[{','.join(names)}]" if value.startswith("[") else f"{group}={names[0]}")
+        chosen = f"[{','.join(names)}]" if value.startswith("[") else names[0]
+        found.append(f"{match['add']}{group}={chosen}")
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from go1exp.config import parse_parts
-from go1exp.effects.base import Effect
+from go1exp.effects.base import Effect, Param
 from go1exp.gap.explain import numerical_scale
+from go1exp.gap.files import GapFileError
 from go1exp.gap.fit import scores
 from go1exp.gap.judge import splits
 from go1exp.gap.likelihood import scorer
@@ -46,7 +47,7 @@ class Applied:
         before: held-out excess of the plain model at that step.
         after: with ``effect.yaml`` and ``calibration.yaml`` as training reads them.
         effect_only: with ``effect.yaml`` alone.
-        reported: excess that the search reported at its own step.
+        reported: excess that the search had at its own step with what ``effect.yaml`` holds.
         closed: share of the excess that the files remove.
         holds: whether the model with the files is as good at this step as was reported.
     """
@@ -62,7 +63,11 @@ class Applied:
 
 
 def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
-    """Write the effect files of a result and return those that there are."""
+    """Write the effect files of a result and return those that there are.
+
+    Raises:
+        GapFileError: if the result names an effect or a parameter that is not in the library.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     certified = [n for n in result.named if n.status == "certified"]
     rest = [n for n in result.named if n.status != "certified"]
@@ -84,13 +89,13 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
 def _named_lines(named: Sequence[NamedEffect]) -> list[str]:
     lines = []
     for n in named:
-        params = {p.name: p for p in _kind(n.effect).params}
+        params = _params(n.effect, n.params)
         others = [a for a in n.alias_set if a != n.effect]
         known = f"; these logs cannot tell it from {', '.join(others)}" if others else ""
         lines += [f"{n.effect}:  # {n.status}{known}"]
         widths: dict[str, float] = {}
         for name, places in n.params.items():
-            lines.append(f"  {name}: {_value(places)}  # {params[name].unit}")
+            lines.append(f"  {name}: {_value(places, params[name])}  # {params[name].unit}")
             for place, (low, high) in n.interval.get(name, {}).items():
                 lines.append(
                     f"    # {place}: {places.get(place, params[name].null):.4g}, 95 % within {low:.4g} to {high:.4g}"
@@ -106,9 +111,9 @@ def _named_lines(named: Sequence[NamedEffect]) -> list[str]:
 def _box_lines(box: Values) -> list[str]:
     lines = []
     for effect, params in box.items():
-        kind = {p.name: p for p in _kind(effect).params}
+        kind = _params(effect, params)
         body = [
-            f"  {name}: {_value(places)}  # {kind[name].unit}"
+            f"  {name}: {_value(places, kind[name])}  # {kind[name].unit}"
             for name, places in params.items()
             if any(abs(v - kind[name].null) > 1e-3 * kind[name].tolerance for v in places.values())
         ]
@@ -116,12 +121,22 @@ def _box_lines(box: Values) -> list[str]:
     return lines
 
 
-def _value(places: Mapping[str, float]) -> str:
-    """Write values per joint, or one number."""
-    rounded = {place: float(f"{value:.5g}") for place, value in places.items()}
+def _value(places: Mapping[str, float], param: Param) -> str:
+    """Write values per joint, or one number; rounding must not carry them out of their range (3.1416 > pi)."""
+    rounded = {place: min(max(float(f"{value:.5g}"), param.low), param.high) for place, value in places.items()}
     if set(places) == {ROBOT}:
         return json.dumps(rounded[ROBOT])
     return json.dumps(rounded)
+
+
+def _params(effect: str, names: Collection[str]) -> dict[str, Param]:
+    """Return the declarations of an effect by name, of which ``names`` must be some."""
+    there = effect in members("effect")
+    known = {p.name: p for p in _kind(effect).params} if there else {}
+    strange = [f"{effect}.{name}" for name in names if name not in known] if there else [effect]
+    if strange:
+        raise GapFileError(f"{strange[0]}: not in the library; the result is of another version of go1exp")
+    return known
 
 
 def _kind(effect: str) -> type[Effect]:
@@ -165,6 +180,15 @@ def theta_of(terms: Sequence[Term], joints: Sequence[str]) -> Theta:
     return found
 
 
+def _reported(result: GapResult) -> float:
+    """Return the excess that the search had with the certified effects alone; NaN if it did not say."""
+    certified = [n.effect for n in result.named if n.status == "certified"]
+    if len(certified) == len(result.named):
+        return result.excess.get("final", float("nan"))
+    steps = dict(result.waterfall)  # terms in the order in which they were found, the certified ones first
+    return steps.get(certified[-1], float("nan")) if certified else result.excess.get("box", float("nan"))
+
+
 def prove(
     recordings: Sequence[Recording],
     config: RobotConfig,
@@ -195,6 +219,6 @@ def prove(
     both = {**theta_of(terms_of(contents.get(CALIBRATION, {})), machine.joints), **effect}
     found = scores(judge, [{}, effect, both], held, dt)
     before, alone, after = (excess(x) for x in found)
-    reported = result.excess.get("final", float("nan"))
+    reported = _reported(result)
     holds = after <= max(settings.adequate, 1.5 * reported + 0.1)
     return Applied((), dt, before, after, alone, reported, removed(before, after), bool(holds))

@@ -18,7 +18,7 @@ from go1exp.gap.fit import residuals
 from go1exp.gap.judge import splits
 from go1exp.gap.likelihood import Scorer, scorer
 from go1exp.gap.localise import localise
-from go1exp.gap.replay import Machine, Replayer, Theta, hung, variants
+from go1exp.gap.replay import HungGo1, Machine, Replayer, Theta, hung, variants
 from go1exp.gap.result import Floors, GapResult, GapSettings, Overlay
 from go1exp.gap.search import Progress, Search, excess, removed
 from go1exp.gap.windows import Windows, cut
@@ -33,6 +33,8 @@ TELLING = ("delay", "torque")
 
 NUMERICAL = 24
 """Windows in which the error of the physics step is measured."""
+
+GO1 = "go1"
 
 FEWEST = 8
 """Windows below which nothing is judged."""
@@ -155,6 +157,8 @@ def unusable(recording: Recording, machine: Machine) -> list[str]:
     """Return why a recording cannot be compared with the model, a line each."""
     meta, name = recording.meta, recording.meta.episode
     found = []
+    if isinstance(machine, HungGo1) and meta.robot != GO1:
+        found.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}")
     if meta.joints != machine.joints:
         found.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(machine.joints)}")
         return found

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.gap.result import Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
+from go1exp.gap.result import EXIT_CODES, Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
 from go1exp.registry import Expected
 
 RESULT = "verdict.json"
@@ -51,11 +51,14 @@ def from_dict(plain: Mapping[str, Any]) -> GapResult:
     values = {key: value for key, value in plain.items() if key in known}
     values["named"] = tuple(_named(item) for item in plain["named"])
     values["candidates"] = tuple(_candidate(item) for item in plain["candidates"])
-    values["floors"] = None if plain["floors"] is None else Floors(**plain["floors"])
+    if plain["verdict"] not in EXIT_CODES:
+        raise ValueError(f"verdict {plain['verdict']!r}")
+    values["floors"] = None if plain["floors"] is None else _floors(plain["floors"])
     values["before"], values["after"] = (_localisation(plain[key]) for key in ("before", "after"))
     values["overlays"] = tuple(_overlay(item) for item in plain["overlays"])
     values["waterfall"] = tuple((str(label), _number(value)) for label, value in plain["waterfall"])
-    values["excess"] = {name: _number(value) for name, value in plain["excess"].items()}
+    for name in ("excess", "bags", "box"):
+        values[name] = _numbers(plain[name])
     for name in ("closed", "seconds"):
         values[name] = _number(plain[name])
     for name in ("advice", "warnings"):
@@ -67,19 +70,32 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
+def _numbers(plain: Any) -> Any:
+    """Put NaN for None in nested lists and mappings of numbers."""
+    if isinstance(plain, Mapping):
+        return {key: _numbers(value) for key, value in plain.items()}
+    return [_numbers(value) for value in plain] if isinstance(plain, list) else _number(plain)
+
+
+def _floors(item: Mapping[str, Any]) -> Floors:
+    repeated = item["repeatability"]
+    noise, numerical = _numbers(item["noise"]), _numbers(item["numerical"])
+    return Floors(noise, numerical, None if repeated is None else _numbers(repeated))
+
+
 def _named(item: Mapping[str, Any]) -> NamedEffect:
     interval = {
         param: {joint: (_number(low), _number(high)) for joint, (low, high) in places.items()}
         for param, places in item["interval"].items()
     }
     tuples = {name: tuple(item[name]) for name in ("joints", "alias_set")}
-    return NamedEffect(**{**item, **tuples, "interval": interval})
+    return NamedEffect(**{**item, **tuples, "params": _numbers(item["params"]), "interval": interval})
 
 
 def _candidate(item: Mapping[str, Any]) -> Candidate:
     numbers = {name: _number(item[name]) for name in ("excess_after", "log_gain", "p", "size_over_tolerance")}
     tuples = {name: tuple(item[name]) for name in ("joints", "alias_class")}
-    return Candidate(**{**item, **numbers, **tuples})
+    return Candidate(**{**item, **numbers, **tuples, "params": _numbers(item["params"])})
 
 
 def _localisation(item: Mapping[str, Any] | None) -> Localisation | None:
@@ -92,7 +108,7 @@ def _localisation(item: Mapping[str, Any] | None) -> Localisation | None:
 
 def _overlay(item: Mapping[str, Any]) -> Overlay:
     curves = {name: {k: np.array(v, dtype=float) for k, v in item[name].items()} for name in _CURVES}
-    return Overlay(item["episode"], np.array(item["t"], dtype=float), **curves, noise=dict(item["noise"]))
+    return Overlay(item["episode"], np.array(item["t"], dtype=float), **curves, noise=_numbers(item["noise"]))
 
 
 _CURVES = ("measured", "before", "after")

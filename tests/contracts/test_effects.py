@@ -387,7 +387,7 @@ def calls(effect: Effect, n: int, k: int) -> Iterator[tuple[str, tuple[Any, ...]
         "on_transmission": (torque, q, qd),
         "on_joint": (q, qd),
         "on_friction": (torque.abs(), torque, qd),
-        "on_base": (three[0],),
+        "on_base": (torch.cat([three[0], three[0]], dim=1),),
     }
     for hook, tensors in given.items():
         if getattr(type(effect), hook) is not getattr(Effect, hook):
