@@ -120,7 +120,7 @@ def _apply(result: GapResult, recordings: list[Recording], config: RobotConfig, 
         f"floor ({1 + proof.before:.3g} without; {1 + proof.effect_only:.3g} with {apply.EFFECT} alone)"
     )
     if not proof.holds:
-        print(f"NOT applied: it was {1 + proof.reported:.3g} in the search; do not train with it at this step")
+        print(f"NOT applied: it was {1 + proof.reported:.3g} in the search, and is worse at this step")
         return DOES_NOT_HOLD
     if result.named:
         print(f"now: go1exp train effect={out / apply.EFFECT}")

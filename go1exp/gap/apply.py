@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 
 from go1exp.config import parse_parts
 from go1exp.effects.base import Effect, Param
-from go1exp.gap.explain import numerical_scale
+from go1exp.gap.explain import fingerprint, numerical_scale
 from go1exp.gap.files import GapFileError
 from go1exp.gap.fit import scores
 from go1exp.gap.judge import splits
@@ -189,6 +189,20 @@ def _reported(result: GapResult) -> float:
     return steps.get(certified[-1], float("nan")) if certified else result.excess.get("box", float("nan"))
 
 
+def _same_search(recordings: Sequence[Recording], settings: GapSettings, result: GapResult) -> None:
+    before, now = result.provenance.get("settings", {}), asdict(settings)
+    changed = [f"search.{k}" for k in SPLITTING if k in before and before[k] != now[k]]
+    if changed:
+        raise GapFileError(f"{', '.join(changed)}: not as in the search that found this; run go1exp gap explain again")
+    logs = result.provenance.get("logs")
+    if logs and logs != {r.meta.episode: fingerprint(r) for r in recordings}:
+        raise GapFileError("logs: not those of the search that found this; run go1exp gap explain again")
+
+
+SPLITTING = ("window_s", "burn_s", "stride_s", "confirm_fraction", "seed", "torque")
+"""Settings that decide which windows were held out."""
+
+
 def prove(
     recordings: Sequence[Recording],
     config: RobotConfig,
@@ -197,7 +211,7 @@ def prove(
     contents: Mapping[str, Mapping[str, Any]],
     physics_dt: float,
 ) -> Applied:
-    """Score written files on the held-out windows of the search, at the step of training.
+    """Score written files at the step of training, on the windows kept for a last check (if none, the held-out ones).
 
     Args:
         recordings: those of the search.
@@ -206,7 +220,11 @@ def prove(
         result: its outcome.
         contents: file name -> content, as read back from the files.
         physics_dt: training's step, s.
+
+    Raises:
+        GapFileError: if logs or settings are not those of the search: what it held out would not be known.
     """
+    _same_search(recordings, settings, result)
     machine, windows = hung(config), cut(recordings, settings)
     quats = np.array([recordings[e].meta.base_quat for e in windows.episode])
     replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
@@ -214,7 +232,8 @@ def prove(
     scale, _ = numerical_scale(replayer, dt)
     judge = scorer(replayer, {}, scale, dt)
     rng = np.random.default_rng(settings.seed)
-    held = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng).select
+    parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
+    held = parts.confirm if len(parts.confirm) else parts.select  # the values were fitted on all but the former
     effect = theta_of(terms_of(contents.get(EFFECT, {})), machine.joints)
     both = {**theta_of(terms_of(contents.get(CALIBRATION, {})), machine.joints), **effect}
     found = scores(judge, [{}, effect, both], held, dt)

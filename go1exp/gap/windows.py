@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.gap.result import GapSettings
-from go1exp.recording import Recording
+from go1exp.recording import Recording, RecordingError
 
 PAST_S = 0.064
 """Commands before a window that are kept, s: the longest command delay that an effect may have, and a little."""
@@ -197,6 +197,10 @@ def cut(recordings: Sequence[Recording], settings: GapSettings) -> Windows:
                     "switches": _since(begin, _changes(t, on, begin - PAST_S, begin + long)),
                 }
             )
+    if not rows:
+        raise RecordingError(
+            f"no window of {settings.burn_s:g} + {settings.window_s:g} s fits into these recordings; record longer ones"
+        )
     plain = {key: np.stack([row[key] for row in rows]) for key in rows[0] if key not in ("edges", "switches")}
     return Windows(
         joints=joints,
