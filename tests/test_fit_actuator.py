@@ -17,7 +17,6 @@ from go1exp import data_root
 from go1exp.fit import FitError, FitResult, FitSettings, NetFileError, fit, load, plot, smooth_motion, text
 from go1exp.fit.dataset import fingerprint, split, windows
 from go1exp.fit.net import ActuatorNet, InputName
-from go1exp.fit.torch_net import TorchNet
 from go1exp.recording import Meta, Recording, RecordingError, problems
 
 JOINTS = ("FR_hip", "FR_calf")
@@ -452,9 +451,7 @@ def test_a_damaged_or_foreign_file_is_refused(result: FitResult, tmp_path: Path)
 
 
 @pytest.mark.parametrize("form", ["one", "several"])
-def test_torch_and_onnx_agree_with_the_formula(
-    form: str, result: FitResult, by_kind: FitResult, tmp_path: Path
-) -> None:
+def test_onnx_agrees_with_the_formula(form: str, result: FitResult, by_kind: FitResult, tmp_path: Path) -> None:
     import onnxruntime
 
     net = result.net if form == "one" else by_kind.net
@@ -463,23 +460,14 @@ def test_torch_and_onnx_agree_with_the_formula(
     assert [p.name for p in tmp_path.iterdir()] == ["net.onnx"]
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx", providers=["CPUExecutionProvider"])
     assert session.get_modelmeta().custom_metadata_map["period_s"] == "0.005"
-    module = net.torch_module()
-    assert isinstance(module, TorchNet)
     rng = np.random.default_rng(0)
-    for rows in (1, 7, 2048, 5000):
+    for rows in (1, 7, 5000):
         x = rng.normal(size=(nets, rows, net.info.features)) * net.input_std[:, None] + net.input_mean[:, None]
         expected = np.stack([net.torque(x[k], k) for k in range(nets)])
         given = x.astype(np.float32) if nets > 1 else x[0].astype(np.float32)
-        by_torch = module(torch.tensor(given)).numpy()
         (by_onnx,) = session.run(["torque"], {"features": given})
-        assert by_torch.shape == by_onnx.shape == given.shape[:-1]
-        np.testing.assert_allclose(by_torch.reshape(nets, rows), expected, rtol=0, atol=1e-5)
-        np.testing.assert_allclose(by_onnx, by_torch, rtol=0, atol=1e-5)
-        by_batch = module._batched(torch.tensor(given.reshape(nets, rows, -1))).numpy()  # the way of a GPU
-        np.testing.assert_allclose(by_batch, expected, rtol=0, atol=1e-5)
-    if nets > 1:
-        with pytest.raises(ValueError, match="2 nets want rows"):
-            module(torch.zeros(3, net.info.features))
+        assert by_onnx.shape == given.shape[:-1]
+        np.testing.assert_allclose(by_onnx.reshape(nets, rows), expected, rtol=0, atol=1e-5)
 
 
 def test_a_net_knows_the_range_it_was_trained_in(recordings: list[Recording], result: FitResult) -> None:

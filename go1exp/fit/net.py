@@ -26,7 +26,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from go1exp.registry import STRICT, Expected, NonNegative, Positive, explain
 
 if TYPE_CHECKING:
-    import torch
+    pass
 
 InputName = Literal["position_error", "velocity", "tau_cmd", "position"]
 """Inputs: target minus angle, rad; angular velocity, rad/s; commanded torque, N m; angle, rad."""
@@ -224,12 +224,6 @@ class ActuatorNet:
         out = (h @ self.weights[-1][group] + self.biases[-1][group])[:, 0] + z @ self.skip[group]
         return np.asarray(self.output_mean[group] + self.output_std[group] * out)
 
-    def torch_module(self) -> torch.nn.Module:
-        """Return a float32 module without gradients: ``(R, F) -> (R,)`` if K = 1, and ``(K, R, F) -> (K, R)``."""
-        from go1exp.fit.torch_net import TorchNet
-
-        return TorchNet(*self.folded)
-
     def save(self, path: Path) -> None:
         """Write the net, whole or not at all; ``path`` should end in ``.npz``."""
         path = Path(path)
@@ -244,7 +238,10 @@ class ActuatorNet:
             partial.unlink(missing_ok=True)
 
     def export_onnx(self, path: Path) -> None:
-        """Write an ONNX model, ``features`` -> ``torque``, with the shapes of ``torch_module``; one file, opset 20."""
+        """Write an ONNX model, ``features`` -> ``torque``, one file, opset 20.
+
+        Features (R, F) to torque (R,) of a single net; (K, R, F) to (K, R) of several.
+        """
         from go1exp.fit.onnx_file import write_onnx
 
         info = self.info
