@@ -42,7 +42,7 @@ BARS: dict[str, tuple[tuple[float, float, float], str]] = {
     "stribeck": ((0.7, 0.55, 0.5), "a jump of the target frees a stuck joint half a step late"),
     "torque_delay": ((0.5, 0.8, 0.5), "hardly damped: a delay takes kp x delay from kd"),
 }
-"""Effects that cannot keep ``BAR``: what they were measured to keep, by gains, and why."""
+"""Effects that cannot keep ``BAR``: the bar they keep instead, by gains, some 15 % above what was measured, and why."""
 
 
 @cache

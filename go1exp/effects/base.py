@@ -7,15 +7,13 @@ the robot moves as without it, bit for bit.
 from __future__ import annotations
 
 import inspect
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from go1exp.drive import DriveSetup, ModelFields
-from go1exp.joint_values import JointValues, each_within, numbers
+from go1exp.joint_values import JointValues, each_within
 from go1exp.memory import Memory
 
 if TYPE_CHECKING:
@@ -184,9 +182,3 @@ class Effect(Memory):
 
     def reset(self, mask: Tensor) -> None:
         """Begin a new episode in the rows of ``mask`` (N,)."""
-
-
-def is_null(kind: type[Effect], values: Mapping[str, JointValues]) -> bool:
-    """Return whether an effect with these settings is absent everywhere."""
-    sizes = [p for p in kind.params if p.tolerance != math.inf]
-    return all(v == p.null for p in sizes for v in numbers(values.get(p.name, p.null)))

@@ -22,11 +22,11 @@ from go1exp import data_root, robot
 from go1exp.compose import compose
 from go1exp.config import MANY_TERMS, TaskConfig, parse_task
 from go1exp.drive import DriveSetup
-from go1exp.effects.base import Effect, Measured, Param, is_null
+from go1exp.effects.base import Effect, Measured, Param
 from go1exp.effects.stack import HOOKS
 from go1exp.env.core import Go1Core
 from go1exp.env.plant import Plant, drive_setup
-from go1exp.joint_values import spread
+from go1exp.joint_values import JointValues, numbers, spread
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
 from go1exp.randomness import EnvRandom
@@ -53,6 +53,12 @@ FLOORS = {"q": 5e-4, "qd": 0.05, "torque": 0.1, "gravity": 2e-3, "gyro": 0.02, "
 
 
 # ---------------------------------------------------------------------- robots to try effects on
+
+
+def is_null(kind: type[Effect], values: Mapping[str, JointValues]) -> bool:
+    """Return whether an effect with these settings is absent everywhere."""
+    sizes = [p for p in kind.params if p.tolerance != math.inf]
+    return all(v == p.null for p in sizes for v in numbers(values.get(p.name, p.null)))
 
 
 @cache
