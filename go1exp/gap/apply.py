@@ -230,7 +230,7 @@ def prove(
     replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
     dt = float(windows.period / np.ceil(windows.period / physics_dt - 1e-3))
     scale, _ = numerical_scale(replayer, dt)
-    judge = scorer(replayer, {}, scale, dt)
+    judge = scorer(replayer, {}, scale, dt, settings.clock_s)
     rng = np.random.default_rng(settings.seed)
     parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
     held = parts.confirm if len(parts.confirm) else parts.select  # the values were fitted on all but the former

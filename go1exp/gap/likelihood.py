@@ -1,7 +1,7 @@
-"""How well the model explains windows of data: Gaussian noise, with what is not known of the first state averaged out.
+"""How well the model explains windows of data: Gaussian noise, with the unknown first state and clock averaged out.
 
 A window's residual r and its change J per parameter, both in units of the noise, have the covariance I + S S', where S
-is the change per standard deviation of the first state. All that fits and scores need is the Gram matrix of [J r] in
+is the change per standard deviation of the first state, and of the time between stamps of commands and of readings. All that fits and scores need is the Gram matrix of [J r] in
 the metric of that covariance, window by window and group of joints by group.
 """
 
@@ -48,7 +48,8 @@ class Scorer:
     Attributes:
         replayer: the model.
         scale: (W, C, J) standard deviation of noise and numerical error.
-        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the first state.
+        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the first state and
+            of the clock.
     """
 
     replayer: Replayer
@@ -64,7 +65,8 @@ class Scorer:
     def size(self) -> np.ndarray:
         """(W,) number of values in a window and group."""
         w = self.windows
-        return np.asarray(w.valid.sum(1) * len(w.quantities) * len(self.replayer.machine.groups[0]))
+        used = np.isfinite(self.scale).sum((1, 2)) / len(self.replayer.machine.groups)
+        return np.asarray(w.valid.sum(1) * used)
 
     def unit(self, y: np.ndarray, window: np.ndarray) -> np.ndarray:
         """Return readings, or differences of them, (R, n, C, J) in units of the noise as (R, G, m)."""
@@ -82,17 +84,27 @@ class Scorer:
 
 
 def state_probes(machine: Machine) -> list[Probe]:
-    """Return the probes of the first state: angles, then speeds, of each place in the groups."""
+    """Return the probes of the first state: angles, then speeds, of each place in the groups; then of a free base."""
     places, joints = range(len(machine.groups[0])), len(machine.joints)
-    return [
+    found = [
         Probe(kind, place, np.full(joints, size))
         for kind, size in zip(("q", "qd"), STATE_PROBE, strict=True)
         for place in places
     ]
+    return found + [Probe("base", None, row) for row in np.diag(machine.base_probe)]
 
 
-def scorer(replayer: Replayer, theta: Theta, scale: np.ndarray, dt: float) -> Scorer:
-    """Measure how the first states act on the readings, with the model at ``theta``."""
+def _start_sd(windows: Windows, machine: Machine, probe: Probe) -> np.ndarray:
+    """Return the standard deviation of a coordinate of the first state (W, G), in changes by its probe."""
+    if probe.key == "base":
+        axis = int(np.argmax(probe.delta))
+        return np.full((len(windows), 1), machine.base_sd[axis] / machine.base_probe[axis])
+    sd = windows.q_sd if probe.key == "q" else windows.qd_sd
+    return sd[:, np.array(machine.groups)[:, probe.place]] / STATE_PROBE[probe.key == "qd"]
+
+
+def scorer(replayer: Replayer, theta: Theta, scale: np.ndarray, dt: float, clock_s: float = 0.0) -> Scorer:
+    """Measure how the first states, and a clock that is off by ``clock_s``, act on the readings, at ``theta``."""
     w, machine = replayer.windows, replayer.machine
     probes = state_probes(machine)
     everything = np.arange(len(w))
@@ -101,9 +113,12 @@ def scorer(replayer: Replayer, theta: Theta, scale: np.ndarray, dt: float) -> Sc
     y = replayer.run(rows, dt).reshape(len(w), 1 + len(probes), *w.y.shape[1:])
     columns = []
     for k, probe in enumerate(probes):
-        sd = (w.q_sd if probe.key == "q" else w.qd_sd)[:, np.array(machine.groups)[:, probe.place]]  # W G
+        sd = _start_sd(w, machine, probe)
         per = empty.unit(y[:, 1 + k] - y[:, 0], everything)
-        columns.append(per * (sd / STATE_PROBE[probe.key == "qd"])[..., None].astype(np.float32))
+        columns.append(per * sd[..., None].astype(np.float32))
+    columns += [empty.unit(change, everything) for change in w.unknown(y[:, 0])]
+    if clock_s:
+        columns.append(empty.unit(clock_s * np.gradient(y[:, 0], w.period, axis=1), everything))
     return dataclasses.replace(empty, state=np.stack(columns, axis=-1))
 
 

@@ -40,6 +40,8 @@ class GapSettings:
         burn_s: time replayed before it and not scored, s: filters and delay lines settle.
         stride_s: from the beginning of one window to that of the next, s.
         physics_dt: longest physics step, s; the one used divides the logger's period.
+        clock_s: standard deviation of the time by which readings may be stamped early or late against commands, window
+            by window; a hundredth of a control step, which nothing in training would notice.
         torque: also score the torque that the drives report, where it was logged.
         alpha: significance that a term needs.
         min_share: share of the remaining excess that a term must remove.
@@ -64,6 +66,7 @@ class GapSettings:
     burn_s: NonNegative = 0.07
     stride_s: Positive = 0.4
     physics_dt: Annotated[float, Field(gt=0, le=0.002)] = 0.001
+    clock_s: NonNegative = 0.00015
     torque: bool = False
     alpha: Share = 0.01
     min_share: Fraction = 0.1
@@ -88,7 +91,7 @@ class Floors:
 
     Attributes:
         noise: sensor noise by quantity (``q`` rad, ``qd`` rad/s, ``tau_est`` N m), median over joints and episodes.
-        numerical: difference between replays at the step used and half of it, root mean square, by quantity.
+        numerical: error of the physics step, twice what half the step changes, median of windows, by quantity.
         repeatability: difference between repeated episodes over sqrt(2), root mean square, by quantity; None if no
             episode was repeated.
     """

@@ -85,7 +85,7 @@ def survey(
     dt = float(windows.period / np.ceil(windows.period / settings.physics_dt - 1e-3))
     on_progress("measuring the floors", 0.1)
     scale, numerical = numerical_scale(replayer, dt)
-    score = scorer(replayer, {}, scale, 2.0 * dt)
+    score = scorer(replayer, {}, scale, 2.0 * dt, settings.clock_s)
     rng = np.random.default_rng(settings.seed)
     everything = np.arange(len(windows))
     noise = {name: float(np.median(windows.scale[0, c])) for c, name in enumerate(windows.quantities)}

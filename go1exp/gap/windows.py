@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,6 +80,19 @@ class Windows:
     def __len__(self) -> int:
         return len(self.episode)
 
+    @property
+    def channels(self) -> tuple[tuple[str, int, int], ...]:
+        """Name, quantity and place of every reading."""
+        return tuple((f"{q}_{j}", c, i) for c, q in enumerate(self.quantities) for i, j in enumerate(self.joints))
+
+    def by_quantity(self, values: np.ndarray) -> dict[str, float]:
+        """Return the median of values (W, C, J) by quantity."""
+        return {name: float(np.median(values[:, c])) for c, name in enumerate(self.quantities)}
+
+    def unknown(self, y: np.ndarray) -> list[np.ndarray]:
+        """Return changes of the readings ``y`` (W, n, C, J) per standard deviation of what sensors may be off by."""
+        return []
+
 
 def even_clock(recording: Recording) -> np.ndarray:
     """Return the times (T,) at which samples were taken, s.
@@ -110,9 +123,13 @@ def noise(recordings: Sequence[Recording], quantity: str) -> np.ndarray:
 
     Where values have steps so coarse that a resting joint shows none of its noise, a uniform error of one step counts.
     """
+    return noise_of([r.joint(quantity) for r in recordings])
+
+
+def noise_of(series: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the noise of several episodes' readings (T, J), in the way of :func:`noise`."""
     blocks, steps = [], []
-    for r in recordings:
-        values = r.joint(quantity)
+    for values in series:
         third = np.diff(values, 3, axis=0)
         count = len(third) // 50
         if count:
@@ -149,11 +166,29 @@ def _changes(t: np.ndarray, values: np.ndarray, lo: float, hi: float) -> tuple[n
     return t[first:last][moved], part[moved]
 
 
-def cut(recordings: Sequence[Recording], settings: GapSettings) -> Windows:
+def bridged(t: np.ndarray, target: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times and targets with a row for every single lost sample, and the times of those that hide a step.
+
+    A target that changes with every sample changed at the lost one too; taking it for held there makes it late by a
+    sample, which is a gap of its own. Whether a target that stepped did so at the lost sample or after, nobody knows.
+    """
+    lost = np.flatnonzero(np.abs(np.diff(t) / period - 2.0) < 0.5)
+    lost = lost[(lost >= 1) & (lost + 2 < len(t))]
+    before, last, first, after = (target[lost + k] for k in (-1, 0, 1, 2))
+    flows = (last - before) * (after - first) > 0
+    middle = np.where(flows, 0.5 * (last + first), last)
+    hidden = t[lost][np.any((last != first) & ~flows, axis=1)]
+    return np.insert(t, lost + 1, 0.5 * (t[lost] + t[lost + 1])), np.insert(target, lost + 1, middle, axis=0), hidden
+
+
+def cut(
+    recordings: Sequence[Recording], settings: GapSettings, doubt: Callable[[int, float], float] = lambda number, at: 0.0
+) -> Windows:
     """Cut recordings of one robot into windows.
 
     A window begins where the motion is smooth, within a third of a stride of where it should, since its first state
-    comes from smoothing. Windows with holes are left out.
+    comes from smoothing. Windows with holes are left out. ``doubt`` adds to the misfit of a first state of recording
+    ``number`` at time ``at``, s; where it is infinite none begins.
     """
     joints = recordings[0].meta.joints
     quantities = QUANTITIES if settings.torque and all(r.has("tau_est") for r in recordings) else QUANTITIES[:2]
@@ -166,17 +201,19 @@ def cut(recordings: Sequence[Recording], settings: GapSettings) -> Windows:
     for number, (r, t) in enumerate(zip(recordings, clocks, strict=True)):
         y = np.stack([r.joint(name) for name in quantities], axis=1)
         target = r.joint("q_target")
+        *asked, hidden = bridged(t, target, period)
         on = r.channels.get("torque_enable", np.ones(len(t), dtype=bool)).astype(bool)
-        holes = t[:-1][np.diff(t) > GAP * period]
+        holes = np.concatenate([t[:-1][np.diff(t) > GAP * period], hidden])
         at = t[0] + PAST_S
         while at + settings.stride_s / 3 + long < t[-1]:
             tries = at + np.linspace(0.0, settings.stride_s / 3, 9)
             tries = t[np.searchsorted(t, tries)]
             fits = [_start(t, y[:, 0], y[:, 1], float(s), sd) for s in tries]
-            best = int(np.argmin([f[3].max() for f in fits]))
+            misfits = [f[3].max() + doubt(number, float(s)) for f, s in zip(fits, tries, strict=True)]
+            best = int(np.argmin(misfits))
             begin, (q, qd, qdd, misfit) = float(tries[best]), fits[best]
             at += settings.stride_s
-            if np.any((holes > begin - PAST_S) & (holes < begin + long)):
+            if not np.isfinite(misfits[best]) or np.any((holes > begin - PAST_S) & (holes < begin + long)):
                 continue
             inside = np.flatnonzero((t >= begin + settings.burn_s - 1e-9) & (t <= begin + long + 1e-9))[:most]
             rows.append(
@@ -193,7 +230,7 @@ def cut(recordings: Sequence[Recording], settings: GapSettings) -> Windows:
                     "t": _padded(t[inside] - begin, most),
                     "y": _padded(y[inside], most),
                     "valid": _padded(np.ones(len(inside), dtype=bool), most),
-                    "edges": _since(begin, _changes(t, target, begin - PAST_S, begin + long)),
+                    "edges": _since(begin, _changes(*asked, begin - PAST_S, begin + long)),
                     "switches": _since(begin, _changes(t, on, begin - PAST_S, begin + long)),
                 }
             )
