@@ -285,7 +285,7 @@ def test_the_case_does_not_depend_on_the_others_and_sizes_go_round() -> None:
     assert {(e["effect"], e["size"]) for e in drawn} == {(e, s) for e in cases.HUNG for s in cases.SIZES}
     for e in drawn:
         for name in e["sizes"]:
-            away = np.abs(np.asarray(e["params"][name]) - told.null(e["effect"], name))
+            away = np.abs(np.asarray(e["drawn"][name]) - told.null(e["effect"], name))
             assert away.max() <= 1.16 * e["size"] * told.TOLERANCES[e["effect"]][name]
             if e["effect"] not in ("base_tilt", "asymmetric_friction"):
                 assert away.min() >= 0.999 * e["size"] * told.TOLERANCES[e["effect"]][name]
@@ -428,3 +428,13 @@ def test_the_command_seals_writes_and_continues(
 def test_wrong_settings_are_refused(words: list[str], message: str) -> None:
     with pytest.raises(SystemExit, match=message):
         generate.settings(words)
+
+
+def test_the_answer_is_the_robot_and_not_only_what_was_added() -> None:
+    case = cases.make("single", cases.HUNG.index("armature"), 5, 2, 0.2)
+    (effect,) = case.answer["effects"]
+    at = [robot.JOINTS.index(j) for j in effect["joints"]]
+    nominal = np.tile(told.NOMINAL["armature"], 4)
+    assert not case.answer["clean"]
+    np.testing.assert_allclose(effect["params"]["added"], (case.truth.armature - nominal)[at], atol=1e-9)
+    assert np.abs(np.subtract(effect["params"]["added"], effect["drawn"]["added"])).max() > 1e-6

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.gap import logger, outside, told
 from benchmarks.gap.motions import MOTIONS, RATE
 from benchmarks.gap.simulate import Episode
-from benchmarks.gap.truth import Truth, apply
+from benchmarks.gap.truth import Truth, apply, differences
 from go1exp import robot
 
 KINDS = ("null", "single", "pair", "outside", "not_excited", "damaged")
@@ -129,13 +129,18 @@ def draw_values(effect: str, size: float, joints: np.ndarray, rng: np.random.Gen
 
 
 def effect_answer(effect: str, size: float, joints: np.ndarray, values: Values) -> dict[str, Any]:
-    """Write an effect down as the scorer reads it; ``sizes`` are the parameters that have a tolerance."""
+    """Write an effect down as the scorer reads it; ``sizes`` are the parameters that have a tolerance.
+
+    ``drawn`` is what was added, ``params`` what an estimate is compared with.
+    """
     per_robot = effect in ("base_tilt", "payload")
+    drawn = {k: v if isinstance(v, float) else [float(x) for x in v] for k, v in values.items()}
     return {
         "effect": effect,
         "size": size,
         "joints": [] if per_robot else [robot.JOINTS[j] for j in joints],
-        "params": {k: v if isinstance(v, float) else [float(x) for x in v] for k, v in values.items()},
+        "drawn": drawn,
+        "params": dict(drawn),
         "sizes": list(told.TOLERANCES[effect]),
     }
 
@@ -255,6 +260,10 @@ def make(kind: str, index: int, seed: int, count: int = 8, seconds: float = 5.0,
         detail["damage"] = damage
     elif kind != "null":
         raise ValueError(f"no kind {kind!r}; there are {', '.join(KINDS)}")
+    for effect in effects:
+        at = np.array([robot.JOINTS.index(name) for name in effect["joints"]], dtype=int)
+        for key, value in differences(truth, effect["effect"], at).items():
+            effect["params"][key] = value if isinstance(value, float) else [float(x) for x in value]
     own = tuple(int(x) for x in noise.generate_state(4))
     episodes = experiment(motions, count, seconds, rng)
     dt = 1e-4 if truth.yielding.any() else float(rng.choice([2e-4, 2.5e-4]))

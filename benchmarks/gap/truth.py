@@ -158,3 +158,26 @@ def apply(truth: Truth, effect: str, values: Mapping[str, np.ndarray | float], j
                 continue
             for attribute in added[effect][name]:
                 getattr(truth, attribute)[joints] += value
+
+
+def differences(truth: Truth, effect: str, joints: np.ndarray) -> dict[str, np.ndarray | float]:
+    """Return what an effect's parameters are in all, where the background adds to them; an estimate sees only the sum.
+
+    Args:
+        truth: the robot, with all its effects and its background.
+        effect: a name of ``told.LIBRARY``.
+        joints: indices of the joints at which the effect was added.
+    """
+    if effect == "base_tilt":
+        return {"roll": float(truth.tilt[0]), "pitch": float(truth.tilt[1])}
+    found = {
+        "coulomb": {"bound": np.minimum(truth.forward, truth.backward)},
+        "asymmetric_friction": {"forward": truth.forward, "backward": truth.backward},
+        "viscous": {"damping": truth.viscous},
+        "armature": {"added": truth.armature - robot.per_joint(robot.ROTOR_ARMATURE)},
+        "encoder_offset": {"offset": truth.offset},
+        "strength": {"scale": truth.strength},
+        "link_mass": {"scale": truth.mass},
+        "link_com": {"along": -truth.com[:, 2]},
+    }.get(effect, {})
+    return {name: values[joints] for name, values in found.items()}
