@@ -38,13 +38,15 @@ $(OK): pyproject.toml requirements/lock.txt
 	@$(PIP) check
 	@touch $@
 
-demo: setup ## train for some minutes, judge the policy and film it, all in runs/demo
-	@echo "demo 1/3: go1exp train experiment=demo"
+demo: setup ## train for some minutes, judge the policy, film it, find what a log hides, all in runs/demo
+	@echo "demo 1/4: go1exp train experiment=demo"
 	@$(BIN)/go1exp train experiment=demo hydra.run.dir=runs/demo
-	@echo "demo 2/3: go1exp eval"
+	@echo "demo 2/4: go1exp eval"
 	@$(BIN)/go1exp eval run=runs/demo 'grid.x=[0.5]' grid.y=[] grid.yaw=[] duration_s=10
-	@echo "demo 3/3: go1exp play"
+	@echo "demo 3/4: go1exp play"
 	@$(BIN)/go1exp play run=runs/demo viewer=clip
+	@echo "demo 4/4: go1exp gap, on recordings of a robot that is not quite like its model"
+	@$(BIN)/go1exp gap logs=assets/demo/hung_go1 out=runs/demo/gap || [ $$? -eq 10 ]
 
 test: setup ## run the tests
 	@echo "test: pytest"

@@ -29,6 +29,7 @@ from go1exp.compose import compose, config_folder
 from go1exp.config import TrainConfig, parse_parts, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.fit import FitSettings
+from go1exp.gap.models import parse_model
 from go1exp.mdp import rewards
 from go1exp.registry import ConfigError, Term
 
@@ -377,8 +378,10 @@ def parse(verb: str, container: dict[str, Any]) -> None:
     own = {f.name for f in fields(VERBS[verb])}
     checked: Any = settings.parse(VERBS[verb], {k: v for k, v in container.items() if k in own})
     others = container.keys() - own
-    assert others <= {*RIG, "excitation"}
-    problems = parse_parts(container, tuple(others - {"excitation"}))[1]
+    assert others <= {*RIG, "excitation", "model"}
+    problems = parse_parts(container, tuple(others - {"excitation", "model"}))[1]
+    if "model" in others:
+        parse_model(container["model"])
     if "excitation" in others:
         problems += motions(container["excitation"])[1]
     if verb == "fit-actuator":

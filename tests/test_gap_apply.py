@@ -24,7 +24,7 @@ from go1exp.env.core import Go1Core
 from go1exp.gap import files
 from go1exp.gap.apply import CALIBRATION, COMPENSATING, EFFECT, prove, terms_of, theta_of, write
 from go1exp.gap.explain import explain, unusable
-from go1exp.gap.replay import hung
+from go1exp.gap.machine import hung
 from go1exp.gap.result import Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
 from go1exp.record import plan, simulate
 from go1exp.recording import Recording

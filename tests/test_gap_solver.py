@@ -17,7 +17,8 @@ from go1exp.gap.box import Bounds, solve
 from go1exp.gap.explain import explain
 from go1exp.gap.judge import max_t, splits
 from go1exp.gap.likelihood import Layout, gram, predicted
-from go1exp.gap.replay import HungGo1, Probe
+from go1exp.gap.machine import HungGo1
+from go1exp.gap.replay import Probe
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
 from go1exp.gap.windows import even_clock, held, noise
 from go1exp.record import plan, simulate
@@ -137,21 +138,31 @@ def meta(episode: str, excitation: str, kd: float, repeat_of: str | None = None)
     return Meta(kd=(kd,), excitation=excitation, episode=episode, **usual, **about)
 
 
-def test_splits_are_whole_episodes_that_resemble_each_other() -> None:
-    names = [(e, kd) for e in ("chirp", "steps") for kd in (0.5, 1.0, 2.0)]
-    metas = [meta(f"{e}{kd}", e, kd) for e, kd in names] + [meta("again", "chirp", 0.5, "chirp0.5")]
-    episode = np.repeat(np.arange(7), 5)
-    found = splits(metas, episode, 0.2, np.random.default_rng(0))
-    assert found.by_episode
+def test_episodes_that_have_a_like_are_held_out_whole() -> None:
+    names = [(e, kd, seed) for e in ("chirp", "steps") for kd in (0.5, 1.0) for seed in "ab"]
+    metas = [meta(f"{e}{kd}{s}", e, kd) for e, kd, s in names] + [meta("again", "chirp", 0.5, "chirp0.5a")]
+    episode = np.repeat(np.arange(9), 7)
+    found = splits(metas, episode, 0.1, np.random.default_rng(0))
     parts = [set(episode[p]) for p in (found.train, found.select, found.confirm)]
-    assert set.union(*parts) == set(range(7))
-    assert sum(len(p) for p in parts) == 7
-    assert any({0, 6} <= p for p in parts)
-    assert len({metas[e].excitation for e in parts[0]}) == 2
-    assert len({metas[e].excitation for e in parts[1]}) == 2
-    few = splits(metas[:1], np.zeros(30, dtype=int), 0.2, np.random.default_rng(0))
-    assert not few.by_episode
-    assert len(few.train) + len(few.select) + len(few.confirm) == 30
+    assert set.union(*parts) == set(range(9))
+    assert any({0, 8} <= p for p in parts)
+    kinds = [{(metas[e].excitation, metas[e].kd) for e in p} for p in parts]
+    cut = {metas[e].episode for e in parts[0] & parts[1]}
+    assert cut == set(found.alone)
+    assert len(cut) == 1  # the like of the one that is kept for the last check
+    assert len(kinds[0]) == len(kinds[1]) == 4
+
+
+def test_episodes_without_a_like_are_cut_into_stretches() -> None:
+    metas = [meta(f"{k}", "chirp", float(k)) for k in range(3)]
+    episode = np.repeat(np.arange(3), 12)
+    found = splits(metas, episode, 0.2, np.random.default_rng(0))
+    assert found.alone == ("0", "1", "2")
+    assert len(found.train) == len(found.select) == 18
+    assert not len(found.confirm)
+    assert not set(found.train) & set(found.select)
+    assert all(set(episode[p]) == {0, 1, 2} for p in (found.train, found.select))
+    assert set(np.diff(np.flatnonzero(np.diff(np.isin(np.arange(12), found.select))))) == {3}
 
 
 # ---------------------------------------------------------------------- windows

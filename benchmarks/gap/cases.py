@@ -205,7 +205,15 @@ def _cycle(choices: Sequence[Any], index: int) -> Any:
     return choices[index % len(choices)]
 
 
-def make(kind: str, index: int, seed: int, count: int = 8, seconds: float = 5.0, only: Sequence[str] = ()) -> Case:
+def make(
+    kind: str,
+    index: int,
+    seed: int,
+    count: int = 8,
+    seconds: float = 5.0,
+    only: Sequence[str] = (),
+    sizes: Sequence[float] = SIZES,
+) -> Case:
     """Draw case ``index`` of a kind; the same arguments give the same case, whatever others there are.
 
     Args:
@@ -215,6 +223,7 @@ def make(kind: str, index: int, seed: int, count: int = 8, seconds: float = 5.0,
         count: episodes of the case.
         seconds: length of an episode.
         only: take the single effects from these.
+        sizes: of single effects, in tolerances.
     """
     root = np.random.SeedSequence([seed, zlib.crc32(kind.encode()), index])
     world, noise = root.spawn(2)
@@ -240,7 +249,7 @@ def make(kind: str, index: int, seed: int, count: int = 8, seconds: float = 5.0,
     detail: dict[str, Any] = {}
     if kind == "single":
         scope = str(rng.choice(("all", "kind", "single"), p=(0.4, 0.4, 0.2)))
-        add(_cycle(names, index), _cycle(SIZES, index // len(names)), scope)
+        add(_cycle(names, index), _cycle(tuple(sizes), index // len(names)), scope)
     elif kind == "pair":
         add(*_pair(rng, names))
         add(*_pair(rng, [e for e in names if e not in told.family(effects[0]["effect"]) | _CLASH]))

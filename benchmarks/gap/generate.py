@@ -80,13 +80,15 @@ def settings(arguments: Sequence[str]) -> argparse.Namespace:
         "episodes": 8,
         "seconds": 5.0,
         "effects": "",
+        "sizes": ",".join(f"{size:g}" for size in cases.SIZES),
         "answers": None,
         "jobs": 1,
         "signals": None,
     }
     words = (
         "usage: python -m benchmarks.gap.generate out=DIR seed=INT [kinds=null,single] [n=10] [episodes=8] "
-        f"[seconds=5] [effects=coulomb,lag] [answers=FILE] [signals=DIR] [jobs=1]\nkinds: {', '.join(cases.KINDS)}\n"
+        "[seconds=5] [effects=coulomb,lag] [sizes=1,2,5] [answers=FILE] [signals=DIR] [jobs=1]\n"
+        f"kinds: {', '.join(cases.KINDS)}\n"
         f"effects (of single and pair): {', '.join(told.LIBRARY)}"
     )
     for argument in arguments:
@@ -104,6 +106,10 @@ def settings(arguments: Sequence[str]) -> argparse.Namespace:
     found.answers = Path(found.answers) if found.answers else found.out.with_name(found.out.name + ".answers.json")
     found.signals = Path(found.signals) if found.signals else None
     found.kinds = tuple(found.kinds.split(","))
+    try:
+        found.sizes = tuple(float(size) for size in found.sizes.split(","))
+    except ValueError:
+        raise SystemExit(f"sizes={found.sizes}: not numbers\n{words}") from None
     found.effects = tuple(e for e in found.effects.split(",") if e)
     for name, known in [*((k, cases.KINDS) for k in found.kinds), *((e, told.LIBRARY) for e in found.effects)]:
         if name not in known:
@@ -120,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Draw, seal and simulate."""
     s = settings(sys.argv[1:] if arguments is None else arguments)
     todo = cases.plan(
-        s.kinds, s.n, lambda kind, index: cases.make(kind, index, s.seed, s.episodes, s.seconds, s.effects)
+        s.kinds, s.n, lambda kind, index: cases.make(kind, index, s.seed, s.episodes, s.seconds, s.effects, s.sizes)
     )
     text, digest = seal({case.name: case.answer for case in todo})
     mark = s.out / "SEAL"

@@ -12,6 +12,9 @@ from yaml import YAMLError
 
 from go1exp.registry import ConfigError
 
+PATHS = {"model": "mjcf"}
+"""Group -> key of its files that names another file, from where the file itself lies."""
+
 GROUP_IS_FILE = re.compile(r"^(?P<add>\+?)(?P<group>[a-z_]+)=(?P<value>\[?.*\.ya?ml\b.*)$")
 
 
@@ -48,6 +51,9 @@ def _choice(group: str, file: str) -> str:
         raise ConfigError([f"{group}={file}: no YAML ({str(error).splitlines()[0]})"]) from None
     if not isinstance(content, DictConfig):
         raise ConfigError([f"{group}={file}: must be a mapping, as the files of conf/{group} are"])
+    named = content.get(PATHS.get(group, ""))
+    if isinstance(named, str):
+        content[PATHS[group]] = str((path.parent / named).resolve())
     name = re.sub(r"\W", "_", str(path.with_suffix("")))
     ConfigStore.instance().store(group=group, name=name, node=content, provider=str(path))
     return name

@@ -15,9 +15,9 @@ from go1exp.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb
+    from go1exp.gap.machine import Machine
     from go1exp.gap.result import GapResult
     from go1exp.recording import Recording
-    from go1exp.robot import RobotConfig
 
 DOES_NOT_HOLD = 15
 """Exit status if what was found is not as good at the step of training."""
@@ -26,15 +26,19 @@ DOES_NOT_HOLD = 15
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.settings import GapVerb, parse
     from go1exp.config import parse_parts
+    from go1exp.gap.models import parse_model
 
     parts, problems = parse_parts(container, ("robot",))
     try:
-        settings = parse(GapVerb, {k: v for k, v in container.items() if k != "robot"})
+        settings = parse(GapVerb, {k: v for k, v in container.items() if k not in ("robot", "model")})
     except ConfigError as error:
-        raise ConfigError([*problems, *error.problems]) from None
+        problems += error.problems
+    try:
+        model = parse_model(container["model"])
+    except ConfigError as error:
+        problems += error.problems
     if problems:
         raise ConfigError(problems)
-    config: RobotConfig = parts["robot"]
     out = Path(settings.out)
 
     from go1exp.cli.logs import read_all, writable
@@ -45,21 +49,25 @@ def _task(container: dict[str, Any]) -> int:
     recordings = read_all(settings.logs)
     if settings.stage in ("all", "explain", "apply"):
         writable(settings.out)
+
+    from go1exp.gap.machine import machine_of
+
+    machine = machine_of(model, parts["robot"])
     if settings.stage == "check":
-        return _check(recordings, config, settings)
+        return _check(recordings, machine, settings)
     if settings.stage == "localise":
-        return _localise(recordings, config, settings)
+        return _localise(recordings, machine, settings)
     if settings.stage == "apply":
         result = files.load(out)
-        return _apply(result, recordings, config, settings) or result.exit_code
+        return _apply(result, recordings, machine, settings) or result.exit_code
 
     from go1exp.gap.explain import explain
 
-    result = explain(recordings, config, settings.search, _progress())
+    result = explain(recordings, machine, settings.search, _progress())
     print(f"\n{result.sentence}\n\nwritten to {files.save(result, out)}")
     status = result.exit_code
     if settings.stage == "all" and result.verdict != "bad log":
-        status = _apply(result, recordings, config, settings) or status
+        status = _apply(result, recordings, machine, settings) or status
     if settings.stage == "all":
         _report(result, out)
     return status
@@ -78,7 +86,7 @@ def _progress() -> Callable[[str, float], None]:
     return show
 
 
-def _check(recordings: list[Recording], config: RobotConfig, settings: GapVerb) -> int:
+def _check(recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
     """Say whether the logs are fit to be compared, their floors, and which effects they could not show."""
     from go1exp.audit import audit
     from go1exp.gap.survey import survey
@@ -88,30 +96,31 @@ def _check(recordings: list[Recording], config: RobotConfig, settings: GapVerb) 
         print(f"{recording.meta.episode}: {report.verdict}")
         for flaw in report.flaws:
             print(f"  {flaw.verdict:8} {flaw.channel}: {flaw.message}")
-    found = survey(recordings, config, settings.search, _progress())
+    found = survey(recordings, machine, settings.search, _progress())
     print(f"\n{found.text()}")
     return found.exit_code
 
 
-def _localise(recordings: list[Recording], config: RobotConfig, settings: GapVerb) -> int:
+def _localise(recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
     """Print where the plain model is wrong."""
     from go1exp.gap.report import localisation_text
     from go1exp.gap.survey import survey
 
-    found = survey(recordings, config, settings.search, _progress(), screen=False)
+    found = survey(recordings, machine, settings.search, _progress(), screen=False)
     if found.where is not None:
         print(f"\n{localisation_text(found.where)}")
     return found.exit_code
 
 
-def _apply(result: GapResult, recordings: list[Recording], config: RobotConfig, settings: GapVerb) -> int:
+def _apply(result: GapResult, recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
     """Write the effect files, read them back as training does, and score them at training's step."""
     from go1exp.gap import apply
+    from go1exp.robot import JOINTS
 
     out = Path(settings.out)
     written = apply.write(result, out)
     contents = {path.name: OmegaConf.to_container(OmegaConf.load(path)) for path in written}
-    proof = apply.prove(recordings, config, settings.search, result, contents, settings.train_dt)  # type: ignore[arg-type]
+    proof = apply.prove(recordings, machine, settings.search, result, contents, settings.train_dt)  # type: ignore[arg-type]
     about = {**asdict(proof), "files": [path.name for path in written]}
     (out / "applied.json").write_text(json.dumps(about, indent=2) + "\n")
     print(f"\nwritten to {', '.join(str(path) for path in written)}")
@@ -122,7 +131,7 @@ def _apply(result: GapResult, recordings: list[Recording], config: RobotConfig, 
     if not proof.holds:
         print(f"NOT applied: it was {1 + proof.reported:.3g} in the search, and is worse at this step")
         return DOES_NOT_HOLD
-    if result.named:
+    if result.named and machine.joints == JOINTS:
         print(f"now: go1exp train effect={out / apply.EFFECT}")
     return 0
 

@@ -165,7 +165,6 @@ class GapVerb:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     logs: str | tuple[str, ...]
-    model: Literal["go1"]
     stage: Literal["all", "check", "localise", "explain", "apply", "report"]
     out: str
     train_dt: Annotated[float, Field(gt=0, le=0.02)]

@@ -13,15 +13,15 @@ import numpy as np
 
 from go1exp.config import parse_parts
 from go1exp.effects.base import Effect, Param
-from go1exp.gap.explain import fingerprint, numerical_scale
+from go1exp.gap.explain import fingerprint, measured
 from go1exp.gap.files import GapFileError
 from go1exp.gap.fit import scores
 from go1exp.gap.judge import splits
-from go1exp.gap.likelihood import scorer
-from go1exp.gap.replay import Replayer, Theta, hung
+from go1exp.gap.machine import Machine, hung
+from go1exp.gap.prepare import prepare
+from go1exp.gap.replay import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
-from go1exp.gap.search import excess, removed
-from go1exp.gap.windows import cut
+from go1exp.gap.trial import excess, removed
 from go1exp.joint_values import spread
 from go1exp.recording import Recording
 from go1exp.registry import Term, members
@@ -205,7 +205,7 @@ SPLITTING = ("window_s", "burn_s", "stride_s", "confirm_fraction", "seed", "torq
 
 def prove(
     recordings: Sequence[Recording],
-    config: RobotConfig,
+    config: RobotConfig | Machine,
     settings: GapSettings,
     result: GapResult,
     contents: Mapping[str, Mapping[str, Any]],
@@ -215,7 +215,7 @@ def prove(
 
     Args:
         recordings: those of the search.
-        config: the nominal robot.
+        config: the nominal Go1, or another robot as a machine.
         settings: those of the search.
         result: its outcome.
         contents: file name -> content, as read back from the files.
@@ -225,18 +225,21 @@ def prove(
         GapFileError: if logs or settings are not those of the search: what it held out would not be known.
     """
     _same_search(recordings, settings, result)
-    machine, windows = hung(config), cut(recordings, settings)
-    quats = np.array([recordings[e].meta.base_quat for e in windows.episode])
-    replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
+    machine = hung(config) if isinstance(config, RobotConfig) else config
+    ready = prepare(recordings, machine, settings)
+    recordings, settings, windows = ready.recordings, ready.settings, ready.windows()
     dt = float(windows.period / np.ceil(windows.period / physics_dt - 1e-3))
-    scale, _ = numerical_scale(replayer, dt)
-    judge = scorer(replayer, {}, scale, dt, settings.clock_s)
+    judge, _ = measured(ready, windows, dt, dt)
     rng = np.random.default_rng(settings.seed)
     parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
     held = parts.confirm if len(parts.confirm) else parts.select  # the values were fitted on all but the former
     effect = theta_of(terms_of(contents.get(EFFECT, {})), machine.joints)
     both = {**theta_of(terms_of(contents.get(CALIBRATION, {})), machine.joints), **effect}
-    found = scores(judge, [{}, effect, both], held, dt)
+    renewed = judge.renewed
+    found = [
+        scores(judge if renewed is None or not theta else renewed(theta), [theta], held, dt)[0]
+        for theta in ({}, effect, both)
+    ]
     before, alone, after = (excess(x) for x in found)
     reported = _reported(result)
     holds = after <= max(settings.adequate, 1.5 * reported + 0.1)

@@ -7,14 +7,15 @@ has or obviously could have moves freely inside.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import lsq_linear
 
 from go1exp.effects.base import Effect, Param
+from go1exp.gap import machine as machines
 from go1exp.gap.likelihood import Layout
 from go1exp.gap.replay import Key, Machine, Probe, Theta
 from go1exp.registry import members
@@ -24,6 +25,15 @@ BOX = (
     *("link_mass", "link_com", "encoder_offset", "base_tilt", "command_delay", "torque_delay"),
 )
 """Effects that every model has a value for, if only the null one."""
+
+ON_FEET = ("payload", "com_offset", "foot_friction", "ground_compliance")
+"""Effects that the model of a robot on its feet has a value for as well."""
+
+
+def of(machine: Machine) -> tuple[str, ...]:
+    """Return the effects whose parameters may move within their tolerances."""
+    return (*BOX, *ON_FEET) if machine.base_probe else BOX
+
 
 PRIOR = 0.5
 """Standard deviation of a parameter within its tolerance, in tolerances: it settles what the data leave open."""
@@ -41,8 +51,10 @@ def effect_class(name: str) -> type[Effect]:
 
 
 def param(key: Key) -> Param:
-    """Return the declaration of a parameter."""
-    return next(p for p in effect_class(key[0]).params if p.name == key[1])
+    """Return the declaration of a parameter, with the tolerance of the machine at hand."""
+    found = next(p for p in effect_class(key[0]).params if p.name == key[1])
+    own = machines.tolerance(*key, found.tolerance)
+    return found if own == found.tolerance else replace(found, tolerance=own)
 
 
 def sizes(effect: str) -> tuple[Key, ...]:
@@ -94,8 +106,44 @@ class Bounds:
     weight: np.ndarray
 
 
-def bounds(layout: Layout, columns: Sequence[Probe], theta: Mapping[Key, np.ndarray], free: Collection[str]) -> Bounds:
-    """Return the limits: the declared range for effects in ``free``, the tolerance for the others."""
+@dataclass(frozen=True)
+class Freedom:
+    """What may leave its tolerance.
+
+    Attributes:
+        effects: that may.
+        kept: effects and joints that may not although their effect may elsewhere.
+        rigid: whether all others stay at their nominal values, and not only within their tolerances (an ablation).
+    """
+
+    effects: frozenset[str] = frozenset()
+    kept: frozenset[tuple[str, int]] = frozenset()
+    rigid: bool = False
+
+    def also(self, *effects: str) -> Freedom:
+        """Return the same with more effects."""
+        return replace(self, effects=self.effects | {*effects})
+
+    def reach(self, key: Key, joint: int) -> float:
+        """Return how far from null a parameter may go, as far as tolerances are concerned."""
+        tolerance = param(key).tolerance
+        if key[0] in self.effects:
+            return tolerance if (key[0], joint) in self.kept else math.inf
+        return 0.0 if self.rigid else tolerance
+
+
+def bounds(
+    layout: Layout, columns: Sequence[Probe], theta: Mapping[Key, np.ndarray], may: Freedom, back: bool = False
+) -> Bounds:
+    """Return the limits of unknowns.
+
+    Args:
+        layout: of the unknowns.
+        columns: their probes.
+        theta: present values.
+        may: what may leave its tolerance.
+        back: whether what is outside must come back inside, and not only no further.
+    """
     low, high, centre, weight = (np.zeros(layout.size) for _ in range(4))
     for i in range(layout.size):
         probe = columns[layout.probe[i]]
@@ -107,14 +155,16 @@ def bounds(layout: Layout, columns: Sequence[Probe], theta: Mapping[Key, np.ndar
                 j if probe.key in theta and theta[probe.key].size > 1 else 0
             ]
         )
-        wide = probe.key[0] in free or not math.isfinite(p.tolerance)
-        reach = math.inf if wide else p.tolerance
+        reach = may.reach(probe.key, int(layout.joint[i]))
+        wide = not math.isfinite(reach)
         low[i] = max(p.low, p.null - reach) - value
         high[i] = min(p.high, p.null + reach) - value
         centre[i] = p.null - value
         scale = p.tolerance if math.isfinite(p.tolerance) else p.high - p.low
         weight[i] = 1.0 / ((WIDE if wide else PRIOR) * scale) ** 2
-    return Bounds(np.minimum(low, 0.0), np.maximum(high, 0.0), centre, weight)
+    if not back:
+        low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
+    return Bounds(low, high, centre, weight)
 
 
 def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:

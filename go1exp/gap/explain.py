@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 
 import numpy as np
@@ -14,15 +14,21 @@ import torch
 from go1exp import __version__
 from go1exp.audit import audit
 from go1exp.gap import verdict as words
+from go1exp.gap.box import param
+from go1exp.gap.first_state import settled
 from go1exp.gap.fit import residuals
 from go1exp.gap.judge import splits
 from go1exp.gap.likelihood import Scorer, scorer
 from go1exp.gap.localise import localise
-from go1exp.gap.replay import HungGo1, Machine, Replayer, Theta, hung, variants
+from go1exp.gap.machine import FixedBase, HungGo1, Machine, hung, tolerances_of
+from go1exp.gap.prepare import Ready, prepare
+from go1exp.gap.replay import Replayer, Theta, variants
 from go1exp.gap.result import Floors, GapResult, GapSettings, Overlay
-from go1exp.gap.search import Progress, Search, excess, removed
-from go1exp.gap.windows import Windows, cut
-from go1exp.recording import Recording
+from go1exp.gap.search import Progress, Search
+from go1exp.gap.standing import StandingGo1, StandingReplayer, StandingWindows
+from go1exp.gap.trial import excess, removed
+from go1exp.gap.windows import Windows
+from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
 
 NEEDED = ("t", "q", "qd", "q_target")
@@ -32,6 +38,9 @@ TELLING = ("delay", "torque")
 """Checks of the audit that a missing effect may fail; they say nothing against the log."""
 
 GO1 = "go1"
+
+MOST = 0.75
+"""Share of the excess that terms must remove before the first of them is certified although a gap remains."""
 
 FEWEST = 8
 """Windows below which nothing is judged."""
@@ -47,54 +56,66 @@ def explain(
 
     Args:
         recordings: of one robot, its base fixed.
-        config: the nominal Go1, or another robot as a :class:`~go1exp.gap.replay.Machine`.
+        config: the nominal Go1, or another robot as a :class:`~go1exp.gap.machine.Machine`.
         settings: how; the defaults if None.
         on_progress: told what goes on and which share of the work is done.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # its arrays are small here: more threads wait for each other longer than they work
     try:
-        return _explain(recordings, config, settings or GapSettings(), on_progress)
+        machine = hung(config) if isinstance(config, RobotConfig) else config
+        with tolerances_of(machine):
+            return _explain(recordings, machine, settings or GapSettings(), on_progress)
     finally:
         torch.set_num_threads(threads)
 
 
 def _explain(
-    recordings: Sequence[Recording], config: RobotConfig | Machine, settings: GapSettings, on_progress: Progress
+    recordings: Sequence[Recording], machine: Machine, settings: GapSettings, on_progress: Progress
 ) -> GapResult:
     start = time.perf_counter()
-    machine = hung(config) if isinstance(config, RobotConfig) else config
     on_progress("auditing the logs", 0.0)
-    flaws = [line for r in recordings for line in unusable(r, machine)]
+    logs, ready = recordings, prepare(recordings, machine, settings)
+    flaws = ready.flaws or [line for r in recordings for line in unusable(r, ready.machine)]
     if flaws:
         said = f"These logs cannot be compared with the model: {'; '.join(flaws[:3])}."
         return GapResult("bad log", said, warnings=tuple(flaws), seconds=time.perf_counter() - start)
     rng = np.random.default_rng(settings.seed)
-    windows = cut(recordings, settings)
+    recordings, asked, settings = ready.recordings, settings, ready.settings
+    try:
+        windows = ready.windows()
+    except RecordingError as error:
+        return GapResult("bad log", f"{error}.", warnings=ready.warnings, seconds=time.perf_counter() - start)
     if len(windows) < FEWEST:
         said = f"These logs are too short: {len(windows)} windows of {settings.window_s:g} s, {FEWEST} are needed."
         return GapResult("bad log", said, warnings=(said,), seconds=time.perf_counter() - start)
-    quats = np.array([recordings[e].meta.base_quat for e in windows.episode])
-    replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
-    dt = windows.period / np.ceil(windows.period / settings.physics_dt - 1e-3)
-    warnings: list[str] = []
+    dt = float(windows.period / np.ceil(windows.period / settings.physics_dt - 1e-3))
+    warnings = list(ready.warnings)
 
     on_progress("measuring the floors", 0.02)
-    scale, numerical = numerical_scale(replayer, dt)
-    score = scorer(replayer, {}, scale, 2.0 * dt, settings.clock_s)
+    score, numerical = measured(ready, windows, dt, 2.0 * dt)
     parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
-    if not parts.by_episode:
-        warnings.append("Fewer than three different episodes: stretches of windows were held out instead of episodes.")
-    elif not len(parts.confirm):
+    if parts.alone:
+        warnings.append(
+            f"Of {len(parts.alone)} episodes there is no other with the same motion and gains; stretches of them judge "
+            "what was fitted on the rest of them."
+        )
+    if not len(parts.confirm):
         warnings.append("Too few episodes to keep some for a last check.")
 
     search = Search(score, parts, settings, float(dt), rng, on_progress)
-    plain = search.held_out({})
     search.run()
-    first, final = search.steps[0][1], search.steps[-1][1]
+    score = search.scorer  # its floors and first states suit the model as it was found
+    plain = search.held_out({})
+    if search.terms and not search.confirmed():
+        warnings.append(
+            f"Withdrawn, since episodes kept for a last check do not bear it out: {', '.join(search.terms)}."
+        )
+        search.withdraw()
+    first, final = search.first, search.steps[-1][1]
     on_progress("intervals", 0.88)
     theta, drawn = words.finish(search)
-    named = words.name_terms(search, theta, drawn, final <= settings.adequate)
+    named = words.name_terms(search, theta, drawn, final <= settings.adequate, removed(first, final) > MOST)
     verdict = words.decide(search, first, final)
     excesses = {"null": excess(plain), "box": first, "final": final}
     if len(parts.confirm):
@@ -107,7 +128,7 @@ def _explain(
     on_progress("where it is wrong", 0.93)
     shown = np.sort(np.concatenate([parts.select, parts.confirm]))
     before, after = residuals(score, [{}, search.theta], shown, float(dt))
-    silent = words.not_excited(search.signal)
+    silent = words.not_excited(search.signal, held=not ready.machine.base_probe)
     more = words.advice({n.effect: n.alias_set for n in named})
     box = {key: value for key, value in theta.items() if key[0] not in search.terms}
     result = GapResult(
@@ -116,7 +137,7 @@ def _explain(
         named=named,
         candidates=words.evidence(search),
         floors=Floors(
-            {name: float(np.median(windows.scale[0, c])) for c, name in enumerate(windows.quantities)},
+            {name: value for name, value in windows.by_quantity(windows.scale).items() if np.isfinite(value)},
             numerical,
             repeatability(recordings),
         ),
@@ -131,9 +152,9 @@ def _explain(
         overlays=overlays(score, recordings, search.theta, parts.select, settings.overlays, float(dt)),
         box=_nested(box, windows.joints),
         provenance={
-            "logs": {r.meta.episode: fingerprint(r) for r in recordings},
+            "logs": {r.meta.episode: fingerprint(r) for r in logs},
             "versions": {"go1exp": __version__, "mujoco": version("mujoco-core"), "numpy": np.__version__},
-            "settings": asdict(settings),
+            "settings": asdict(asked),
             "seed": settings.seed,
             "physics_dt": float(dt),
             "windows": len(windows),
@@ -141,7 +162,7 @@ def _explain(
                 name: sorted({recordings[e].meta.episode for e in windows.episode[getattr(parts, name)]})
                 for name in ("train", "select", "confirm")
             },
-            "simulation_steps": replayer.made,
+            "simulation_steps": score.replayer.made,
         },
         warnings=tuple(warnings),
         seconds=time.perf_counter() - start,
@@ -154,32 +175,59 @@ def unusable(recording: Recording, machine: Machine) -> list[str]:
     """Return why a recording cannot be compared with the model, a line each."""
     meta, name = recording.meta, recording.meta.episode
     found = []
-    if isinstance(machine, HungGo1) and meta.robot != GO1:
+    if isinstance(machine, FixedBase):
+        return []  # ``prepare`` has looked
+    if isinstance(machine, HungGo1 | StandingGo1) and meta.robot != GO1:
         found.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}")
     if meta.joints != machine.joints:
         found.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(machine.joints)}")
         return found
-    if meta.base != "fixed":
-        found.append(f"{name}: the trunk is free; only robots with a fixed base can be compared so far")
+    if meta.base != "fixed" and not machine.base_probe:
+        found.append(f"{name}: the trunk is free; only robots with a fixed base can be compared")
     if meta.kp is None or meta.kd is None:
         found.append(f"{name}: says no gains (kp, kd)")
     found += [f"{name}: no {q}" for q in ("q", "qd", "q_target") if not recording.has(q)]
+    # On its feet a robot's weight moves joints against their targets; a flipped sign is for the comparison to show.
+    telling = (*TELLING, "sign") if meta.base == "floating" else TELLING
     if not found:
         for flaw in audit(recording).flaws:
             needed = flaw.channel in (*NEEDED, "all") or flaw.channel.startswith(("q_", "qd_"))
-            if flaw.verdict == "bad" and needed and flaw.check not in TELLING:
+            if flaw.verdict == "bad" and needed and flaw.check not in telling:
                 found.append(f"{name}: {flaw.channel}: {flaw.message}")
     return found
 
 
-def numerical_scale(replayer: Replayer, dt: float) -> tuple[np.ndarray, dict[str, float]]:
+def measured(ready: Ready, windows: Windows, dt: float, coarse: float) -> tuple[Scorer, dict[str, float]]:
+    """Return what scores replays at step ``dt``, s, and the error of that step by quantity.
+
+    Where a robot is held, the influence of the first states is taken at the step ``coarse``, s.
+    """
+    settings, machine = ready.settings, ready.machine
+    level = (1.0, 0.0, 0.0, 0.0)
+    quats = np.array([ready.recordings[e].meta.base_quat or level for e in windows.episode])
+    if isinstance(windows, StandingWindows):
+        return settled(
+            StandingReplayer(machine, windows, quats, settings.max_rows, settings.threads), dt, settings.clock_s
+        )
+    replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
+
+    def at(theta: Theta) -> tuple[Scorer, dict[str, float]]:
+        scale, numerical = numerical_scale(replayer, dt, theta)
+        found = scorer(replayer, theta, scale, coarse, settings.clock_s)
+        return replace(found, renewed=lambda values: at(values)[0]), numerical
+
+    return at({})
+
+
+def numerical_scale(replayer: Replayer, dt: float, theta: Theta | None = None) -> tuple[np.ndarray, dict[str, float]]:
     """Return the noise (W, C, J) with the error of the physics step in it, and that error by quantity.
 
-    The error is that of each window, since one with an impact has a hundred times that of one without. It is taken as
-    twice the change that half the step makes: the engine's error falls in proportion to its step.
+    The error is that of each window, since one with an impact has a hundred times that of one without, and of the model
+    with the values ``theta``, since one with dry friction has ten times that of one without. It is taken as twice the
+    change that half the step makes: the engine's error falls in proportion to its step.
     """
     w = replayer.windows
-    rows = variants(replayer.machine, {}, np.arange(len(w)), [])
+    rows = variants(replayer.machine, theta or {}, np.arange(len(w)), [])
     coarse, fine = (replayer.run(rows, step) for step in (dt, 0.5 * dt))
     weight = w.valid[..., None, None] / np.maximum(w.valid.sum(1), 1)[:, None, None, None]
     error = 2.0 * np.sqrt(np.sum((coarse - fine) ** 2 * weight, axis=1))  # W C J
@@ -215,16 +263,15 @@ def overlays(
     picked = order[np.unique(np.linspace(0, len(order) // 2, count).astype(int))]
     after = score.replayer.run(variants(machine, theta, windows[picked], []), dt)
     found = []
+    compared = [at for at in w.channels if np.isfinite(w.scale[windows[0]][at[1:]])]
     for row, k in enumerate(picked):
         window = windows[k]
         valid = w.valid[window]
 
         def curves(y: np.ndarray, valid: np.ndarray = valid) -> dict[str, np.ndarray]:
-            return {f"{q}_{j}": y[valid, c, i] for c, q in enumerate(w.quantities) for i, j in enumerate(w.joints)}
+            return {name: y[valid, c, i] for name, c, i in compared}
 
-        noise = {
-            f"{q}_{j}": float(w.scale[window, c, i]) for c, q in enumerate(w.quantities) for i, j in enumerate(w.joints)
-        }
+        noise = {name: float(w.scale[window, c, i]) for name, c, i in compared}
         found.append(
             Overlay(
                 recordings[w.episode[window]].meta.episode,
@@ -241,7 +288,8 @@ def overlays(
 def _nested(theta: Theta, joints: Sequence[str]) -> dict[str, dict[str, dict[str, float]]]:
     found: dict[str, dict[str, dict[str, float]]] = {}
     for (effect, name), value in theta.items():
-        names = joints if len(value) == len(joints) else ("robot",)
+        names = joints if param((effect, name)).per == "joint" else ("robot",)
+        value = np.broadcast_to(value, len(names))
         found.setdefault(effect, {})[name] = {n: float(v) for n, v in zip(names, value, strict=True)}
     return found
 

@@ -25,7 +25,7 @@ class Model:
     Attributes:
         name: of the effect that it is about.
         theta: values.
-        free: effects that may leave their tolerances.
+        may: what may leave its tolerance.
         keys: parameters whose columns are refreshed in every step; the rest keep those of the common table.
         chi2: (V, G) per value, on the windows of the fit.
         residual: (V, G, m) there, in units of the noise.
@@ -33,7 +33,7 @@ class Model:
 
     name: str
     theta: Theta
-    free: frozenset[str]
+    may: box.Freedom
     keys: tuple[Key, ...]
     chi2: np.ndarray | None = None
     residual: np.ndarray | None = None
@@ -48,7 +48,7 @@ def stacked(parts: Sequence[Rows]) -> Rows:
         wide = max(rows.values[key].shape[1] for rows in parts if key in rows.values)
         columns = [rows.values.get(key, np.broadcast_to(value, (len(rows.window), wide))) for rows in parts]
         values[key] = np.concatenate(columns)
-    moved = [np.concatenate([getattr(rows, name) for rows in parts]) for name in ("q", "qd")]
+    moved = [np.concatenate([getattr(rows, name) for rows in parts]) for name in ("q", "qd", "base")]
     return Rows(np.concatenate([rows.window for rows in parts]), values, *moved)
 
 
@@ -123,7 +123,7 @@ def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) ->
         grams = Table(windows, tuple(every), model.residual, whole, model.theta).grams(scorer)
         weight = 1.0 / np.maximum(_chi2(model), 1.0)
         matrix, right = layout.total(grams * weight[..., None, None])
-        limits = box.bounds(layout, every, model.theta, model.free)
+        limits = box.bounds(layout, every, model.theta, model.may)
         found.append((every, layout, box.solve(matrix, right, limits), limits))
     return found
 

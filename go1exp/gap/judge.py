@@ -13,7 +13,7 @@ FLIPS = 4000
 """Sign flips of a test: the smallest p-value is 1 / (FLIPS + 1)."""
 
 SAME = 0.02
-"""Gains of log chi2 that differ by less mean the same: 2 % of the floor."""
+"""Gains of log chi2 that differ by less mean the same: 2 % of the floor, or of the larger of the gains."""
 
 WORSE = 0.05
 """A model with a p-value below this is worse than another."""
@@ -24,51 +24,61 @@ LEAST = 0.7
 
 @dataclass(frozen=True)
 class Splits:
-    """Numbers of the windows that models are fitted on, chosen by, and finally confirmed on."""
+    """Numbers of the windows that models are fitted on, chosen by, and finally confirmed on.
+
+    Attributes:
+        train: to fit.
+        select: to judge by.
+        confirm: whole episodes that nothing is decided on; may be empty.
+        alone: episodes of which some stretches are in ``train`` and some in ``select``.
+    """
 
     train: np.ndarray
     select: np.ndarray
     confirm: np.ndarray
-    by_episode: bool
+    alone: tuple[str, ...] = ()
+
+
+def _stretch(episode: np.ndarray) -> np.ndarray:
+    """Return the number of the stretch of three windows that each window (W,) is in."""
+    place = np.arange(len(episode)) - np.searchsorted(episode, episode)
+    return np.asarray(np.unique(episode * len(episode) + place // 3, return_inverse=True)[1])
 
 
 def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.random.Generator) -> Splits:
-    """Split windows by episode so that every part has, if it can, every excitation and every gain set.
+    """Split windows by episode, or within an episode of which there is only one of its kind.
 
-    An episode and its repetition stay together. With fewer than three different episodes, stretches of windows are
-    split instead.
+    What only one episode shows, at the gains that show it, cannot be fitted if that episode judges, nor judged if it
+    is fitted. So of episodes of one motion and gain set half are fitted and half judge; one that is alone is cut into
+    stretches of three windows, which take turns. An episode and its repetition count as one.
 
     Args:
         metas: of the recordings.
         episode: (W,) recording of each window.
-        confirm: share for the last check.
-        rng: of the search for a good split.
+        confirm: share of the episodes for the last check, none of fewer than four.
+        rng: of what goes where.
     """
-    names = [m.repeat_of or m.episode for m in metas]
-    units = list(dict.fromkeys(names))
-    by_episode = len(units) >= 3
-    if by_episode:
-        unit = np.array([units.index(names[e]) for e in episode])
-    else:
-        first = np.searchsorted(episode, episode)
-        unit = np.unique(episode * 1000 + (np.arange(len(episode)) - first) // 3, return_inverse=True)[1]
-    count = int(unit.max()) + 1
-    about = [metas[episode[np.flatnonzero(unit == u)[0]]] for u in range(count)]
-    last = max(1, round(confirm * count)) if confirm and count > 3 else 0
-    middle = max(1, round(0.45 * (count - last)))
-    best, chosen = -1.0, np.arange(count)
-    for _ in range(400):
-        order = rng.permutation(count)
-        parts = order[last + middle :], order[last : last + middle], order[:last]
-        value = 0.0
-        for part, weight in zip(parts, (2.0, 1.5, 1.0), strict=True):
-            value += weight * len({about[u].excitation for u in part})
-            value += weight * len({(about[u].kp, about[u].kd) for u in part})
-        if value > best + 1e-9:
-            best, chosen = value, order
-    parts = chosen[last + middle :], chosen[last : last + middle], chosen[:last]
-    train, select, kept = (np.flatnonzero(np.isin(unit, part)) for part in parts)
-    return Splits(train, select, kept, by_episode)
+    units = list(dict.fromkeys(m.repeat_of or m.episode for m in metas))
+    unit = np.array([units.index(m.repeat_of or m.episode) for m in metas])[episode]
+    about = {m.repeat_of or m.episode: m for m in reversed(metas)}
+    kinds = [(about[u].excitation, about[u].kp, about[u].kd) for u in units]
+    last = max(1, round(confirm * len(units))) if confirm and len(units) > 3 else 0
+    # For the last check first those of which there are others, by their kind, then by their motion alone.
+    likes = [(kinds.count(k), sum(k[0] == other[0] for other in kinds), rng.random()) for k in kinds]
+    kept = sorted(range(len(units)), key=lambda u: likes[u], reverse=True)[:last]
+    select = np.zeros(len(episode), dtype=bool)
+    alone = []
+    for kind in dict.fromkeys(kinds):
+        mine = rng.permutation([u for u in range(len(units)) if kinds[u] == kind and u not in kept])
+        if len(mine) == 1:
+            alone.append(units[mine[0]])
+            stretch = np.unique(_stretch(episode)[unit == mine[0]], return_inverse=True)[1]
+            select[unit == mine[0]] = (stretch + len(alone)) % 2 == 1
+        else:
+            select |= np.isin(unit, mine[: len(mine) // 2])
+    confirmed = np.isin(unit, kept)
+    train, held, last_check = (np.flatnonzero(m) for m in (~select & ~confirmed, select & ~confirmed, confirmed))
+    return Splits(train, held, last_check, tuple(alone))
 
 
 def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -97,10 +107,15 @@ def max_t(gain: np.ndarray, rng: np.random.Generator, flips: int = FLIPS) -> np.
     return np.asarray([(1 + np.sum(largest >= s - 1e-12)) / (flips + 1) for s in seen])
 
 
+def same(gain: float) -> float:
+    """Return by how much the mean of another model's gain may be smaller and still mean the same."""
+    return SAME * max(1.0, gain)
+
+
 def equals(gain: np.ndarray, best: int, rng: np.random.Generator) -> np.ndarray:
     """Return which models (M,) do as well as ``best`` by their gains (M, V): all but so, or not significantly worse."""
     mean = gain.mean(axis=1)
-    found = mean >= mean[best] - SAME
+    found = mean >= mean[best] - same(mean[best])
     for k in np.flatnonzero(~found & (mean > LEAST * mean[best])):
         found[k] = max_t((gain[best] - gain[k])[None], rng)[0] > WORSE
     found[best] = True

@@ -1,14 +1,15 @@
 """How well the model explains windows of data: Gaussian noise, with the unknown first state and clock averaged out.
 
 A window's residual r and its change J per parameter, both in units of the noise, have the covariance I + S S', where S
-is the change per standard deviation of the first state, and of the time between stamps of commands and of readings. All that fits and scores need is the Gram matrix of [J r] in
-the metric of that covariance, window by window and group of joints by group.
+is the change per standard deviation of the first state, and of the time between stamps of commands and of readings.
+All that fits and scores need is the Gram matrix of [J r] in the metric of that covariance, window by window and group
+of joints by group.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,11 +51,13 @@ class Scorer:
         scale: (W, C, J) standard deviation of noise and numerical error.
         state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the first state and
             of the clock.
+        renewed: returns a scorer whose floors and first states suit other values of the model.
     """
 
     replayer: Replayer
     scale: np.ndarray
     state: np.ndarray
+    renewed: Callable[[Theta], Scorer] | None = None
 
     @property
     def windows(self) -> Windows:
@@ -98,22 +101,32 @@ def _start_sd(windows: Windows, machine: Machine, probe: Probe) -> np.ndarray:
     """Return the standard deviation of a coordinate of the first state (W, G), in changes by its probe."""
     if probe.key == "base":
         axis = int(np.argmax(probe.delta))
-        return np.full((len(windows), 1), machine.base_sd[axis] / machine.base_probe[axis])
+        return windows.base_sd[:, axis, None] / machine.base_probe[axis]
     sd = windows.q_sd if probe.key == "q" else windows.qd_sd
     return sd[:, np.array(machine.groups)[:, probe.place]] / STATE_PROBE[probe.key == "qd"]
 
 
-def scorer(replayer: Replayer, theta: Theta, scale: np.ndarray, dt: float, clock_s: float = 0.0) -> Scorer:
-    """Measure how the first states, and a clock that is off by ``clock_s``, act on the readings, at ``theta``."""
+def scorer(
+    replayer: Replayer,
+    theta: Theta,
+    scale: np.ndarray,
+    dt: float,
+    clock_s: float = 0.0,
+    some: np.ndarray | None = None,
+) -> Scorer:
+    """Measure how the first states, and a clock that is off by ``clock_s``, act on the readings, at ``theta``.
+
+    With the numbers of ``some`` windows, ``state`` is that of those alone.
+    """
     w, machine = replayer.windows, replayer.machine
     probes = state_probes(machine)
-    everything = np.arange(len(w))
+    everything = np.arange(len(w)) if some is None else some
     rows = variants(machine, theta, everything, probes)
     empty = Scorer(replayer, scale, np.empty(0))
-    y = replayer.run(rows, dt).reshape(len(w), 1 + len(probes), *w.y.shape[1:])
+    y = replayer.run(rows, dt).reshape(len(everything), 1 + len(probes), *w.y.shape[1:])
     columns = []
     for k, probe in enumerate(probes):
-        sd = _start_sd(w, machine, probe)
+        sd = _start_sd(w, machine, probe)[everything]
         per = empty.unit(y[:, 1 + k] - y[:, 0], everything)
         columns.append(per * sd[..., None].astype(np.float32))
     columns += [empty.unit(change, everything) for change in w.unknown(y[:, 0])]

@@ -13,6 +13,12 @@ REGIMES = (
     *("stick", "reversal", "slow", "fast", "high torque", "after an edge", "drives off"),
     *("early in the episode", "late in the episode", "small angle", "large angle"),
 )
+ON_FEET = ("stance", "swing", "impact")
+"""Regimes of a robot on its feet, beside the others."""
+
+IMPACT_S = 0.03
+"""Time after a foot begins to carry weight that counts as impact, s."""
+
 AT_REST, SLOW, FAST = 0.1, 1.0, 5.0
 """Speeds up to which a joint rests or is slow, and from which it is fast, rad/s."""
 
@@ -42,7 +48,9 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
         jump = np.abs(np.diff(values, axis=0, prepend=values[:1])) > EDGE
         since = t[row][:, None] - when
         edge[row] = np.einsum("te,ej->tj", ((since >= 0) & (since < 0.06)).astype(int), jump.astype(int)) > 0
-    demand = np.abs(w.kp[windows][:, None] * (target - q) - w.kd[windows][:, None] * qd) * on[..., None]
+    kp, kd = w.kp[windows][:, None], w.kd[windows][:, None]
+    asked = np.where((kp == 0.0) & (kd == 0.0), target, kp * (target - q) - kd * qd)  # without gains, of torques
+    demand = np.abs(asked) * on[..., None]
     span = max(int(TURN_S / w.period), 1)
     turn = np.zeros(q.shape, dtype=bool)
     turn[:, span:-span] = qd[:, : -2 * span] * qd[:, 2 * span :] < 0
@@ -55,6 +63,13 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
     found = [speed < AT_REST, turn, (speed >= AT_REST) & (speed < SLOW), speed >= FAST]
     found += [demand > HIGH * np.maximum(demand.max((0, 1)), 1e-9), edge, np.broadcast_to(~on[..., None], q.shape)]
     found += [time < third[0], time > third[1], away < 0.5 * far, away > far]
+    loads = w.loads()
+    if loads is not None:
+        stance = loads[windows]
+        touched = stance & ~np.concatenate([stance[:, :1], stance[:, :-1]], axis=1)
+        long = max(round(IMPACT_S / w.period), 1)
+        impact = np.stack([touched[:, max(k - long, 0) : k + 1].any(1) for k in range(stance.shape[1])], axis=1)
+        found += [stance, ~stance, impact]
     return np.stack(found) & w.valid[windows][None, ..., None]
 
 
@@ -73,7 +88,8 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     split = left.reshape(len(windows), len(groups), n, quantities, -1)
     square = np.empty((len(windows), n, len(w.joints)))
     for g, joints in enumerate(groups):
-        square[:, :, joints] = (split[:, g] ** 2).mean(axis=2)
+        scored = np.isfinite(scorer.scale[windows][:, : w.of_joints, joints]).sum(1)  # V K quantities
+        square[:, :, joints] = (split[:, g, :, : w.of_joints] ** 2).sum(axis=2) / np.maximum(scored, 1)[:, None]
     there = regimes(scorer, windows)
     count = there.sum((1, 2))
     score = np.log(np.maximum(square, 1e-3)) * w.valid[windows][..., None]  # a few violent samples must not decide
@@ -88,7 +104,8 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     flagged = np.zeros(count.shape, dtype=bool)
     if enough.any():
         flagged[enough] = false_discovery_control(p[enough]) < FALSE_DISCOVERIES
-    return Localisation(w.joints, REGIMES, count.T, excess.T, p.T, (flagged & (excess > 0.1)).T)
+    names = REGIMES if w.loads() is None else (*REGIMES, *ON_FEET)
+    return Localisation(w.joints, names, count.T, excess.T, p.T, (flagged & (excess > 0.1)).T)
 
 
 def _means(score: np.ndarray, there: np.ndarray, count: np.ndarray) -> np.ndarray:

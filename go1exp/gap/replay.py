@@ -4,71 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-import go1exp.actuator
 import go1exp.effects  # noqa: F401  (registers every effect)
-from go1exp import robot
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Measured
-from go1exp.env.plant import FRICTION, Plant, drive_setup
-from go1exp.gap.windows import PAST_S, Windows, held
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
+from go1exp.env.plant import FRICTION, Plant
+from go1exp.gap.machine import Machine, drive_of
+from go1exp.gap.windows import PAST_S, Windows, averaged, held
 from go1exp.registry import bind, members
-from go1exp.robot import RobotConfig
-from go1exp.terrain import TerrainConfig, build_terrain
 
 Key = tuple[str, str]
 """Effect and parameter."""
 Theta = dict[Key, np.ndarray]
 """Values by key: (J,) per joint, or (1,) of the robot."""
-
-NEEDLESS = 1 << 4 | 1 << 13
-"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
-
-
-class Machine(Protocol):
-    """A robot that can be replayed."""
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints."""
-
-    @property
-    def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Joints that move together, equally many in each group; groups do not feel each other."""
-
-    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
-        """Return a backend with ``num`` held robots, and their drives."""
-
-
-@dataclass(frozen=True)
-class HungGo1:
-    """A Go1 whose trunk is held, so that its legs do not feel each other."""
-
-    config: RobotConfig
-    joints: tuple[str, ...] = robot.JOINTS
-    groups: tuple[tuple[int, ...], ...] = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
-
-    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
-        """Return a backend with ``num`` held robots, and their drives."""
-        w, x, y, z = base_quat
-        ground = build_terrain(TerrainConfig(kind="flat"))
-        model, blocks = build_model(self.config, ground, physics_dt, held=(w, x, y, z))
-        model.opt.disableflags |= NEEDLESS
-        backend = MujocoCpu(model, blocks, num, threads)
-        return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
-
-
-def hung(config: RobotConfig) -> Machine:
-    """Return a Go1 whose trunk is held."""
-    return HungGo1(config)
 
 
 @dataclass(frozen=True)
@@ -80,16 +33,18 @@ class Rows:
         values: of the effects, (R, J) or (R, 1).
         q: (R, J) added to the first angles, rad; None for nothing.
         qd: (R, J) added to the first speeds, rad/s.
+        base: (R, 9) added to a free base's first height, roll and pitch, velocity and rate.
     """
 
     window: np.ndarray
     values: Mapping[Key, np.ndarray]
     q: np.ndarray | None = None
     qd: np.ndarray | None = None
+    base: np.ndarray | None = None
 
     def part(self, which: np.ndarray) -> Rows:
         """Return some of them."""
-        moved = (None if v is None else v[which] for v in (self.q, self.qd))
+        moved = (None if v is None else v[which] for v in (self.q, self.qd, self.base))
         return Rows(self.window[which], {k: v[which] for k, v in self.values.items()}, *moved)
 
 
@@ -147,9 +102,7 @@ class Replayer:
             backend.derive_constants(torch.ones(len(rows.window), dtype=torch.bool))
         names = list(dict.fromkeys(effect for effect, _ in rows.values))
         terms = [bind("effect", name, {}, name)[0] for name in names]
-        actuator = bind("actuator", "pd", {}, "pd")[0]
-        assert actuator is not None
-        plant = Plant(backend, setup, actuator, [term for term in terms if term is not None])
+        plant = Plant(backend, setup, drive_of(self.machine), [term for term in terms if term is not None])
         touched |= set(plant.effects.fields) | {FRICTION, "dof_armature"}
         for (effect, parameter), value in rows.values.items():
             live = getattr(plant.effects.effects[effect], parameter)
@@ -168,7 +121,7 @@ class Replayer:
         everyone = torch.ones(len(q), dtype=torch.bool)
         effects, backend = plant.effects, plant.backend
         plant.enabled = None
-        backend.reset(everyone, q, qd)
+        backend.reset(everyone, *self._state(plant, rows, q, qd))
         plant.reset(everyone, past[0])
         seen, _ = effects.on_encoder(q, qd)
         true = q - (seen - q)
@@ -178,7 +131,7 @@ class Replayer:
             twist = gears.compliance * torque + 0.5 * gears.gap * torque.sign()
             true = true - twist
         half = 0.5 * dt * torch.as_tensor(w.qdd[rows.window])  # the engine's speeds are half a step old
-        backend.reset(everyone, true, qd - 3.0 * half)
+        backend.reset(everyone, *self._state(plant, rows, true, qd - 3.0 * half))
         plant.reset(everyone, past[-1])
         plant.qd.copy_(qd - half)
         if effects.rotors:
@@ -189,12 +142,20 @@ class Replayer:
             if hasattr(effect, "_time"):
                 effect._time.copy_(torch.as_tensor(w.begin[rows.window]).unsqueeze(1))
 
+    def _state(self, plant: Plant, rows: Rows, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the coordinates and speeds of robots whose joints are at ``q`` (R, J) and ``qd``."""
+        return q, qd
+
+    def _ears(self, steps: int, rows: int) -> Any:
+        """Return what listens to more than the joints, or None."""
+        return None
+
     def _signals(self, dt: float) -> tuple[Tensor, Tensor]:
         """Return targets (K, W, J) and whether drives are on (K, W) at every step, the past included."""
         if dt not in self._inputs:
             w = self.windows
             steps = np.arange(-round(PAST_S / dt), int(np.ceil(w.length / dt)) + 1) * dt
-            targets = np.stack([held(changes, steps) for changes in w.edges], axis=1)
+            targets = np.stack([averaged(changes, steps) for changes in w.edges], axis=1)
             enabled = np.stack([held(changes, steps) for changes in w.switches], axis=1)
             self._inputs[dt] = torch.as_tensor(targets), torch.as_tensor(enabled)
         return self._inputs[dt]
@@ -215,19 +176,24 @@ class Replayer:
         shape = (kept, len(index), len(w.joints))
         q, qd, torque = np.empty(shape), np.empty(shape), np.empty(shape) if "tau_est" in w.quantities else None
         senses = plant.effects.senses
+        ears = self._ears(kept, len(index))
         for k in range(steps):
             if k >= first:
                 seen = Measured(plant.q, plant.speed())
                 if senses:
                     seen = plant.effects.measure(seen)
                 q[k - first], qd[k - first] = seen.joint_pos.numpy(), seen.joint_vel.numpy()
+                if ears is not None:
+                    ears.take(k - first, plant)
             if not always:
                 plant.enabled = enabled[past + k]
             plant.step(targets[past + k])
             if torque is not None and k >= first:
                 torque[k - first] = plant.torque.numpy()
         self.made += len(index) * steps
-        return _sampled(q, qd, torque, w.t[rows.window] / dt - first, dt)
+        at = w.t[rows.window] / dt - first
+        found = _sampled(q, qd, torque, at, dt)
+        return found if ears is None else ears.joined(found, at, plant, dt)
 
 
 def _sampled(q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float) -> np.ndarray:
@@ -278,9 +244,12 @@ def variants(
             per = {p.name: p.per for p in members("effect")[effect].target.params}[key[1]]  # type: ignore[attr-defined]
             wide = joints if per == "joint" else 1
             full[key] = np.tile(np.broadcast_to(theta.get(key, value), (wide,)), (count, 1))
-    q, qd = np.zeros((count, joints)), np.zeros((count, joints))
+    q, qd, base = np.zeros((count, joints)), np.zeros((count, joints)), np.zeros((count, len(machine.base_probe)))
     for k, probe in enumerate(probes):
         mine = slice(1 + k, None, size)
+        if probe.key == "base":
+            base[mine] += probe.delta
+            continue
         columns = slice(None) if probe.place is None else groups[:, probe.place]
         if isinstance(probe.key, str):
             (q if probe.key == "q" else qd)[mine, columns] += probe.delta[columns]
@@ -288,4 +257,4 @@ def variants(
         for key, value in probe.also.items():
             full[key][mine] = value
         full[probe.key][mine, columns] += probe.delta[columns]
-    return Rows(np.repeat(windows, size), full, q, qd)
+    return Rows(np.repeat(windows, size), full, q, qd, base)

@@ -43,6 +43,10 @@ class GapSettings:
         clock_s: standard deviation of the time by which readings may be stamped early or late against commands, window
             by window; a hundredth of a control step, which nothing in training would notice.
         torque: also score the torque that the drives report, where it was logged.
+        calibrate: whether nominal parameters may move within their tolerances first; without, small errors of the model
+            are taken for effects (for comparison).
+        judge: by what candidates are judged: ``max_t`` on held-out windows; for comparison ``gain``, any gain there, or
+            ``bic``, Schwarz's criterion on the windows of the fit.
         alpha: significance that a term needs.
         min_share: share of the remaining excess that a term must remove.
         max_terms: most terms that are named.
@@ -68,6 +72,8 @@ class GapSettings:
     physics_dt: Annotated[float, Field(gt=0, le=0.002)] = 0.001
     clock_s: NonNegative = 0.00015
     torque: bool = False
+    calibrate: bool = True
+    judge: Literal["max_t", "gain", "bic"] = "max_t"
     alpha: Share = 0.01
     min_share: Fraction = 0.1
     max_terms: Count = 4

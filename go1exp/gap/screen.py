@@ -25,6 +25,8 @@ LEVELS: dict[str, tuple[dict[str, float], ...]] = {
     "flexibility": ({"compliance": 0.001}, {"compliance": 0.004}),
     "joint_stop": ({"time_constant": 0.006}, {"time_constant": 0.03}),
     "command_delay": ({"delay": 0.01},),
+    "foot_friction": ({"scale": -0.3}, {"scale": 0.3}),
+    "ground_compliance": ({"time_constant": 0.01}, {"time_constant": -0.008}),
 }
 """Changes by which effects with a threshold, or far from linear, are probed; any one may become the start of a fit."""
 
@@ -39,6 +41,7 @@ FREE_SHAPES: dict[str, tuple[str, ...]] = {
     "parallel_stiffness": ("rest",),
     "cogging": ("phase", "count"),
     "torque_speed_limit": ("stall",),
+    "payload": ("x", "y", "z"),
 }
 """Shapes that a full fit may change."""
 
@@ -87,9 +90,9 @@ def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -
     """Return every way in which an effect could be missing; ``mean`` (J,) are the joints' average angles, rad."""
     found: list[Variant] = []
     for effect in members("effect"):
-        if effect in GROUND or effect in exclude:
+        if (effect in GROUND and not machine.base_probe) or effect in exclude:
             continue
-        if effect in box.BOX and effect not in LEVELS:
+        if effect in box.of(machine) and effect not in LEVELS:
             found.append(Variant(effect))
             continue
         keys = box.sizes(effect)
@@ -134,7 +137,12 @@ class Screened:
 
 
 def screen(
-    scorer: Scorer, theta: Theta, own: Table, free: Collection[str], library: Sequence[Variant], dt: float
+    scorer: Scorer,
+    theta: Theta,
+    own: Table,
+    may: box.Freedom,
+    library: Sequence[Variant],
+    dt: float,
 ) -> list[Screened]:
     """Rank variants.
 
@@ -142,7 +150,7 @@ def screen(
         scorer: of the windows.
         theta: present values.
         own: the linear model of what may move already.
-        free: effects among it that may leave their tolerances.
+        may: what may leave its tolerance.
         library: the variants.
         dt: physics step, s.
     """
@@ -167,7 +175,7 @@ def screen(
         part = grams[:, :, [*pick, -1]][..., [*pick, -1]]
         layout = Layout.of(machine, probes)
         matrix, right = layout.total(part * weight[..., None, None])
-        limits = box.bounds(layout, probes, theta, {*free, variant.effect})
+        limits = box.bounds(layout, probes, theta, may.also(variant.effect))
         if variant.quadrature:
             limits.low[layout.part(np.arange(known, len(probes)))] = -np.inf
         x = box.solve(matrix, right, limits)

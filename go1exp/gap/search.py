@@ -8,12 +8,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from go1exp.gap import box, judge
+from go1exp.gap import alone, box, evidence, judge
 from go1exp.gap.fit import Model, fit, scores
-from go1exp.gap.likelihood import Scorer, Table, table
+from go1exp.gap.likelihood import Layout, Scorer, Table, table
 from go1exp.gap.replay import Key, Theta
 from go1exp.gap.result import Candidate, GapSettings
 from go1exp.gap.screen import FREE_SHAPES, Screened, library, screen
+from go1exp.gap.trial import excess, removed, tried
 
 Progress = Callable[[str, float], None]
 
@@ -23,21 +24,17 @@ SILENT = 0.02
 SCREENED = 20
 """Windows in which candidates are screened, at most."""
 
-FEW = 0.5
-"""A candidate that removes more than this share of the excess without being significant is seen in too few windows."""
+LOOSENED = 3
+"""Most effects that join the box because the data ask for some of them, within their tolerances."""
+
+NEEDED = 12.0
+"""Fall of chi2 that a joint must bring before it may leave the tolerance of a term's effect."""
+
+SIMPLER = {"asymmetric_friction": "coulomb", "stribeck": "coulomb", "load_friction": "coulomb"}
+"""Effect -> one that says the same with fewer numbers, where it does."""
 
 SETTLED = 0.01
 """Fall of log chi2 in a round of fitting, and log chi2 itself, below which more rounds are not worth their time."""
-
-
-def excess(chi2: np.ndarray) -> float:
-    """Return the mean excess of chi2 per value (V, G)."""
-    return float(chi2.mean() - 1.0) if chi2.size else math.nan
-
-
-def removed(before: float, after: float) -> float:
-    """Return the share of an excess that is gone; what lies below the floor counts as nothing."""
-    return 1.0 - max(after, 0.0) / before if before > 0 else 0.0
 
 
 @dataclass
@@ -52,12 +49,17 @@ class Search:
         rng: of tests and bags.
         progress: told what goes on, and which share of all is done.
         theta: values of the present model.
+        nominal: values of the model within its tolerances, before any term.
+        first: held-out excess with these.
         terms: accepted effects.
+        loosened: effects that may move within their tolerances beside those of the box.
+        kept: effects and joints that stay within tolerance although their effect is a term.
         aliases: effect -> effects that do as well.
         shares: effect -> share of bags in which it wins.
         candidates: the evidence.
         signal: effect -> how loud it would be at twice its tolerance.
         steps: (what, held-out excess) after every accepted term.
+        single: the term that explains nearly everything alone, if there is one (``gap/alone.py``).
         own: the linear model of what may move, with the residuals at ``theta`` and changes near it.
     """
 
@@ -68,18 +70,23 @@ class Search:
     rng: np.random.Generator
     progress: Progress
     theta: Theta = field(default_factory=dict)
+    nominal: Theta = field(default_factory=dict)
+    first: float = math.nan
     terms: list[str] = field(default_factory=list)
+    loosened: list[str] = field(default_factory=list)
+    kept: frozenset[tuple[str, int]] = frozenset()
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
     shares: dict[str, float] = field(default_factory=dict)
     candidates: list[Candidate] = field(default_factory=list)
     signal: dict[str, float] = field(default_factory=dict)
     steps: list[tuple[str, float]] = field(default_factory=list)
     own: Table | None = None
+    single: str = ""
 
     @property
     def keys(self) -> tuple[Key, ...]:
         """All parameters that may move: those of the box, and of the terms."""
-        effects = dict.fromkeys([*box.BOX, *self.terms])
+        effects = dict.fromkeys([*box.of(self.scorer.replayer.machine), *self.loosened, *self.terms])
         shapes = [(e, name) for e in self.terms for name in FREE_SHAPES.get(e, ())]
         return (*(k for e in effects for k in box.sizes(e)), *shapes)
 
@@ -87,12 +94,21 @@ class Search:
         """Return the linear model of what may move."""
         return table(self.scorer, theta, windows, box.probes(self.scorer.replayer.machine, self.keys, theta), self.dt)
 
+    @property
+    def may(self) -> box.Freedom:
+        """What may leave its tolerance."""
+        return box.Freedom(frozenset(self.terms), self.kept, not self.settings.calibrate)
+
+    def model(self, theta: Theta) -> Model:
+        """Return a model with all terms, to fit."""
+        return Model("", theta, self.may, ())
+
     def settle(self, rounds: int) -> np.ndarray:
         """Fit all that may move, on the windows for training; return chi2 (V, G) there."""
         reached = np.inf
         for _ in range(rounds):
             own = self.linear(self.theta, self.splits.train)
-            (best,) = fit(self.scorer, [Model("", self.theta, frozenset(self.terms), ())], own, 2, self.dt)
+            (best,) = fit(self.scorer, [self.model(self.theta)], own, 2, self.dt)
             self.theta = best.theta
             assert best.chi2 is not None
             before, reached = reached, float(np.log(best.chi2).mean())
@@ -110,119 +126,169 @@ class Search:
     def run(self) -> None:
         """Search."""
         settings = self.settings
+        hidden = alone.cause(self) if self.scorer.replayer.machine.base_probe else None
         self.progress("fitting the model within its tolerances", 0.1)
         train = self.settle(3)
         now = self.held_out(self.theta)
+        self.nominal, self.first = self.theta, excess(now)
         self.steps.append(("within tolerances", excess(now)))
-        for stage in range(1, settings.max_terms + 1):
-            if excess(now) < settings.material and stage > 1:
-                break
+        stage = 1
+        if hidden is not None:
+            self.progress(f"fitting the model with {hidden.name}", 0.2)
+            train, now = self._take(hidden)
+            stage = 2
+        while stage <= settings.max_terms and (stage == 1 or excess(now) >= settings.material):
             share = 0.15 + 0.7 * (stage - 1) / settings.max_terms
             self.progress(f"screening for term {stage}", share)
-            found, own = self._screened()
-            if stage == 1:
+            found = self._screened()
+            if not self.signal:
                 self._listen(found)
             if excess(now) < settings.material:
+                self.candidates += evidence.absorbed(self.keys, self._relief(), self.theta, settings.shortlist)
                 break
             self.progress(f"fitting candidates for term {stage}", share + 0.06)
-            fitted = self._fitted(found, own)
-            accepted = self._judged(stage, fitted, found, train, now)
-            if accepted is None:
+            fitted = self._fitted(found)
+            accepted, inside = self.judged(stage, fitted, train, now)
+            if accepted is None and (inside is None or len(self.loosened) == LOOSENED):
                 break
-            self.terms.append(accepted.name)
-            # What the box had taken on in place of the effect it gives back: it starts from the nominal values.
-            self.theta = {key: value for key, value in accepted.theta.items() if key[0] in self.terms}
-            self.progress(f"fitting the model with {accepted.name}", share + 0.12)
-            train = self.settle(4)
-            now = self.held_out(self.theta)
-            self.steps.append((accepted.name, excess(now)))
-        if len(self.terms) > 1:
+            self.progress(f"fitting the model with {(accepted or inside).name}", share + 0.12)  # type: ignore[union-attr]
+            if accepted is not None:
+                before, state = excess(now), (list(self.terms), list(self.loosened), self.theta, self.own, self.scorer)
+                train, now = self._take(accepted)
+                if excess(now) > before:
+                    self.terms, self.loosened, self.theta, self.own, self.scorer = state
+                    now = self._refused(accepted.name)
+                    break
+                stage += 1
+            else:
+                assert inside is not None
+                train, now = self._loosen(inside, now)
+        if self.terms:
+            self.progress("is all of it needed", 0.85)
             self._eliminate(now)
+            self._simplify()
+            self._prune()
+
+    def confirmed(self) -> bool:
+        """Return whether the terms help on the episodes kept for a last check, or there is nothing to help there."""
+        kept = self.splits.confirm
+        if not len(kept):
+            return True
+        before, after = (self.held_out(theta, kept) for theta in (self.nominal, self.theta))
+        least = 0.0 if excess(before) > self.settings.material else -judge.SAME
+        return bool(judge.gains(before, after[None]).mean() > least)
+
+    def withdraw(self) -> None:
+        """Take back all terms."""
+        self.terms, self.theta = [], self.nominal
+        self.steps.append(("withdrawn", self.first))
 
     def listen(self) -> None:
         """Only find out how loud each effect would be (``signal``)."""
         self.settle(1)
-        found, _ = self._screened()
-        self._listen(found)
+        self._listen(self._screened())
 
-    def _screened(self) -> tuple[list[Screened], Table]:
-        assert self.own is not None
+    def _take(self, model: Model) -> tuple[np.ndarray, np.ndarray]:
+        """Make a candidate a term; return chi2 of training and of held-out windows."""
+        self.terms.append(model.name)
+        self.loosened = [name for name in self.loosened if name != model.name]
+        # What the box had taken on in place of the effect it gives back: it starts from the nominal values.
+        self.theta = {k: v for k, v in model.theta.items() if k[0] in (*self.terms, *self.loosened)}
+        if self.scorer.renewed is not None and model.name == self.single:
+            self.scorer = self.scorer.renewed(self.theta)
+        train = self.settle(4)
+        if self.scorer.renewed is not None:
+            self.scorer = self.scorer.renewed(self.theta)
+            train = self.settle(1)
+        now = self.held_out(self.theta)
+        self.steps.append((model.name, excess(now)))
+        return train, now
+
+    def _refused(self, name: str) -> np.ndarray:
+        """Note that a term that looked well made things worse with all else fitted again; return held-out chi2."""
+        self.steps.pop()
+        self.candidates = [
+            replace(c, status="rejected", reason="with all else fitted again the held-out error grows")
+            if c.effect == name and c.status == "accepted"
+            else c
+            for c in self.candidates
+        ]
+        return self.held_out(self.theta)
+
+    def _loosen(self, model: Model, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Let an effect move within its tolerance; return chi2 of training and of held-out windows."""
+        self.loosened.append(model.name)
+        self.theta = model.theta
+        train, after = self.settle(2), self.held_out(self.theta)
+        if not self.terms:
+            self.nominal, self.first = self.theta, excess(after)
+        self.steps.append((f"{model.name} within its tolerance", excess(after)))
+        return train, after
+
+    def _screened(self) -> list[Screened]:
+        own = self.own
+        assert own is not None
         mean = self.scorer.windows.y[:, :, 0].mean((0, 1))
-        ways = library(self.scorer.replayer.machine, mean, self.terms)
+        ways = library(self.scorer.replayer.machine, mean, [*self.terms, *self.loosened])
         if self.settings.effects:
             ways = [v for v in ways if v.effect in self.settings.effects]
-        count = len(self.own.windows)
+        count = len(own.windows)
         # Half of the windows that are looked at are the worst, half are spread evenly.
-        worst = np.argsort(-self.scorer.chi2(self.own.residual, self.own.windows).sum(1))[: SCREENED // 2]
+        worst = np.argsort(-self.scorer.chi2(own.residual, own.windows).sum(1))[: SCREENED // 2]
         evenly = np.linspace(0, count - 1, min(SCREENED // 2, count)).astype(int)
-        some = self.own.part(np.unique([*worst, *evenly]))
-        return screen(self.scorer, self.theta, some, self.terms, ways, self.dt), self.own
+        some = own.part(np.unique([*worst, *evenly]))
+        return screen(self.scorer, self.theta, some, self.may, ways, self.dt)
 
     def _listen(self, found: Sequence[Screened]) -> None:
         for s in found:
             self.signal[s.variant.effect] = max(self.signal.get(s.variant.effect, 0.0), s.signal)
 
-    def _fitted(self, found: Sequence[Screened], own: Table) -> list[Model]:
+    def _fitted(self, found: Sequence[Screened]) -> list[Model]:
         chosen: dict[str, Screened] = {}
         for s in found:
             if len(chosen) < self.settings.shortlist and s.gain > 0.0:
                 chosen.setdefault(s.variant.effect, s)
-        models = []
-        for effect, s in chosen.items():
-            keys = s.variant.free
-            models.append(Model(effect, s.theta, frozenset([*self.terms, effect]), keys))
-        return fit(self.scorer, models, own, self.settings.iterations, self.dt) if models else []
+        models = [Model(effect, s.theta, self.may.also(effect), s.variant.free) for effect, s in chosen.items()]
+        assert self.own is not None
+        return fit(self.scorer, models, self.own, self.settings.iterations, self.dt) if models else []
 
-    def _judged(
-        self, stage: int, fitted: list[Model], found: Sequence[Screened], train: np.ndarray, now: np.ndarray
-    ) -> Model | None:
-        """Test the fitted candidates on held-out windows, note the evidence, and return the one to accept."""
-        settings = self.settings
+    def judged(
+        self, stage: int, fitted: list[Model], train: np.ndarray, now: np.ndarray
+    ) -> tuple[Model | None, Model | None]:
+        """Test the fitted candidates on held-out windows and note the evidence.
+
+        Returns:
+            The one to accept, and the best of those that help within their tolerances.
+        """
         if not fitted:
-            return None
-        after = scores(self.scorer, [m.theta for m in fitted], self.splits.select, self.dt)
-        gain = judge.gains(now, after)
-        p = judge.max_t(gain, self.rng)
-        sizes = [self._size(m) for m in fitted]
-        share = [removed(excess(now), excess(a)) for a in after]
-        fit_for_it = [
-            k
-            for k in range(len(fitted))
-            if p[k] < settings.alpha and share[k] > settings.min_share and sizes[k] > 1.0 and gain[k].mean() > 0
-        ]
-        chosen, alias = None, np.zeros(len(fitted), dtype=bool)
-        if fit_for_it:
-            best = max(fit_for_it, key=lambda k: gain[k].mean())
-            alias = judge.equals(gain, best, self.rng) & np.isin(np.arange(len(fitted)), fit_for_it)
-            many = [len(m.keys) for m in fitted]
-            simplest = min(many[k] for k in np.flatnonzero(alias))
-            alias &= np.array(many) == simplest  # what says the same with more numbers is no rival
-            chosen = int(max(np.flatnonzero(alias), key=lambda k: gain[k].mean()))
-        names = tuple(fitted[k].name for k in sorted(np.flatnonzero(alias), key=lambda k: -gain[k].mean()))
-        for k in np.argsort(-gain.mean(axis=1)):
-            status, reason = self._reason(int(k), chosen, alias, p, share, sizes, gain, fitted)
+            return None, None
+        trial = tried(self.scorer, self.settings, fitted, train, now, self.splits.select, self.dt, self.rng)
+        names = tuple(fitted[k].name for k in sorted(np.flatnonzero(trial.alias), key=lambda k: -trial.mean[k]))
+        for k in np.argsort(-trial.mean):
+            status, reason = trial.reason(int(k))
             self.candidates.append(
-                Candidate(
-                    effect=fitted[k].name,
-                    joints=self._joints(fitted[k]),
-                    params=self._params(fitted[k]),
-                    excess_after=excess(after[k]),
-                    log_gain=float(gain[k].mean()),
-                    p=float(p[k]),
-                    size_over_tolerance=sizes[k],
-                    alias_class=names if alias[k] else (fitted[k].name,),
-                    status=status,  # type: ignore[arg-type]
+                evidence.candidate(
+                    fitted[k],
+                    self.scorer.windows.joints,
+                    excess_after=trial.after[k],
+                    log_gain=float(trial.mean[k]),
+                    p=float(trial.p[k]),
+                    alias_class=names if trial.alias[k] else (fitted[k].name,),
+                    status=status,
                     reason=reason,
                     stage=stage,
                 )
             )
-        if chosen is None:
-            return None
-        accepted = fitted[chosen]
+        helps = [k for k in range(len(fitted)) if trial.helps[k] and trial.sizes[k] <= 1.0]
+        inside = fitted[max(helps, key=lambda k: trial.mean[k])] if helps else None
+        if trial.chosen is None:
+            return None, inside
+        accepted = fitted[trial.chosen]
         self.aliases[accepted.name] = (accepted.name, *(n for n in names if n != accepted.name))
-        every = np.concatenate([judge.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None])), gain], 1)
-        self.shares[accepted.name] = self._bag(every, chosen, alias)
-        return accepted
+        on_train = judge.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None]))
+        every = np.concatenate([on_train, trial.gain], axis=1)
+        self.shares[accepted.name] = self._bag(every, trial.chosen, trial.alias)
+        return accepted, inside
 
     def _bag(self, gain: np.ndarray, chosen: int, alias: np.ndarray) -> float:
         """Return the share of resampled windows in which the chosen candidate, or its equal, gains most."""
@@ -232,78 +298,85 @@ class Search:
         for _ in range(self.settings.bags):
             picked = judge.resampled(episode, self.rng)
             mean = gain[:, picked].mean(axis=1)
-            close = mean >= mean.max() - judge.SAME
+            close = mean >= mean.max() - judge.same(mean.max())
             wins += bool(close[chosen] or close[alias].any())
         return wins / max(self.settings.bags, 1)
 
-    def _reason(
-        self,
-        k: int,
-        chosen: int | None,
-        alias: np.ndarray,
-        p: np.ndarray,
-        share: Sequence[float],
-        sizes: Sequence[float],
-        gain: np.ndarray,
-        fitted: Sequence[Model],
-    ) -> tuple[str, str]:
-        settings = self.settings
-        if k == chosen:
-            return "accepted", f"removes {share[k]:.1%} of the excess on held-out windows, p = {p[k]:.2g}"
-        if chosen is not None and alias[k]:
-            return "alias", f"does as well as {fitted[chosen].name}: these data cannot tell them apart"
-        if sizes[k] <= 1.0:
-            return "rejected", f"fits within its tolerance ({sizes[k]:.2g} of it)"
-        if p[k] >= settings.alpha and share[k] > FEW and gain[k].mean() > 0:
-            return "rejected", f"removes {share[k]:.1%} of the excess, but too few windows show it (p = {p[k]:.2g})"
-        if p[k] >= settings.alpha or gain[k].mean() <= 0:
-            return "rejected", f"no significant gain on held-out windows (p = {p[k]:.2g})"
-        if share[k] <= settings.min_share:
-            return "rejected", f"removes only {max(share[k], 0.0):.1%} of the excess on held-out windows"
-        assert chosen is not None
-        if gain[k].mean() >= gain[chosen].mean() - judge.SAME:
-            return "rejected", f"does no better than {fitted[chosen].name}, which needs fewer numbers"
-        return "rejected", f"explains less than {fitted[chosen].name} (excess falls by {share[k]:.1%})"
-
-    def _size(self, model: Model) -> float:
-        """Return the largest deviation of an effect from null in tolerances."""
-        return max(float(np.max(_deviation(model.theta, key))) for key in box.sizes(model.name))
-
-    def _joints(self, model: Model) -> tuple[str, ...]:
-        joints = self.scorer.windows.joints
-        beyond = np.zeros(len(joints), dtype=bool)
-        for key in box.sizes(model.name):
-            if box.param(key).per == "joint":
-                beyond |= np.broadcast_to(_deviation(model.theta, key) > 1.0, len(joints))
-        return tuple(j for j, b in zip(joints, beyond, strict=True) if b)
-
-    def _params(self, model: Model) -> dict[str, list[float] | float]:
-        named = np.isin(self.scorer.windows.joints, self._joints(model))
-        found: dict[str, list[float] | float] = {}
-        for key, value in model.theta.items():
-            if key[0] == model.name:
-                per_joint = box.param(key).per == "joint"
-                full = np.broadcast_to(value, len(named)) if per_joint else value
-                found[key[1]] = [float(v) for v in full[named]] if per_joint else float(full[0])
-        return found
-
     def _eliminate(self, now: np.ndarray) -> None:
         """Drop terms without which the rest does as well."""
-        for name in list(self.terms[:-1]):
+        for name in [t for t in self.terms if t != self.single and len(self.terms) > 1]:
             rest = replace(self, terms=[t for t in self.terms if t != name], theta=_without(self.theta, name))
             rest.settle(1)
             without = self.held_out(rest.theta)
             gain = judge.gains(without, now[None])
             needed = removed(excess(without), excess(now)) > self.settings.min_share
             if not needed or judge.max_t(gain, self.rng)[0] >= self.settings.alpha:
-                self.terms, self.theta, now = rest.terms, rest.theta, without
+                self.terms, self.theta, self.own, now = rest.terms, rest.theta, rest.own, without
                 self.steps.append((f"without {name}", excess(now)))
 
+    def _simplify(self) -> None:
+        """Replace terms by effects that say the same with fewer numbers, where they do."""
+        for name in [t for t in self.terms if SIMPLER.get(t, t) not in self.terms]:
+            other = SIMPLER[name]
+            terms = [other if t == name else t for t in self.terms]
+            rest = replace(self, terms=terms, theta=_without(self.theta, name))
+            rest.settle(2)
+            before, now = self.held_out(self.nominal), self.held_out(self.theta)
+            gain, less = judge.gains(before, np.stack([now, self.held_out(rest.theta)])).mean(axis=1)
+            if less > gain - judge.same(gain) and evidence.size(other, rest.theta) > 1.0:
+                self.terms, self.theta, self.own = rest.terms, rest.theta, rest.own
+                self.aliases[other], self.shares[other] = (other,), self.shares[name]
+                self.steps.append((f"{other} in place of {name}", excess(self.held_out(self.theta))))
 
-def _deviation(theta: Theta, key: Key) -> np.ndarray:
-    """Return how far a parameter is from null, in tolerances."""
-    p = box.param(key)
-    return np.asarray(np.abs(theta.get(key, np.array([p.null])) - p.null) / p.tolerance)
+    def _cost(self, own: Table) -> Callable[[box.Freedom], float]:
+        """Return a function that says how small chi2 and priors can be, to first order, with some freedom."""
+        layout = Layout.of(self.scorer.replayer.machine, own.probes)
+        chi2 = self.scorer.chi2(own.residual, own.windows)
+        matrix, right = layout.total(own.grams(self.scorer) / np.maximum(chi2, 1.0)[..., None, None])
+
+        def cost(may: box.Freedom) -> float:
+            limits = box.bounds(layout, own.probes, own.theta, may, back=True)
+            x = box.solve(matrix, right, limits)
+            return float(x @ matrix @ x - 2.0 * right @ x + (limits.weight * (x - limits.centre) ** 2).sum())
+
+        return cost
+
+    def _relief(self) -> dict[str, float]:
+        """Return by how much chi2 and priors would fall if an effect of the box might leave its tolerance."""
+        assert self.own is not None
+        cost = self._cost(self.own)
+        return {effect: cost(self.may) - cost(self.may.also(effect)) for effect in {k[0]: None for k in self.keys}}
+
+    def _prune(self) -> None:
+        """Bring back within tolerance what leaves it at a joint for next to nothing."""
+        machine = self.scorer.replayer.machine
+        assert self.own is not None
+        cost = self._cost(self.own)
+        kept = self.kept
+        for name in self.terms:
+            out = np.flatnonzero(evidence.beyond(name, self.theta, machine.joints))
+            far = np.max(
+                [np.broadcast_to(evidence.deviation(self.theta, k), len(machine.joints)) for k in box.sizes(name)], 0
+            )
+            for j in sorted(out, key=lambda j: far[j])[: len(out) - 1]:
+                more = kept | {(name, int(j))}
+                if cost(replace(self.may, kept=more)) - cost(replace(self.may, kept=kept)) < NEEDED:
+                    kept = more
+        if kept != self.kept:
+            self.kept = kept
+            self.theta = {k: self._within(k, v) for k, v in self.theta.items()}
+            self.settle(2)
+            self.steps.append(("at fewer joints", excess(self.held_out(self.theta))))
+
+    def _within(self, key: Key, value: np.ndarray) -> np.ndarray:
+        """Return values of which those of ``kept`` joints are within tolerance."""
+        p = box.param(key)
+        mine = [j for name, j in self.kept if name == key[0]]
+        if not mine or not math.isfinite(p.tolerance):
+            return value
+        found = np.broadcast_to(value, (len(self.scorer.windows.joints),)).copy()
+        found[mine] = found[mine].clip(p.null - p.tolerance, p.null + p.tolerance)
+        return found
 
 
 def _without(theta: Theta, name: str) -> Theta:
@@ -312,7 +385,7 @@ def _without(theta: Theta, name: str) -> Theta:
     for key, value in theta.items():
         if key[0] == name:
             p = box.param(key)
-            if name not in box.BOX or not math.isfinite(p.tolerance):
+            if name not in (*box.BOX, *box.ON_FEET) or not math.isfinite(p.tolerance):
                 continue
             value = value.clip(p.null - p.tolerance, p.null + p.tolerance)
         found[key] = value

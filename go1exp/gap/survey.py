@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from go1exp.gap import verdict as words
-from go1exp.gap.explain import FEWEST, numerical_scale, repeatability, unusable
+from go1exp.gap.explain import FEWEST, measured, repeatability, unusable
 from go1exp.gap.fit import residuals
 from go1exp.gap.judge import splits
-from go1exp.gap.likelihood import scorer
 from go1exp.gap.localise import localise
-from go1exp.gap.replay import Replayer, hung
+from go1exp.gap.machine import Machine, hung, tolerances_of
+from go1exp.gap.prepare import prepare
 from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
-from go1exp.gap.search import Progress, Search, excess
-from go1exp.gap.windows import cut
-from go1exp.recording import Recording
+from go1exp.gap.search import Progress, Search
+from go1exp.gap.trial import excess
+from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
@@ -34,6 +34,7 @@ class Survey:
         excess: of the plain model, over all windows (floor 0).
         where: it is wrong.
         not_excited: effect -> excitation to record next.
+        warnings: what was chosen, a sentence each.
     """
 
     flaws: tuple[str, ...]
@@ -42,6 +43,7 @@ class Survey:
     excess: float = float("nan")
     where: Localisation | None = None
     not_excited: dict[str, str] | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -53,6 +55,7 @@ class Survey:
         if self.flaws or self.floors is None:
             return "\n".join(["these logs cannot be compared with the model:", *(f"  {f}" for f in self.flaws)])
         lines = [f"{self.windows} windows; the plain model's error is {1 + self.excess:.3g} times the floor"]
+        lines = [*self.warnings, *lines]
         for name, value in self.floors.noise.items():
             line = f"  {name}: noise {value:.2g} {UNITS[name]}, error of the step {self.floors.numerical[name]:.2g}"
             if self.floors.repeatability and name in self.floors.repeatability:
@@ -66,29 +69,38 @@ class Survey:
 
 def survey(
     recordings: Sequence[Recording],
-    config: RobotConfig,
+    config: RobotConfig | Machine,
     settings: GapSettings,
     on_progress: Progress = lambda what, share: None,
     screen: bool = True,
 ) -> Survey:
     """Take a first look at recordings of a held robot; ``screen`` also asks what they could not tell."""
-    machine = hung(config)
+    machine = hung(config) if isinstance(config, RobotConfig) else config
+    with tolerances_of(machine):
+        return _survey(recordings, machine, settings, on_progress, screen)
+
+
+def _survey(
+    recordings: Sequence[Recording], machine: Machine, settings: GapSettings, on_progress: Progress, screen: bool
+) -> Survey:
     on_progress("auditing the logs", 0.0)
-    flaws = tuple(line for r in recordings for line in unusable(r, machine))
+    ready = prepare(recordings, machine, settings)
+    flaws = ready.flaws or tuple(line for r in recordings for line in unusable(r, ready.machine))
     if flaws:
         return Survey(flaws)
-    windows = cut(recordings, settings)
+    recordings, settings = ready.recordings, ready.settings
+    try:
+        windows = ready.windows()
+    except RecordingError as error:
+        return Survey((str(error),))
     if len(windows) < FEWEST:
         return Survey((f"{len(windows)} windows of {settings.window_s:g} s; {FEWEST} are needed",))
-    quats = np.array([recordings[e].meta.base_quat for e in windows.episode])
-    replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
     dt = float(windows.period / np.ceil(windows.period / settings.physics_dt - 1e-3))
     on_progress("measuring the floors", 0.1)
-    scale, numerical = numerical_scale(replayer, dt)
-    score = scorer(replayer, {}, scale, 2.0 * dt, settings.clock_s)
+    score, numerical = measured(ready, windows, dt, 2.0 * dt)
     rng = np.random.default_rng(settings.seed)
     everything = np.arange(len(windows))
-    noise = {name: float(np.median(windows.scale[0, c])) for c, name in enumerate(windows.quantities)}
+    noise = {name: value for name, value in windows.by_quantity(windows.scale).items() if np.isfinite(value)}
     floors = Floors(noise, numerical, repeatability(recordings))
     on_progress("where it is wrong", 0.4)
     plain = residuals(score, [{}], everything, dt)[0]
@@ -99,6 +111,6 @@ def survey(
         parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
         search = Search(score, parts, settings, dt, rng, lambda what, share: None)
         search.listen()
-        silent = words.not_excited(search.signal)
+        silent = words.not_excited(search.signal, held=not ready.machine.base_probe)
     on_progress("done", 1.0)
-    return Survey((), floors, len(windows), excess(score.chi2(plain, everything)), where, silent)
+    return Survey((), floors, len(windows), excess(score.chi2(plain, everything)), where, silent, ready.warnings)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from go1exp.gap import box, judge
-from go1exp.gap.fit import Model, fit
+from go1exp.gap.evidence import inaudible
+from go1exp.gap.fit import fit
 from go1exp.gap.likelihood import Layout
 from go1exp.gap.replay import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
@@ -59,31 +59,30 @@ def advice(aliases: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def not_excited(signal: Mapping[str, float]) -> dict[str, str]:
-    """Return effects that these data cannot show, and the excitation that would."""
+def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str]:
+    """Return effects that these data cannot show, and the excitation that would; ``held``: the trunk is."""
     silent = [effect for effect, loud in signal.items() if loud < SILENT]
-    return {effect: RECORD.get(effect, "chirp") for effect in (*silent, *GROUND)}
+    return {effect: RECORD.get(effect, "chirp") for effect in (*silent, *(GROUND if held else ()))}
 
 
 def finish(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
-    """Fit once more, on all windows but those for the last check, and resample them.
+    """Fit once more, on all windows but those for the last check, and resample them; nothing to do without terms.
 
     Returns:
         The values, and by parameter of the terms their resampled values (B, J) or (B, 1).
     """
     scorer, machine = search.scorer, search.scorer.replayer.machine
+    if not search.terms:
+        return search.theta, {}
     fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
     own = search.linear(search.theta, fitted)
-    model = Model("", search.theta, frozenset(search.terms), ())
-    (best,) = fit(scorer, [model], own, 1, search.dt)
+    (best,) = fit(scorer, [search.model(search.theta)], own, 1, search.dt)
     assert best.chi2 is not None
     theta = best.theta
-    if not search.terms:
-        return theta, {}
     layout = Layout.of(machine, own.probes)
     grams = own.grams(scorer)
     grams = grams / np.maximum(best.chi2, 1.0)[..., None, None]
-    limits = box.bounds(layout, own.probes, search.theta, search.terms)
+    limits = box.bounds(layout, own.probes, search.theta, search.may)
     episode = scorer.windows.episode[fitted]
     drawn: dict[Key, list[np.ndarray]] = {}
     spread = 1.0 / np.sqrt(limits.weight)
@@ -102,7 +101,7 @@ def finish(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
 
 
 def name_terms(
-    search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], adequate: bool
+    search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], adequate: bool, mostly: bool
 ) -> tuple[NamedEffect, ...]:
     """Return what was found, with intervals; the joints are those where it leaves its tolerance beyond doubt."""
     joints = search.scorer.windows.joints
@@ -130,7 +129,7 @@ def name_terms(
             params[p.name] = {names[k]: float(value[k]) for k in kept}
             interval[p.name] = {names[k]: (float(min(low[k], value[k])), float(max(high[k], value[k]))) for k in kept}
         stable = search.shares.get(effect, 0.0) >= search.settings.certified
-        certified = stable and (adequate or number == 0)
+        certified = stable and (adequate or (number == 0 and mostly))
         status = "certified" if certified else "compensating"
         found.append(
             NamedEffect(effect, where, params, interval, search.aliases[effect], status)  # type: ignore[arg-type]
@@ -207,7 +206,7 @@ def sentence(
     rejected = [c.effect for c in search.candidates if c.status == "rejected" and c.stage == 1][:2]
     if named and rejected:
         parts.append(f"{' and '.join(rejected)} {'was' if len(rejected) == 1 else 'were'} considered and rejected.")
-    quiet = [effect for effect in silent if effect not in GROUND]
+    quiet = [effect for effect in silent if effect not in GROUND or effect in search.signal]
     if quiet:
         parts.append(f"These logs cannot show {', '.join(quiet)}.")
     return " ".join([*parts, *more])
@@ -215,14 +214,7 @@ def sentence(
 
 def evidence(search: Search) -> tuple[Candidate, ...]:
     """Return the candidates, best first, with those that the data cannot show."""
-    seen = {c.effect for c in search.candidates}
-    quiet = [
-        Candidate(
-            effect, (), {}, math.nan, 0.0, 1.0, 0.0, (effect,), "not excited", "twice its tolerance would not show"
-        )
-        for effect, loud in search.signal.items()
-        if loud < SILENT and effect not in seen
-    ]
+    quiet = inaudible(search.signal, SILENT, [c.effect for c in search.candidates])
     accepted = {c.effect for c in search.candidates if c.status == "accepted"} - set(search.terms)
     kept = [
         replace(c, status="rejected", reason="dropped: the other terms do as well without it")
@@ -231,4 +223,4 @@ def evidence(search: Search) -> tuple[Candidate, ...]:
         for c in search.candidates
     ]
     order = {"accepted": 0, "alias": 1, "rejected": 2}
-    return (*sorted(kept, key=lambda c: (c.stage, order[c.status], -c.log_gain)), *quiet)
+    return (*sorted(kept, key=lambda c: (c.stage, order[c.status])), *quiet)

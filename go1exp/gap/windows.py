@@ -15,7 +15,10 @@ PAST_S = 0.064
 """Commands before a window that are kept, s: the longest command delay that an effect may have, and a little."""
 
 FIT_S = 0.014
-"""Half width of the smoothing that gives a window's first state, s."""
+"""Half width of the smoothing that gives a window's first state, s, where samples are not too far apart for it."""
+
+FIT_SAMPLES = 2.2
+"""Least half width of that smoothing in samples."""
 
 START_SD = (1.0e-3, 0.1)
 """Least uncertainty of a window's first state, rad and rad/s (chosen: several times what smoothing leaves)."""
@@ -81,6 +84,16 @@ class Windows:
         return len(self.episode)
 
     @property
+    def of_joints(self) -> int:
+        """How many of the quantities, the first ones, are the joints'."""
+        return len(self.quantities)
+
+    @property
+    def base_sd(self) -> np.ndarray:
+        """(W, B) standard deviations of a free base's first state; B is 0 for one that is held."""
+        return np.empty((len(self), 0))
+
+    @property
     def channels(self) -> tuple[tuple[str, int, int], ...]:
         """Name, quantity and place of every reading."""
         return tuple((f"{q}_{j}", c, i) for c, q in enumerate(self.quantities) for i, j in enumerate(self.joints))
@@ -92,6 +105,10 @@ class Windows:
     def unknown(self, y: np.ndarray) -> list[np.ndarray]:
         """Return changes of the readings ``y`` (W, n, C, J) per standard deviation of what sensors may be off by."""
         return []
+
+    def loads(self) -> np.ndarray | None:
+        """Return which joints' legs carry weight (W, n, J) bool; None for a robot that is held."""
+        return None
 
 
 def even_clock(recording: Recording) -> np.ndarray:
@@ -142,9 +159,11 @@ def noise_of(series: Sequence[np.ndarray]) -> np.ndarray:
     return np.maximum(found, np.where(np.isfinite(step), step, 0.0) / np.sqrt(12.0)).clip(1e-9)
 
 
-def _start(t: np.ndarray, q: np.ndarray, qd: np.ndarray, at: float, sd: np.ndarray) -> tuple[np.ndarray, ...]:
+def _start(
+    t: np.ndarray, q: np.ndarray, qd: np.ndarray, at: float, sd: np.ndarray, half: float = FIT_S
+) -> tuple[np.ndarray, ...]:
     """Fit a cubic about an instant; return angle, speed, acceleration, and the misfit in units of noise (J,)."""
-    near = np.abs(t - at) <= FIT_S
+    near = np.abs(t - at) <= half
     x = t[near] - at
     one, zero = np.ones_like(x), np.zeros_like(x)
     angle, speed = np.stack([one, x, x**2, x**3], 1), np.stack([zero, one, 2 * x, 3 * x**2], 1)
@@ -182,7 +201,9 @@ def bridged(t: np.ndarray, target: np.ndarray, period: float) -> tuple[np.ndarra
 
 
 def cut(
-    recordings: Sequence[Recording], settings: GapSettings, doubt: Callable[[int, float], float] = lambda number, at: 0.0
+    recordings: Sequence[Recording],
+    settings: GapSettings,
+    doubt: Callable[[int, float], float] = lambda number, at: 0.0,
 ) -> Windows:
     """Cut recordings of one robot into windows.
 
@@ -195,20 +216,21 @@ def cut(
     sd = np.stack([noise(recordings, name) for name in quantities])
     clocks = [even_clock(r) for r in recordings]
     period = float(np.median([np.median(np.diff(t)) for t in clocks]))
+    half = max(FIT_S, FIT_SAMPLES * period)
     rows: list[dict[str, Any]] = []
     long = settings.burn_s + settings.window_s
     most = int(np.ceil(settings.window_s / period)) + 1
     for number, (r, t) in enumerate(zip(recordings, clocks, strict=True)):
         y = np.stack([r.joint(name) for name in quantities], axis=1)
         target = r.joint("q_target")
-        *asked, hidden = bridged(t, target, period)
+        stamps, asked, hidden = bridged(t, target, period)
         on = r.channels.get("torque_enable", np.ones(len(t), dtype=bool)).astype(bool)
         holes = np.concatenate([t[:-1][np.diff(t) > GAP * period], hidden])
         at = t[0] + PAST_S
         while at + settings.stride_s / 3 + long < t[-1]:
             tries = at + np.linspace(0.0, settings.stride_s / 3, 9)
             tries = t[np.searchsorted(t, tries)]
-            fits = [_start(t, y[:, 0], y[:, 1], float(s), sd) for s in tries]
+            fits = [_start(t, y[:, 0], y[:, 1], float(s), sd, half) for s in tries]
             misfits = [f[3].max() + doubt(number, float(s)) for f, s in zip(fits, tries, strict=True)]
             best = int(np.argmin(misfits))
             begin, (q, qd, qdd, misfit) = float(tries[best]), fits[best]
@@ -230,7 +252,7 @@ def cut(
                     "t": _padded(t[inside] - begin, most),
                     "y": _padded(y[inside], most),
                     "valid": _padded(np.ones(len(inside), dtype=bool), most),
-                    "edges": _since(begin, _changes(*asked, begin - PAST_S, begin + long)),
+                    "edges": _since(begin, _changes(stamps, asked, begin - PAST_S, begin + long)),
                     "switches": _since(begin, _changes(t, on, begin - PAST_S, begin + long)),
                 }
             )
@@ -260,6 +282,24 @@ def _padded(values: np.ndarray, rows: int) -> np.ndarray:
     missing = rows - len(values)
     fill = np.zeros_like(values[-1:]) if values.dtype == bool else values[-1:]
     return np.concatenate([values, np.repeat(fill, missing, axis=0)]) if missing else values
+
+
+def averaged(changes: tuple[np.ndarray, np.ndarray], times: np.ndarray) -> np.ndarray:
+    """Return the means (K, ...) of a held signal over the even steps that begin at ``times`` (K,).
+
+    That is second order in the step for changes between steps too, as the plant lets a change at the beginning of a
+    step count for half of it.
+    """
+    at, values = changes
+    place = (at - times[0]) / (times[1] - times[0])
+    index = np.searchsorted(place, np.arange(len(times)) + 1e-6, side="right") - 1
+    found = np.array(values[index.clip(0)], dtype=float)
+    step = np.floor(place + 1e-6).astype(int)
+    share = 1.0 - (place - step)
+    for k in np.flatnonzero((step >= 0) & (step < len(times)) & (place - step > 1e-6)):
+        if k:  # the first is in force from the beginning
+            found[step[k]] += share[k] * (values[k] - values[k - 1])
+    return found
 
 
 def held(changes: tuple[np.ndarray, np.ndarray], times: np.ndarray) -> np.ndarray:

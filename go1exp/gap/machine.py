@@ -1,0 +1,221 @@
+"""Robots that the gap workflow can replay: the hung Go1, and any chain of hinges on a fixed base from a config."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+
+import go1exp.actuator
+import go1exp.effects  # noqa: F401  (registers every effect)
+from go1exp import robot
+from go1exp.actuator.setup import Gains
+from go1exp.drive import DriveSetup
+from go1exp.env.plant import drive_setup
+from go1exp.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import build_model
+from go1exp.randomness import EnvRandom
+from go1exp.registry import ConfigError, Entry, Term, bind
+from go1exp.robot import RobotConfig
+from go1exp.terrain import TerrainConfig, build_terrain
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from go1exp.gap.models import ModelConfig
+
+NEEDLESS = 1 << 4 | 1 << 13
+"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
+
+
+class Machine(Protocol):
+    """A robot that can be replayed.
+
+    One that is not driven by the ideal PD law has ``drive() -> Term`` beside; one whose nominal parameters are known
+    worse or better than the effects declare has ``tolerances``, by (effect, parameter).
+    """
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints."""
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Joints that move together, equally many in each group; groups do not feel each other."""
+
+    @property
+    def base_probe(self) -> tuple[float, ...]:
+        """Changes of a free base's first state by which its influence is measured; empty for one that is held."""
+
+    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` held robots, and their drives."""
+
+
+@dataclass(frozen=True)
+class HungGo1:
+    """A Go1 whose trunk is held, so that its legs do not feel each other."""
+
+    config: RobotConfig
+    joints: tuple[str, ...] = robot.JOINTS
+    groups: tuple[tuple[int, ...], ...] = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
+    base_probe: tuple[float, ...] = ()
+
+    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` held robots, and their drives."""
+        w, x, y, z = base_quat
+        ground = build_terrain(TerrainConfig(kind="flat"))
+        model, blocks = build_model(self.config, ground, physics_dt, held=(w, x, y, z))
+        model.opt.disableflags |= NEEDLESS
+        backend = MujocoCpu(model, blocks, num, threads)
+        return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+
+
+def hung(config: RobotConfig) -> Machine:
+    """Return a Go1 whose trunk is held."""
+    return HungGo1(config)
+
+
+def machine_of(model: ModelConfig | None, config: RobotConfig, path: str = "model") -> Machine:
+    """Return the robot of a description; the Go1 ``config``, hung, where there is none.
+
+    Raises:
+        ConfigError: with what its MuJoCo file lacks, naming the key.
+    """
+    return hung(config) if model is None else FixedBase.of(model, path)
+
+
+# ---------------------------------------------------------------------- any other robot
+
+
+class TorqueDrive(Gains):
+    """A drive that makes the torque it is told: its target is a torque, N m, clipped at the peak. Gains do nothing."""
+
+    def __init__(self, setup: DriveSetup) -> None:
+        """Note the peak torque."""
+        self.kp, self.kd = setup.zeros(), setup.zeros()
+        self._limit = setup.effort_limit
+
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+        """Return the joint torques (N, J), N m."""
+        return torch.clamp(target, -self._limit, self._limit)
+
+    def reset(self, mask: Tensor) -> None:
+        """Nothing to forget."""
+
+
+@dataclass(frozen=True)
+class FixedBase:
+    """A robot of hinges on a fixed base.
+
+    Attributes:
+        config: its description.
+        joints: names, as recordings have them.
+        groups: numbers of the joints that move together.
+        effort: peak torque (J,), N m.
+        top_speed: (J,) rad/s.
+        tolerances: of nominal parameters, where they are not those that the effects declare.
+    """
+
+    config: ModelConfig
+    joints: tuple[str, ...]
+    groups: tuple[tuple[int, ...], ...]
+    effort: tuple[float, ...]
+    top_speed: tuple[float, ...]
+    tolerances: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    base_probe: tuple[float, ...] = ()
+
+    @staticmethod
+    def of(config: ModelConfig, path: str = "model") -> FixedBase:
+        """Check a description against its MuJoCo file.
+
+        Raises:
+            ConfigError: with every problem, each naming its key.
+        """
+        index = {name: k for k, name in enumerate(config.joints)}
+        groups = tuple(tuple(index[name] for name in group) for group in config.joint_groups)
+        effort, top = (tuple(float(v) for v in config.per_joint(name)) for name in ("torque_limit", "speed_limit"))
+        machine = FixedBase(config, config.joints, groups, effort, top, config.tolerance)
+        try:
+            model = machine.model(0.001, (1.0, 0.0, 0.0, 0.0))
+        except FixedBaseError as error:
+            raise ConfigError([f"{path}.{error}"]) from None
+        group_of = {k: g for g, members in enumerate(groups) for k in members}
+        for a in range(len(index)):
+            for b in range(a):
+                if group_of[a] != group_of[b] and feel_each_other(model, a, b):
+                    names = f"{config.joints[b]} and {config.joints[a]}"
+                    raise ConfigError([f"{path}.groups: {names} must be in one group, since one carries the other"])
+        return machine
+
+    def model(self, physics_dt: float, base_quat: Sequence[float]) -> Any:
+        """Return the compiled MuJoCo model."""
+        file, base = Path(self.config.mjcf), self.config.base
+        return build_fixed_base(file, base, self.joints, self.effort, physics_dt, base_quat, NEEDLESS)
+
+    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` robots, and their drives."""
+        from go1exp.physics.fixed_base import NO_SENSORS
+
+        backend = MujocoCpu(self.model(physics_dt, base_quat), NO_SENSORS, num, threads)
+        like = backend.qpos
+
+        def tensor(values: Sequence[float]) -> Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=like.dtype, device=like.device)
+
+        setup = DriveSetup(
+            num_envs=num,
+            physics_dt=physics_dt,
+            joints=self.joints,
+            effort_limit=tensor(self.effort),
+            velocity_limit=tensor(self.top_speed),
+            armature=backend.compiled("dof_armature"),
+            random=EnvRandom(0, num, device=like.device),
+            device=like.device,
+            dtype=like.dtype,
+            floating=False,
+        )
+        return backend, setup
+
+    def drive(self) -> Term:
+        """Return what turns commands into torques."""
+        if self.config.drive == "torque":
+            return Term("torque", Entry("actuator", "torque", TorqueDrive), {})
+        return pd()
+
+
+def pd() -> Term:
+    """Return the ideal PD law."""
+    term = bind("actuator", "pd", {}, "pd")[0]
+    assert term is not None
+    return term
+
+
+def drive_of(machine: Machine) -> Term:
+    """Return what turns a machine's commands into torques: the ideal PD law unless it says otherwise."""
+    own = getattr(machine, "drive", None)
+    return pd() if own is None else own()
+
+
+_TOLERANCES: ContextVar[Mapping[tuple[str, str], float]] = ContextVar("tolerances")
+
+
+@contextmanager
+def tolerances_of(machine: Machine) -> Iterator[None]:
+    """Let a machine's own tolerances count wherever one is asked for within the block (``gap/box.py``)."""
+    token = _TOLERANCES.set(getattr(machine, "tolerances", {}))
+    try:
+        yield
+    finally:
+        _TOLERANCES.reset(token)
+
+
+def tolerance(effect: str, parameter: str, declared: float) -> float:
+    """Return the tolerance of a parameter of the machine at hand, ``declared`` unless the machine has its own."""
+    return _TOLERANCES.get({}).get((effect, parameter), declared)

@@ -1,0 +1,402 @@
+"""Robots other than the Go1: their models against closed forms, what is made of their recordings, what is found."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from go1exp import data_root
+from go1exp.cli.files import choices_from_files
+from go1exp.compose import compose
+from go1exp.env.plant import Plant
+from go1exp.gap import box
+from go1exp.gap.explain import explain
+from go1exp.gap.machine import FixedBase, HungGo1, machine_of, tolerances_of
+from go1exp.gap.models import ModelConfig, parse_model
+from go1exp.gap.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, prepare, slope
+from go1exp.gap.result import GapSettings
+from go1exp.gap.windows import averaged
+from go1exp.importers import import_recordings
+from go1exp.recording import Meta, Recording, joint_channel
+from go1exp.registry import ConfigError, bind
+
+MODELS = sorted(f.stem for f in (data_root() / "conf/model").glob("*.yaml") if f.stem != "go1")
+DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+G = 9.81
+
+
+def description(name: str, **changes: Any) -> dict[str, Any]:
+    found = OmegaConf.to_container(OmegaConf.load(data_root() / f"conf/model/{name}.yaml"))
+    assert isinstance(found, dict)
+    return {**found, **changes}  # type: ignore[dict-item]
+
+
+def machine(name: str, **changes: Any) -> FixedBase:
+    config = parse_model(description(name, **changes))
+    assert isinstance(config, ModelConfig)
+    found = machine_of(config, None)  # type: ignore[arg-type]
+    assert isinstance(found, FixedBase)
+    return found
+
+
+def still(name: str, q: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Torques that hold a model at ``q``, and its inertia there."""
+    model = machine(name).model(0.001, LEVEL)
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, full, data.qM) if hasattr(data, "qM") else mujoco.mj_fullM(model, data, full)
+    return data.qfrc_bias.copy(), full
+
+
+# ---------------------------------------------------------------------- models
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_is_a_robot_of_its_joints(name: str) -> None:
+    found = machine(name)
+    model = found.model(0.001, LEVEL)
+    assert [model.joint(k).name for k in range(model.njnt)] == list(found.joints)
+    assert sorted(k for group in found.groups for k in group) == list(range(len(found.joints)))
+    assert all(model.body(joint).id > 0 for joint in (*found.joints, "trunk"))
+    backend, setup = found.build(2, 0.001, LEVEL, 1)
+    assert backend.qpos.shape == (2, len(found.joints))
+    assert torch.all(setup.effort_limit > 0)
+    assert not setup.floating
+
+
+def test_the_servo_pendulum_is_a_point_mass() -> None:
+    for q in (0.0, 0.7, -2.0):
+        torque, inertia = still("xl330_pendulum", q)
+        assert torque[0] == pytest.approx(0.49 * G * 0.1 * np.sin(q), abs=1e-9)
+        assert inertia[0, 0] == pytest.approx(0.49 * 0.1**2 + 0.005, abs=2e-6)  # and the mass's own 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "m1", "r1", "i1", "l1", "m2", "r2", "i2"),
+    [
+        ("ak80_double_pendulum_a", 0.608, 0.275, 0.0547, 0.3, 0.630, 0.166, 0.0252),
+        ("ak80_double_pendulum_c", 0.548, 0.2, 0.0242, 0.2, 0.598, 0.275, 0.0535),
+    ],
+)
+def test_the_double_pendulums_are_the_textbooks(
+    name: str, m1: float, r1: float, i1: float, l1: float, m2: float, r2: float, i2: float
+) -> None:
+    rotor = 6.1e-5 * 6**2
+    for q1, q2 in ((0.0, 0.0), (0.8, -1.3), (-2.0, 0.4)):
+        torque, inertia = still(name, (q1, q2))
+        low = m2 * r2 * G * np.sin(q1 + q2)
+        np.testing.assert_allclose(torque, [(m1 * r1 + m2 * l1) * G * np.sin(q1) + low, low], atol=1e-9)
+        cross = m2 * l1 * r2 * np.cos(q2)
+        expected = [[i1 + i2 + m2 * l1**2 + 2 * cross + rotor, i2 + cross], [i2 + cross, i2 + rotor]]
+        np.testing.assert_allclose(inertia, expected, atol=1e-7)
+
+
+def test_a_straight_leg_of_the_go2_hangs_like_a_plumb_line() -> None:
+    """About the thigh's axis only what lies before it pulls; about the hip's, what lies beside it."""
+    torque, _ = still("go2", np.zeros(12))
+    calf = (0.154, 0.00548), (0.04, 0.0)
+    pulls = 1.152 * -0.00374 + sum(m * x for m, x in calf)
+    np.testing.assert_allclose(torque[[1, 4, 7, 10]], -G * pulls, atol=1e-6)
+    left = 0.678 * 0.00194 + 1.152 * (0.0955 - 0.0223) + 0.154 * (0.0955 - 0.000975) + 0.04 * 0.0955
+    np.testing.assert_allclose(torque[[0, 3, 6, 9]], G * left * np.array([-1, 1, -1, 1]), atol=1e-6)
+
+
+def test_the_arm_is_held_up_by_its_servos() -> None:
+    torque, _ = still("so101", np.zeros(5))
+    wrist = 0.079 * 0.0386 + 0.099 * (0.0611 + 0.029)
+    elbow = 0.104 * 0.0981 + (0.079 + 0.099) * 0.1349 + wrist
+    pitch = elbow + (0.104 + 0.079 + 0.099) * 0.028 + 0.103 * 0.0084
+    np.testing.assert_allclose(torque[1:4], -G * np.array([pitch, elbow, wrist]), rtol=1e-6)
+    assert torque[0] == pytest.approx(0.0, abs=1e-9)
+    upright, _ = still("so101", (0.0, 0.0, -np.pi / 2, 0.0, 0.0))  # forearm up too
+    assert abs(upright[2]) < 0.05 * abs(torque[2])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"mjcf": "assets/nowhere.xml"}, "model.mjcf = "),
+        ({"mjcf": "assets/SOURCES.md"}, "not a MuJoCo model"),
+        ({"base": "table"}, "model.base = 'table': no body of"),
+        ({"joints": ["shoulder", "wrist"]}, "model.joints: 'wrist' is no hinge of"),
+        ({"joints": ["elbow", "shoulder"]}, "model.joints: must be in the order of"),
+        ({"groups": [["shoulder"], ["elbow"]]}, "model.groups: shoulder and elbow must be in one group"),
+        ({"groups": [["shoulder"]]}, "model.groups: must have every joint once"),
+        ({"torque_limit": {"elbow": 3.0}}, "model.torque_limit: gives shoulder no value"),
+        ({"torque_limit": 0.0}, "model.torque_limit = 0.0: every value must be at least"),
+        ({"kp": 3.0}, "model.drive = 'torque': takes no kp, kd or firmware"),
+        ({"drive": "voltage"}, "model.drive = 'voltage': "),
+        ({"masss": 1.0}, "model.masss: unknown key 'masss'"),
+        ({"tolerances": {"colomb": {"bound": 1.0}}}, "model.tolerances.colomb: unknown effect 'colomb'; did you mean"),
+        ({"tolerances": {"coulomb": {"bond": 1.0}}}, "model.tolerances.coulomb.bond: unknown parameter 'bond'"),
+        ({"tolerances": {"stribeck": {"speed": 1.0}}}, "model.tolerances.stribeck.speed: is a shape"),
+        ({"firmware": {"note": "gain", "kp": 1.0}, "drive": "position"}, "must have one group, the number"),
+    ],
+)
+def test_a_wrong_description_is_told_by_its_key(changes: Mapping[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        machine("ak80_double_pendulum_a", **changes)
+    assert said in str(error.value)
+    assert str(error.value).startswith("model.")
+
+
+def test_the_go1_is_the_model_without_a_file() -> None:
+    robot: Any = object()
+    assert machine_of(parse_model({"mjcf": None}), robot) == HungGo1(robot)
+    with pytest.raises(ConfigError, match=r"model.mjcf: is null, which is the Go1; base would do nothing"):
+        parse_model({"mjcf": None, "base": "trunk"})
+    with pytest.raises(ConfigError, match=r"model = 'go7': must be a choice"):
+        parse_model("go7")
+
+
+def test_a_users_own_file_names_its_model_from_where_it_lies(tmp_path: Path) -> None:
+    source = data_root() / "assets/xl330_pendulum/xl330_pendulum.xml"
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts/mine.xml").write_text(source.read_text())
+    own = {**description("xl330_pendulum"), "mjcf": "parts/mine.xml", "search": {"window_s": 0.7}}
+    OmegaConf.save(OmegaConf.create(own), tmp_path / "mine.yaml")
+    given = choices_from_files([f"model={tmp_path}/mine.yaml"])
+    container = compose("gap", given)
+    model = parse_model(container["model"])
+    assert model is not None
+    assert model.mjcf == str(tmp_path / "parts/mine.xml")
+    assert container["search"]["window_s"] == 0.7
+    assert compose("gap", [*given, "search.window_s=0.2"])["search"]["window_s"] == 0.2
+    assert compose("gap", [])["search"]["window_s"] == GapSettings().window_s
+    FixedBase.of(model)
+
+
+def test_a_machines_own_tolerances_count_while_it_is_at_hand() -> None:
+    key = ("base_tilt", "roll")
+    declared = box.param(key).tolerance
+    with tolerances_of(machine("go2")):
+        assert box.param(key).tolerance == 0.05
+        with tolerances_of(HungGo1(None)):  # type: ignore[arg-type]
+            assert box.param(key).tolerance == declared
+    assert box.param(key).tolerance == declared
+
+
+# ---------------------------------------------------------------------- recordings
+
+
+def recording(joints: tuple[str, ...], t: np.ndarray, channels: Mapping[str, np.ndarray], **about: Any) -> Recording:
+    usual: dict[str, Any] = {"robot": "servo_pendulum_xl330", "rate_hz": 1 / float(np.median(np.diff(t)))}
+    usual |= {"base": "fixed", "base_quat": LEVEL, "kp": None, "kd": None, "tau_limit": None, "excitation": "sine"}
+    usual |= {"episode": "one", "repeat_of": None, "source": "measured", "tool": "test", "versions": {}, "notes": ""}
+    columns = {"t": t} | {
+        joint_channel(k, j): v[:, i].copy() for k, v in channels.items() for i, j in enumerate(joints)
+    }
+    return Recording(Meta(joints=joints, **(usual | about)), columns)
+
+
+def servo(episode: str = "one", seconds: float = 6.0, **about: Any) -> Recording:
+    t = np.arange(0.0, seconds, 0.005)
+    q = np.stack([np.sin(4 * t) + 1e-3 * np.random.default_rng(1).standard_normal(len(t))], 1)
+    qd = np.stack([4 * np.cos(4 * t)], 1)
+    about = {"notes": "Position gain 200 in the firmware's own unit", "episode": episode} | about
+    return recording(("pendulum",), t, {"q": q, "qd": qd, "q_target": q + 0.3 * np.cos(3 * t)[:, None]}, **about)
+
+
+def test_gains_come_from_the_recording_else_from_its_notes_else_from_the_model() -> None:
+    xl330 = machine("xl330_pendulum")
+    ready = prepare([servo(), servo("two", kp=(1.5,), kd=(0.1,))], xl330, GapSettings())
+    assert ready.flaws == ()
+    assert [(r.meta.kp, r.meta.kd) for r in ready.recordings] == [((0.0019 * 200,), (0.048,)), ((1.5,), (0.1,))]
+    assert any("guess: kp 0.38 1.5, kd 0.048 0.1" in line for line in ready.warnings)
+    without = machine("xl330_pendulum", firmware=None)
+    assert "says no gains" in prepare([servo()], without, GapSettings()).flaws[0]
+    assert "is of the robot 'go2'" in prepare([servo(robot="go2")], xl330, GapSettings()).flaws[0]
+
+
+def test_a_speed_that_disagrees_with_the_angle_is_not_compared() -> None:
+    xl330 = machine("xl330_pendulum")
+    good, bad = servo(), servo("two")
+    assert prepare([good], xl330, GapSettings()).ignored == ()
+    bad.channels["qd_pendulum"] *= 1.15
+    ready = prepare([good, bad], xl330, GapSettings())
+    assert ready.ignored == ("qd",)
+    assert "times the change of q_pendulum" in ready.warnings[0]
+    windows = ready.windows()
+    assert np.all(np.isinf(windows.scale[:, 1]))
+    assert np.all(np.isfinite(windows.scale[:, 0]))
+    lacking = Recording(good.meta, {k: v for k, v in good.channels.items() if k != "qd_pendulum"})
+    ready = prepare([lacking], xl330, GapSettings())
+    assert "1 of 1 recordings have none" in ready.warnings[0]
+    np.testing.assert_allclose(ready.recordings[0].joint("qd")[5:-5], good.joint("qd")[5:-5], atol=0.8)
+
+
+def test_one_bad_recording_of_many_is_left_out_and_said() -> None:
+    xl330 = machine("xl330_pendulum")
+    many = [servo(f"e{k}") for k in range(4)]
+    ready = prepare([*many, servo("strange", robot="other")], xl330, GapSettings())
+    assert [r.meta.episode for r in ready.recordings] == ["e0", "e1", "e2", "e3"]
+    assert any(line.startswith("Left out: strange: is of the robot 'other'") for line in ready.warnings)
+    half = [servo("x", robot="other"), servo("y", robot="other")]
+    assert len(prepare([many[0], *half], xl330, GapSettings()).flaws) == 2
+
+
+def test_hours_of_recordings_cost_no_more_than_minutes() -> None:
+    ready = prepare([servo(seconds=200.0)], machine("xl330_pendulum"), GapSettings())
+    assert ready.settings.stride_s == pytest.approx(200.0 / MOST_WINDOWS, rel=0.01)
+    assert any("s in every" in line for line in ready.warnings)
+    assert len(ready.windows()) <= MOST_WINDOWS
+
+
+def test_a_slope_is_that_of_a_parabola() -> None:
+    t = np.array([0.0, 0.011, 0.019, 0.03, 0.041, 0.052, 0.058])
+    np.testing.assert_allclose(slope(t, 3.0 * t), 3.0)
+    assert np.all(slope(t[:2], t[:2]) == 0.0)
+
+
+def test_a_clock_is_rebuilt_from_speeds() -> None:
+    rng = np.random.default_rng(0)
+    true = np.cumsum(rng.uniform(0.003, 0.006, 3000))
+    phase = np.array([0.0, 1.0, 2.5, 4.0])
+    q, qd = np.sin(9 * true[:, None] + phase), 9 * np.cos(9 * true[:, None] + phase)
+    rows = 0.005 * np.arange(len(true))
+    found = clock_of_speeds(rows, q, qd)
+    np.testing.assert_allclose(np.diff(found), np.diff(true), rtol=0.02)
+    assert np.std(np.diff(rows) - np.diff(true)) > 20 * np.std(np.diff(found) - np.diff(true))
+    np.testing.assert_allclose(clock_of_speeds(rows, 0 * q, 0 * qd), rows)  # at rest only the rows tell
+
+
+def test_noise_of_uneven_samples_is_that_about_the_motion() -> None:
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.003, 0.006, 3000))
+    q = np.sin(9 * t)[:, None] + 2e-3 * rng.standard_normal((3000, 1))
+    assert noise_in_time([recording(("pendulum",), t, {"q": q})])[0] == pytest.approx(2e-3, rel=0.1)
+
+
+def test_a_held_signal_is_averaged_over_steps() -> None:
+    rng = np.random.default_rng(0)
+    at = np.concatenate([[-0.01], np.sort(rng.uniform(0.0, 0.1, 15))])
+    values, times = rng.standard_normal((16, 2)), 0.001 * np.arange(100)
+    found = averaged((at, values), times)
+
+    def area(x: np.ndarray) -> np.ndarray:  # under the signal up to x
+        ends = np.append(at[1:], np.inf)
+        return np.clip(np.minimum(x[:, None], ends) - at, 0.0, None) @ values
+
+    np.testing.assert_allclose(found, (area(times + 0.001) - area(times)) / 0.001, atol=1e-9)
+
+
+# ---------------------------------------------------------------------- what is found
+
+
+def played(robot: FixedBase, effects: Mapping[str, Mapping[str, Any]], target: np.ndarray, every: int) -> np.ndarray:
+    """Play targets (K, J), one per 0.5 ms step, on the model with effects; return angles at every so many steps."""
+    backend, setup = robot.build(1, 0.0005, LEVEL, 1)
+    terms = [bind("effect", name, dict(values), name)[0] for name, values in effects.items()]
+    plant = Plant(backend, setup, robot.drive(), [term for term in terms if term])
+    if robot.config.drive == "position":
+        plant.set_gains(torch.full((1, 1), 3.0).double(), torch.full((1, 1), 0.05).double())
+    plant.startup()
+    everyone = torch.ones(1, dtype=torch.bool)
+    backend.reset(everyone, torch.zeros_like(backend.qpos), torch.zeros_like(backend.qvel))
+    plant.reset(everyone, torch.as_tensor(target[:1]))
+    found = []
+    for k, row in enumerate(target):
+        if k % every == 0:
+            found.append(plant.q[0].numpy().copy())
+        plant.step(torch.as_tensor(row[None]))
+    return np.array(found)
+
+
+QUICK = GapSettings(
+    window_s=0.25,
+    stride_s=0.3,
+    effects=("coulomb", "stribeck"),
+    shortlist=2,
+    iterations=2,
+    max_terms=1,
+    bags=20,
+    overlays=1,
+    threads=1,
+)
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only some of the nominal parameters may vary, so that a replay has ten variants and not forty."""
+    monkeypatch.setattr(box, "BOX", ("strength", "coulomb", "viscous", "link_mass", "base_tilt"))
+
+
+@pytest.mark.usefixtures("few")
+def test_friction_hidden_in_a_servo_is_named() -> None:
+    robot = machine("xl330_pendulum", tolerances={})
+    steps, logs = np.arange(0.0, 6.0, 0.0005), []
+    for n, speed in enumerate((3.0, 5.0, 8.0)):
+        target = (0.8 * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
+        q = played(robot, {"coulomb": {"bound": 0.12}}, target, 10)
+        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
+        logs.append(recording(("pendulum",), steps[::10], {"q": q, "q_target": target[::10]}, kp=(3.0,), kd=(0.05,)))
+    logs = [dataclasses.replace(r, meta=dataclasses.replace(r.meta, episode=f"e{n}")) for n, r in enumerate(logs)]
+    result = explain(logs, robot, QUICK)
+    assert [n.effect for n in result.named] == ["coulomb"], result.sentence
+    assert result.named[0].params["bound"]["pendulum"] == pytest.approx(0.12, abs=0.01)
+    assert result.box["base_tilt"]["pitch"].keys() == {"robot"}
+    assert any("Speeds are not compared" in line for line in result.warnings)
+
+
+@pytest.mark.usefixtures("few")
+def test_friction_hidden_in_a_double_pendulum_of_torque_drives_is_named() -> None:
+    robot = machine("ak80_double_pendulum_a", tolerances={})
+    steps, logs, joints = np.arange(0.0, 4.0, 0.0005), [], ("shoulder", "elbow")
+    for n, speed in enumerate((3.0, 4.0, 6.0)):
+        torque = np.stack([0.9 * np.sin(speed * steps), 0.5 * np.sin(1.7 * speed * steps)], 1)
+        q = played(robot, {"coulomb": {"bound": {"elbow": 0.15}}}, torque, 4)
+        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
+        about = {"robot": "ak80_double_pendulum_a", "episode": f"e{n}"}
+        logs.append(recording(joints, steps[::4], {"q": q, "tau_cmd": torque[::4]}, **about))
+    result = explain(logs, robot, QUICK)
+    assert [n.effect for n in result.named] == ["coulomb"], result.sentence
+    assert result.named[0].joints == ("elbow",)
+    assert result.named[0].params["bound"]["elbow"] == pytest.approx(0.15, abs=0.015)
+
+
+@pytest.mark.parametrize(
+    ("source", "folder", "name"),
+    [
+        ("go2_in_air", "go2_in_air", "go2"),
+        ("ak80_double_pendulum", "ak80_double_pendulum/design_A_0", "ak80_double_pendulum_a"),
+        ("ak80_double_pendulum", "ak80_double_pendulum/design_C_0", "ak80_double_pendulum_c"),
+        ("servo_pendulum_xl330", "servo_pendulum_xl330", "xl330_pendulum"),
+        ("so101_arm", "so101_arm/step_response.npz", "so101"),
+    ],
+)
+def test_real_recordings_can_be_compared(source: str, folder: str, name: str) -> None:
+    if not (DATA / folder).exists():
+        pytest.skip(f"{folder}: real recordings are not here (GO1EXP_DATA)")
+    robot = machine(name)
+    logs = import_recordings(source, DATA / folder, {})[:4]
+    defaults = {k: v for k, v in dataclasses.asdict(robot.config.search).items() if v is not None}
+    ready = prepare(logs, robot, GapSettings(**defaults))
+    assert ready.flaws == ()
+    assert ready.ignored == ("qd",)
+    windows = ready.windows()
+    assert len(windows) >= 20
+    assert np.all(np.isfinite(windows.scale[:, 0]))
+
+
+def test_the_go2s_rows_are_closer_than_its_file_says() -> None:
+    """The clock that hips and thighs tell fits the calves, which had no part in it."""
+    if not (DATA / "go2_in_air").exists():
+        pytest.skip("go2_in_air: real recordings are not here (GO1EXP_DATA)")
+    (log,) = import_recordings("go2_in_air", DATA / "go2_in_air", {})
+    tell = np.array([not j.endswith("calf") for j in log.meta.joints])
+    found = clock_of_speeds(log.t, log.joint("q")[:, tell], log.joint("qd")[:, tell])
+    assert len(found) / (found[-1] - found[0]) == pytest.approx(226.0, abs=4.0)
+    calves = noise_in_time([Recording(log.meta, {**log.channels, "t": found})])[~tell]
+    assert np.all(calves < 0.85 * noise_in_time([log])[~tell])

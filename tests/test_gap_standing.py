@@ -1,0 +1,228 @@
+"""``go1exp.gap`` on a robot on its feet: the first state and the IMU against the truth, a null, a payload."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import go1exp.excitations  # noqa: F401  (registers every excitation)
+from go1exp.cli.record import RIG
+from go1exp.cli.settings import RecordSettings, parse
+from go1exp.compose import compose
+from go1exp.config import parse_parts
+from go1exp.gap import alone
+from go1exp.gap.base_state import AGREE, Base, Log, base_state
+from go1exp.gap.explain import explain
+from go1exp.gap.first_state import settled
+from go1exp.gap.fit import residuals
+from go1exp.gap.judge import splits
+from go1exp.gap.likelihood import Scorer
+from go1exp.gap.localise import ON_FEET, REGIMES, localise
+from go1exp.gap.machine import HungGo1
+from go1exp.gap.prepare import prepare
+from go1exp.gap.replay import Probe, Replayer, variants
+from go1exp.gap.result import GapSettings
+from go1exp.gap.search import Search
+from go1exp.gap.standing import StandingGo1, StandingReplayer, StandingWindows, on_feet
+from go1exp.gap.trial import excess
+from go1exp.physics.legs import Legs
+from go1exp.physics.scene import build_model
+from go1exp.record import plan, simulate
+from go1exp.recording import VECTORS, Recording
+from go1exp.registry import bind
+from go1exp.robot import RobotConfig
+from go1exp.terrain import TerrainConfig, build_terrain
+
+QUICK = GapSettings(window_s=0.1, stride_s=0.25, physics_dt=0.002, bags=20, overlays=0)
+
+
+@cache
+def recorded(*overrides: str) -> tuple[RobotConfig, tuple[Recording, ...]]:
+    """Record a Go1 on the ground for 2 s a motion."""
+    container = compose(
+        "record",
+        ["backend.threads=1", "support=ground", "gains=[[35,0.6]]", "seconds=2.0", "sensors.truth=true", *overrides],
+    )
+    parts, problems = parse_parts(container, RIG)
+    assert problems == []
+    terms = [bind("excitation", name, {}, name)[0] for name in container["excitation"]]
+    settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*RIG, "excitation")})
+    rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
+    episodes = plan.episodes([t for t in terms if t], settings)
+    found = simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None)
+    return rig.robot, tuple(found)
+
+
+def truth(recording: Recording) -> np.ndarray:
+    """Return the bases (T, 13) of a recording that has them, as ``StandingWindows.base`` has them."""
+    names = (VECTORS[name] for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel"))
+    return np.concatenate([recording.block(*columns) for columns in names], axis=1)
+
+
+def errors(config: RobotConfig, recording: Recording) -> tuple[np.ndarray, list[Base]]:
+    """Return by how much estimates miss height, roll, pitch, velocity and rate (K, 9), and the estimates."""
+    legs, log, true = Legs(config), Log.of(recording), truth(recording)
+    found, bases = [], []
+    for row in range(40, len(log.t) - 40, 31):
+        base = base_state(legs, log, float(log.t[row]))
+        bases.append(base)
+        if base.spread < AGREE:
+            was, now = (Rotation.from_quat(x[3:7], scalar_first=True) for x in (true[row], base.state))
+            turn = (was.inv() * now).as_rotvec()[:2]
+            found.append([base.state[2] - true[row, 2], *turn, *(base.state[7:] - true[row, 7:])])
+    return np.array(found), bases
+
+
+def test_a_squatting_base_is_where_legs_and_imu_say() -> None:
+    config, (squat, *_) = recorded("excitation=[squat,gait]")
+    missed, bases = errors(config, squat)
+    assert len(missed) > 25
+    assert all(base.loaded.all() for base in bases)
+    miss = np.sqrt(np.mean(missed**2, axis=0))
+    assert miss[0] < 5e-4
+    assert miss[1:3].max() < 1e-3
+    assert miss[3:6].max() < 5e-3
+    assert miss[6:].max() < 6e-3
+
+
+def test_a_walking_base_is_estimated_where_two_feet_agree_and_nowhere_else() -> None:
+    config, (_, gait) = recorded("excitation=[squat,gait]")
+    missed, bases = errors(config, gait)
+    assert 10 < len(missed) < len(bases)
+    assert all(base.spread == np.inf for base in bases if base.loaded.sum() < 2)
+    middle = np.median(np.abs(missed), axis=0)
+    assert middle[0] < 1.5e-3
+    assert middle[3:6].max() < 0.06
+
+
+def ready(config: RobotConfig, recordings: tuple[Recording, ...]) -> tuple[StandingReplayer, float]:
+    """Return the replayer of ``QUICK`` windows, and its step."""
+    done = prepare(recordings, HungGo1(config), QUICK)
+    windows = done.windows()
+    assert isinstance(windows, StandingWindows)
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(windows), 1))
+    return StandingReplayer(done.machine, windows, level, 512, 1), float(windows.period)
+
+
+def test_the_replayed_imu_says_what_the_engine_s_own_sensors_say() -> None:
+    config, recordings = recorded("excitation=[squat,gait]")
+    replayer, dt = ready(config, recordings)
+    windows = replayer.windows
+    assert isinstance(windows, StandingWindows)
+    everything = np.arange(len(windows))
+    ours = replayer.run(variants(replayer.machine, {}, everything, []), dt)[:, :, 2, :6]
+    backend = next(iter(replayer._backends.values()))[0]
+    model, blocks = build_model(config, build_terrain(TerrainConfig(kind="flat")), dt, imu=True)
+    data = mujoco.MjData(model)
+    last = len(everything) - 1
+    data.qpos[:], data.qvel[:] = backend.qpos[last].numpy(), backend.qvel[last].numpy()
+    mujoco.mj_forward(model, data)
+    speed = torch.as_tensor(data.qvel.copy())
+    mujoco.mj_step(model, data)
+    change = (data.qvel - speed.numpy()) / dt
+    rotation = Rotation.from_quat(backend.qpos[last, 3:7].numpy(), scalar_first=True)
+    rate = data.sensordata[blocks.imu_gyro]
+    site = windows.imu_site
+    force = rotation.inv().apply(change[:3] + np.array([0.0, 0.0, 9.81])) + np.cross(change[3:6], site)
+    force += np.cross(rate, np.cross(rate, site))
+    np.testing.assert_allclose(force, data.sensordata[blocks.imu_acc], rtol=1e-6, atol=1e-6)
+    measured = windows.y[:, :, 2, :6]
+    calm = windows.episode == 0  # the squat
+    assert np.abs(ours - measured)[calm, :, :3].max() < 0.1
+    assert np.sqrt(np.mean((ours - measured)[calm, :, 3:] ** 2)) < 0.2
+
+
+@cache
+def scored() -> tuple[Scorer, np.ndarray]:
+    """Return the scorer of a robot as the model has it, and its residuals."""
+    replayer, dt = ready(*recorded("excitation=[squat,gait]"))
+    score, _ = settled(replayer, dt, 0.00015)
+    return score, residuals(score, [{}], np.arange(len(score.windows)), dt)[0]
+
+
+def test_a_robot_like_the_model_scores_the_floor_squatting_and_walking() -> None:
+    score, residual = scored()
+    chi2 = score.chi2(residual, np.arange(len(score.windows)))[:, 0]
+    squat = score.windows.episode == 0
+    assert chi2[squat].mean() == pytest.approx(1.0, abs=0.15)
+    assert np.median(chi2[~squat]) < 1.3
+    assert not np.isnan(chi2).any()
+
+
+def test_regimes_of_the_ground_follow_the_feet() -> None:
+    score, residual = scored()
+    everything = np.arange(len(score.windows))
+    found = localise(score, residual, everything, np.random.default_rng(0))
+    assert found.regimes == (*REGIMES, *ON_FEET)
+    stance, swing, impact = (found.samples[:, found.regimes.index(name)] for name in ON_FEET)
+    assert (stance > swing).all()
+    assert (swing > 0).all()
+    assert (impact > 0).all()
+    assert (stance + swing == score.windows.valid.sum()).all()
+
+
+def test_hung_windows_among_standing_ones_are_replayed_as_by_themselves() -> None:
+    config, recordings = recorded("excitation=[squat,gait]")
+    _, hung = recorded("excitation=[chirp]", "support=hung")
+    assert isinstance(on_feet(HungGo1(config), (*recordings, *hung)), StandingGo1)
+    assert isinstance(on_feet(HungGo1(config), hung), HungGo1)
+    replayer, dt = ready(config, (*recordings, *hung))
+    windows = replayer.windows
+    assert isinstance(windows, StandingWindows)
+    held = np.flatnonzero(windows.held)
+    assert set(windows.episode[held]) == {len(recordings)}
+    assert np.isinf(windows.scale[held, 2]).all()
+    probes = [Probe(("coulomb", "bound"), 1, np.full(12, 0.2))]
+    found = replayer.run(variants(replayer.machine, {}, held, probes), dt)
+    alone = Replayer(HungGo1(config), windows.plain(), replayer.quats, 512, 1)
+    expected = alone.run(variants(alone.machine, {}, held, []), dt)
+    np.testing.assert_allclose(found[::2, :, :2], expected, atol=1e-12)
+    assert np.abs(found[1::2] - found[::2]).max() > 1e-3
+    assert not found[:, :, 2].any()
+
+
+def test_a_recording_without_an_imu_says_so() -> None:
+    config, (squat, *_) = recorded("excitation=[squat,gait]")
+    gone = set(VECTORS["imu_acc"])
+    deaf = Recording(squat.meta, {k: v for k, v in squat.channels.items() if k not in gone})
+    found = explain([deaf], config, QUICK)
+    assert found.verdict == "bad log"
+    assert "no imu_acc" in found.sentence
+
+
+def search_in(*overrides: str) -> Search:
+    """Return a search that has not begun, in a squatting and falling robot's recordings."""
+    config, recordings = recorded("excitation=[squat,drop]", "seeds=[0,1]", *overrides)
+    replayer, dt = ready(config, recordings)
+    score, _ = settled(replayer, dt, 0.00015)
+    rng = np.random.default_rng(0)
+    parts = splits([r.meta for r in recordings], score.windows.episode, 0.2, rng)
+    return Search(score, parts, QUICK, dt, rng, lambda what, share: None)
+
+
+def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it() -> None:
+    search = search_in("+effect.payload.mass=1.0")
+    plain = excess(search.held_out({}))
+    found = alone.cause(search)
+    assert found is not None
+    assert found.name == "payload"
+    assert found.theta["payload", "mass"].item() == pytest.approx(1.0, abs=0.1)
+    assert [(c.effect, c.status) for c in search.candidates] == [("payload", "accepted")]
+    assert plain > 1.0
+    assert search.candidates[0].excess_after < 0.1 * plain
+
+
+def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
+    search = search_in()
+    assert alone.cause(search) is None
+    assert search.candidates == []
+    assert excess(search.held_out({})) < search.settings.material
+
+
+def test_drives_that_are_all_a_little_weak_are_no_payload() -> None:
+    assert alone.cause(search_in("+effect.strength.scale=0.93")) is None
