@@ -38,7 +38,7 @@ G = 9.81
 def description(name: str, **changes: Any) -> dict[str, Any]:
     found = OmegaConf.to_container(OmegaConf.load(data_root() / f"conf/model/{name}.yaml"))
     assert isinstance(found, dict)
-    return {**found, **changes}  # type: ignore[dict-item]
+    return {**found, **changes}
 
 
 def machine(name: str, **changes: Any) -> FixedBase:
