@@ -21,6 +21,7 @@ class Armature(Effect):
     ``strength`` wherever inertia rules, and ``link_inertia`` but for the coupling between joints.
     """
 
+    title = "rotor inertia"
     params = (Param("added", "kg m2", -0.01, 0.05, 0.0, 0.001, "joint", "inertia about the joint's axis"),)
     fields = ("dof_armature",)
     added: Tensor

@@ -25,6 +25,7 @@ class AsymmetricFriction(Effect):
     ``encoder_offset`` in one pose. Differences of up to 0.6 N m are likely (a judgement).
     """
 
+    title = "dry friction that depends on direction"
     params = (
         Param("forward", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "further friction while the angle grows"),
         Param("backward", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "further friction while the angle falls"),

@@ -21,6 +21,7 @@ class Backlash(Effect):
     rest; within the gap the joint has lost its rotor, which ``armature`` mimics in part.
     """
 
+    title = "play in the gears"
     params = (Param("gap", "rad", 0.0, 0.1, 0.0, 0.001, "joint", "free angle from flank to flank"),)
     gap: Tensor
 

@@ -93,14 +93,16 @@ class Gears:
 class Effect(Memory):
     """Base of all effects.
 
-    A subclass lists its ``params``, annotates one attribute for each, and overrides the hooks that it needs and no
-    others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
+    A subclass has a ``title``, lists its ``params``, annotates one attribute for each, and overrides the hooks that it
+    needs and no others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
     ``on_target``, ``on_encoder``, the actuator, ``on_drive``, ``on_transmission``, ``on_gears``, then ``on_joint``,
     ``on_friction`` and ``on_base`` beside it.
     """
 
+    title: ClassVar[str] = ""
+    """What it is, as the object of a sentence: "the model lacks ..."."""
     params: ClassVar[tuple[Param, ...]] = ()
     fields: ClassVar[tuple[str, ...]] = ()
     """Model fields that ``edit_model`` writes."""

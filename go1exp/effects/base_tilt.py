@@ -34,6 +34,7 @@ class BaseTilt(Effect):
     looks like an ``encoder_offset`` in one pose, and every leg feels the same; two orientations of the trunk tell.
     """
 
+    title = "a tilt of the trunk"
     params = (
         Param("roll", "rad", -0.2, 0.2, 0.0, 0.0087, "robot", "left side up"),
         Param("pitch", "rad", -0.2, 0.2, 0.0, 0.0087, "robot", "nose down"),

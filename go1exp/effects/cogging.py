@@ -24,6 +24,7 @@ class Cogging(Effect):
     angle show it as ``coulomb``. A step must not skip a period: count times speed times step should stay below 1.
     """
 
+    title = "cogging torque"
     params = (
         Param("amplitude", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "largest torque"),
         Param("count", "-", 1.0, 150.0, 38.0, math.inf, "joint", "periods per turn of the joint"),

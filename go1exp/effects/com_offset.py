@@ -22,6 +22,7 @@ class ComOffset(Effect):
     the paper, 25 mm). A held trunk shows none of it. Standing, it looks like ``base_tilt`` or a ``payload``.
     """
 
+    title = "a shift of the trunk's centre of mass"
     params = (
         Param("x", "m", -0.1, 0.1, 0.0, 0.005, "robot", "shift forward"),
         Param("y", "m", -0.1, 0.1, 0.0, 0.005, "robot", "shift to the left"),

@@ -21,6 +21,7 @@ class CommandDelay(Delayed):
     shift between them as a delay; in a narrow band so do ``kp_scale`` and armature.
     """
 
+    title = "a delay of commands"
     params = (Param("delay", "s", 0.0, 0.06, 0.0, 0.001, "joint", "age of the target"),)
 
     def on_target(self, target: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ class Coulomb(Effect):
     ``Plant.refresh`` on.
     """
 
+    title = "dry friction"
     params = (Param("bound", "N m", 0.0, 3.0, 0.0, 0.05, "joint", "friction torque"),)
     fields = ("dof_frictionloss",)
     bound: Tensor

@@ -19,6 +19,7 @@ class EncoderOffset(Effect):
     In one pose it cannot be told from a tilted trunk, a shifted centre of mass or a constant torque of kp offset.
     """
 
+    title = "a zero error of the encoders"
     params = (Param("offset", "rad", -0.15, 0.15, 0.0, 0.003, "joint", "reading at true zero"),)
     order = 10  # after the transmission: the encoder reads the motor's side
     offset: Tensor

@@ -22,6 +22,7 @@ class ExternalWrench(Effect):
     ``base_tilt``.
     """
 
+    title = "an external force or torque"
     params = (
         Param("x", "N", -50.0, 50.0, 0.0, 1.0, "robot", "force along the world's x"),
         Param("y", "N", -50.0, 50.0, 0.0, 1.0, "robot", "along y"),

@@ -24,6 +24,7 @@ class Flexibility(Effect):
     shakes the rotor.
     """
 
+    title = "compliance of the gears"
     params = (
         Param("compliance", "rad/(N m)", 0.0, 0.02, 0.0, 5e-4, "joint", "twist per torque"),
         Param("damping", "-", 0.02, 1.0, 0.05, math.inf, "joint", "damping ratio of the rotor on this spring"),

@@ -24,6 +24,7 @@ class FootFriction(Effect):
     this; with ``set`` it replaces this. It shows while a foot slips only, and resembles a slope of the ground.
     """
 
+    title = "a change of foot friction"
     params = (Param("scale", "-", 0.1, 2.5, 1.0, 0.1, "robot", "friction over the model's"),)
     fields = ("geom_friction",)
     scale: Tensor

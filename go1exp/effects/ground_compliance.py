@@ -29,6 +29,7 @@ class GroundCompliance(Effect):
     MuJoCo raises it to that. It shows at touch-down and in the height of the stance, like a foot of another radius.
     """
 
+    title = "compliance of the ground"
     params = (Param("time_constant", "s", 0.004, 0.1, NULL, 0.003, "robot", "of the contact's spring-damper"),)
     fields = ("geom_solref",)
     time_constant: Tensor

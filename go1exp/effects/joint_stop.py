@@ -26,6 +26,7 @@ class JointStop(Effect):
     too. Below twice the physics step MuJoCo raises it to that.
     """
 
+    title = "softness of the joint stops"
     params = (Param("time_constant", "s", 0.004, 0.2, NULL, 0.003, "joint", "of the stop's spring-damper"),)
     fields = ("jnt_solref",)
     time_constant: Tensor

@@ -20,6 +20,7 @@ class KdScale(Effect):
     kd. New values count from ``Plant.refresh`` on.
     """
 
+    title = "a change of the speed gain"
     params = (Param("scale", "-", 0.0, 3.0, 1.0, 0.15, "joint", "real gain over configured gain"),)
     scale: Tensor
 

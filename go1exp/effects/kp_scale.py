@@ -19,6 +19,7 @@ class KpScale(Effect):
     ``strength``, in a narrow band not from ``command_delay``. New values count from ``Plant.refresh`` on.
     """
 
+    title = "a change of the position gain"
     params = (Param("scale", "-", 0.2, 2.0, 1.0, 0.1, "joint", "real gain over configured gain"),)
     scale: Tensor
 

@@ -25,6 +25,7 @@ class Lag(Effect):
     ``torque_delay``; fast chirps, which it damps and a delay does not, tell them apart. An episode begins settled.
     """
 
+    title = "a lag of torque"
     params = (Param("time", "s", 0.0, 0.05, 0.0, 0.001, "joint", "time constant"),)
     memory = ("_made", "_asked", "_fresh")
     order = 40

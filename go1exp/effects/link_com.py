@@ -21,6 +21,7 @@ class LinkCom(Effect):
     ``encoder_offset`` or of ``base_tilt``.
     """
 
+    title = "a shift of link mass"
     params = (Param("along", "m", -0.05, 0.05, 0.0, 0.002, "joint", "shift away from the trunk"),)
     fields = ("body_ipos",)
     along: Tensor

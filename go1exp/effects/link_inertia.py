@@ -20,6 +20,7 @@ class LinkInertia(Effect):
     at fast motion only, like ``armature``, from which the coupling between joints tells it.
     """
 
+    title = "a change of link inertia"
     params = (Param("scale", "-", 0.5, 2.0, 1.0, 0.1, "joint", "inertia over the model's"),)
     fields = ("body_inertia",)
     scale: Tensor

@@ -20,6 +20,7 @@ class LinkMass(Effect):
     pose the torque of gravity is also that of ``link_com``; ``strength`` scales it the other way round.
     """
 
+    title = "a change of link mass"
     params = (Param("scale", "-", 0.5, 2.0, 1.0, 0.05, "joint", "mass over the model's"),)
     fields = ("body_mass", "body_inertia")
     scale: Tensor

@@ -23,6 +23,7 @@ class LoadFriction(Effect):
     resembles ``strength`` and ``kp_scale``.
     """
 
+    title = "friction that grows with load"
     params = (Param("coefficient", "-", 0.0, 0.5, 0.0, 0.01, "joint", "friction per torque of the drive"),)
     coefficient: Tensor
 

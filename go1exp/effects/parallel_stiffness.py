@@ -21,6 +21,7 @@ class ParallelStiffness(Effect):
     gravity.
     """
 
+    title = "a spring beside the drive"
     params = (
         Param("stiffness", "N m/rad", 0.0, 20.0, 0.0, 0.1, "joint", "torque per angle"),
         Param("rest", "rad", -5.0, 5.0, 0.0, math.inf, "joint", "angle without torque"),

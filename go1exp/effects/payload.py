@@ -42,6 +42,7 @@ class Payload(Effect):
     its place looks like ``com_offset``.
     """
 
+    title = "a payload on the trunk"
     params = (
         Param("mass", "kg", -1.0, 5.0, 0.0, 0.2, "robot", "mass carried"),
         Param("x", "m", -0.3, 0.3, 0.0, math.inf, "robot", "its place, forward of the trunk's origin"),

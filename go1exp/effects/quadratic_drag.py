@@ -20,6 +20,7 @@ class QuadraticDrag(Effect):
     (``torque_speed_limit``).
     """
 
+    title = "drag that grows with the square of speed"
     params = (Param("drag", "N m s2/rad2", 0.0, 0.05, 0.0, 0.002, "joint", "torque per speed squared"),)
     drag: Tensor
 

@@ -19,6 +19,7 @@ class Strength(Effect):
     from ``kp_scale``, and dynamics scaled the other way round (payload and armature together) look much the same.
     """
 
+    title = "a change of drive strength"
     params = (Param("scale", "-", 0.3, 1.5, 1.0, 0.05, "joint", "torque made over torque asked for"),)
     order = 10
     scale: Tensor

@@ -23,6 +23,7 @@ class Stribeck(Effect):
     0.1 to 1 rad/s and exponents of 1 upwards (BAM, ICRA 2025); LuGre's exponent is 2.
     """
 
+    title = "friction that falls with speed"
     params = (
         Param("strength", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "further friction at rest"),
         Param("speed", "rad/s", 0.01, 2.0, 0.2, math.inf, "joint", "speed at which exp(-1) of it is left"),

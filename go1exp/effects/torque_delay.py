@@ -21,6 +21,7 @@ class TorqueDelay(Delayed):
     command edges tell them apart.
     """
 
+    title = "a delay of torque"
     params = (Param("delay", "s", 0.0, 0.02, 0.0, 0.001, "joint", "age of the torque"),)
     order = 30
 

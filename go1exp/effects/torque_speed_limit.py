@@ -32,6 +32,7 @@ class TorqueSpeedLimit(Effect):
     With ``peak`` 1 and ``droop`` 0 torques pass as they are, without a limit beyond the actuator's and the model's own.
     """
 
+    title = "a tighter torque-speed limit"
     params = (
         Param("peak", "-", 0.2, 1.0, 1.0, 0.05, "joint", "peak torque over the robot's"),
         Param("droop", "-", 0.0, 2.5, 0.0, 0.1, "joint", "the robot's top speed over that at which the line ends"),

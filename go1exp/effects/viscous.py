@@ -20,6 +20,7 @@ class Viscous(Effect):
     told from a larger kd (``kd_scale``), unless kd is varied, the drive switched off or its torque measured well.
     """
 
+    title = "viscous friction"
     params = (Param("damping", "N m s/rad", 0.0, 2.0, 0.0, 0.02, "joint", "torque per speed"),)
     damping: Tensor
 

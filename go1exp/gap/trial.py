@@ -45,7 +45,7 @@ class Trial:
         alpha: significance that one must have.
         helps: (M,) which do both.
         alias: (M,) which do as well as the best of those that also leave their tolerances.
-        chosen: the one of these to accept; None if there is none.
+        chosen: the one of these to accept; None if there is none, or if one within its tolerance does as well.
     """
 
     names: list[str]
@@ -78,6 +78,8 @@ class Trial:
             return "rejected", f"removes {share:.1%} of the excess, but too few windows show it (p = {p:.2g})"
         if p >= self.alpha or self.mean[k] <= 0:
             return "rejected", f"no significant gain on held-out windows (p = {p:.2g})"
+        if chosen is None and self.helps[k]:
+            return "rejected", "another effect does as well within its tolerance"
         if share <= self.needed:
             return "rejected", f"removes only {max(share, 0.0):.1%} of the excess on held-out windows"
         assert chosen is not None
@@ -126,6 +128,12 @@ def tried(
         many = np.array([len(m.keys) for m in fitted])
         alias &= many == many[alias].min()  # what says the same with more numbers is no rival
         chosen = int(max(np.flatnonzero(alias), key=lambda k: gain[k].mean()))
+        inside = gain.mean(axis=1)[helps & (sizes <= 1.0)]
+        if len(inside) and inside.max() >= gain[chosen].mean() - judge.same(gain[chosen].mean()):
+            chosen, alias = (
+                None,
+                np.zeros(len(fitted), dtype=bool),
+            )  # a tolerance does as well: nothing must leave its own
     names = [m.name for m in fitted]
     return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, chosen)
 

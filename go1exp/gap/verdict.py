@@ -119,7 +119,7 @@ def name_terms(
         beyond = np.zeros(len(joints), dtype=bool)
         for key in per_joint:
             p = box.param(key)
-            low, high = np.quantile(drawn[key], [0.1, 0.9], axis=0)
+            low, high = np.quantile(drawn[key], [0.025, 0.975], axis=0)
             value = np.broadcast_to(theta[key], len(joints))
             beyond |= (np.abs(value - p.null) > p.tolerance) & ((low > p.null) | (high < p.null))
         where = tuple(j for j, b in zip(joints, beyond, strict=True) if b)
@@ -136,7 +136,8 @@ def name_terms(
             params[p.name] = {names[k]: float(value[k]) for k in kept}
             interval[p.name] = {names[k]: (float(min(low[k], value[k])), float(max(high[k], value[k]))) for k in kept}
         stable = search.shares.get(effect, 0.0) >= search.settings.certified
-        certified = stable and (adequate or (number == 0 and mostly))
+        somewhere = bool(where) or not per_joint
+        certified = stable and somewhere and (adequate or (number == 0 and mostly))
         status = "certified" if certified else "compensating"
         found.append(
             NamedEffect(effect, where, params, interval, search.aliases[effect], status)  # type: ignore[arg-type]
@@ -203,7 +204,8 @@ def sentence(
                 texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}")
         at = f" at {where(effect.joints, everyone)}" if effect.joints else ""
         doubt = "" if effect.status == "certified" else " (compensating, not certified)"
-        parts.append(f"{effect.effect} is missing{at}: {'; '.join(texts)}{doubt}.")
+        what = f"{box.effect_class(effect.effect).title} ({effect.effect})"
+        parts.append(f"The model lacks {what}{at}: {'; '.join(texts)}{doubt}.")
     if named:
         parts.append(
             f"With that the held-out error falls from {first:.3g} to {final:.3g} times the noise floor (floor 1)."

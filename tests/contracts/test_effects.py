@@ -204,6 +204,9 @@ def test_an_effect_describes_its_parameters(entry: Entry) -> None:
     assert set(entry.parameters) == {p.name for p in kind(entry).params}
     assert entry.doc.endswith(".")
     assert "".join(part.capitalize() for part in entry.name.split("_")) == kind(entry).__name__
+    title = kind(entry).title
+    assert title == title.strip(" .")
+    assert 2 <= len(title.split()) <= 8
 
 
 @each

@@ -1,0 +1,66 @@
+"""The whole sealed benchmark: ``python -m benchmarks.gap_full out=DIR seed=INT [jobs=2] [scale=1.0]``.
+
+Draws and seals the cases of every kind, solves them without their answers (``gap_solve``), scores all together, prints
+the table and writes ``OUT/results.json``. What is done already is not done again, so an interrupted run goes on.
+``scale`` makes all numbers of cases smaller or larger.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import gap_solve
+from benchmarks.gap import generate, score
+
+PLAN: dict[str, tuple[int, str]] = {
+    "null": (104, "1,2,5"),
+    "damaged": (8, "1,2,5"),
+    "not_excited": (6, "1,2,5"),
+    "outside": (11, "1,2,5"),
+    "single": (50, "2,5"),
+    "pair": (14, "1,2,5"),
+}
+"""Kind -> number of cases, and sizes of single effects in tolerances: every effect of a hung robot at both."""
+
+
+def merged(out: Path, kinds: Sequence[str]) -> score.Score:
+    """Score the cases of several kinds together.
+
+    Raises:
+        SystemExit: if answers are not those that were sealed.
+    """
+    answers: dict[str, Any] = {}
+    results: dict[str, Any] = {}
+    for kind in kinds:
+        text = (out / f"{kind}.answers.json").read_bytes()
+        digest = generate.seal(json.loads(text))[1]
+        if (out / kind / "SEAL").read_text().split()[0] != digest:
+            raise SystemExit(f"{out / kind}: its answers are not those that were sealed")
+        answers |= json.loads(text)
+        results |= score.read_results(out / f"out_{kind}")
+    return score.judge(answers, results)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Draw, solve, score."""
+    given = dict(a.split("=", 1) for a in arguments if "=" in a)
+    if not {"out", "seed"} <= set(given) <= {"out", "seed", "jobs", "scale"}:
+        raise SystemExit("usage: python -m benchmarks.gap_full out=DIR seed=INT [jobs=2] [scale=1.0]")
+    out, jobs, scale = Path(given["out"]), given.get("jobs", "2"), float(given.get("scale", 1.0))
+    for k, (kind, (number, sizes)) in enumerate(PLAN.items()):
+        n = max(1, round(scale * number))
+        print(f"{kind}: {n} cases", flush=True)
+        where = [f"out={out / kind}", f"seed={int(given['seed']) + k}", f"kinds={kind}", f"n={n}", f"sizes={sizes}"]
+        generate.main([*where, f"jobs={jobs}"])
+        gap_solve.main([f"cases={out / kind}", f"out={out / f'out_{kind}'}", f"jobs={jobs}"])
+    found = merged(out, tuple(PLAN))
+    print(score.table(found))
+    (out / "results.json").write_text(json.dumps(score.flat(found), indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
