@@ -22,7 +22,7 @@ from go1exp.compose import compose
 from go1exp.config import parse_parts, parse_task
 from go1exp.env.core import Go1Core
 from go1exp.gap import files
-from go1exp.gap.apply import CALIBRATION, COMPENSATING, EFFECT, prove, terms_of, theta_of, write
+from go1exp.gap.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
 from go1exp.gap.explain import explain, unusable
 from go1exp.gap.machine import hung
 from go1exp.gap.result import Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
@@ -175,6 +175,18 @@ def test_training_reads_what_was_named(tmp_path: Path) -> None:
     assert {t.key for t in both.effect} == {*terms, "armature"}
 
 
+def test_a_calibration_of_other_joints_joins_the_effect_in_training_as_in_the_proof(tmp_path: Path) -> None:
+    left = {"FR_hip": 0.01, "FL_hip": 0.02}
+    written = write(result(FRICTION, box={"coulomb": {"bound": left}}), tmp_path)
+    contents: dict[str, Any] = {path.name: OmegaConf.to_container(OmegaConf.load(path)) for path in written}
+    files = f"effect=[{tmp_path / CALIBRATION},{tmp_path / EFFECT}]"
+    (trained,) = parse_task(compose("train", choices_from_files([files]))).effect
+    (proved,) = terms_of(composed(contents[CALIBRATION], contents[EFFECT]))
+    assert trained.parameters == proved.parameters
+    assert trained.parameters["bound"] == pytest.approx(left | FRICTION.params["bound"])
+    assert trained.slots["spread"] == proved.slots["spread"] == {"bound": 0.1}
+
+
 def test_files_of_an_earlier_answer_do_not_stay(tmp_path: Path) -> None:
     write(
         result(named("viscous", "compensating", damping={"FR_hip": 0.3}), box={"coulomb": {"bound": {"FR_hip": 0.02}}}),
@@ -318,7 +330,7 @@ def test_what_is_not_for_training_is_not_asked_of_the_proof(tmp_path: Path) -> N
 # ---------------------------------------------------------------------- logs that cannot be compared
 
 
-def test_logs_of_another_robot_or_of_a_free_one_are_refused() -> None:
+def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
     rig, (recording, *_) = robot()
     machine, meta = hung(rig.robot), recording.meta
     assert unusable(recording, machine) == []
@@ -327,7 +339,6 @@ def test_logs_of_another_robot_or_of_a_free_one_are_refused() -> None:
     stuck = {**recording.channels, "q_FR_hip": np.full(len(recording.t), 0.1)}
     for changed, said in (
         (swapped, f"{meta.episode}: has joints {meta.joints[1]}"),
-        (replace(recording, meta=replace(meta, base="floating", base_quat=None)), "the trunk is free"),
         (replace(recording, meta=replace(meta, kp=None, kd=None)), "says no gains (kp, kd)"),
         (replace(recording, channels=bare), f"{meta.episode}: no qd"),
         (replace(recording, channels=stuck), f"{meta.episode}: q_FR_hip: "),

@@ -169,6 +169,17 @@ def terms_of(plain: Mapping[str, Any]) -> tuple[Term, ...]:
     return terms
 
 
+def composed(*contents: Mapping[str, Any]) -> dict[str, Any]:
+    """Return files' contents as one: later ones win, joint by joint, as when training composes them."""
+    found: dict[str, Any] = {}
+    for effect, params in (item for content in contents for item in content.items()):
+        mine = found.setdefault(effect, {})
+        for name, value in params.items():
+            both = isinstance(value, Mapping) and isinstance(mine.get(name), Mapping)
+            mine[name] = {**mine[name], **value} if both else value
+    return found
+
+
 def theta_of(terms: Sequence[Term], joints: Sequence[str]) -> Theta:
     """Return the values of effects per joint (J,), or (1,) for one of the robot, by (effect, parameter)."""
     found: Theta = {}
@@ -233,8 +244,8 @@ def prove(
     rng = np.random.default_rng(settings.seed)
     parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
     held = parts.confirm if len(parts.confirm) else parts.select  # the values were fitted on all but the former
-    effect = theta_of(terms_of(contents.get(EFFECT, {})), machine.joints)
-    both = {**theta_of(terms_of(contents.get(CALIBRATION, {})), machine.joints), **effect}
+    calibration, lacking = contents.get(CALIBRATION, {}), contents.get(EFFECT, {})
+    effect, both = (theta_of(terms_of(c), machine.joints) for c in (lacking, composed(calibration, lacking)))
     renewed = judge.renewed
     found = [
         scores(judge if renewed is None or not theta else renewed(theta), [theta], held, dt)[0]

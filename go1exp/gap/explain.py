@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 
@@ -14,7 +14,6 @@ import torch
 from go1exp import __version__
 from go1exp.audit import audit
 from go1exp.gap import verdict as words
-from go1exp.gap.box import param
 from go1exp.gap.first_state import settled
 from go1exp.gap.fit import residuals
 from go1exp.gap.judge import splits
@@ -23,7 +22,7 @@ from go1exp.gap.localise import localise
 from go1exp.gap.machine import FixedBase, HungGo1, Machine, hung, tolerances_of
 from go1exp.gap.prepare import Ready, prepare
 from go1exp.gap.replay import Replayer, Theta, variants
-from go1exp.gap.result import Floors, GapResult, GapSettings, Overlay
+from go1exp.gap.result import Floors, GapResult, GapSettings, NamedEffect, Overlay
 from go1exp.gap.search import Progress, Search
 from go1exp.gap.standing import StandingGo1, StandingReplayer, StandingWindows
 from go1exp.gap.trial import excess, removed
@@ -130,7 +129,6 @@ def _explain(
     before, after = residuals(score, [{}, search.theta], shown, float(dt))
     silent = words.not_excited(search.signal, held=not ready.machine.base_probe)
     more = words.advice({n.effect: n.alias_set for n in named})
-    box = {key: value for key, value in theta.items() if key[0] not in search.terms}
     result = GapResult(
         verdict=verdict,
         sentence=words.sentence(verdict, search, named, excesses, silent, more),
@@ -150,7 +148,7 @@ def _explain(
         bags=dict(search.shares),
         waterfall=(("model as it is", excesses["null"]), *search.steps),
         overlays=overlays(score, recordings, search.theta, parts.select, settings.overlays, float(dt)),
-        box=_nested(box, windows.joints),
+        box=_nested(theta, windows.joints, {n.effect: n for n in named}),
         provenance={
             "logs": {r.meta.episode: fingerprint(r) for r in logs},
             "versions": {"go1exp": __version__, "mujoco": version("mujoco-core"), "numpy": np.__version__},
@@ -285,12 +283,19 @@ def overlays(
     return tuple(found)
 
 
-def _nested(theta: Theta, joints: Sequence[str]) -> dict[str, dict[str, dict[str, float]]]:
+def _nested(
+    theta: Theta, joints: Sequence[str], named: Mapping[str, NamedEffect]
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Return what stays within tolerance, by effect, parameter and joint: all but what is named, where it is."""
     found: dict[str, dict[str, dict[str, float]]] = {}
     for (effect, name), value in theta.items():
-        names = joints if param((effect, name)).per == "joint" else ("robot",)
-        value = np.broadcast_to(value, len(names))
-        found.setdefault(effect, {})[name] = {n: float(v) for n, v in zip(names, value, strict=True)}
+        if effect not in named:
+            names = joints if len(value) == len(joints) else ("robot",)
+            found.setdefault(effect, {})[name] = {n: float(v) for n, v in zip(names, value, strict=True)}
+        elif named[effect].status == "certified" and len(value) == len(joints):
+            left = {n: float(v) for n, v in zip(joints, value, strict=True) if n not in named[effect].joints}
+            if left and named[effect].joints:
+                found.setdefault(effect, {})[name] = left
     return found
 
 
