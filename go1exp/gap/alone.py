@@ -121,7 +121,7 @@ class Seeker(Protocol):
         """Return chi2 on windows no fit has seen."""
 
     def judged(
-        self, stage: int, fitted: list[Model], train: np.ndarray, now: np.ndarray
+        self, stage: int, fitted: list[Model], train: np.ndarray, now: np.ndarray, small: bool = False
     ) -> tuple[Model | None, Model | None]:
         """Test fitted candidates and note the evidence."""
 

@@ -104,6 +104,16 @@ def _explain(
 
     search = Search(score, parts, settings, float(dt), rng, on_progress)
     search.run()
+    if len(parts.confirm) and not search.terms and search.first <= settings.adequate:
+        unseen = excess(search.held_out(search.theta, parts.confirm))
+        if unseen > settings.adequate:
+            warnings.append(
+                f"Episodes kept for a last check show an error of {1 + unseen:.3g} times the floor, others do not: "
+                "they were taken into the search, with nothing left for a last check."
+            )
+            parts = splits([r.meta for r in recordings], windows.episode, 0.0, rng)
+            search = Search(score, parts, settings, float(dt), rng, on_progress)
+            search.run()
     score = search.scorer  # its floors and first states suit the model as it was found
     plain = search.held_out({})
     if search.terms and not search.confirmed():

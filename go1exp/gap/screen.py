@@ -45,6 +45,9 @@ FREE_SHAPES: dict[str, tuple[str, ...]] = {
 }
 """Shapes that a full fit may change."""
 
+COUNTS = tuple(float(count) for count in range(18, 64, 3))
+"""Periods per turn at which cogging is looked for; over a radian of motion, neighbours differ by half a period."""
+
 PROBE = 2.0
 """Change of a parameter by which it is probed, in tolerances."""
 
@@ -74,6 +77,7 @@ class Variant:
             for i in range(layout.size):
                 (sine if layout.probe[i] < len(self.probes) // 2 else cosine)[layout.joint[i]] = x[i]
             found = {
+                **{key: np.broadcast_to(value, sine.shape).copy() for key, value in self.shapes.items()},
                 (self.effect, "amplitude"): np.hypot(sine, cosine),
                 (self.effect, "phase"): np.arctan2(cosine, sine),
             }
@@ -98,10 +102,12 @@ def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -
         keys = box.sizes(effect)
         if effect == "cogging":
             key = (effect, "amplitude")
-            zero, half = ({(effect, "phase"): np.array([v])} for v in (0.0, math.pi / 2))
             plain = box.probes(machine, [key], {}, PROBE)
-            both = [Probe(key, p.place, p.delta, also) for also in (zero, half) for p in plain]
-            found.append(Variant(effect, tuple(both), {}, quadrature=True))
+            for count in COUNTS:
+                at: Theta = {(effect, "count"): np.array([count])}
+                sides = [{**at, (effect, "phase"): np.array([v])} for v in (0.0, math.pi / 2)]
+                both = [Probe(key, p.place, p.delta, also) for also in sides for p in plain]
+                found.append(Variant(effect, tuple(both), at, quadrature=True))
             continue
         for given in SHAPES.get(effect, ({},)):
             shapes: Theta = {

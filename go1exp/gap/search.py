@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from go1exp.gap import alone, box, evidence, judge
+from go1exp.gap import alone, box, evidence, judge, strain
 from go1exp.gap.fit import Model, fit, scores
-from go1exp.gap.likelihood import Layout, Scorer, Table, table
+from go1exp.gap.likelihood import Scorer, Table, table
 from go1exp.gap.replay import Key, Theta
 from go1exp.gap.result import Candidate, GapSettings
 from go1exp.gap.screen import FREE_SHAPES, Screened, library, screen
@@ -137,25 +137,30 @@ class Search:
             self.progress(f"fitting the model with {hidden.name}", 0.2)
             train, now = self._take(hidden)
             stage = 2
-        while stage <= settings.max_terms and (stage == 1 or excess(now) >= settings.material):
+        while stage <= settings.max_terms:
             share = 0.15 + 0.7 * (stage - 1) / settings.max_terms
-            self.progress(f"screening for term {stage}", share)
-            found = self._screened()
-            if not self.signal:
+            small = excess(now) < settings.material
+            found: list[Screened] = []
+            if not small or not self.signal:
+                self.progress(f"screening for term {stage}", share)
+                found = self._screened()
                 self._listen(found)
-            if excess(now) < settings.material:
-                self.candidates += evidence.absorbed(self.keys, self._relief(), self.theta, settings.shortlist)
+            assert self.own is not None
+            relief = strain.relief(self.scorer, self.own, self.may) if small else {}
+            straining = strain.straining(self.scorer, self.own, relief, [*self.terms, *self._unasked()])
+            if small and straining is None:
+                self.candidates += evidence.absorbed(self.keys, relief, self.theta, settings.shortlist)
                 break
             self.progress(f"fitting candidates for term {stage}", share + 0.06)
-            fitted = self._fitted(found)
-            accepted, inside = self.judged(stage, fitted, train, now)
+            fitted = self._fitted(found) if straining is None else self._freed(straining)
+            accepted, inside = self.judged(stage, fitted, train, now, small)
             if accepted is None and (inside is None or len(self.loosened) == LOOSENED):
                 break
             self.progress(f"fitting the model with {(accepted or inside).name}", share + 0.12)  # type: ignore[union-attr]
             if accepted is not None:
                 before, state = excess(now), (list(self.terms), list(self.loosened), self.theta, self.own, self.scorer)
                 train, now = self._take(accepted)
-                if excess(now) > before:
+                if excess(now) > before + judge.SAME:
                     self.terms, self.loosened, self.theta, self.own, self.scorer = state
                     now = self._refused(accepted.name)
                     break
@@ -239,6 +244,16 @@ class Search:
         some = own.part(np.unique([*worst, *evenly]))
         return screen(self.scorer, self.theta, some, self.may, ways, self.dt)
 
+    def _unasked(self) -> list[str]:
+        """Return the effects that the user does not want to be considered."""
+        return [e for e in box.BOX if self.settings.effects and e not in self.settings.effects]
+
+    def _freed(self, effect: str) -> list[Model]:
+        """Return the model in which an effect of the box may leave its tolerance, fitted."""
+        assert self.own is not None
+        model = Model(effect, self.theta, self.may.also(effect), box.sizes(effect))
+        return fit(self.scorer, [model], self.own, self.settings.iterations, self.dt)
+
     def _listen(self, found: Sequence[Screened]) -> None:
         for s in found:
             self.signal[s.variant.effect] = max(self.signal.get(s.variant.effect, 0.0), s.signal)
@@ -253,16 +268,18 @@ class Search:
         return fit(self.scorer, models, self.own, self.settings.iterations, self.dt) if models else []
 
     def judged(
-        self, stage: int, fitted: list[Model], train: np.ndarray, now: np.ndarray
+        self, stage: int, fitted: list[Model], train: np.ndarray, now: np.ndarray, small: bool = False
     ) -> tuple[Model | None, Model | None]:
         """Test the fitted candidates on held-out windows and note the evidence.
+
+        Where the gap is ``small``, what a candidate removes of it is not asked.
 
         Returns:
             The one to accept, and the best of those that help within their tolerances.
         """
         if not fitted:
             return None, None
-        trial = tried(self.scorer, self.settings, fitted, train, now, self.splits.select, self.dt, self.rng)
+        trial = tried(self.scorer, self.settings, fitted, train, now, self.splits.select, self.dt, self.rng, small)
         names = tuple(fitted[k].name for k in sorted(np.flatnonzero(trial.alias), key=lambda k: -trial.mean[k]))
         for k in np.argsort(-trial.mean):
             status, reason = trial.reason(int(k))
@@ -328,30 +345,11 @@ class Search:
                 self.aliases[other], self.shares[other] = (other,), self.shares[name]
                 self.steps.append((f"{other} in place of {name}", excess(self.held_out(self.theta))))
 
-    def _cost(self, own: Table) -> Callable[[box.Freedom], float]:
-        """Return a function that says how small chi2 and priors can be, to first order, with some freedom."""
-        layout = Layout.of(self.scorer.replayer.machine, own.probes)
-        chi2 = self.scorer.chi2(own.residual, own.windows)
-        matrix, right = layout.total(own.grams(self.scorer) / np.maximum(chi2, 1.0)[..., None, None])
-
-        def cost(may: box.Freedom) -> float:
-            limits = box.bounds(layout, own.probes, own.theta, may, back=True)
-            x = box.solve(matrix, right, limits)
-            return float(x @ matrix @ x - 2.0 * right @ x + (limits.weight * (x - limits.centre) ** 2).sum())
-
-        return cost
-
-    def _relief(self) -> dict[str, float]:
-        """Return by how much chi2 and priors would fall if an effect of the box might leave its tolerance."""
-        assert self.own is not None
-        cost = self._cost(self.own)
-        return {effect: cost(self.may) - cost(self.may.also(effect)) for effect in {k[0]: None for k in self.keys}}
-
     def _prune(self) -> None:
         """Bring back within tolerance what leaves it at a joint for next to nothing."""
         machine = self.scorer.replayer.machine
         assert self.own is not None
-        cost = self._cost(self.own)
+        cost = strain.cost(self.scorer, self.own)
         kept = self.kept
         for name in self.terms:
             out = np.flatnonzero(evidence.beyond(name, self.theta, machine.joints))

@@ -97,6 +97,7 @@ def tried(
     windows: np.ndarray,
     dt: float,
     rng: np.random.Generator,
+    small: bool = False,
 ) -> Trial:
     """Compare fitted candidates with the present model, whose chi2 on ``windows`` is ``now`` (V, G).
 
@@ -109,6 +110,7 @@ def tried(
         windows: which no fit has seen.
         dt: physics step, s.
         rng: of the sign flips.
+        small: the gap is within the tolerances; which share of it a candidate removes means nothing.
     """
     found = scores(scorer, [m.theta for m in fitted], windows, dt)
     gain = judge.gains(now, found)
@@ -118,6 +120,7 @@ def tried(
     before, after = excess(now), [excess(a) for a in found]
     share = np.array([removed(before, a) for a in after])
     needed = settings.min_share if before > settings.adequate else max(MOSTLY, settings.min_share)
+    needed = -math.inf if small else needed
     sizes = np.array([evidence.size(m.name, m.theta) for m in fitted])
     helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
     fit_for_it = np.flatnonzero(helps & (sizes > 1.0))

@@ -1,0 +1,56 @@
+"""How hard the tolerances are leant on: what would be gained if the model might leave them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+
+import numpy as np
+
+from go1exp.gap import box
+from go1exp.gap.likelihood import Layout, Scorer, Table
+
+STRAIN = 0.0125
+"""Fall of chi2 per value, were the tolerance of one effect wider, from which a gap that the tolerances close is taken
+for that effect: at most 0.0054 in 45 development nulls within tolerances, 0.046 to 0.07 for effects of two of them."""
+
+LEAD = 3.0
+"""The same over that of the next effect."""
+
+
+def cost(scorer: Scorer, own: Table) -> Callable[[box.Freedom], float]:
+    """Return a function that says how small chi2 and priors can be, to first order about ``own``, with some freedom."""
+    layout = Layout.of(scorer.replayer.machine, own.probes)
+    chi2 = scorer.chi2(own.residual, own.windows)
+    matrix, right = layout.total(own.grams(scorer) / np.maximum(chi2, 1.0)[..., None, None])
+
+    def found(may: box.Freedom) -> float:
+        limits = box.bounds(layout, own.probes, own.theta, may, back=True)
+        x = box.solve(matrix, right, limits)
+        return float(x @ matrix @ x - 2.0 * right @ x + (limits.weight * (x - limits.centre) ** 2).sum())
+
+    return found
+
+
+def relief(scorer: Scorer, own: Table, may: box.Freedom) -> dict[str, float]:
+    """Return by how much chi2 and priors would fall if an effect of ``own`` might leave its tolerance."""
+    effects = dict.fromkeys(p.key[0] for p in own.probes)
+    price = cost(scorer, own)
+    return {effect: price(may) - price(may.also(effect)) for effect in effects}
+
+
+def straining(scorer: Scorer, own: Table, relieved: Mapping[str, float], but: Collection[str]) -> str | None:
+    """Return the one effect that would leave its tolerance if it might, far more than any other; None if none would.
+
+    Args:
+        scorer: of the windows.
+        own: the linear model of what may move.
+        relieved: what :func:`relief` found.
+        but: effects that are out of the question.
+    """
+    order = sorted((e for e in relieved if e not in but), key=lambda e: -relieved[e])
+    if not order:
+        return None
+    values = float(scorer.size[own.windows].sum()) * len(scorer.replayer.machine.groups)
+    second = relieved[order[1]] if len(order) > 1 else 0.0
+    clear = relieved[order[0]] > STRAIN * values and relieved[order[0]] > LEAD * second
+    return order[0] if clear else None
