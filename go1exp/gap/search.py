@@ -158,10 +158,10 @@ class Search:
                 break
             self.progress(f"fitting the model with {(accepted or inside).name}", share + 0.12)  # type: ignore[union-attr]
             if accepted is not None:
-                before, state = excess(now), (list(self.terms), list(self.loosened), self.theta, self.own, self.scorer)
+                state = list(self.terms), list(self.loosened), self.theta, self.own, self.scorer, self.first
                 train, now = self._take(accepted)
-                if excess(now) > before + judge.SAME:
-                    self.terms, self.loosened, self.theta, self.own, self.scorer = state
+                if excess(now) > excess(self.held_out(state[2])) + judge.SAME:  # by the same floors
+                    self.terms, self.loosened, self.theta, self.own, self.scorer, self.first = state
                     now = self._refused(accepted.name)
                     break
                 stage += 1
@@ -205,7 +205,12 @@ class Search:
         if self.scorer.renewed is not None:
             self.scorer = self.scorer.renewed(self.theta)
             train = self.settle(1)
-        now = self.held_out(self.theta)
+        now, plain = self.held_out(self.theta), self.held_out(model.theta)
+        if excess(plain) < excess(now) - judge.SAME:  # little data: what was fitted from scratch is a poorer optimum
+            self.theta, now = model.theta, plain
+            self.own = self.linear(self.theta, self.splits.train)
+            train = self.scorer.chi2(self.own.residual, self.own.windows)
+        self.first = excess(self.held_out(self.nominal))  # by the same floors
         self.steps.append((model.name, excess(now)))
         return train, now
 
