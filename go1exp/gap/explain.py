@@ -14,6 +14,7 @@ import torch
 from go1exp import __version__
 from go1exp.audit import audit
 from go1exp.gap import verdict as words
+from go1exp.gap.box import param
 from go1exp.gap.first_state import settled
 from go1exp.gap.fit import residuals
 from go1exp.gap.judge import splits
@@ -299,13 +300,15 @@ def _nested(
     """Return what stays within tolerance, by effect, parameter and joint: all but what is named, where it is."""
     found: dict[str, dict[str, dict[str, float]]] = {}
     for (effect, name), value in theta.items():
-        if effect not in named:
-            names = joints if len(value) == len(joints) else ("robot",)
-            found.setdefault(effect, {})[name] = {n: float(v) for n, v in zip(names, value, strict=True)}
-        elif named[effect].status == "certified" and len(value) == len(joints):
-            left = {n: float(v) for n, v in zip(joints, value, strict=True) if n not in named[effect].joints}
-            if left and named[effect].joints:
-                found.setdefault(effect, {})[name] = left
+        own = named.get(effect)
+        if param((effect, name)).per == "robot":
+            left = {} if own else {"robot": float(value[0])}
+        else:
+            full = zip(joints, np.broadcast_to(value, (len(joints),)), strict=True)
+            away = own is not None and (own.status != "certified" or not own.joints)
+            left = {} if away else {n: float(v) for n, v in full if own is None or n not in own.joints}
+        if left:
+            found.setdefault(effect, {})[name] = left
     return found
 
 
