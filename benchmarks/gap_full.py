@@ -7,6 +7,7 @@ the table and writes ``OUT/results.json``. What is done already is not done agai
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 from collections.abc import Sequence
@@ -37,8 +38,7 @@ def merged(out: Path, kinds: Sequence[str]) -> score.Score:
     results: dict[str, Any] = {}
     for kind in kinds:
         text = (out / f"{kind}.answers.json").read_bytes()
-        digest = generate.seal(json.loads(text))[1]
-        if (out / kind / "SEAL").read_text().split()[0] != digest:
+        if (out / kind / "SEAL").read_text().split()[0] != hashlib.sha256(text).hexdigest():
             raise SystemExit(f"{out / kind}: its answers are not those that were sealed")
         answers |= json.loads(text)
         results |= score.read_results(out / f"out_{kind}")

@@ -21,7 +21,7 @@ from go1exp.gap.judge import splits
 from go1exp.gap.likelihood import Scorer, scorer
 from go1exp.gap.localise import localise
 from go1exp.gap.machine import FixedBase, HungGo1, Machine, hung, tolerances_of
-from go1exp.gap.prepare import Ready, prepare
+from go1exp.gap.prepare import TELLING, Ready, prepare
 from go1exp.gap.replay import Replayer, Theta, variants
 from go1exp.gap.result import Floors, GapResult, GapSettings, NamedEffect, Overlay
 from go1exp.gap.search import Progress, Search
@@ -33,9 +33,6 @@ from go1exp.robot import RobotConfig
 
 NEEDED = ("t", "q", "qd", "q_target")
 """Channels, or quantities, without which nothing can be replayed."""
-
-TELLING = ("delay", "torque")
-"""Checks of the audit that a missing effect may fail; they say nothing against the log."""
 
 GO1 = "go1"
 

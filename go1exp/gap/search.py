@@ -149,7 +149,8 @@ class Search:
             relief = strain.relief(self.scorer, self.own, self.may) if small else {}
             straining = strain.straining(self.scorer, self.own, relief, [*self.terms, *self._unasked()])
             if small and straining is None:
-                self.candidates += evidence.absorbed(self.keys, relief, self.theta, settings.shortlist)
+                if not self.terms:  # beside a term they are no rivals of it
+                    self.candidates += evidence.absorbed(self.keys, relief, self.theta, settings.shortlist)
                 break
             self.progress(f"fitting candidates for term {stage}", share + 0.06)
             fitted = self._fitted(found) if straining is None else self._freed(straining)
