@@ -16,20 +16,18 @@ from omegaconf import OmegaConf
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.files import choices_from_files
-from go1exp.cli.record import RIG
-from go1exp.cli.settings import RecordSettings, parse
 from go1exp.compose import compose
-from go1exp.config import parse_parts, parse_task
+from go1exp.config import parse_task
 from go1exp.env.core import Go1Core
 from go1exp.gap import files
 from go1exp.gap.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
 from go1exp.gap.explain import explain, unusable
 from go1exp.gap.machine import hung
 from go1exp.gap.result import Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
-from go1exp.record import plan, simulate
+from go1exp.record import simulate
 from go1exp.recording import Recording
-from go1exp.registry import bind
 from go1exp.robot import JOINTS
+from tests.laboratory import recorded
 
 NAN = math.nan
 CALVES = tuple(j for j in JOINTS if j.endswith("calf"))
@@ -272,16 +270,8 @@ HIDDEN = dict(zip(JOINTS, np.linspace(0.3, 0.6, 12).round(3).tolist(), strict=Tr
 @cache
 def robot() -> tuple[simulate.Rig, tuple[Recording, ...]]:
     """Record a hung robot with friction that the model lacks: four chirps of a second."""
-    small = ["backend.threads=1", "physics_dt=0.001", "seconds=1.0", "excitation=[chirp]", "seeds=[0,1,2,3]"]
-    container = compose("record", small)
-    container["effect"] = {"coulomb": {"bound": HIDDEN}}
-    parts, problems = parse_parts(container, RIG)
-    assert problems == []
-    terms = [bind("excitation", name, {}, name)[0] for name in container["excitation"]]
-    settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*RIG, "excitation")})
-    rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
-    episodes = plan.episodes([t for t in terms if t], settings)
-    return rig, tuple(simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None))
+    small = ["physics_dt=0.001", "seconds=1.0", "excitation=[chirp]", "seeds=[0,1,2,3]"]
+    return recorded(small, {"coulomb": {"bound": HIDDEN}})
 
 
 def proof(tmp_path: Path, found: GapResult, physics_dt: float = 0.001) -> Any:

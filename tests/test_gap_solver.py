@@ -10,7 +10,6 @@ import pytest
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import RIG
-from go1exp.cli.settings import RecordSettings, parse
 from go1exp.compose import compose
 from go1exp.config import parse_parts
 from go1exp.gap.box import Bounds, solve
@@ -21,9 +20,9 @@ from go1exp.gap.machine import HungGo1
 from go1exp.gap.replay import Probe
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
 from go1exp.gap.windows import even_clock, held, noise
-from go1exp.record import plan, simulate
+from go1exp.record import simulate
 from go1exp.recording import Meta, Recording
-from go1exp.registry import bind
+from tests.laboratory import recorded
 
 QUICK = GapSettings(
     stride_s=0.4,
@@ -40,17 +39,8 @@ QUICK = GapSettings(
 def robot(*overrides: str) -> tuple[simulate.Rig, list[Recording]]:
     """Record a hung robot: three gain sets, a chirp each, 3.5 s."""
     gains = "gains=[[20,0.5],[35,0.6],[35,1.2]]"
-    container = compose(
-        "record",
-        ["backend.threads=1", "physics_dt=0.0005", "seconds=3.5", "excitation=[chirp]", gains, *overrides],
-    )
-    parts, problems = parse_parts(container, RIG)
-    assert problems == []
-    terms = [bind("excitation", name, {}, name)[0] for name in container["excitation"]]
-    settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*RIG, "excitation")})
-    rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
-    episodes = plan.episodes([t for t in terms if t], settings)
-    return rig, simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None)
+    rig, found = recorded(["physics_dt=0.0005", "seconds=3.5", "excitation=[chirp]", gains, *overrides])
+    return rig, list(found)
 
 
 # ---------------------------------------------------------------------- statistics

@@ -11,10 +11,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.cli.record import RIG
-from go1exp.cli.settings import RecordSettings, parse
-from go1exp.compose import compose
-from go1exp.config import parse_parts
 from go1exp.gap import alone
 from go1exp.gap.base_state import AGREE, Base, Log, base_state
 from go1exp.gap.explain import explain
@@ -32,11 +28,10 @@ from go1exp.gap.standing import StandingGo1, StandingReplayer, StandingWindows, 
 from go1exp.gap.trial import excess
 from go1exp.physics.legs import Legs
 from go1exp.physics.scene import build_model
-from go1exp.record import plan, simulate
 from go1exp.recording import VECTORS, Recording
-from go1exp.registry import bind
 from go1exp.robot import RobotConfig
 from go1exp.terrain import TerrainConfig, build_terrain
+from tests import laboratory
 
 QUICK = GapSettings(window_s=0.1, stride_s=0.25, physics_dt=0.002, bags=20, overlays=0)
 
@@ -44,18 +39,10 @@ QUICK = GapSettings(window_s=0.1, stride_s=0.25, physics_dt=0.002, bags=20, over
 @cache
 def recorded(*overrides: str) -> tuple[RobotConfig, tuple[Recording, ...]]:
     """Record a Go1 on the ground for 2 s a motion."""
-    container = compose(
-        "record",
-        ["backend.threads=1", "support=ground", "gains=[[35,0.6]]", "seconds=2.0", "sensors.truth=true", *overrides],
+    rig, found = laboratory.recorded(
+        ["support=ground", "gains=[[35,0.6]]", "seconds=2.0", "sensors.truth=true", *overrides]
     )
-    parts, problems = parse_parts(container, RIG)
-    assert problems == []
-    terms = [bind("excitation", name, {}, name)[0] for name in container["excitation"]]
-    settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*RIG, "excitation")})
-    rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
-    episodes = plan.episodes([t for t in terms if t], settings)
-    found = simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None)
-    return rig.robot, tuple(found)
+    return rig.robot, found
 
 
 def truth(recording: Recording) -> np.ndarray:
