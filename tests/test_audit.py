@@ -296,6 +296,24 @@ def test_a_dead_joint_channel_is_named(name: str, value: float) -> None:
     assert size(report, "dead", name) == value
 
 
+def test_an_angle_that_stops_being_read_is_named() -> None:
+    recording = made("multisine")
+    q = recording.channels["q_RR_thigh"].copy()
+    q[ROWS // 2 :] = q[ROWS // 2]
+    report = audit(with_(recording, q_RR_thigh=q))
+    assert ("frozen", "q_RR_thigh", "bad") in flaws(report)
+    stuck = recording.t[-1] - recording.t[ROWS // 2]
+    assert size(report, "frozen", "q_RR_thigh") == pytest.approx(stuck, abs=2e-3)
+    assert not [f for f in audit(recording).findings if f.check == "frozen"]
+
+
+def test_a_joint_that_leans_on_its_stop_is_not_called_frozen() -> None:
+    recording = made("multisine")
+    q = recording.channels["q_RR_thigh"]
+    leaning = np.clip(q, None, np.quantile(q, 0.3))
+    assert not [f for f in audit(with_(recording, q_RR_thigh=leaning)).findings if f.check == "frozen"]
+
+
 def test_a_dead_imu_axis_is_named() -> None:
     report = audit(with_(made(), imu_gyro_z=np.zeros(ROWS)))
     assert flaws(report) == {("dead", "imu_gyro_z", "bad")}

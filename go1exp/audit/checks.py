@@ -42,8 +42,14 @@ def audit(recording: Recording) -> AuditReport:
     repeats_found, repeats = single.stale(log)
     noise_found, floors = single.noise(log, repeats)
     delay_found, delay = commands.timing(log)
-    found += [*repeats_found, *single.resolution(log), *noise_found, *single.dead(log), *single.saturation(log)]
-    found += [*single.ranges(log), *related.attitude_length(log), *related.speed(log), *related.torque(log)]
+    found += [*repeats_found, *single.resolution(log), *noise_found, *single.dead(log), *single.frozen(log)]
+    found += [
+        *single.saturation(log),
+        *single.ranges(log),
+        *related.attitude_length(log),
+        *related.speed(log),
+        *related.torque(log),
+    ]
     found += [*related.rotation(log), *related.gravity(log), *commands.order_and_sign(log), *delay_found]
     off = _times(log, ~log.on)
     still = _times(log, log.still)

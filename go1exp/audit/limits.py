@@ -37,6 +37,9 @@ NOISE = {"rad": (5e-3, 2e-2), "rad/s": (0.5, 2.0), "N m": (1.0, 5.0), "m/s2": (2
 """White noise by unit: some five times what drives of this class show (0.2 to 1 mrad, 0.05 rad/s, 0.15 N m)."""
 WHITE = (0.8, 1.25)
 """Noise estimates by third and by fifth differences agree within this ratio if it is noise and not motion."""
+FROZEN_TIME, FROZEN_ANGLE = 1.0, 0.5
+"""s and rad: an angle that has not changed by a bit for so long, while its target moved so far, is not being read
+(soft servos with coarse encoders stick for 0.7 s and 0.8 rad, and for 12 s and 0.2 rad)."""
 PLATEAU = 5
 """Samples in a row at the extreme value, entered and left at speed, that count as clipped."""
 CLIPPED = (0.0, 0.05)

@@ -10,6 +10,7 @@ import go1exp.audit.limits as limits
 import go1exp.audit.signals as signals
 from go1exp.audit.log import Log, finding, graded
 from go1exp.audit.report import Finding
+from go1exp.recording import joint_channel
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
 
 
@@ -138,6 +139,29 @@ def dead(log: Log) -> Iterator[Finding]:
             live = any(moved.values()) and quantity in ("imu_gyro", "imu_acc", "imu_quat", "base_quat", "base_pos")
             verdict, why = ("bad", "while the robot moves") if live else ("suspect", "")
         yield finding("dead", name, verdict, float(values[0]), log.unit(name), f"{said} {why}".rstrip())  # type: ignore[arg-type]
+
+
+def frozen(log: Log) -> Iterator[Finding]:
+    """Joint angles that stop changing although their target goes on; one at the end of its range may lean on a stop."""
+    if not (log.recording.has("q") and log.recording.has("q_target")):
+        return
+    q, target = log.recording.joint("q"), log.recording.joint("q_target")
+    for j, joint in enumerate(log.joints):
+        ends = q[:, j].min(), q[:, j].max()
+        runs = signals.stretches(np.append(log.on[1:] & (np.diff(q[:, j]) == 0.0), False))
+        caught = [
+            (first, last)
+            for first, last in runs
+            if log.t[last] - log.t[first] > limits.FROZEN_TIME
+            and np.ptp(target[first : last + 1, j]) > limits.FROZEN_ANGLE
+            and min(abs(q[first, j] - end) for end in ends) > limits.STILL_ANGLE
+        ]
+        if caught:
+            first, last = max(caught, key=lambda run: log.t[run[1]] - log.t[run[0]])
+            time = float(log.t[last] - log.t[first])
+            said = f"is {q[first, j]:.6g} rad without a change for {time:.2g} s from {log.t[first]:.3f} s, while its "
+            said += f"target moves by {np.ptp(target[first : last + 1, j]):.2g} rad"
+            yield finding("frozen", joint_channel("q", joint), "bad", time, "s", said)
 
 
 def saturation(log: Log) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from go1exp.gap import box
+from go1exp.gap import box, strain
 from go1exp.gap.likelihood import Layout, Scorer, Table, differences, predicted
 from go1exp.gap.replay import Key, Machine, Probe, Theta, variants
 from go1exp.registry import members
@@ -133,12 +133,14 @@ class Screened:
         variant: which.
         theta: where a fit would begin.
         gain: mean fall of log chi2 over the windows.
+        relief: fall of chi2 and priors per value, if the effect may leave its tolerance.
         signal: largest chi2 that twice its tolerance adds to one value of a window, on average over the window.
     """
 
     variant: Variant
     theta: Theta
     gain: float
+    relief: float
     signal: float
 
 
@@ -172,6 +174,7 @@ def screen(
     grams = full.grams(scorer)
     before = grams[..., -1, -1] / size
     weight = 1.0 / np.maximum(before, 1.0)
+    plain, values = strain.cost(scorer, own)(may), float(size.sum()) * len(machine.groups)
     at = known
     for variant in library:
         added = list(range(at, at + len(variant.probes)))
@@ -181,15 +184,17 @@ def screen(
         part = grams[:, :, [*pick, -1]][..., [*pick, -1]]
         layout = Layout.of(machine, probes)
         matrix, right = layout.total(part * weight[..., None, None])
-        limits = box.bounds(layout, probes, theta, may.also(variant.effect))
-        if variant.quadrature:
-            limits.low[layout.part(np.arange(known, len(probes)))] = -np.inf
+        freed = may.also(variant.effect)
+        limits, strict = (box.bounds(layout, probes, theta, freed, back) for back in (False, True))
+        for some in (limits, strict) if variant.quadrature else ():
+            some.low[layout.part(np.arange(known, len(probes)))] = -np.inf
+        relief = (plain - strain.price(matrix, right, strict)) / values
         x = box.solve(matrix, right, limits)
         after = predicted(part, layout, x) / size
         gain = float(np.mean(np.log(before.sum(1) / np.maximum(after, 0.3).sum(1))))
         start = _start(theta, variant, own.probes, layout, x, machine)
         mine = [*added, *(k for k, p in enumerate(own.probes) if p.key[0] == variant.effect)]
-        found.append(Screened(variant, start, gain, _signal(grams, full.probes, mine, size)))
+        found.append(Screened(variant, start, gain, relief, _signal(grams, full.probes, mine, size)))
     return sorted(found, key=lambda s: -s.gain)
 
 

@@ -148,12 +148,13 @@ class Search:
             assert self.own is not None
             relief = strain.relief(self.scorer, self.own, self.may) if small else {}
             straining = strain.straining(self.scorer, self.own, relief, [*self.terms, *self._unasked()])
-            if small and straining is None:
+            outside = strain.outside(found, box.of(self.scorer.replayer.machine)) if small and not straining else []
+            if small and straining is None and not outside:
                 if not self.terms:  # beside a term they are no rivals of it
                     self.candidates += evidence.absorbed(self.keys, relief, self.theta, settings.shortlist)
                 break
             self.progress(f"fitting candidates for term {stage}", share + 0.06)
-            fitted = self._fitted(found) if straining is None else self._freed(straining)
+            fitted = self._fitted(outside if small else found) if straining is None else self._freed(straining)
             accepted, inside = self.judged(stage, fitted, train, now, small)
             if accepted is None and (inside is None or len(self.loosened) == LOOSENED):
                 break

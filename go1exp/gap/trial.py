@@ -69,6 +69,8 @@ class Trial:
         """Return what becomes of a candidate, and why."""
         share, p, chosen = self.share[k], self.p[k], self.chosen
         if k == chosen:
+            if self.needed < 0.0:  # a small gap
+                return "accepted", f"held-out log chi2 falls by {self.mean[k]:.2g}, p = {p:.2g}"
             return "accepted", f"removes {share:.1%} of the excess on held-out windows, p = {p:.2g}"
         if chosen is not None and self.alias[k]:
             return "alias", f"does as well as {self.names[chosen]}: these data cannot tell them apart"
