@@ -50,11 +50,15 @@ def main(arguments: Sequence[str]) -> None:
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
     if not {"out", "seed"} <= set(given) <= {"out", "seed", "jobs", "scale"}:
         raise SystemExit("usage: python -m benchmarks.gap_full out=DIR seed=INT [jobs=2] [scale=1.0]")
-    out, jobs, scale = Path(given["out"]), given.get("jobs", "2"), float(given.get("scale", 1.0))
+    try:
+        seed, scale = int(given["seed"]), float(given.get("scale", 1.0))
+    except ValueError as error:
+        raise SystemExit(f"seed must be a whole number and scale a number: {error}") from error
+    out, jobs = Path(given["out"]), given.get("jobs", "2")
     for k, (kind, (number, sizes)) in enumerate(PLAN.items()):
         n = max(1, round(scale * number))
         print(f"{kind}: {n} cases", flush=True)
-        where = [f"out={out / kind}", f"seed={int(given['seed']) + k}", f"kinds={kind}", f"n={n}", f"sizes={sizes}"]
+        where = [f"out={out / kind}", f"seed={seed + k}", f"kinds={kind}", f"n={n}", f"sizes={sizes}"]
         generate.main([*where, f"jobs={jobs}"])
         gap_solve.main([f"cases={out / kind}", f"out={out / f'out_{kind}'}", f"jobs={jobs}"])
     found = merged(out, tuple(PLAN))
