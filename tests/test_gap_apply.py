@@ -15,14 +15,16 @@ import torch
 from omegaconf import OmegaConf
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
+from go1exp.audit import audit
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
 from go1exp.config import parse_task
 from go1exp.env.core import Go1Core
 from go1exp.gap import files
 from go1exp.gap.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
-from go1exp.gap.explain import explain, unusable
+from go1exp.gap.explain import explain
 from go1exp.gap.machine import hung
+from go1exp.gap.prepare import prepare, unusable
 from go1exp.gap.result import Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
 from go1exp.record import simulate
 from go1exp.recording import Recording
@@ -323,7 +325,7 @@ def test_what_is_not_for_training_is_not_asked_of_the_proof(tmp_path: Path) -> N
 def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
     rig, (recording, *_) = robot()
     machine, meta = hung(rig.robot), recording.meta
-    assert unusable(recording, machine) == []
+    assert unusable(recording, audit(recording), machine) == []
     swapped = replace(recording, meta=replace(meta, joints=(*meta.joints[1:], meta.joints[0])))
     bare = {k: v for k, v in recording.channels.items() if not k.startswith("qd_")}
     stuck = {**recording.channels, "q_FR_hip": np.full(len(recording.t), 0.1)}
@@ -333,13 +335,23 @@ def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
         (replace(recording, channels=bare), f"{meta.episode}: no qd"),
         (replace(recording, channels=stuck), f"{meta.episode}: q_FR_hip: "),
     ):
-        flaws = unusable(changed, machine)
+        flaws = unusable(changed, audit(changed), machine)
         assert any(said in line for line in flaws), (said, flaws)
         answer = explain([recording, changed], rig.robot)
         assert (answer.verdict, answer.exit_code) == ("bad log", 14)
         assert list(answer.warnings) == flaws
         assert flaws[0] in answer.sentence
         assert answer.floors is None
+
+
+def test_one_bad_log_of_many_is_left_out_and_said() -> None:
+    rig, recordings = robot()
+    stuck = {**recordings[0].channels, "q_FR_hip": np.full(len(recordings[0].t), 0.1)}
+    ready = prepare([replace(recordings[0], channels=stuck), *recordings[1:]], hung(rig.robot), GapSettings())
+    assert ready.flaws == ()
+    assert ready.recordings == recordings[1:]
+    assert ready.warnings
+    assert all(w.startswith(f"Left out: {recordings[0].meta.episode}: ") for w in ready.warnings)
 
 
 def test_logs_that_are_too_short_are_refused() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,14 @@ import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import RIG
 from go1exp.compose import compose
 from go1exp.config import parse_parts
+from go1exp.gap import strain
 from go1exp.gap.box import Bounds, solve
-from go1exp.gap.explain import explain
+from go1exp.gap.explain import explain, measured
+from go1exp.gap.fit import scores
 from go1exp.gap.judge import max_t, splits
 from go1exp.gap.likelihood import Layout, gram, predicted
-from go1exp.gap.machine import HungGo1
+from go1exp.gap.machine import HungGo1, hung
+from go1exp.gap.prepare import prepare
 from go1exp.gap.replay import Probe
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
 from go1exp.gap.windows import even_clock, held, noise
@@ -197,6 +201,30 @@ def test_a_model_that_is_right_has_no_gap(plain: tuple[simulate.Rig, list[Record
     assert abs(result.excess["null"]) < 0.05
     assert result.floors is not None
     assert result.floors.numerical["q"] < 1e-4
+
+
+def test_a_clock_need_not_start_at_zero(plain: tuple[simulate.Rig, list[Recording]]) -> None:
+    """What changes in the course of an episode counts from its beginning, not from when the logger was switched on."""
+    rig, found = plain
+    late = [replace(r, channels={**r.channels, "t": r.t + 1000.0}) for r in found]
+    weaker = {("strength_drift", "rate"): np.full(12, 0.05)}
+    chi2 = []
+    for logs in (found, late):
+        ready = prepare(logs, hung(rig.robot), QUICK)
+        windows = ready.windows()
+        np.testing.assert_allclose(windows.elapsed, windows.begin - 1000.0 * (logs is late), atol=2e-3)
+        score, _ = measured(ready, windows, 0.001, 0.002)
+        chi2.append(scores(score, [weaker], np.arange(len(windows)), 0.001)[0])
+    assert chi2[0].mean() > 2.0
+    np.testing.assert_allclose(chi2[1], chi2[0], rtol=1e-3)
+
+
+def test_what_strains_by_far_the_most_is_tried_and_nothing_else() -> None:
+    relief = {"armature": 900.0, "link_mass": 200.0, "strength": 100.0}
+    assert strain.straining(relief, []) == "armature"
+    assert strain.straining(relief, ["armature"]) is None  # 200 is too little
+    assert strain.straining(relief | {"link_mass": 301.0}, []) is None  # two that do nearly as much
+    assert strain.straining({}, []) is None
 
 
 def test_hidden_friction_is_named_where_it_is() -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from go1exp import __version__
-from go1exp.audit import audit
 from go1exp.gap import verdict as words
 from go1exp.gap.box import param
 from go1exp.gap.first_state import settled
@@ -20,21 +19,16 @@ from go1exp.gap.fit import residuals
 from go1exp.gap.judge import splits
 from go1exp.gap.likelihood import Scorer, scorer
 from go1exp.gap.localise import localise
-from go1exp.gap.machine import FixedBase, HungGo1, Machine, hung, tolerances_of
-from go1exp.gap.prepare import TELLING, Ready, prepare
+from go1exp.gap.machine import Machine, hung, tolerances_of
+from go1exp.gap.prepare import Ready, prepare
 from go1exp.gap.replay import Replayer, Theta, variants
 from go1exp.gap.result import Floors, GapResult, GapSettings, NamedEffect, Overlay
 from go1exp.gap.search import Progress, Search
-from go1exp.gap.standing import StandingGo1, StandingReplayer, StandingWindows
+from go1exp.gap.standing import StandingReplayer, StandingWindows
 from go1exp.gap.trial import excess, removed
 from go1exp.gap.windows import Windows
 from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
-
-NEEDED = ("t", "q", "qd", "q_target")
-"""Channels, or quantities, without which nothing can be replayed."""
-
-GO1 = "go1"
 
 MOST = 0.75
 """Share of the excess that terms must remove before the first of them is certified although a gap remains."""
@@ -73,10 +67,9 @@ def _explain(
     start = time.perf_counter()
     on_progress("auditing the logs", 0.0)
     logs, ready = recordings, prepare(recordings, machine, settings)
-    flaws = ready.flaws or [line for r in recordings for line in unusable(r, ready.machine)]
-    if flaws:
-        said = f"These logs cannot be compared with the model: {'; '.join(flaws[:3])}."
-        return GapResult("bad log", said, warnings=tuple(flaws), seconds=time.perf_counter() - start)
+    if ready.flaws:
+        said = f"These logs cannot be compared with the model: {'; '.join(ready.flaws[:3])}."
+        return GapResult("bad log", said, warnings=ready.flaws, seconds=time.perf_counter() - start)
     rng = np.random.default_rng(settings.seed)
     recordings, asked, settings = ready.recordings, settings, ready.settings
     try:
@@ -118,7 +111,7 @@ def _explain(
         warnings.append(
             f"Withdrawn, since episodes kept for a last check do not bear it out: {', '.join(search.terms)}."
         )
-        search.withdraw()
+        search.withdraw("episodes kept for a last check do not bear it out")
     first, final = search.first, search.steps[-1][1]
     on_progress("intervals", 0.88)
     theta, drawn = words.finish(search)
@@ -175,32 +168,6 @@ def _explain(
     )
     on_progress("done", 1.0)
     return result
-
-
-def unusable(recording: Recording, machine: Machine) -> list[str]:
-    """Return why a recording cannot be compared with the model, a line each."""
-    meta, name = recording.meta, recording.meta.episode
-    found = []
-    if isinstance(machine, FixedBase):
-        return []  # ``prepare`` has looked
-    if isinstance(machine, HungGo1 | StandingGo1) and meta.robot != GO1:
-        found.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}")
-    if meta.joints != machine.joints:
-        found.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(machine.joints)}")
-        return found
-    if meta.base != "fixed" and not machine.base_probe:
-        found.append(f"{name}: the trunk is free; only robots with a fixed base can be compared")
-    if meta.kp is None or meta.kd is None:
-        found.append(f"{name}: says no gains (kp, kd)")
-    found += [f"{name}: no {q}" for q in ("q", "qd", "q_target") if not recording.has(q)]
-    # On its feet a robot's weight moves joints against their targets; a flipped sign is for the comparison to show.
-    telling = (*TELLING, "sign") if meta.base == "floating" else TELLING
-    if not found:
-        for flaw in audit(recording).flaws:
-            needed = flaw.channel in (*NEEDED, "all") or flaw.channel.startswith(("q_", "qd_"))
-            if flaw.verdict == "bad" and needed and flaw.check not in telling:
-                found.append(f"{name}: {flaw.channel}: {flaw.message}")
-    return found
 
 
 def measured(ready: Ready, windows: Windows, dt: float, coarse: float) -> tuple[Scorer, dict[str, float]]:
@@ -318,4 +285,4 @@ def fingerprint(recording: Recording) -> str:
     return digest.hexdigest()
 
 
-__all__ = ["Windows", "explain", "fingerprint", "overlays", "repeatability", "unusable"]
+__all__ = ["Windows", "explain", "fingerprint", "overlays", "repeatability"]

@@ -55,7 +55,7 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
     turn = np.zeros(q.shape, dtype=bool)
     turn[:, span:-span] = qd[:, : -2 * span] * qd[:, 2 * span :] < 0
     speed = np.abs(qd)
-    time = np.broadcast_to((w.begin[windows][:, None] + t)[..., None], q.shape)
+    time = np.broadcast_to((w.elapsed[windows][:, None] + t)[..., None], q.shape)
     third = np.quantile(time, [1 / 3, 2 / 3])
     middle = np.median(q, axis=(0, 1))
     away = np.abs(q - middle)

@@ -43,6 +43,11 @@ MOST_STEPS = 250_000
 TELLING = ("delay", "torque")
 """Checks of the audit that a missing effect may fail; they say nothing against the log."""
 
+NEEDED = ("t", "q", "qd", "q_target")
+"""Channels, or quantities, without which nothing can be replayed."""
+
+GO1 = "go1"
+
 FEWEST = 3
 """Recordings that must be left if others are left out."""
 
@@ -87,19 +92,21 @@ class Ready:
 def prepare(recordings: Sequence[Recording], machine: Machine, settings: GapSettings) -> Ready:
     """Make recordings comparable with a machine, or say why they are not; the Go1 takes them as they are."""
     machine = on_feet(machine, recordings)
-    if isinstance(machine, StandingGo1):
-        lacking = tuple(f"{r.meta.episode}: no {name}" for r in recordings for name in missing(r))
-        return Ready(tuple(recordings), machine, for_feet(settings, recordings), flaws=lacking)
-    if not isinstance(machine, FixedBase):
-        return Ready(tuple(recordings), machine, settings)
     reports = [audit(r) for r in recordings]
-    flaws = [_flaws(r, a, machine) for r, a in zip(recordings, reports, strict=True)]
+    if isinstance(machine, FixedBase):
+        flaws = [_flaws(r, a, machine) for r, a in zip(recordings, reports, strict=True)]
+    else:
+        flaws = [unusable(r, a, machine) for r, a in zip(recordings, reports, strict=True)]
     good = [k for k, lines in enumerate(flaws) if not lines]
     lines = tuple(line for own in flaws for line in own)
     if not good or (lines and (len(good) < FEWEST or 2 * len(good) < len(recordings))):
         return Ready((), machine, settings, flaws=lines)
     warnings = [f"Left out: {line}." for line in lines]
     kept = [recordings[k] for k in good]
+    if isinstance(machine, StandingGo1):
+        return Ready(tuple(kept), machine, for_feet(settings, kept), warnings=tuple(warnings))
+    if not isinstance(machine, FixedBase):
+        return Ready(tuple(kept), machine, settings, warnings=tuple(warnings))
     wrong = _wrong_speeds(kept, [reports[k] for k in good], machine)
     if wrong:
         warnings.append(f"Speeds are not compared, and first speeds come from the angles: {wrong}.")
@@ -107,6 +114,32 @@ def prepare(recordings: Sequence[Recording], machine: Machine, settings: GapSett
     warnings += [*_clocks(kept, found, machine), *_guesses(kept, machine)]
     spaced, said = _spaced(found, settings, len(machine.groups[0]))
     return Ready(found, machine, spaced, ("qd",) if wrong else (), (*warnings, *said))
+
+
+def unusable(recording: Recording, report: AuditReport, machine: Machine) -> list[str]:
+    """Return why a recording cannot be compared with a model of the Go1, a line each."""
+    meta, name = recording.meta, recording.meta.episode
+    found = []
+    if meta.robot != GO1:
+        found.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}")
+    if meta.joints != machine.joints:
+        found.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(machine.joints)}")
+        return found
+    if meta.base != "fixed" and not machine.base_probe:
+        found.append(f"{name}: the trunk is free; only robots with a fixed base can be compared")
+    if meta.kp is None or meta.kd is None:
+        found.append(f"{name}: says no gains (kp, kd)")
+    found += [f"{name}: no {q}" for q in ("q", "qd", "q_target") if not recording.has(q)]
+    if isinstance(machine, StandingGo1):
+        found += [f"{name}: no {quantity}" for quantity in missing(recording)]
+    # On its feet a robot's weight moves joints against their targets; a flipped sign is for the comparison to show.
+    telling = (*TELLING, "sign") if meta.base == "floating" else TELLING
+    if not found:
+        for flaw in report.flaws:
+            needed = flaw.channel in (*NEEDED, "all") or flaw.channel.startswith(("q_", "qd_"))
+            if flaw.verdict == "bad" and needed and flaw.check not in telling:
+                found.append(f"{name}: {flaw.channel}: {flaw.message}")
+    return found
 
 
 def _flaws(recording: Recording, report: AuditReport, machine: FixedBase) -> list[str]:

@@ -132,7 +132,7 @@ class Search:
         now = self.held_out(self.theta)
         self.nominal, self.first = self.theta, excess(now)
         self.steps.append(("within tolerances", excess(now)))
-        stage = 1
+        stage, strained = 1, False
         if hidden is not None:
             self.progress(f"fitting the model with {hidden.name}", 0.2)
             train, now = self._take(hidden)
@@ -147,7 +147,7 @@ class Search:
                 self._listen(found)
             assert self.own is not None
             relief = strain.relief(self.scorer, self.own, self.may) if small else {}
-            straining = strain.straining(self.scorer, self.own, relief, [*self.terms, *self._unasked()])
+            straining = strain.straining(relief, [*self.terms, *self._unasked()])
             outside = strain.outside(found, box.of(self.scorer.replayer.machine)) if small and not straining else []
             if small and straining is None and not outside:
                 if not self.terms:  # beside a term they are no rivals of it
@@ -161,6 +161,7 @@ class Search:
             self.progress(f"fitting the model with {(accepted or inside).name}", share + 0.12)  # type: ignore[union-attr]
             if accepted is not None:
                 state = list(self.terms), list(self.loosened), self.theta, self.own, self.scorer, self.first
+                strained |= small and not self.terms
                 train, now = self._take(accepted)
                 if excess(now) > excess(self.held_out(state[2])) + judge.SAME:  # by the same floors
                     self.terms, self.loosened, self.theta, self.own, self.scorer, self.first = state
@@ -175,6 +176,8 @@ class Search:
             self._eliminate(now)
             self._simplify()
             self._prune()
+        if strained and self.terms and max(evidence.size(t, self.theta) for t in self.terms) <= strain.CLEAR:
+            self.withdraw("it leaves its tolerance by too little to be called missing")
 
     def confirmed(self) -> bool:
         """Return whether the terms help on the episodes kept for a last check, or there is nothing to help there."""
@@ -185,8 +188,9 @@ class Search:
         least = 0.0 if excess(before) > self.settings.material else -judge.SAME
         return bool(judge.gains(before, after[None]).mean() > least)
 
-    def withdraw(self) -> None:
+    def withdraw(self, why: str) -> None:
         """Take back all terms."""
+        self._reject(self.terms, why)
         self.terms, self.theta = [], self.nominal
         self.steps.append(("withdrawn", self.first))
 
@@ -219,13 +223,13 @@ class Search:
     def _refused(self, name: str) -> np.ndarray:
         """Note that a term that looked well made things worse with all else fitted again; return held-out chi2."""
         self.steps.pop()
-        self.candidates = [
-            replace(c, status="rejected", reason="with all else fitted again the held-out error grows")
-            if c.effect == name and c.status == "accepted"
-            else c
-            for c in self.candidates
-        ]
+        self._reject([name], "with all else fitted again the held-out error grows")
         return self.held_out(self.theta)
+
+    def _reject(self, names: Sequence[str], why: str) -> None:
+        for k, c in enumerate(self.candidates):
+            if c.status == "accepted" and c.effect in names:
+                self.candidates[k] = replace(c, status="rejected", reason=why)
 
     def _loosen(self, model: Model, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Let an effect move within its tolerance; return chi2 of training and of held-out windows."""
@@ -360,11 +364,9 @@ class Search:
         kept = self.kept
         for name in self.terms:
             out = np.flatnonzero(evidence.beyond(name, self.theta, machine.joints))
-            far = np.max(
-                [np.broadcast_to(evidence.deviation(self.theta, k), len(machine.joints)) for k in box.sizes(name)], 0
-            )
-            for j in sorted(out, key=lambda j: far[j])[: len(out) - 1]:
-                more = kept | {(name, int(j))}
+            alone = {int(j): cost(replace(self.may, kept=kept | {(name, int(j))})) for j in out}
+            for j in sorted(alone, key=lambda j: alone[j])[: len(out) - 1]:  # where it brings most, it stays
+                more = kept | {(name, j)}
                 if cost(replace(self.may, kept=more)) - cost(replace(self.may, kept=kept)) < NEEDED:
                     kept = more
         if kept != self.kept:

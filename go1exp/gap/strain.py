@@ -13,16 +13,21 @@ from go1exp.gap.likelihood import Layout, Scorer, Table
 if TYPE_CHECKING:
     from go1exp.gap.screen import Screened
 
-STRAIN = 0.0125
-"""Fall of chi2 per value, were the tolerance of one effect wider, from which a gap that the tolerances close is taken
-for that effect: at most 0.0054 in 45 development nulls within tolerances, 0.046 to 0.07 for effects of two of them."""
+STRAIN = 300.0
+"""Fall of chi2, were the tolerance of one effect wider, from which that effect is tried although the tolerances close
+the gap. In nulls it reaches 900 (a link's mass near the edge of its tolerance), for effects of two tolerances 670 and
+more: what decides is how far the effect goes when it may (``CLEAR``)."""
 
 LEAD = 3.0
 """The same over that of the next effect."""
 
+CLEAR = 1.5
+"""Tolerances that an effect must reach to be named where the tolerances close the gap."""
+
 OUTSIDE = 0.03
-"""The same for an effect that the tolerances have no place for, in the windows of the screening, of which half are
-the worst: at most 0.0074 in development nulls, 0.053 and 0.138 for effects of two tolerances that the others hid."""
+"""Fall of chi2 per value, in the windows of the screening, of which half are the worst, for an effect that the
+tolerances have no place for: at most 0.0074 in development nulls, 0.053 and 0.138 for effects of two tolerances that
+others hid."""
 
 
 def cost(scorer: Scorer, own: Table) -> Callable[[box.Freedom], float]:
@@ -51,32 +56,28 @@ def relief(scorer: Scorer, own: Table, may: box.Freedom) -> dict[str, float]:
     return {effect: price(may) - price(may.also(effect)) for effect in effects}
 
 
-def straining(scorer: Scorer, own: Table, relieved: Mapping[str, float], but: Collection[str]) -> str | None:
+def straining(relieved: Mapping[str, float], but: Collection[str]) -> str | None:
     """Return the one effect that would leave its tolerance if it might, far more than any other; None if none would.
 
     Args:
-        scorer: of the windows.
-        own: the linear model of what may move.
         relieved: what :func:`relief` found.
         but: effects that are out of the question.
     """
     order = sorted((e for e in relieved if e not in but), key=lambda e: -relieved[e])
-    if not order:
-        return None
-    values = float(scorer.size[own.windows].sum()) * len(scorer.replayer.machine.groups)
     second = relieved[order[1]] if len(order) > 1 else 0.0
-    clear = relieved[order[0]] > STRAIN * values and relieved[order[0]] > LEAD * second
-    return order[0] if clear else None
+    return order[0] if order and relieved[order[0]] > max(STRAIN, LEAD * second) else None
 
 
 def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Screened]:
-    """Return the effects that have no tolerance to move in and would relieve the others of much, strongest first.
+    """Return the effects to try if one that has no tolerance to move in would relieve the others most; none otherwise.
 
-    Those that relieve nearly as much as the strongest are its rivals; held-out data decide between them.
+    Those that would relieve nearly as much are its rivals; held-out data decide between them.
 
     Args:
         screened: what the linear model says of every effect.
         within: effects that move within their tolerances already.
     """
-    order = sorted((s for s in screened if s.variant.effect not in within), key=lambda s: -s.relief)
-    return [s for s in order if s.relief > max(OUTSIDE, order[0].relief / LEAD)]
+    order = sorted(screened, key=lambda s: -s.relief)
+    if not order or order[0].variant.effect in within or order[0].relief < OUTSIDE:
+        return []
+    return [s for s in order if s.relief > order[0].relief / LEAD]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from go1exp.gap import verdict as words
-from go1exp.gap.explain import FEWEST, measured, repeatability, unusable
+from go1exp.gap.explain import FEWEST, measured, repeatability
 from go1exp.gap.fit import residuals
 from go1exp.gap.judge import splits
 from go1exp.gap.localise import localise
@@ -85,9 +85,8 @@ def _survey(
 ) -> Survey:
     on_progress("auditing the logs", 0.0)
     ready = prepare(recordings, machine, settings)
-    flaws = ready.flaws or tuple(line for r in recordings for line in unusable(r, ready.machine))
-    if flaws:
-        return Survey(flaws)
+    if ready.flaws:
+        return Survey(ready.flaws)
     recordings, settings = ready.recordings, ready.settings
     try:
         windows = ready.windows()

@@ -12,6 +12,7 @@ from go1exp.gap import box, evidence, judge
 from go1exp.gap.fit import Model, scores
 from go1exp.gap.likelihood import Layout, Scorer
 from go1exp.gap.result import GapSettings
+from go1exp.gap.strain import CLEAR
 
 FEW = 0.5
 """A candidate that removes more than this share of the excess without being significant is seen in too few windows."""
@@ -74,6 +75,8 @@ class Trial:
             return "accepted", f"removes {share:.1%} of the excess on held-out windows, p = {p:.2g}"
         if chosen is not None and self.alias[k]:
             return "alias", f"does as well as {self.names[chosen]}: these data cannot tell them apart"
+        if self.needed < 0.0 and 1.0 < self.sizes[k] <= CLEAR:
+            return "rejected", f"leaves its tolerance by too little ({self.sizes[k]:.2g} of it) to be called missing"
         if self.sizes[k] <= 1.0:
             return "rejected", f"fits within its tolerance ({self.sizes[k]:.2g} of it)"
         if p >= self.alpha and share > FEW and self.mean[k] > 0:
@@ -125,7 +128,7 @@ def tried(
     needed = -math.inf if small else needed
     sizes = np.array([evidence.size(m.name, m.theta) for m in fitted])
     helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
-    fit_for_it = np.flatnonzero(helps & (sizes > 1.0))
+    fit_for_it = np.flatnonzero(helps & (sizes > (CLEAR if small else 1.0)))
     chosen, alias = None, np.zeros(len(fitted), dtype=bool)
     if len(fit_for_it):
         best = int(max(fit_for_it, key=lambda k: gain[k].mean()))

@@ -43,7 +43,8 @@ class Windows:
         quantities: names of the C quantities.
         period: the logger's, s.
         episode: (W,) index of the recording.
-        begin: (W,) time of the first state in the episode, s.
+        begin: (W,) time of the first state by the recording's clock, s.
+        origin: (W,) time at which the recording begins, by the same clock, s.
         q: (W, J) first state, rad.
         qd: (W, J) rad/s.
         qdd: (W, J) rad/s2.
@@ -65,6 +66,7 @@ class Windows:
     period: float
     episode: np.ndarray
     begin: np.ndarray
+    origin: np.ndarray
     q: np.ndarray
     qd: np.ndarray
     qdd: np.ndarray
@@ -82,6 +84,11 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.episode)
+
+    @property
+    def elapsed(self) -> np.ndarray:
+        """(W,) time of the first state since the episode began, s."""
+        return self.begin - self.origin
 
     @property
     def of_joints(self) -> int:
@@ -242,6 +249,7 @@ def cut(
                 {
                     "episode": number,
                     "begin": begin,
+                    "origin": t[0],
                     "q": q,
                     "qd": qd,
                     "qdd": qdd,
