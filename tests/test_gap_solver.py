@@ -221,10 +221,12 @@ def test_a_clock_need_not_start_at_zero(plain: tuple[simulate.Rig, list[Recordin
 
 def test_what_strains_by_far_the_most_is_tried_and_nothing_else() -> None:
     relief = {"armature": 900.0, "link_mass": 200.0, "strength": 100.0}
-    assert strain.straining(relief, []) == "armature"
-    assert strain.straining(relief, ["armature"]) is None  # 200 is too little
-    assert strain.straining(relief | {"link_mass": 301.0}, []) is None  # two that do nearly as much
-    assert strain.straining({}, []) is None
+    values = 900.0 / (2.0 * strain.STRAIN)
+    assert strain.straining(relief, values, []) == "armature"
+    assert strain.straining(relief, 3.0 * values, []) is None
+    assert strain.straining(relief, values, ["armature"]) is None  # 200 is too little
+    assert strain.straining(relief | {"link_mass": 301.0}, values, []) is None  # two that do nearly as much
+    assert strain.straining({}, values, []) is None
 
 
 def test_hidden_friction_is_named_where_it_is() -> None:

@@ -174,7 +174,7 @@ def screen(
     grams = full.grams(scorer)
     before = grams[..., -1, -1] / size
     weight = 1.0 / np.maximum(before, 1.0)
-    plain, values = strain.cost(scorer, own)(may), float(size.sum()) * len(machine.groups)
+    plain, count = strain.cost(scorer, own)(may), strain.values(scorer, own)
     at = known
     for variant in library:
         added = list(range(at, at + len(variant.probes)))
@@ -188,7 +188,7 @@ def screen(
         limits, strict = (box.bounds(layout, probes, theta, freed, back) for back in (False, True))
         for some in (limits, strict) if variant.quadrature else ():
             some.low[layout.part(np.arange(known, len(probes)))] = -np.inf
-        relief = (plain - strain.price(matrix, right, strict)) / values
+        relief = (plain - strain.price(matrix, right, strict)) / count
         x = box.solve(matrix, right, limits)
         after = predicted(part, layout, x) / size
         gain = float(np.mean(np.log(before.sum(1) / np.maximum(after, 0.3).sum(1))))

@@ -147,7 +147,7 @@ class Search:
                 self._listen(found)
             assert self.own is not None
             relief = strain.relief(self.scorer, self.own, self.may) if small else {}
-            straining = strain.straining(relief, [*self.terms, *self._unasked()])
+            straining = strain.straining(relief, strain.values(self.scorer, self.own), [*self.terms, *self._unasked()])
             outside = strain.outside(found, box.of(self.scorer.replayer.machine)) if small and not straining else []
             if small and straining is None and not outside:
                 if not self.terms:  # beside a term they are no rivals of it

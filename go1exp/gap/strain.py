@@ -13,10 +13,10 @@ from go1exp.gap.likelihood import Layout, Scorer, Table
 if TYPE_CHECKING:
     from go1exp.gap.screen import Screened
 
-STRAIN = 300.0
-"""Fall of chi2, were the tolerance of one effect wider, from which that effect is tried although the tolerances close
-the gap. In nulls it reaches 900 (a link's mass near the edge of its tolerance), for effects of two tolerances 670 and
-more: what decides is how far the effect goes when it may (``CLEAR``)."""
+STRAIN = 0.0125
+"""Fall of chi2 per value, were the tolerance of one effect wider, from which that effect is tried although the
+tolerances close the gap: at most 0.0054 in 45 development nulls, 0.046 to 0.07 for effects of two tolerances. With much
+less, masses of links that hardly matter get names: at 300 in all, in 2 of 8 nulls."""
 
 LEAD = 3.0
 """The same over that of the next effect."""
@@ -28,6 +28,11 @@ OUTSIDE = 0.03
 """Fall of chi2 per value, in the windows of the screening, of which half are the worst, for an effect that the
 tolerances have no place for: at most 0.0074 in development nulls, 0.053 and 0.138 for effects of two tolerances that
 others hid."""
+
+
+def values(scorer: Scorer, own: Table) -> float:
+    """Return how many values are compared in the windows of ``own``."""
+    return float(scorer.size[own.windows].sum()) * len(scorer.replayer.machine.groups)
 
 
 def cost(scorer: Scorer, own: Table) -> Callable[[box.Freedom], float]:
@@ -56,16 +61,17 @@ def relief(scorer: Scorer, own: Table, may: box.Freedom) -> dict[str, float]:
     return {effect: price(may) - price(may.also(effect)) for effect in effects}
 
 
-def straining(relieved: Mapping[str, float], but: Collection[str]) -> str | None:
+def straining(relieved: Mapping[str, float], count: float, but: Collection[str]) -> str | None:
     """Return the one effect that would leave its tolerance if it might, far more than any other; None if none would.
 
     Args:
         relieved: what :func:`relief` found.
+        count: of values that were compared.
         but: effects that are out of the question.
     """
     order = sorted((e for e in relieved if e not in but), key=lambda e: -relieved[e])
     second = relieved[order[1]] if len(order) > 1 else 0.0
-    return order[0] if order and relieved[order[0]] > max(STRAIN, LEAD * second) else None
+    return order[0] if order and relieved[order[0]] > max(STRAIN * count, LEAD * second) else None
 
 
 def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Screened]:
