@@ -13,7 +13,7 @@ from go1exp.gap.fit import Model, fit, scores
 from go1exp.gap.likelihood import Scorer, Table, table
 from go1exp.gap.replay import Key, Theta
 from go1exp.gap.result import Candidate, GapSettings
-from go1exp.gap.screen import FREE_SHAPES, Screened, library, screen
+from go1exp.gap.screen import FREE_SHAPES, Screened, library, outside, screen
 from go1exp.gap.trial import excess, removed, tried
 
 Progress = Callable[[str, float], None]
@@ -148,13 +148,13 @@ class Search:
             assert self.own is not None
             relief = strain.relief(self.scorer, self.own, self.may) if small else {}
             straining = strain.straining(relief, strain.values(self.scorer, self.own), [*self.terms, *self._unasked()])
-            outside = strain.outside(found, box.of(self.scorer.replayer.machine)) if small and not straining else []
-            if small and straining is None and not outside:
+            beyond = outside(found, box.of(self.scorer.replayer.machine)) if small and not straining else []
+            if small and straining is None and not beyond:
                 if not self.terms:  # beside a term they are no rivals of it
                     self.candidates += evidence.absorbed(self.keys, relief, self.theta, settings.shortlist)
                 break
             self.progress(f"fitting candidates for term {stage}", share + 0.06)
-            fitted = self._fitted(outside if small else found) if straining is None else self._freed(straining)
+            fitted = self._fitted(beyond if small else found) if straining is None else self._freed(straining)
             accepted, inside = self.judged(stage, fitted, train, now, small)
             if accepted is None and (inside is None or len(self.loosened) == LOOSENED):
                 break

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 
 from go1exp.gap import box
 from go1exp.gap.likelihood import Layout, Scorer, Table
-
-if TYPE_CHECKING:
-    from go1exp.gap.screen import Screened
 
 STRAIN = 0.0125
 """Fall of chi2 per value, were the tolerance of one effect wider, from which that effect is tried although the
@@ -23,11 +19,6 @@ LEAD = 3.0
 
 CLEAR = 1.5
 """Tolerances that an effect must reach to be named where the tolerances close the gap."""
-
-OUTSIDE = 0.03
-"""Fall of chi2 per value, in the windows of the screening, of which half are the worst, for an effect that the
-tolerances have no place for: at most 0.0074 in development nulls, 0.053 and 0.138 for effects of two tolerances that
-others hid."""
 
 
 def values(scorer: Scorer, own: Table) -> float:
@@ -72,18 +63,3 @@ def straining(relieved: Mapping[str, float], count: float, but: Collection[str])
     order = sorted((e for e in relieved if e not in but), key=lambda e: -relieved[e])
     second = relieved[order[1]] if len(order) > 1 else 0.0
     return order[0] if order and relieved[order[0]] > max(STRAIN * count, LEAD * second) else None
-
-
-def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Screened]:
-    """Return the effects to try if one that has no tolerance to move in would relieve the others most; none otherwise.
-
-    Those that would relieve nearly as much are its rivals; held-out data decide between them.
-
-    Args:
-        screened: what the linear model says of every effect.
-        within: effects that move within their tolerances already.
-    """
-    order = sorted(screened, key=lambda s: -s.relief)
-    if not order or order[0].variant.effect in within or order[0].relief < OUTSIDE:
-        return []
-    return [s for s in order if s.relief > order[0].relief / LEAD]
