@@ -11,6 +11,7 @@ import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -28,8 +29,11 @@ from go1exp.config import ActionConfig, TaskConfig, parse_task, parse_train
 from go1exp.deploy import bundle
 from go1exp.deploy.archive import BundleError, as_json, pack, seal, stored
 from go1exp.deploy.bundle import MEMBERS, Bundle, loads
+from go1exp.deploy.controller import Controller
+from go1exp.deploy.messages import Link, LowCmd, LowState
 from go1exp.deploy.metadata import Metadata
 from go1exp.deploy.policy import OnnxPolicy
+from go1exp.deploy.safety import Safety
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.policy import load_policy
 from go1exp.export import graph
@@ -524,10 +528,44 @@ def test_a_row_is_the_same_alone_and_among_others(good: Bundle) -> None:
             np.testing.assert_allclose(values[0], together[name][k], rtol=0, atol=1e-5)
 
 
+def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: Bundle) -> None:
+    """Controller, policy and safety in a row, from a state's arrival to the command that is sent."""
+    trace = good.trace
+    apart = np.flatnonzero(np.diff(trace["time"]) > 0.021)  # where an episode ended
+    rows = int(apart[0]) + 1 if len(apart) else len(trace["time"])
+    assert rows > 5
+    still = np.zeros(12)
+    states = [
+        LowState(
+            t=float(trace["time"][k]),
+            joint_torque=still,
+            imu_acc=np.zeros(3),
+            foot_force=np.zeros(4),
+            **{name: trace[f"input.{name}"][k] for name in ("joint_pos", "joint_vel", "imu_quat", "imu_gyro")},
+        )
+        for k in range(rows)
+    ]
+    sent: list[LowCmd] = []
+    seen: list[Any] = []
+    link = SimpleNamespace(receive=lambda: [states[len(sent)]], send=sent.append)
+    commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
+    estimator = SimpleNamespace(update=lambda state: trace["input.base_lin_vel_b"][len(sent)])
+    safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
+    runtime = Controller(good, cast(Link, link), commands, estimator, safety, stand_up=0.0, on_cycle=seen.append)
+    for state in states:
+        assert runtime.cycle(state.t)
+    assert safety.fault is None
+    assert not safety.clamped.any()
+    np.testing.assert_allclose([c.observation for c in seen], trace["output.observation"][:rows], rtol=0, atol=1e-5)
+    np.testing.assert_allclose([c.joint_target for c in sent], trace["output.joint_target"][:rows], rtol=0, atol=1e-5)
+    assert all((c.kp == good.metadata.kp).all() and (c.kd == good.metadata.kd).all() for c in sent)
+
+
 def test_loading_a_bundle_loads_neither_torch_nor_an_engine_nor_hydra(data: bytes, tmp_path: Path) -> None:
     (tmp_path / "b.zip").write_bytes(data)
     code = (
-        "import sys, json; from go1exp.deploy.bundle import load; found = load('b.zip'); "
+        "import sys, json, go1exp.deploy.controller, go1exp.deploy.loop, go1exp.deploy.safety; "
+        "from go1exp.deploy.bundle import load; found = load('b.zip'); "
         "print(json.dumps([found.seal, sorted({name.split('.')[0] for name in sys.modules})]))"
     )
     done = subprocess.run(
