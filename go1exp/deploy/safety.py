@@ -22,6 +22,11 @@ DEFAULT_KD = 2.0
 """Braking gain, N m s/rad: lets a Go1 sink in about a second and is far from what makes its drives chatter (chosen)."""
 
 
+READ = ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
+ASKED = ("joint_target", "kp", "kd")
+"""Parts of a state and of a command that have to be numbers."""
+
+
 @dataclass(frozen=True)
 class SafetyConfig:
     """Where the faults begin.
@@ -143,16 +148,16 @@ class Safety:
         return LowCmd(target, self._zeros, self._braking, damping=True)
 
     def limited(self, state: LowState, command: LowCmd) -> LowCmd:
-        """Cut targets to the SDK's range and the stops, and then to where they ask for no more than the peak torque."""
-        target = np.clip(command.joint_target, self._low, self._high)
-        brake = command.kd * state.joint_vel
-        with np.errstate(divide="ignore", invalid="ignore"):
-            reach_low = state.joint_pos + (brake - self._torque_limit) / command.kp
-            reach_high = state.joint_pos + (brake + self._torque_limit) / command.kp
-        held = command.kp > 0
-        target = np.where(held, np.clip(target, reach_low, reach_high), target)
-        # Where the joint moves so fast that both cannot be had, the range of the targets wins.
-        target = np.clip(target, self._low, self._high)
+        """Cut targets to where they ask for no more than the peak torque, and then to the SDK's range and the stops.
+
+        Where a joint moves so fast that both cannot be had, the range wins.
+        """
+        held = command.kp > 0.0
+        reach = np.divide(self._torque_limit, command.kp, out=np.full_like(self._torque_limit, np.inf), where=held)
+        drag = np.divide(command.kd, command.kp, out=np.zeros_like(self._torque_limit), where=held)
+        still = state.joint_pos + drag * state.joint_vel  # the target that asks for no torque
+        target = np.minimum(np.maximum(command.joint_target, still - reach), still + reach)
+        target = np.minimum(np.maximum(target, self._low), self._high)
         self.clamped += target != command.joint_target
         return LowCmd(target, command.kp, command.kd, command.damping)
 
@@ -171,18 +176,15 @@ class Safety:
 
     def not_finite(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
         """A reading or a command is no number."""
-        parts: list[tuple[str, np.ndarray]] = []
-        if state is not None:
-            names = ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
-            parts += [(name, getattr(state, name)) for name in names]
-        if command is not None:
-            parts += [(name, getattr(command, name)) for name in ("joint_target", "kp", "kd")]
-        for name, values in parts:
-            if not np.isfinite(values).all():
-                k = int(np.flatnonzero(~np.isfinite(values))[0])
-                where = self._joints[k] if len(values) == len(self._joints) else str(k)
-                return f"{name} of {where} is {values[k]}"
-        return None
+        given: list[tuple[LowState | LowCmd, str]] = [(state, name) for name in READ] if state is not None else []
+        given += [(command, name) for name in ASKED] if command is not None else []
+        vectors = [getattr(message, name) for message, name in given]
+        if not vectors or np.isfinite(np.concatenate(vectors)).all():
+            return None
+        (_, name), values = next(p for p in zip(given, vectors, strict=True) if not np.isfinite(p[1]).all())
+        k = int(np.flatnonzero(~np.isfinite(values))[0])
+        where = self._joints[k] if len(values) == len(self._joints) else str(k)
+        return f"{name} of {where} is {values[k]}"
 
     def attitude(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
         """The attitude is none, as from an IMU that has not started."""
