@@ -23,6 +23,8 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
+from go1exp.errors import Expected as Expected  # where everything above the runtime takes it from
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -43,10 +45,6 @@ def ordered(bounds: tuple[float, float]) -> tuple[float, float]:
 Range = Annotated[tuple[float, float], AfterValidator(ordered)]
 """``[low, high]`` of a uniform distribution."""
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
-
-
-class Expected(RuntimeError):
-    """Base of failures whose message says all there is to say; the command line prints it without a traceback."""
 
 
 class ConfigError(ValueError):

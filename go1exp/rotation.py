@@ -20,6 +20,12 @@ def rotate_inverse(quat: Tensor, vector: Tensor) -> Tensor:
     return vector - w * t + torch.linalg.cross(axis, t)
 
 
+def projected_gravity(quat: Tensor) -> Tensor:
+    """Direction of gravity (N, 3), unit length, in the frame of orientation ``quat`` (N, 4), w-x-y-z."""
+    zero = torch.zeros_like(quat[:, 0])
+    return rotate_inverse(quat, torch.stack([zero, zero, zero - 1.0], dim=-1))
+
+
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product (N, 4), w-x-y-z: the rotation ``b`` followed, in the fixed frame, by ``a``."""
     aw, av, bw, bv = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]

@@ -144,6 +144,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("gap logs=5", ("gap: logs = 5: ", "valid string or a valid array")),
         ("gap logs=x stage=fit search.alpha=2", ("2 problems", "stage = 'fit'", "'localise'", "search.alpha = 2")),
         ("gap logs=x +search.int=3", ("search.int: unknown key",)),
+        ("export", ("run: required",)),
+        ("export run=nowhere secnds=2", ("secnds=2", "did you mean 'seconds'")),
+        ("export run=nowhere seconds=0", ("seconds = 0", "greater than 0")),
+        ("export check", ("go1exp export check: file: required",)),
+        ("export check a.zip +deep=1", ("deep: unknown key",)),
         ("list efects", ("'efects'", "did you mean 'effect'")),
         # others
         ("train seed=4294967296", ("seed = 4294967296", "4294967295")),
@@ -243,7 +248,9 @@ def test_a_recording_that_is_not_there_is_named(arguments: str, said: str, tmp_p
     assert (done.returncode, done.stdout, done.stderr) == (1, "", f"{said}\n")
 
 
-@pytest.mark.parametrize("argument", ["eval run=nowhere", "play run=nowhere", "train resume=nowhere"])
+@pytest.mark.parametrize(
+    "argument", ["eval run=nowhere", "play run=nowhere", "export run=nowhere", "train resume=nowhere"]
+)
 def test_a_run_folder_that_does_not_exist_is_refused_at_once(argument: str, tmp_path: Path) -> None:
     assert_refused(tmp_path, argument.split(), "nowhere", "not a run folder")
 
@@ -331,6 +338,8 @@ def test_the_examples_of_the_help_are_commands_that_exist(
         ("record_audit", ["a.parquet", "b.parquet", "out=x"], ["out=x", "files=['a.parquet','b.parquet']"]),
         ("record_audit", ["files=[a]", "--cfg", "job"], ["files=[a]", "--cfg", "job"]),
         ("record_import", ["go2_in_air", "logs/it's.csv"], ["source='go2_in_air'", r"path='logs/it\'s.csv'"]),
+        ("export_check", ["walk.zip"], ["file='walk.zip'"]),
+        ("export", ["run=x", "walk.zip"], ["run=x", "walk.zip"]),
         ("record_import", ["go2_in_air", "a", "b"], ["source='go2_in_air'", "path='a'", "b"]),
         ("train", ["reward=paper", "word"], ["reward=paper", "word"]),
         ("record", [], []),
@@ -407,6 +416,9 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
         ("go1exp record effect=cou", {"effect=coulomb"}),
         ("go1exp record audit ou", {"out="}),
         ("go1exp record import opt", {"options="}),
+        ("go1exp export ch", {"check", "checkpoint="}),
+        ("go1exp export seco", {"seconds="}),
+        ("go1exp export check fi", {"file="}),
         ("go1exp fit-actuator epo", {"epochs=", "epoch_rows="}),
     ],
 )

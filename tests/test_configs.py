@@ -341,6 +341,8 @@ VERBS: dict[str, type] = {
     "record_audit": settings.AuditSettings,
     "record_import": settings.ImportSettings,
     "gap": settings.GapVerb,
+    "export": settings.ExportSettings,
+    "export_check": settings.ExportCheckSettings,
     "fit-actuator": settings.FitActuatorSettings,
     "list": settings.ListSettings,
     "bench": settings.BenchSettings,

@@ -41,7 +41,9 @@ from go1exp.cli.app import App
 from go1exp.cli.record import RIG
 from go1exp.compose import config_folder, register_groups
 from go1exp.config import MANY_TERMS, ONE_TERM, parse_parts, parse_train
+from go1exp.deploy.bundle import loads
 from go1exp.env.core import Go1Core
+from go1exp.export.build import build
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.registry import ConfigError, Range
 from go1exp.train import run_folder, trainer
@@ -59,7 +61,7 @@ EXEMPT = {
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
-    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap")},
+    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     "model/go1.yaml:model": "the Go1 is that of the group robot",
     **{
         f"model/{name}.yaml:model": "a robot that is not simulated here; test_gap_machines.py shows what its keys do"
@@ -128,6 +130,8 @@ SMALL: dict[str, dict[str, Any]] = {
         "search.overlays": 1,
         "search.threads": 1,
     },
+    "export": {"seconds": 0.1},
+    "export_check": {},
     "list": {},
     "bench": {"num_envs": 4, "rounds": 1, "seconds": 0.1, "threads": 1},
 }
@@ -166,6 +170,9 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "gap:search.confirm_fraction": lambda walk: [0.5],
     "gap:search.certified": lambda walk: [0.0],
     "gap:search.max_rows": lambda walk: [64],
+    "export:run": lambda walk: [str(walk.trained("other", "seed=5"))],
+    "export:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
+    "export_check:file": lambda walk: [str(walk.exported("other", "seed=5"))],
     "list:group": lambda walk: ["reward"],
     "bench:overrides": lambda walk: [["sim.physics_dt=0.004"]],
 }
@@ -312,6 +319,8 @@ SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
     "record_import": (settings.ImportSettings, ()),
     "fit-actuator": (settings.FitActuatorSettings, ("robot",)),
     "gap": (settings.GapVerb, ("robot", "model")),
+    "export": (settings.ExportSettings, ()),
+    "export_check": (settings.ExportCheckSettings, ()),
     "list": (settings.ListSettings, ()),
     "bench": (settings.BenchSettings, ()),
 }
@@ -444,6 +453,13 @@ class Walk:
             self._runs[name] = folder
         return self._runs[name]
 
+    def exported(self, name: str, *overrides: str) -> Path:
+        """The bundle of a finished run."""
+        file = self._scratch / f"{name}.zip"
+        if not file.exists():
+            file.write_bytes(build(self.trained(name, *overrides), seconds=0.1))
+        return file
+
     def logs(self, seed: int) -> Path:
         """A folder with a log of each of two other robots."""
         folder, rng = self._scratch / f"logs{seed}", np.random.default_rng(seed)
@@ -458,7 +474,7 @@ class Walk:
 
     def needs(self, leaf: Leaf) -> list[str]:
         """Overrides without which the program of a leaf does nothing, or nothing that the leaf could change."""
-        if leaf.program in ("eval", "play"):
+        if leaf.program in ("eval", "play", "export"):
             return [f"run={self.trained('run')}"]
         if leaf.program == "record":
             walk = ["excitation=[policy]", f"run={self.trained('run')}"] if leaf.key in ("run", "episodes") else []
@@ -470,6 +486,8 @@ class Walk:
             return ["source=go2_in_air", f"path={self.logs(0)}"]
         if leaf.program == "fit-actuator":
             return [f"recordings={self.recorded('five', FIVE)}"]
+        if leaf.program == "export_check":
+            return [f"file={self.exported('run')}"]
         if leaf.program == "gap":
             return [f"logs={self.recorded('held', HELD)}"]
         return []
@@ -802,6 +820,26 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
             yield name, OmegaConf.to_container(OmegaConf.create(content.decode()))
 
 
+def export_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """The policy, what it is said to be, and its trace; not the configuration that goes with them."""
+    from go1exp.cli.export import APP
+
+    _, files = outcome(APP, container, walk)
+    yield "files", sorted(files)
+    for content in files.values():
+        found = loads(content, "bundle")
+        yield "checkpoint", found.metadata.trained.sha256
+        yield "trace", found.trace
+
+
+def check_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """What is said of the policy, without the file's name."""
+    from go1exp.cli.export_check import APP
+
+    said, _ = outcome(APP, container, walk)
+    yield "said", [re.sub(r"\S+\.zip", "", line) for line in said.splitlines()]
+
+
 def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
     from go1exp.cli.listing import APP
 
@@ -848,6 +886,8 @@ TRACES: dict[str, Callable[[dict[str, Any], Walk], Trace]] = {
     "record_import": import_trace,
     "fit-actuator": fit_trace,
     "gap": gap_trace,
+    "export": export_trace,
+    "export_check": check_trace,
     "list": list_trace,
     "bench": bench_trace,
 }

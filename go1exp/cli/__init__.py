@@ -15,6 +15,7 @@ VERBS = {
     "play": "watch a trained policy: a clip without a display, a live viewer with one",
     "record": "drive the simulated robot and log it; audit recordings, import others",
     "gap": "find where simulation and recordings disagree, name the missing effect, add it",
+    "export": "pack a trained policy into one sealed file for the robot; check such a file",
     "fit-actuator": "learn an actuator net from recordings",
     "list": "list terms, groups and their choices, one line each",
     "bench": "measure speed as ratios in one run",
@@ -24,12 +25,13 @@ VERBS = {
 MODULES = {"eval": "evaluate", "fit-actuator": "fit_actuator", "list": "listing"}
 """Modules that cannot have their verb's name."""
 
-SUBVERBS = {"record": ("audit", "import")}
+SUBVERBS = {"record": ("audit", "import"), "export": ("check",)}
 """Second words of a verb that are verbs of their own; module and configuration are called VERB_WORD."""
 
 POSITIONAL: dict[str, tuple[str, ...]] = {
     "record_audit": ("files",),
     "record_import": ("source", "path"),
+    "export_check": ("file",),
     "gap": ("stage",),
     "list": ("group",),
 }

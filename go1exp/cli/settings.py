@@ -18,6 +18,7 @@ T = TypeVar("T")
 REQUIRED = {
     "run": "run=runs/NAME",
     "files": "go1exp record audit recordings/NAME.parquet",
+    "file": "go1exp export check runs/NAME/bundle.zip",
     "source": "go1exp record import go2_in_air PATH",
     "path": "go1exp record import go2_in_air PATH",
     "recordings": "recordings=recordings",
@@ -128,6 +129,28 @@ class ImportSettings:
     path: str
     options: dict[str, Any] | None
     out: str
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """``conf/export.yaml``."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    run: RunFolder
+    checkpoint: str | None
+    seconds: Annotated[float, Field(gt=0, le=600)]
+    seed: Annotated[int, Field(ge=0)]
+    out: str | None
+
+
+@dataclass(frozen=True)
+class ExportCheckSettings:
+    """``conf/export_check.yaml``."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    file: Annotated[str, Field(min_length=1)]
 
 
 @dataclass(frozen=True)

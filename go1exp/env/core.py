@@ -17,6 +17,7 @@ from go1exp import robot
 from go1exp.config import BackendConfig, TaskConfig
 from go1exp.env.faults import NumericalFault
 from go1exp.env.plant import Plant, drive_setup
+from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.foot_timers import FootTimers
 from go1exp.mdp.ground import GroundHeight
 from go1exp.mdp.kinematics import KinematicState
@@ -24,7 +25,7 @@ from go1exp.physics.backend import PhysicsBackend
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
 from go1exp.randomness import EnvRandom
-from go1exp.rotation import rotate_inverse
+from go1exp.rotation import projected_gravity, rotate_inverse
 from go1exp.terrain import build_terrain
 from go1exp.types import Snapshot, StepResult
 
@@ -233,11 +234,10 @@ class Go1Core:
 
     def _advance_physics(self, action: Tensor) -> None:
         """Run the substeps of one policy step."""
-        clip = self.task.action.clip
         self.previous_action.copy_(self.action)
-        self.action.copy_(action.clamp(-clip, clip))
+        self.action.copy_(clipped(action, self.task.action.clip))
         self._last_action.copy_(self.action)
-        self.target.copy_(self._nominal + self.task.action.scale * self.action)
+        self.target.copy_(joint_target(self.action, self._nominal, self.task.action.scale))
         target = self.target.to(self.backend.qpos.dtype)
         self.feet.begin_step()
         self._touched.zero_()
@@ -295,8 +295,6 @@ class Go1Core:
         """Return the present moment as the MDP sees it; staleness of sensors as in ``physics/backend.py``."""
         state = self._state
         quat = state.base_quat_w.float()
-        gravity = torch.zeros(self.num_envs, 3, device=self.device)
-        gravity[:, 2] = -1.0
         foot_pos = self._foot_pos_w.float()
         ground = self._ground(foot_pos[..., :2]) if self._bounded else 0.0
         timers = self.feet
@@ -305,7 +303,7 @@ class Go1Core:
             base_quat_w=quat,
             base_lin_vel_b=rotate_inverse(quat, state.base_lin_vel_w.float()),
             base_ang_vel_b=state.base_ang_vel_b.float(),
-            projected_gravity_b=rotate_inverse(quat, gravity),
+            projected_gravity_b=projected_gravity(quat),
             joint_pos=state.joint_pos.float(),
             joint_vel=state.joint_vel.float(),
             joint_acc=self.joint_acc,

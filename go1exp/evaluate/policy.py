@@ -33,7 +33,18 @@ def load_run(run: Path, which: Path | None = None) -> tuple[TrainConfig, Policy,
 
 
 def load_policy(run: Path, config: PPOConfig, which: Path | None = None) -> tuple[Policy, dict[str, Any]]:
-    """Load the policy of a run.
+    """Load the policy of a run as a function; arguments and errors as ``load_network``'s."""
+    network, about = load_network(run, config, which)
+
+    def policy(observation: Tensor) -> Tensor:
+        with torch.no_grad():
+            return network._predict(observation, deterministic=True)
+
+    return policy, about
+
+
+def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tuple[GaussianPolicy, dict[str, Any]]:
+    """Load the network of a run's policy.
 
     Args:
         run: run folder.
@@ -41,7 +52,7 @@ def load_policy(run: Path, config: PPOConfig, which: Path | None = None) -> tupl
         which: a checkpoint file; the newest if None.
 
     Returns:
-        The policy, and the checkpoint's ``iteration`` and ``num_timesteps`` with its ``file``.
+        The network, and the checkpoint's ``iteration`` and ``num_timesteps`` with its ``file``.
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
@@ -56,10 +67,5 @@ def load_policy(run: Path, config: PPOConfig, which: Path | None = None) -> tupl
     )
     network.load_state_dict(state["policy"])
     network.set_training_mode(False)
-
-    def policy(observation: Tensor) -> Tensor:
-        with torch.no_grad():
-            return network._predict(observation, deterministic=True)
-
     about = {"iteration": state["iteration"], "num_timesteps": state["num_timesteps"], "file": str(path)}
-    return policy, about
+    return network, about

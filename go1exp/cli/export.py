@@ -1,0 +1,36 @@
+"""``go1exp export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from go1exp.cli.app import App, spinner
+
+
+def _task(container: dict[str, Any]) -> None:
+    from go1exp.cli.settings import ExportSettings, checkpoint_file, parse, run_folder
+
+    settings = parse(ExportSettings, container)
+    run = run_folder(settings.run)
+    checkpoint = checkpoint_file(run, settings.checkpoint)
+    out = Path(settings.out) if settings.out else run / "bundle.zip"
+
+    from go1exp.cli.logs import writable
+    from go1exp.deploy.bundle import loads
+    from go1exp.export.build import build
+
+    writable(str(out.parent))
+    show = spinner(1, "recording a trace")
+    data = build(run, checkpoint, seconds=settings.seconds, seed=settings.seed, on_step=show)
+    found = loads(data, str(out))
+    partial = out.with_name(f"{out.name}.partial")
+    partial.write_bytes(data)
+    partial.replace(out)
+    worst = max(found.differences.values())
+    print(f"{len(found.trace['time'])} steps of the environment replayed, largest difference {worst:.1e}")
+    print(f"written to {out} ({len(data) / 1e6:.2f} MB), SHA-256 {found.seal}")
+    print(f"now: go1exp export check {out}")
+
+
+APP = App("export", _task)

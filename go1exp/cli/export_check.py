@@ -1,0 +1,90 @@
+"""``go1exp export check``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from go1exp.cli.app import App
+
+if TYPE_CHECKING:
+    from go1exp.deploy.bundle import Bundle
+
+WIDTH = 120
+"""Of the table where there is no terminal, characters."""
+
+
+def _task(container: dict[str, Any]) -> None:
+    from go1exp.cli.settings import ExportCheckSettings, parse
+
+    settings = parse(ExportCheckSettings, container)
+
+    from rich.console import Console
+
+    from go1exp.deploy.bundle import load
+
+    bundle = load(Path(settings.file))
+    console = Console(highlight=False, emoji=False, markup=False, soft_wrap=False)
+    if not console.is_terminal:
+        console = Console(width=WIDTH, highlight=False, emoji=False, markup=False)
+    for table in tables(bundle):
+        console.print(table)
+    worst = max(bundle.differences.values())
+    steps = len(bundle.trace["time"])
+    print(f"good: every hash matches, {steps} steps replayed, largest difference {worst:.1e}")
+
+
+def tables(bundle: Bundle) -> list[Any]:
+    """Return rich tables of what a bundle holds: the policy, its inputs and outputs, its joints, the members."""
+    from rich.table import Table
+
+    def table(title: str, *columns: str) -> Table:
+        made = Table(title=title, title_justify="left", title_style="bold")
+        for column in columns:
+            made.add_column(column, overflow="fold")
+        return made
+
+    about = bundle.metadata
+    what = table("policy", "what", "value")
+    for name, value in summary(bundle):
+        what.add_row(name, value)
+    ports = table("graph", "", "name", "size", "unit", "frame", "meaning")
+    for kind, found in (("in", about.inputs), ("out", about.outputs)):
+        for port in found:
+            ports.add_row(kind, port.name, str(port.size), port.unit, port.frame, port.meaning)
+    terms = table("observation", "columns", "term", "noise in training")
+    for block in about.observation:
+        terms.add_row(f"{block.start} to {block.start + block.size - 1}", block.key, f"{block.noise:g}")
+    joints = table("joints", "name", "nominal rad", "kp N m/rad", "kd N m s/rad", "stops rad", "torque N m")
+    for k, name in enumerate(about.joints):
+        low, high = about.joint_limits[k]
+        kp, kd = ("unknown" if g is None else f"{g[k]:g}" for g in (about.kp, about.kd))
+        joints.add_row(
+            name, f"{about.nominal_stance[k]:g}", kp, kd, f"{low:g} to {high:g}", f"{about.torque_limit[k]:g}"
+        )
+    members = table("members", "name", "bytes")
+    for name, size in bundle.sizes.items():
+        members.add_row(name, f"{size:,}")
+    return [what, ports, terms, joints, members]
+
+
+def summary(bundle: Bundle) -> list[tuple[str, str]]:
+    """Return what a bundle is, as names and values."""
+    about, versions = bundle.metadata, bundle.versions
+    run = versions.get("run") or {}
+    commit = f"{run.get('git') or 'unknown'}{' (with changes)' if run.get('git_dirty') else ''}"
+    ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in about.command_ranges.items())
+    packages = ", ".join(f"{name} {version}" for name, version in versions.get("packages", {}).items())
+    return [
+        ("file", f"{bundle.source}, SHA-256 {bundle.seal}"),
+        ("robot", about.robot),
+        ("trained", f"{about.trained.num_timesteps / 1e6:.2f} M steps, {about.trained.checkpoint}, commit {commit}"),
+        ("rates", f"policy {1 / about.policy_dt:g} Hz, drives {1 / about.physics_dt:g} Hz (in training)"),
+        ("action", f"target = nominal stance + {about.action_scale:g} rad x action, cut at +-{about.action_clip:g}"),
+        ("commands", ranges or "unknown"),
+        ("estimator", ", ".join(f"{k} {v:g}" for k, v in about.estimator.items()) or "no settings of its own"),
+        ("exported by", f"go1exp {versions.get('go1exp')}, Python {versions.get('python')}, {packages}"),
+    ]
+
+
+APP = App("export_check", _task, title="export check")

@@ -1,0 +1,185 @@
+"""One cycle of the runtime: newest state, estimate, policy, safety, command.
+
+Which robot is at the other end of the link, where commands come from and how velocity is estimated, the controller does
+not know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from go1exp.deploy.bundle import Bundle
+from go1exp.deploy.messages import Link, LowCmd, LowState
+from go1exp.deploy.safety import Safety
+
+PHASES = ("waiting", "standing_up", "walking", "damping")
+"""Before the first state; on the way to the nominal stance; under the policy; after a fault, for good."""
+
+
+class Estimator(Protocol):
+    """Finds the trunk's velocity from what the robot measures."""
+
+    def update(self, state: LowState) -> np.ndarray:
+        """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame."""
+
+
+CommandSource = Callable[[float], np.ndarray]
+"""Time since walking began, s -> commanded velocity (3,): x and y in m/s, yaw rate in rad/s."""
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What happened in a cycle, for the log.
+
+    Attributes:
+        t: the runtime's clock, s.
+        phase: one of ``PHASES``.
+        state: the newest state; None before the first.
+        command: what was sent; None if nothing was.
+        velocity: (3,) the command as the policy saw it.
+        base_lin_vel: (3,) the estimate; NaN before the first.
+        observation: (O,) what the network saw; None unless walking.
+    """
+
+    t: float
+    phase: str
+    state: LowState | None
+    command: LowCmd | None
+    velocity: np.ndarray
+    base_lin_vel: np.ndarray
+    observation: np.ndarray | None
+
+
+class Controller:
+    """Runs a bundle's policy on whatever is at the other end of a link.
+
+    Attributes:
+        phase: one of ``PHASES``.
+        safety: judges every command before it goes out.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        link: Link,
+        commands: CommandSource,
+        estimator: Estimator,
+        safety: Safety,
+        *,
+        stand_up: float = 2.0,
+        brake: float = 2.0,
+        patience: float = 5.0,
+        kp: np.ndarray | None = None,
+        kd: np.ndarray | None = None,
+        on_cycle: Callable[[Cycle], None] = lambda cycle: None,
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            bundle: the policy and what goes with it.
+            link: the way to the robot.
+            commands: asked in every cycle.
+            estimator: given every new state.
+            safety: with the robot's limits.
+            stand_up: time from the first pose to the nominal stance, s.
+            brake: time for which the drives are told to brake after a fault before ``cycle`` returns False, s.
+            patience: time to wait for the robot's first state, s.
+            kp: (J,) N m/rad; those of the bundle if None.
+            kd: (J,) N m s/rad.
+            on_cycle: told what happened.
+
+        Raises:
+            ValueError: if neither the bundle nor the caller gives gains.
+        """
+        about = bundle.metadata
+        gains = (about.kp if kp is None else kp), (about.kd if kd is None else kd)
+        if gains[0] is None or gains[1] is None:
+            raise ValueError("kp, kd: the bundle does not know any; they have to be given")
+        self._policy, self._link, self._commands = bundle.policy, link, commands
+        self._estimator, self.safety, self._on_cycle = estimator, safety, on_cycle
+        self._kp, self._kd = (np.asarray(values, dtype=float) for values in gains)
+        self._nominal = np.asarray(about.nominal_stance)
+        self._stand_up, self._brake, self._patience = stand_up, brake, patience
+        self._begin: float | None = None
+        self._readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
+        self._target = self._nominal.copy()
+        self._state: LowState | None = None
+        self._origin = self._nominal
+        self._since = 0.0
+        self._velocity, self._base = np.zeros(3), np.full(3, np.nan)
+        self._observation: np.ndarray | None = None
+        self.phase = "waiting"
+
+    def cycle(self, now: float) -> bool:
+        """Do one cycle; return whether there should be another. ``now`` is the clock's time, s.
+
+        Whatever goes wrong in it, the drives are told to brake: nothing is raised but by the link and ``on_cycle``.
+        """
+        self._begin = now if self._begin is None else self._begin
+        fresh = self._link.receive()
+        if fresh:
+            self._state = fresh[-1]
+        elif self._state is None and now - self._begin > self._patience:
+            self.safety.fail("no_state", f"the robot has not said anything for {self._patience:g} s", now)
+        self._observation = None
+        try:
+            wanted = self._wanted(now, fresh)
+        except Exception as error:  # a robot that goes on with its last command is worse than any bug
+            self.safety.fail("runtime", f"{type(error).__name__}: {error}", now)
+            wanted = None
+        sent = self.safety.review(self._state, wanted, now)
+        if self.safety.fault is not None and self.phase != "damping":
+            self.phase, self._since = "damping", now
+        heard = self._state is not None or self.phase == "damping"
+        if heard:
+            self._target = sent.joint_target
+            self._link.send(sent)
+        command = sent if heard else None
+        self._on_cycle(Cycle(now, self.phase, self._state, command, self._velocity, self._base, self._observation))
+        return self.phase != "damping" or now - self._since < self._brake
+
+    def _wanted(self, now: float, fresh: Sequence[LowState]) -> LowCmd | None:
+        """Return what the present phase asks for; None if it asks for nothing."""
+        state = self._state
+        if state is None or self.phase == "damping":
+            return None
+        for each in fresh:
+            self._base = self._estimator.update(each)
+        if self.phase == "waiting":
+            self.phase, self._since, self._origin = "standing_up", now, state.joint_pos.copy()
+        if self.phase == "standing_up":
+            share = (now - self._since) / self._stand_up if self._stand_up > 0 else 1.0
+            if share < 1.0:
+                return LowCmd(self._origin + share * (self._nominal - self._origin), self._kp, self._kd)
+            self.phase, self._since = "walking", now
+        return self._walk(state, now)
+
+    def _walk(self, state: LowState, now: float) -> LowCmd | None:
+        """Ask the policy; None, and a fault, if the estimate or the command is no number."""
+        self._velocity = np.asarray(self._commands(now - self._since), dtype=float)
+        given = {
+            "joint_pos": state.joint_pos,
+            "joint_vel": state.joint_vel,
+            "imu_gyro": state.imu_gyro,
+            "imu_quat": state.imu_quat,
+            "base_lin_vel_b": self._base,
+            "joint_torque": state.joint_torque,
+            "joint_target": self._target,
+            "command": self._velocity,
+        }
+        for name, values in given.items():
+            if name in self._readings:
+                self._readings[name][0] = values
+        for fault, name in (("estimator", "base_lin_vel_b"), ("command", "command")):
+            if name in self._readings and not np.isfinite(given[name]).all():
+                self.safety.fail(fault, f"{name} is {given[name]}", now)
+                return None
+        outputs = self._policy(self._readings)
+        if "previous_action" in self._readings:
+            self._readings["previous_action"][:] = outputs["action"]
+        self._observation = outputs["observation"][0]
+        return LowCmd(outputs["joint_target"][0].astype(float), self._kp, self._kd)

@@ -1,0 +1,202 @@
+"""A loop at a fixed rate that accounts for every deadline.
+
+Cycle k is due at start + k periods; its work has to be done by the time that cycle k + 1 is due. A cycle that took too
+long is followed at once by the one whose time it then is, so that a little lateness costs little; those whose time is
+over are left out and count as missed. Nothing is made up for in a burst, and the phase stays.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+KEPT = 200_000
+"""Cycles whose periods and durations are kept for the percentiles: 500 s at 400 Hz."""
+
+
+class Clock(Protocol):
+    """Where time comes from."""
+
+    def now(self) -> float:
+        """Return the time, s, which never goes back."""
+
+    def sleep_until(self, when: float) -> None:
+        """Return at ``when`` or a little later; at once if that has passed."""
+
+
+class MonotonicClock:
+    """The system's monotonic clock.
+
+    Args:
+        spin: for this long before the time the core is kept busy instead of asleep, s; 0 leaves it to the system.
+    """
+
+    def __init__(self, spin: float = 0.0) -> None:
+        self._spin = spin
+
+    def now(self) -> float:
+        """Return the time, s."""
+        return time.perf_counter()
+
+    def sleep_until(self, when: float) -> None:
+        """Sleep, and then watch the clock for the last ``spin`` s."""
+        left = when - time.perf_counter() - self._spin
+        if left > 0:
+            time.sleep(left)
+        while self._spin and time.perf_counter() < when:
+            pass
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How a loop kept its time; percentiles are over the newest ``KEPT`` cycles, the rest over all.
+
+    Attributes:
+        cycles: that ran.
+        period_p50: time from one cycle's start to the next one's, median, s.
+        period_p99: s.
+        period_worst: s.
+        work_p50: time that a cycle's work took, median, s.
+        work_p99: s.
+        work_worst: s.
+        late_worst: latest start after the time that was due, s.
+        missed: deadlines: of cycles that were not done when the next was due, and of those that were left out.
+        left_out: cycles that never ran.
+    """
+
+    cycles: int
+    period_p50: float
+    period_p99: float
+    period_worst: float
+    work_p50: float
+    work_p99: float
+    work_worst: float
+    late_worst: float
+    missed: int
+    left_out: int
+
+    @property
+    def missed_share(self) -> float:
+        """Missed deadlines over all deadlines, those of the cycles that were left out included."""
+        return self.missed / max(self.cycles + self.left_out, 1)
+
+    def __str__(self) -> str:
+        """Return a line for the terminal and the log."""
+        period = f"period p50 {1e3 * self.period_p50:.3f}, p99 {1e3 * self.period_p99:.3f}, "
+        period += f"worst {1e3 * self.period_worst:.3f} ms"
+        work = (
+            f"work p50 {1e3 * self.work_p50:.3f}, p99 {1e3 * self.work_p99:.3f}, worst {1e3 * self.work_worst:.3f} ms"
+        )
+        return f"{self.cycles} cycles; {period}; {work}; missed {self.missed} ({100 * self.missed_share:.3f} %)"
+
+
+class Deadlines:
+    """Counts what a loop did; allocates nothing once it is built."""
+
+    def __init__(self, period: float, kept: int = KEPT) -> None:
+        """Account for cycles of ``period`` s."""
+        self._period = period
+        self._periods, self._work = np.zeros(kept), np.zeros(kept)
+        self.cycles = self.missed = self.left_out = 0
+        self._last_start = np.nan
+        self._period_worst = self._work_worst = self._late_worst = 0.0
+
+    def note(self, due: float, start: float, end: float, left_out: int) -> None:
+        """Note a cycle.
+
+        Args:
+            due: when it should have started, s.
+            start: when it did.
+            end: when its work was done.
+            left_out: cycles that will be left out because this one took so long.
+        """
+        place = self.cycles % len(self._work)
+        self._work[place] = end - start
+        self._work_worst = max(self._work_worst, end - start)
+        self._late_worst = max(self._late_worst, start - due)
+        if self.cycles:
+            since = start - self._last_start
+            self._periods[(self.cycles - 1) % len(self._periods)] = since
+            self._period_worst = max(self._period_worst, since)
+        self._last_start = start
+        self.cycles += 1
+        self.left_out += left_out
+        self.missed += left_out + (end > due + self._period)
+
+    def timing(self) -> Timing:
+        """Return the account so far."""
+        periods = self._periods[: min(max(self.cycles - 1, 0), len(self._periods))]
+        work = self._work[: min(self.cycles, len(self._work))]
+        p50, p99 = np.percentile(periods, [50, 99]) if len(periods) else (0.0, 0.0)
+        w50, w99 = np.percentile(work, [50, 99]) if len(work) else (0.0, 0.0)
+        return Timing(
+            cycles=self.cycles,
+            period_p50=float(p50),
+            period_p99=float(p99),
+            period_worst=self._period_worst,
+            work_p50=float(w50),
+            work_p99=float(w99),
+            work_worst=self._work_worst,
+            late_worst=self._late_worst,
+            missed=self.missed,
+            left_out=self.left_out,
+        )
+
+
+def run(
+    work: Callable[[float], bool],
+    rate: float,
+    seconds: float | None = None,
+    clock: Clock | None = None,
+    on_report: Callable[[Timing], None] | None = None,
+    report_every: float = 1.0,
+) -> Timing:
+    """Call ``work(now)`` at a fixed rate until it returns False or the time is up; return how the time was kept.
+
+    Python's garbage collector is off meanwhile: a collection takes milliseconds, and ``work`` should leave nothing that
+    only a collector could find.
+
+    Args:
+        work: one cycle; gets the clock's time at its start, s.
+        rate: cycles per second.
+        seconds: how long; None for as long as ``work`` wants.
+        clock: the system's monotonic one if None.
+        on_report: told the account every ``report_every`` s, after a cycle's work.
+        report_every: s.
+    """
+    clock = clock or MonotonicClock()
+    period = 1.0 / rate
+    account = Deadlines(period)
+    total = None if seconds is None else max(1, round(seconds * rate))
+    collecting = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        begin = clock.now()
+        cycle, next_report = 0, begin + report_every
+        while total is None or cycle < total:
+            due = begin + cycle * period
+            clock.sleep_until(due)
+            start = clock.now()
+            wanted = work(start)
+            end = clock.now()
+            following = max(cycle + 1, math.floor((end - begin) / period + 1e-9))
+            if total is not None:
+                following = min(following, total)
+            account.note(due, start, end, following - cycle - 1)
+            cycle = following
+            if not wanted:
+                break
+            if on_report is not None and end >= next_report:
+                on_report(account.timing())
+                next_report = end + report_every
+    finally:
+        if collecting:
+            gc.enable()
+    return account.timing()

@@ -1,0 +1,70 @@
+"""The exported policy as a function of NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import onnxruntime as ort
+
+from go1exp.deploy.metadata import Port
+
+
+class OnnxPolicy:
+    """Sensor readings in, joint targets out: one thread, the same numbers for the same readings.
+
+    Attributes:
+        inputs: names, sizes and meanings of what goes in, float32 (rows, size) each.
+        outputs: of what comes out.
+    """
+
+    def __init__(self, model: bytes, inputs: Sequence[Port], outputs: Sequence[Port]) -> None:
+        """Prepare the graph.
+
+        Raises:
+            ValueError: if it is no graph, or one with other inputs and outputs.
+        """
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # what is wrong is raised
+        try:
+            self._session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # its own classes, which it does not export
+            raise ValueError(f"not a graph that onnxruntime {ort.__version__} runs ({_first_line(error)})") from None
+        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
+        _compare("input", self._session.get_inputs(), self.inputs)
+        _compare("output", self._session.get_outputs(), self.outputs)
+        self._names = [port.name for port in self.outputs]
+
+    def __call__(self, readings: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the outputs (rows, size) by name for the inputs by name; readings that it does not take are left.
+
+        Raises:
+            ValueError: if one is missing or not float32 (rows, size).
+        """
+        given = {}
+        for port in self.inputs:
+            reading = readings.get(port.name)
+            if reading is None:
+                raise ValueError(f"{port.name}: missing")
+            if reading.dtype != np.float32 or reading.ndim != 2 or reading.shape[1] != port.size:
+                raise ValueError(
+                    f"{port.name}: {reading.dtype} of shape {reading.shape}; must be float32 (rows, {port.size})"
+                )
+            given[port.name] = reading
+        return dict(zip(self._names, self._session.run(self._names, given), strict=True))
+
+
+def _compare(what: str, found: Sequence[ort.NodeArg], wanted: Sequence[Port]) -> None:
+    names = [node.name for node in found]
+    if names != [port.name for port in wanted]:
+        raise ValueError(f"its {what}s are {', '.join(names)} instead of {', '.join(port.name for port in wanted)}")
+    for node, port in zip(found, wanted, strict=True):
+        if node.type != "tensor(float)" or list(node.shape[1:]) != [port.size]:
+            raise ValueError(
+                f"{what} {node.name}: {node.type} of shape {node.shape}; must be float (rows, {port.size})"
+            )
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().split("\n")[0]

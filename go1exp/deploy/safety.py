@@ -1,0 +1,260 @@
+"""Everything that keeps robot and people safe, in one place.
+
+Targets are cut to what the drives may be asked for (``Safety.limited``). A fault, found by any of ``RULES``, ends the
+walk: from then on the drives only brake, whatever anyone asks for, until a person starts anew. A rule is a method that
+returns what is wrong in words, or None; its name is that of the fault in the log.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.deploy.messages import LowCmd, LowState
+
+SDK_RANGE = {"hip": (-1.047, 1.047), "thigh": (-0.663, 2.966), "calf": (-2.721, -0.837)}
+"""Targets that the vendor's SDK lets through, rad (``go1_const.h``, used by its Safety.PositionLimit)."""
+
+DEFAULT_KD = 2.0
+"""Braking gain, N m s/rad: lets a Go1 sink in about a second and is far from what makes its drives chatter (chosen)."""
+
+
+READ = ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
+ASKED = ("joint_target", "kp", "kd")
+"""Parts of a state and of a command that have to be numbers."""
+
+
+@dataclass(frozen=True)
+class SafetyConfig:
+    """Where the faults begin.
+
+    Attributes:
+        tilt: angle between the trunk's z axis and the vertical, rad (chosen: no gait of training leans that far).
+        stale: age of the newest state, s (15 messages of the SDK).
+        beyond_stop: how far a joint may be measured beyond its stop, rad (the SDK's PositionProtect: 5 degrees).
+        power: sum of |torque x speed| over the joints, W (the SDK's PowerProtect at level 5 of 10).
+        torque_margin: reported torque over the joint's limit, as a factor (the report is an estimate).
+        count: a torque or power fault needs so many more cycles over the limit than under it (the SDK: 6 of 2 ms).
+        quat_error: how far the length of the attitude quaternion may be off 1.
+        damping_kd: gain that the drives brake with, N m s/rad.
+    """
+
+    tilt: float = 1.0
+    stale: float = 0.03
+    beyond_stop: float = 0.087
+    power: float = 500.0
+    torque_margin: float = 1.2
+    count: int = 6
+    quat_error: float = 0.05
+    damping_kd: float = DEFAULT_KD
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why the walk ended: the rule's name, when (s, the runtime's clock), and what was wrong."""
+
+    name: str
+    t: float
+    message: str
+
+    def __str__(self) -> str:
+        """Return a line for the log."""
+        return f"{self.name} at {self.t:.3f} s: {self.message}"
+
+
+class _Counter:
+    """Counts up while a limit is broken and down while it is not, as the SDK's PowerProtect does."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self.value = most, 0
+
+    def broken(self, now: bool) -> bool:
+        """Count a cycle; return whether the limit has been broken for long enough."""
+        self.value = min(self.value + 1, 2 * self._most) if now else max(self.value - 1, 0)
+        return self.value >= self._most
+
+
+class Safety:
+    """Judges every cycle before its command goes out.
+
+    Attributes:
+        fault: the first fault, or None. It stays.
+        clamped: cycles in which a target of each joint was cut, (J,).
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[str],
+        stops: np.ndarray,
+        torque_limit: np.ndarray,
+        config: SafetyConfig | None = None,
+        target_range: np.ndarray | None = None,
+    ) -> None:
+        """Take a robot's limits.
+
+        Args:
+            joints: names, J.
+            stops: hard stops (J, 2), rad.
+            torque_limit: (J,) N m.
+            config: where the faults begin.
+            target_range: (J, 2) rad that targets are cut to; None for the Go1's SDK.
+        """
+        self.config = config or SafetyConfig()
+        self._joints, self._stops, self._torque_limit = tuple(joints), np.asarray(stops), np.asarray(torque_limit)
+        allowed = sdk_range(joints) if target_range is None else np.asarray(target_range)
+        self._low, self._high = np.maximum(allowed[:, 0], stops[:, 0]), np.minimum(allowed[:, 1], stops[:, 1])
+        self._torque, self._power = _Counter(self.config.count), _Counter(self.config.count)
+        self._stop: str | None = None
+        self._zeros = np.zeros(len(self._joints))
+        self._braking = np.full(len(self._joints), self.config.damping_kd)
+        self.clamped = np.zeros(len(self._joints), dtype=np.int64)
+        self.fault: Fault | None = None
+
+    # ------------------------------------------------------------------ what callers use
+
+    def stop(self, who: str) -> None:
+        """Stop at the next cycle, for ``who``: a key, a signal. Does nothing else, so a signal handler may call it."""
+        self._stop = who
+
+    def review(self, state: LowState | None, command: LowCmd | None, now: float) -> LowCmd:
+        """Return the command that may go out: the one that was asked for, within limits, or damping.
+
+        Args:
+            state: the newest state ever received; None before the first.
+            command: what is asked for; None if nothing is, which leaves the drives braking.
+            now: the runtime's clock, s.
+        """
+        if self.fault is None:
+            for name, rule in RULES.items():
+                if message := rule(self, state, command, now):
+                    self.fault = Fault(name, now, message)
+                    break
+        if self.fault is not None or command is None or state is None:
+            return self.damping(state)
+        return self.limited(state, command)
+
+    def fail(self, name: str, message: str, now: float) -> None:
+        """Report a fault that was found elsewhere, such as a filter that diverged; the first one stays."""
+        if self.fault is None:
+            self.fault = Fault(name, now, message)
+
+    def damping(self, state: LowState | None) -> LowCmd:
+        """Return the command with which the drives only brake."""
+        usable = state is not None and bool(np.isfinite(state.joint_pos).all())
+        target = state.joint_pos.copy() if state is not None and usable else self._zeros
+        return LowCmd(target, self._zeros, self._braking, damping=True)
+
+    def limited(self, state: LowState, command: LowCmd) -> LowCmd:
+        """Cut targets to where they ask for no more than the peak torque, and then to the SDK's range and the stops.
+
+        Where a joint moves so fast that both cannot be had, the range wins.
+        """
+        held = command.kp > 0.0
+        reach = np.divide(self._torque_limit, command.kp, out=np.full_like(self._torque_limit, np.inf), where=held)
+        drag = np.divide(command.kd, command.kp, out=np.zeros_like(self._torque_limit), where=held)
+        still = state.joint_pos + drag * state.joint_vel  # the target that asks for no torque
+        target = np.minimum(np.maximum(command.joint_target, still - reach), still + reach)
+        target = np.minimum(np.maximum(target, self._low), self._high)
+        self.clamped += target != command.joint_target
+        return LowCmd(target, command.kp, command.kd, command.damping)
+
+    # ------------------------------------------------------------------ the rules
+
+    def operator_stop(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+        """A person, or a signal, asked for the end."""
+        return None if self._stop is None else f"asked for by {self._stop}"
+
+    def stale_state(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+        """The robot has not said anything for too long; before its first word nothing has begun."""
+        if state is None:
+            return None  # nothing has begun: the drives are left braking until a first state comes
+        age = now - state.t
+        return f"the newest state is {1e3 * age:.0f} ms old" if age > self.config.stale else None
+
+    def not_finite(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+        """A reading or a command is no number."""
+        given: list[tuple[LowState | LowCmd, str]] = [(state, name) for name in READ] if state is not None else []
+        given += [(command, name) for name in ASKED] if command is not None else []
+        vectors = [getattr(message, name) for message, name in given]
+        if not vectors or np.isfinite(np.concatenate(vectors)).all():
+            return None
+        (_, name), values = next(p for p in zip(given, vectors, strict=True) if not np.isfinite(p[1]).all())
+        k = int(np.flatnonzero(~np.isfinite(values))[0])
+        where = self._joints[k] if len(values) == len(self._joints) else str(k)
+        return f"{name} of {where} is {values[k]}"
+
+    def attitude(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+        """The attitude is none, as from an IMU that has not started."""
+        if state is None:
+            return None
+        length = math.sqrt(float(state.imu_quat @ state.imu_quat))
+        off = abs(length - 1.0) > self.config.quat_error
+        return f"the attitude quaternion's length is {length:.3f} instead of 1" if off else None
+
+    def tilt(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+        """The trunk leans too far: the robot falls."""
+        if state is None:
+            return None
+        angle = lean(state.imu_quat)
+        return f"the trunk leans by {math.degrees(angle):.0f} degrees" if angle > self.config.tilt else None
+
+    def joint_range(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+        """A joint is measured where it cannot be."""
+        if state is None:
+            return None
+        beyond = np.maximum(self._stops[:, 0] - state.joint_pos, state.joint_pos - self._stops[:, 1])
+        k = int(beyond.argmax())
+        if beyond[k] <= self.config.beyond_stop:
+            return None
+        return f"{self._joints[k]} is at {state.joint_pos[k]:.3f} rad, {beyond[k]:.3f} rad beyond its stop"
+
+    def torque(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+        """A drive reports more than its peak torque, for some cycles."""
+        if state is None:
+            return None
+        share = np.abs(state.joint_torque) / self._torque_limit
+        k = int(share.argmax())
+        if not self._torque.broken(bool(share[k] > self.config.torque_margin)):
+            return None
+        return f"{self._joints[k]} reports {state.joint_torque[k]:.1f} N m, its limit is {self._torque_limit[k]:g} N m"
+
+    def power(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
+        """The drives turn over too much power, for some cycles, whichever way it flows."""
+        if state is None:
+            return None
+        power = float(np.abs(state.joint_torque * state.joint_vel).sum())
+        if not self._power.broken(power > self.config.power):
+            return None
+        return f"the drives turn over {power:.0f} W, the limit is {self.config.power:g} W"
+
+
+Rule = Callable[[Safety, LowState | None, LowCmd | None, float], str | None]
+
+RULES: dict[str, Rule] = {
+    "operator_stop": Safety.operator_stop,
+    "stale_state": Safety.stale_state,
+    "not_finite": Safety.not_finite,
+    "attitude": Safety.attitude,
+    "tilt": Safety.tilt,
+    "joint_range": Safety.joint_range,
+    "torque": Safety.torque,
+    "power": Safety.power,
+}
+"""Name of a fault -> its rule, in the order in which they are asked; the first that speaks is the fault."""
+
+
+def lean(quat: np.ndarray) -> float:
+    """Return the angle between the trunk's z axis and the vertical, rad, of an attitude w-x-y-z."""
+    x, y = float(quat[1]), float(quat[2])
+    squared = float(quat @ quat)
+    if squared == 0.0:
+        return math.pi
+    return math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y) / squared)))
+
+
+def sdk_range(joints: Sequence[str]) -> np.ndarray:
+    """Return the targets (J, 2), rad, that the Go1's SDK lets through; any for a joint that is none of its kinds."""
+    return np.array([SDK_RANGE.get(name.rsplit("_", 1)[-1], (-np.inf, np.inf)) for name in joints])

@@ -1,0 +1,261 @@
+"""Observation terms and policy as one graph: sensor readings in, joint targets out.
+
+The terms in the graph are the very functions of ``go1exp.mdp.observations``, traced by torch, as are the network, the
+cut of the actions and the targets: there is no second version of any of them to drift away.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from go1exp import robot
+from go1exp.config import ActionConfig
+from go1exp.deploy.metadata import Block, Port
+from go1exp.mdp.actions import clipped, joint_target
+from go1exp.registry import Expected, Term
+from go1exp.rotation import projected_gravity
+from go1exp.types import Snapshot
+
+if TYPE_CHECKING:
+    from go1exp.train.ppo import GaussianPolicy
+
+OPSET = 20
+J = robot.NUM_JOINTS
+
+
+class ExportError(Expected):
+    """Something of a run cannot be put into a bundle; the message names it."""
+
+
+def _same(reading: Tensor) -> Tensor:
+    return reading
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a field of the Snapshot comes from on the robot: the name of a reading, and the law between the two."""
+
+    reading: str
+    law: Callable[[Tensor], Tensor] = _same
+
+
+READINGS = (
+    Port("joint_pos", J, "rad", "joint", "joint angles, as the encoders say"),
+    Port("joint_vel", J, "rad/s", "joint", "joint speeds, as the drives say"),
+    Port("imu_gyro", 3, "rad/s", "trunk", "angular velocity of the trunk"),
+    Port("imu_quat", 4, "1", "trunk to world", "attitude of the trunk, unit quaternion w-x-y-z"),
+    Port("base_lin_vel_b", 3, "m/s", "trunk", "velocity of the trunk's origin, from the state estimator"),
+    Port("joint_torque", J, "N m", "joint", "torques that the drives report"),
+    Port("joint_target", J, "rad", "joint", "position targets now in force; the nominal stance at the start"),
+    Port("command", 3, "m/s, m/s, rad/s", "trunk", "commanded velocity: x, y and yaw rate"),
+    Port("previous_action", J, "1", "joint", "the output `action` of the step before; zero at the start"),
+)
+"""What the robot's computer can tell a policy. A graph has those as inputs that its terms read, in this order."""
+
+SOURCES = {
+    "base_lin_vel_b": Source("base_lin_vel_b"),
+    "base_ang_vel_b": Source("imu_gyro"),
+    "base_quat_w": Source("imu_quat"),
+    "projected_gravity_b": Source("imu_quat", projected_gravity),
+    "joint_pos": Source("joint_pos"),
+    "joint_vel": Source("joint_vel"),
+    "joint_torque": Source("joint_torque"),
+    "joint_target": Source("joint_target"),
+    "command": Source("command"),
+    "action": Source("previous_action"),
+}
+"""Field of the Snapshot -> its source. What is not here the robot does not measure."""
+
+OUTPUTS = (
+    Port("joint_target", J, "rad", "joint", "position targets for the drives"),
+    Port("observation", 0, "as each term", "-", "what the network sees: the terms, one after the other"),
+    Port("action", J, "1", "joint", "the network's output, clipped: the next step's `previous_action`"),
+)
+"""Outputs of the graph; the observation's size is the policy's."""
+
+
+class Sensed:
+    """Looks like a Snapshot to a term, and knows only what the robot measures.
+
+    Attributes:
+        read: names of the readings that were asked for.
+
+    Raises:
+        ExportError: where a term reads another field.
+    """
+
+    def __init__(self, readings: Mapping[str, Tensor], term: str = "observation") -> None:
+        """Take readings (N, size) by name; ``term`` is named in complaints."""
+        self._readings, self._term = readings, term
+        self.read: set[str] = set()
+
+    def __getattr__(self, name: str) -> Tensor:
+        """Return a field as the robot knows it."""
+        if name not in {f.name for f in dataclasses.fields(Snapshot)}:
+            raise AttributeError(f"a Snapshot has no {name!r}")
+        source = SOURCES.get(name)
+        if source is None:
+            raise ExportError(
+                f"observation.{self._term}: reads {name}, which the robot does not measure; a policy for the robot may "
+                f"read {', '.join(SOURCES)}"
+            )
+        self.read.add(source.reading)
+        return source.law(self._readings[source.reading])
+
+
+def blocks(terms: Sequence[Term]) -> tuple[Block, ...]:
+    """Return the terms with their place in the flat observation."""
+    found, start = [], 0
+    for term in terms:
+        size = int(term.entry.traits["size"])
+        found.append(Block(term.key, term.entry.name, start, size, float(term.slots.get("noise", 0.0))))
+        start += size
+    return tuple(found)
+
+
+def inputs_of(terms: Sequence[Term]) -> tuple[Port, ...]:
+    """Return the readings that the terms need, in the order of ``READINGS``.
+
+    Raises:
+        ExportError: if a term reads what the robot does not measure.
+    """
+    read: set[str] = set()
+    for term in terms:
+        sensed = Sensed({port.name: torch.zeros(2, port.size) for port in READINGS}, term.key)
+        term(cast(Snapshot, sensed))
+        read |= sensed.read
+    return tuple(port for port in READINGS if port.name in read)
+
+
+class DeployedPolicy(nn.Module):
+    """The graph as a torch module.
+
+    Attributes:
+        inputs: of ``forward``, in order.
+        outputs: of ``forward``, in order.
+    """
+
+    nominal: Tensor
+
+    def __init__(self, network: GaussianPolicy, terms: Sequence[Term], action: ActionConfig) -> None:
+        """Join a trained network with the terms and the action's meaning of its task.
+
+        Raises:
+            ExportError: if a term reads what the robot does not measure.
+        """
+        super().__init__()
+        self.inputs = inputs_of(terms)
+        size = sum(block.size for block in blocks(terms))
+        self.outputs = tuple(dataclasses.replace(p, size=p.size or size) for p in OUTPUTS)
+        self._terms, self._action = tuple(terms), action
+        self.actor, self.head = network.mlp_extractor.policy_net, network.action_net
+        self.register_buffer("nominal", torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32))
+        self.eval()
+
+    def forward(self, *readings: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return joint targets (N, 12), observation (N, O) and clipped action (N, 12) for readings (N, size)."""
+        given = dict(zip([port.name for port in self.inputs], readings, strict=True))
+        observation = torch.cat([term(cast(Snapshot, Sensed(given, term.key))) for term in self._terms], dim=-1)
+        action = clipped(self.head(self.actor(observation)), self._action.clip)
+        return joint_target(action, self.nominal, self._action.scale), observation, action
+
+
+def to_onnx(module: DeployedPolicy) -> bytes:
+    """Return the module as an ONNX model: float32, any number of rows, the same bytes for the same module.
+
+    Raises:
+        ExportError: if onnxscript is not installed, or a term does what has no form in ONNX; names the term.
+    """
+    try:
+        import onnx
+        import onnxscript  # noqa: F401  (what torch exports with)
+    except ImportError as error:
+        raise ExportError(f"export: needs {error.name}; pip install 'go1exp[export]'") from None
+    try:
+        model = _exported(module, module.inputs, [port.name for port in module.outputs])
+    except torch.onnx.errors.OnnxExporterError as error:
+        raise ExportError(f"observation{_culprit(module)}: has no form in ONNX ({_reason(error)})") from None
+    onnx.checker.check_model(model, full_check=True)
+    return bytes(model.SerializeToString())
+
+
+def _exported(module: nn.Module, inputs: Sequence[Port], outputs: Sequence[str]) -> Any:
+    """Return the model without what depends on the place and time of the export."""
+    example = tuple(torch.zeros(2, port.size) for port in inputs)
+    rows = torch.export.Dim("rows", min=1)
+    with _quiet(), torch.no_grad():
+        program = torch.onnx.export(
+            module,
+            example,
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=[port.name for port in inputs],
+            output_names=list(outputs),
+            dynamic_shapes={"readings": tuple({0: rows} for _ in inputs)},
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    del model.metadata_props[:], model.graph.metadata_props[:]
+    model.producer_name, model.producer_version, model.doc_string = "go1exp", "", ""
+    model.graph.name, model.graph.doc_string = "policy", ""
+    for part in (*model.graph.node, *model.graph.initializer, *model.graph.input, *model.graph.output):
+        part.doc_string = ""
+        del part.metadata_props[:]
+    del model.graph.value_info[:]
+    return model
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep torch's exporter from telling of itself: of torchvision, of its own deprecated calls, of its progress."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+class _OneTerm(nn.Module):
+    """A term alone, to find out which one cannot be exported."""
+
+    def __init__(self, term: Term, inputs: Sequence[Port]) -> None:
+        super().__init__()
+        self._term, self._names = term, [port.name for port in inputs]
+
+    def forward(self, *readings: Tensor) -> Tensor:
+        given = dict(zip(self._names, readings, strict=True))
+        return cast(Tensor, self._term(cast(Snapshot, Sensed(given, self._term.key))))
+
+
+def _culprit(module: DeployedPolicy) -> str:
+    """Return ``.key`` of the first term that cannot be exported alone, or nothing."""
+    for term in module._terms:
+        inputs = inputs_of([term])
+        try:
+            _exported(_OneTerm(term, inputs), inputs, [term.key])
+        except torch.onnx.errors.OnnxExporterError:
+            return f".{term.key}"
+    return ""
+
+
+def _reason(error: Exception) -> str:
+    """Return the innermost complaint, its first line."""
+    inner: BaseException = error
+    while inner.__cause__ is not None:
+        inner = inner.__cause__
+    return f"{type(inner).__name__}: {str(inner).strip().splitlines()[0] if str(inner).strip() else ''}"

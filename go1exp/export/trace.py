@@ -1,0 +1,86 @@
+"""Some seconds of the environment under a policy: what its sensors said, and what the environment made of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from torch import Tensor
+
+from go1exp.config import TaskConfig
+from go1exp.deploy.metadata import Port
+from go1exp.effects.base import Measured
+from go1exp.env.core import Go1Core
+
+
+def readings(core: Go1Core) -> dict[str, Tensor]:
+    """Return what the robots' sensors and computers know at this moment, (N, size) by name, without noise."""
+    s = core.snapshot()
+    assert s.base_lin_vel_b is not None
+    seen = Measured(s.joint_pos, s.joint_vel, gyro=s.base_ang_vel_b, quat=s.base_quat_w)
+    effects = core.plant.effects
+    if effects.senses:
+        seen = effects.measure(dataclasses.replace(seen, joint_pos=core.plant.q, joint_vel=core.plant.qd))
+    assert seen.gyro is not None
+    assert seen.quat is not None
+    found = {
+        "joint_pos": seen.joint_pos,
+        "joint_vel": seen.joint_vel,
+        "imu_gyro": seen.gyro,
+        "imu_quat": seen.quat,
+        "base_lin_vel_b": s.base_lin_vel_b,
+        "joint_torque": s.joint_torque,
+        "joint_target": s.joint_target,
+        "command": s.command,
+        "previous_action": s.action,
+    }
+    return {name: values.float().clone() for name, values in found.items()}
+
+
+def traced_task(task: TaskConfig, seconds: float) -> TaskConfig:
+    """Return the task in which a trace is recorded: that of training, in one piece and on one thread."""
+    period = task.sim.policy_dt
+    sim = dataclasses.replace(task.sim, episode_s=(round(seconds / period) + 2) * period, spread_starts=False)
+    backend = dataclasses.replace(task.backend, threads=1)
+    return dataclasses.replace(task, sim=sim, backend=backend, curriculum=())
+
+
+def record(
+    task: TaskConfig,
+    policy: Callable[[Tensor], Tensor],
+    inputs: Sequence[Port],
+    seconds: float,
+    seed: int,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, np.ndarray]:
+    """Run one robot and return ``time``, ``input.NAME`` and ``output.NAME``, a row per policy step.
+
+    Observations, actions and targets are the environment's own. The step that ends an episode is left out, since the
+    environment begins the next one before it can be asked.
+
+    Args:
+        task: of the training; its robot, ground, commands and pushes are drawn as in training, without noise.
+        policy: observations (N, O) -> actions (N, 12).
+        inputs: the readings to keep.
+        seconds: length.
+        seed: of everything random.
+        on_step: told the progress in steps.
+    """
+    core = Go1Core(traced_task(task, seconds), 1, seed, noise=False)
+    observation = core.reset()
+    steps, period = max(1, round(seconds / task.sim.policy_dt)), task.sim.policy_dt
+    rows: list[dict[str, np.ndarray]] = []
+    for step in range(steps):
+        before = readings(core)
+        seen = observation.clone()
+        result = core.step(policy(observation))
+        core.check(result)
+        if not bool(result.terminated | result.truncated):
+            row = {f"input.{port.name}": before[port.name] for port in inputs}
+            made = {"joint_target": core.target, "observation": seen, "action": core.action}
+            row |= {f"output.{name}": values for name, values in made.items()}
+            rows.append({"time": np.array([step * period]), **{k: v.numpy().copy() for k, v in row.items()}})
+        observation = result.observation
+        on_step(step + 1, steps)
+    return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]} if rows else {}

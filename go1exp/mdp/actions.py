@@ -1,0 +1,18 @@
+"""What an action means: a change of the joints' position targets about the nominal stance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def clipped(action: Tensor, clip: float) -> Tensor:
+    """Cut a policy's output (N, 12) at +-``clip``: what acts, and what the policy is told of its last output."""
+    return action.clamp(-clip, clip)
+
+
+def joint_target(action: Tensor, nominal: Tensor, scale: float) -> Tensor:
+    """Return position targets (N, 12), rad: nominal stance (12,) + ``scale`` (rad) x clipped action (N, 12)."""
+    return nominal + scale * action

@@ -1,0 +1,531 @@
+"""The runtime's safety and loop: every fault is injected and leads to damping; deadlines are counted as by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from go1exp import robot
+from go1exp.deploy.bundle import Bundle
+from go1exp.deploy.controller import Controller, Cycle
+from go1exp.deploy.loop import Deadlines, MonotonicClock, Timing, run
+from go1exp.deploy.messages import LowCmd, LowState
+from go1exp.deploy.metadata import Port
+from go1exp.deploy.safety import RULES, Safety, SafetyConfig, lean, sdk_range
+
+NOMINAL = robot.NOMINAL_STANCE
+LIMIT = robot.per_joint(robot.EFFORT_LIMIT)
+KP, KD = np.full(12, 20.0), np.full(12, 0.5)
+
+
+def make_state(t: float = 0.0, **changes: Any) -> LowState:
+    usual: dict[str, Any] = {
+        "joint_pos": NOMINAL.copy(),
+        "joint_vel": np.zeros(12),
+        "joint_torque": np.zeros(12),
+        "imu_quat": np.array([1.0, 0.0, 0.0, 0.0]),
+        "imu_gyro": np.zeros(3),
+        "imu_acc": np.array([0.0, 0.0, 9.81]),
+        "foot_force": np.full(4, 30.0),
+    }
+    return LowState(t, **{**usual, **changes})
+
+
+def make_command(**changes: Any) -> LowCmd:
+    return dataclasses.replace(LowCmd(NOMINAL.copy(), KP, KD), **changes)
+
+
+def make_safety(**changes: float) -> Safety:
+    return Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, LIMIT, SafetyConfig(**changes))  # type: ignore[arg-type]
+
+
+def at(values: np.ndarray, k: int, value: float) -> np.ndarray:
+    changed = values.copy()
+    changed[k] = value
+    return changed
+
+
+def leaning(angle: float, axis: Sequence[float] = (0.6, 0.8, 0.0)) -> np.ndarray:
+    return np.array([math.cos(angle / 2), *(math.sin(angle / 2) * np.asarray(axis))])
+
+
+# ---------------------------------------------------------------------- faults
+
+SOUND = make_state()
+JUST_RIGHT: dict[str, tuple[LowState, LowCmd, float]] = {
+    "stale_state": (make_state(0.0), make_command(), 0.0299),
+    "not_finite": (make_state(joint_vel=np.full(12, 20.0)), make_command(), 0.0),
+    "attitude": (make_state(imu_quat=np.array([1.049, 0, 0, 0])), make_command(), 0.0),
+    "tilt": (make_state(imu_quat=leaning(0.999)), make_command(), 0.0),
+    "joint_range": (make_state(joint_pos=at(NOMINAL, 0, 0.863 + 0.086)), make_command(), 0.0),
+    "torque": (make_state(joint_torque=at(np.zeros(12), 5, -1.19 * 35.55)), make_command(), 0.0),
+    "power": (make_state(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 499 / 240)), make_command(), 0.0),
+}
+FAULTS: dict[str, list[tuple[LowState, LowCmd, float, str]]] = {
+    "stale_state": [(make_state(0.0), make_command(), 0.0301, "the newest state is 30 ms old")],
+    "not_finite": [
+        (make_state(0.0, **{name: at(getattr(SOUND, name), 2, value)}), make_command(), 0.0, f"{name} of")
+        for name in ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
+        for value in (np.nan, np.inf)
+    ]
+    + [
+        (make_state(), make_command(**{name: at(NOMINAL, 4, np.nan)}), 0.0, f"{name} of FL_thigh is nan")
+        for name in ("joint_target", "kp", "kd")
+    ],
+    "attitude": [
+        (make_state(imu_quat=np.zeros(4)), make_command(), 0.0, "length is 0.000 instead of 1"),
+        (make_state(imu_quat=np.array([1.06, 0, 0, 0])), make_command(), 0.0, "length is 1.060"),
+    ],
+    "tilt": [
+        (make_state(imu_quat=leaning(1.01, axis)), make_command(), 0.0, "the trunk leans by 58 degrees")
+        for axis in ((1, 0, 0), (0, 1, 0), (0, -1, 0), (0.6, -0.8, 0))
+    ]
+    + [(make_state(imu_quat=leaning(math.pi)), make_command(), 0.0, "by 180 degrees")],
+    "joint_range": [
+        (make_state(joint_pos=at(NOMINAL, 0, 0.863 + 0.088)), make_command(), 0.0, "FR_hip is at 0.951 rad, 0.088"),
+        (make_state(joint_pos=at(NOMINAL, 11, -2.818 - 0.1)), make_command(), 0.0, "RL_calf is at -2.918 rad, 0.100"),
+    ],
+    "torque": [
+        (make_state(joint_torque=at(np.zeros(12), 5, -1.21 * 35.55)), make_command(), 0.0, "FL_calf reports -43.0 N m")
+    ],
+    "power": [
+        (make_state(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 501 / 240)), make_command(), 0.0, "501 W"),
+        # A joint that brakes does not make good for one that drives.
+        (
+            make_state(joint_torque=np.array([20.0, -20.0] * 6), joint_vel=np.full(12, 2.1)),
+            *(make_command(), 0.0, "turn over 504 W, the limit is 500 W"),
+        ),
+    ],
+}
+COUNTED = ("torque", "power")
+
+
+def cycles(name: str) -> int:
+    return SafetyConfig().count if name in COUNTED else 1
+
+
+CASES = [(name, *case) for name, cases in FAULTS.items() for case in cases]
+
+
+@pytest.mark.parametrize(("name", "state", "command", "now", "said"), CASES, ids=[f"{c[0]}: {c[4]}" for c in CASES])
+def test_a_fault_is_named_and_the_drives_brake_from_then_on(
+    name: str, state: LowState, command: LowCmd, now: float, said: str
+) -> None:
+    safety = make_safety()
+    for _ in range(cycles(name) - 1):
+        assert not safety.review(state, command, now).damping
+    sent = safety.review(state, command, now)
+    assert safety.fault is not None
+    assert (safety.fault.name, safety.fault.t) == (name, now)
+    assert said in safety.fault.message
+    for later in (sent, safety.review(make_state(now), make_command(), now)):
+        assert later.damping
+        assert (later.kp == 0).all()
+        assert (later.kd == SafetyConfig().damping_kd).all()
+        assert np.isfinite(later.joint_target).all()
+    assert safety.fault.name == name  # the first one stays
+
+
+@pytest.mark.parametrize("name", JUST_RIGHT)
+def test_just_within_a_limit_nothing_happens(name: str) -> None:
+    safety = make_safety()
+    for _ in range(20):
+        sent = safety.review(*JUST_RIGHT[name])
+        assert not sent.damping
+    assert safety.fault is None
+
+
+def test_every_rule_is_tried() -> None:
+    assert {*FAULTS, "operator_stop"} == set(RULES)
+    assert {*JUST_RIGHT, "operator_stop"} == set(RULES)
+
+
+def test_a_stop_acts_in_the_next_cycle_and_comes_first() -> None:
+    safety = make_safety()
+    assert not safety.review(make_state(), make_command(), 0.0).damping
+    safety.stop("SIGINT")
+    assert safety.review(make_state(imu_quat=np.zeros(4)), make_command(), 1.0).damping
+    assert str(safety.fault) == "operator_stop at 1.000 s: asked for by SIGINT"
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_a_spike_is_forgiven_and_a_burst_is_not(name: str) -> None:
+    """The SDK's counter: up while over the limit, down while not; alternation never trips it, two of three do."""
+    bad, command, now, _ = FAULTS[name][0]
+    alternating, mostly = make_safety(), make_safety()
+    for _ in range(100):
+        alternating.review(bad, command, now)
+        alternating.review(make_state(), command, now)
+    assert alternating.fault is None
+    for k in range(100):
+        mostly.review(make_state() if k % 3 == 2 else bad, command, now)
+    assert mostly.fault is not None
+    assert mostly.fault.name == name
+
+
+def test_before_the_first_state_and_without_a_command_the_drives_brake() -> None:
+    safety = make_safety()
+    assert safety.review(None, None, 5.0).damping
+    assert safety.review(None, make_command(), 5.0).damping
+    assert safety.review(make_state(), None, 0.0).damping
+    assert safety.fault is None
+
+
+def test_a_fault_found_elsewhere_counts_too_and_the_first_stays() -> None:
+    safety = make_safety()
+    safety.fail("estimator", "diverged", 1.0)
+    safety.fail("command", "late", 2.0)
+    assert safety.review(make_state(), make_command(), 2.0).damping
+    assert str(safety.fault) == "estimator at 1.000 s: diverged"
+
+
+def test_lean_is_the_angle_to_the_vertical_whatever_the_heading() -> None:
+    for angle in (0.0, 0.3, 1.5, 3.0):
+        yaw = np.array([math.cos(0.7), 0, 0, math.sin(0.7)])
+        w, x, y, z = leaning(angle)
+        turned = np.array(
+            [yaw[0] * w - yaw[3] * z, yaw[0] * x - yaw[3] * y, yaw[0] * y + yaw[3] * x, yaw[0] * z + yaw[3] * w]
+        )
+        assert lean(turned) == pytest.approx(angle, abs=1e-7)
+
+
+# ---------------------------------------------------------------------- what is cut
+
+
+def test_targets_are_cut_to_the_sdks_range_and_the_stops() -> None:
+    assert sdk_range(robot.JOINTS).tolist() == [[-1.047, 1.047], [-0.663, 2.966], [-2.721, -0.837]] * 4
+    safety = make_safety()
+    for ask, expected in ((9.0, [0.863, 2.966, -0.888]), (-9.0, [-0.863, -0.663, -2.721])):
+        near = make_state(joint_pos=np.tile(expected, 4))  # so that the torque limit does not act
+        sent = safety.review(near, make_command(joint_target=np.full(12, ask)), 0.0)
+        np.testing.assert_allclose(sent.joint_target, np.tile(expected, 4), atol=1e-12)
+        assert not sent.damping
+    assert (safety.clamped == 2).all()
+
+
+def test_targets_are_cut_to_the_peak_torque() -> None:
+    safety, rng = make_safety(), np.random.default_rng(0)
+    for _ in range(200):
+        q = rng.uniform(*robot.JOINT_POS_LIMITS.T)
+        qd = rng.uniform(-5, 5, 12)
+        command = make_command(joint_target=rng.uniform(-3, 3, 12), kp=np.full(12, 60.0))
+        sent = safety.limited(make_state(joint_pos=q, joint_vel=qd), command)
+        torque = 60.0 * (sent.joint_target - q) - 0.5 * qd
+        inside = (sent.joint_target > safety._low) & (sent.joint_target < safety._high)
+        assert (np.abs(torque)[inside] <= LIMIT[inside] + 1e-9).all()
+        low, high = robot.JOINT_POS_LIMITS.T
+        assert ((sent.joint_target >= low) & (sent.joint_target <= high)).all()
+        same = sent.joint_target == command.joint_target
+        asked = 60.0 * (command.joint_target - q) - 0.5 * qd
+        fine = (np.abs(asked) < LIMIT) & (command.joint_target > safety._low) & (command.joint_target < safety._high)
+        assert (same | ~fine).all()
+
+
+def test_a_command_without_position_gain_is_not_divided_by() -> None:
+    sent = make_safety().review(make_state(), make_command(kp=np.zeros(12)), 0.0)
+    assert (sent.joint_target == NOMINAL).all()
+
+
+# ---------------------------------------------------------------------- the controller
+
+
+class FakeLink:
+    """Gives the states of a script, one list each cycle, and keeps what is sent."""
+
+    def __init__(self, script: Callable[[int], Sequence[LowState]]) -> None:
+        self._script, self.cycle = script, -1
+        self.sent: list[LowCmd] = []
+
+    def receive(self) -> Sequence[LowState]:
+        self.cycle += 1
+        return self._script(self.cycle)
+
+    def send(self, command: LowCmd) -> None:
+        self.sent.append(command)
+
+    def close(self) -> None:
+        pass
+
+
+class FakePolicy:
+    """Answers with its command, as an action for every joint."""
+
+    inputs = tuple(
+        Port(name, size, "", "", "")
+        for name, size in (("joint_pos", 12), ("base_lin_vel_b", 3), ("command", 3), ("previous_action", 12))
+    )
+
+    def __init__(self) -> None:
+        self.seen: list[dict[str, np.ndarray]] = []
+
+    def __call__(self, readings: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        self.seen.append({name: values.copy() for name, values in readings.items()})
+        action = np.repeat(readings["command"][:, :1], 12, axis=1)
+        target = np.asarray(NOMINAL, np.float32) + 0.1 * action
+        return {"joint_target": target, "observation": readings["joint_pos"], "action": action}
+
+
+class Velocity:
+    """An estimator that counts."""
+
+    def __init__(self, fails_at: int = 10**9, how: str = "nan") -> None:
+        self.count, self._fails_at, self._how = 0, fails_at, how
+
+    def update(self, state: LowState) -> np.ndarray:
+        self.count += 1
+        if self.count >= self._fails_at:
+            if self._how == "raise":
+                raise FloatingPointError("singular")
+            return np.full(3, np.nan)
+        return np.array([self.count, 0.0, 0.0])
+
+
+def always(cycle: int) -> Sequence[LowState]:
+    """Five states in each cycle of 10 ms."""
+    return [make_state(0.01 * cycle - 0.002 * k) for k in (4, 3, 2, 1, 0)]
+
+
+def controller(
+    script: Callable[[int], Sequence[LowState]] = always,
+    commands: Callable[[float], np.ndarray] = lambda t: np.array([0.3, 0.0, 0.0]),
+    estimator: Velocity | None = None,
+    **settings: Any,
+) -> SimpleNamespace:
+    link, policy, log = FakeLink(script), FakePolicy(), list[Cycle]()
+    about = SimpleNamespace(kp=tuple(KP), kd=tuple(KD), nominal_stance=tuple(NOMINAL))
+    bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=policy))
+    usual: dict[str, Any] = {"stand_up": 0.1, "brake": 0.045, "on_cycle": log.append}
+    made = Controller(bundle, link, commands, estimator or Velocity(), make_safety(), **{**usual, **settings})
+
+    def go(cycles: int, start: int = 0) -> list[bool]:
+        return [made.cycle(0.01 * k) for k in range(start, start + cycles)]
+
+    return SimpleNamespace(it=made, link=link, policy=policy, log=log, go=go, safety=made.safety)
+
+
+def test_a_robot_stands_up_and_then_walks() -> None:
+    lying = at(NOMINAL, 1, 1.8)
+
+    def script(cycle: int) -> Sequence[LowState]:
+        return [make_state(0.01 * cycle, joint_pos=lying)] if cycle >= 3 else []
+
+    made = controller(script)
+    assert all(made.go(30))
+    assert [c.phase for c in made.log] == ["waiting"] * 3 + ["standing_up"] * 10 + ["walking"] * 17
+    assert [c.command is None for c in made.log] == [True] * 3 + [False] * 27  # nothing is sent to who says nothing
+    thighs = [c.command.joint_target[1] for c in made.log[3:13]]
+    np.testing.assert_allclose(thighs, 1.8 + (NOMINAL[1] - 1.8) * np.arange(10) / 10, atol=1e-9)
+    assert all((c.kp == KP).all() and (c.kd == KD).all() and not c.damping for c in made.link.sent)
+    np.testing.assert_allclose(made.link.sent[-1].joint_target[0], NOMINAL[0] + 0.03, atol=1e-6)
+    actions = [seen["previous_action"][0, 0] for seen in made.policy.seen]
+    np.testing.assert_allclose(actions, [0.0] + [0.3] * 16, atol=1e-6)
+
+
+def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate() -> None:
+    made = controller()
+    made.go(20)
+    assert made.it._estimator.count == 100
+    assert [seen["base_lin_vel_b"][0, 0] for seen in made.policy.seen] == [5.0 * k for k in range(11, 21)]
+
+
+def test_the_command_source_is_asked_for_the_time_since_walking_began() -> None:
+    asked: list[float] = []
+    made = controller(commands=lambda t: asked.append(t) or np.zeros(3))  # type: ignore[func-returns-value]
+    made.go(15)
+    np.testing.assert_allclose(asked, 0.01 * np.arange(5), atol=1e-9)
+
+
+def silent_after(cycle: int) -> Callable[[int], Sequence[LowState]]:
+    return lambda k: always(k) if k < cycle else []
+
+
+def odd_from(cycle: int, **changes: Any) -> Callable[[int], Sequence[LowState]]:
+    return lambda k: [make_state(0.01 * k, **changes)] if k >= cycle else always(k)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("no_state", {"script": lambda k: [], "patience": 0.15}),
+        ("stale_state", {"script": silent_after(17)}),
+        ("not_finite", {"script": odd_from(20, joint_vel=at(np.zeros(12), 3, np.nan))}),
+        ("attitude", {"script": odd_from(20, imu_quat=np.zeros(4))}),
+        ("tilt", {"script": odd_from(20, imu_quat=leaning(1.2))}),
+        ("joint_range", {"script": odd_from(20, joint_pos=at(NOMINAL, 0, 2.0))}),
+        ("torque", {"script": odd_from(15, joint_torque=at(np.zeros(12), 0, 40.0))}),
+        ("power", {"script": odd_from(15, joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 3.0))}),
+        ("estimator", {"estimator": Velocity(101)}),
+        ("runtime", {"estimator": Velocity(101, "raise")}),
+        ("command", {"commands": lambda t: np.full(3, np.nan if t > 0.095 else 0.0)}),
+        ("runtime", {"commands": lambda t: np.zeros(3) if t < 0.095 else 1 / 0}),
+    ],
+)
+def test_whatever_goes_wrong_while_walking_the_robot_brakes_and_the_loop_ends(
+    name: str, settings: dict[str, Any]
+) -> None:
+    made = controller(**settings)
+    going = made.go(30)
+    fault = made.safety.fault
+    assert fault is not None
+    assert fault.name == name
+    last = next(k for k, c in enumerate(made.log) if c.phase == "damping")
+    assert fault.t == pytest.approx(0.01 * last)
+    assert 14 <= last <= 21
+    assert all(c.command.damping and (c.command.kp == 0).all() for c in made.log[last:])
+    assert not any(c.command.damping for c in made.log[:last] if c.command is not None)
+    assert going == [True] * (last + 5) + [False] * (30 - last - 5)  # braking goes on for a while
+
+
+def test_a_stop_before_the_robot_has_said_anything_ends_the_loop() -> None:
+    made = controller(lambda k: [])
+    made.go(2)
+    made.safety.stop("a key")
+    assert made.go(1, 2) == [True]
+    assert made.it.phase == "damping"
+    assert made.link.sent[-1].damping
+
+
+def test_gains_that_nobody_knows_have_to_be_given() -> None:
+    about = SimpleNamespace(kp=None, kd=None, nominal_stance=tuple(NOMINAL))
+    bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=FakePolicy()))
+    arguments = (FakeLink(always), lambda t: np.zeros(3), Velocity(), make_safety())
+    with pytest.raises(ValueError, match="kp, kd: the bundle does not know any"):
+        Controller(bundle, *arguments)
+    assert Controller(bundle, *arguments, kp=KP, kd=KD).cycle(0.0)
+
+
+# ---------------------------------------------------------------------- the loop
+
+
+class FakeClock:
+    """Time that passes only while somebody works or sleeps; a sleeper wakes ``late`` s after the time."""
+
+    def __init__(self, late: Callable[[int], float] = lambda sleep: 0.0) -> None:
+        self.t, self._late, self._sleeps = 100.0, late, 0
+
+    def now(self) -> float:
+        return self.t
+
+    def sleep_until(self, when: float) -> None:
+        if when > self.t:
+            self.t = when + self._late(self._sleeps)
+        self._sleeps += 1
+
+
+def played(work_ms: Sequence[float], rate: float = 100.0, **settings: Any) -> tuple[list[float], Timing]:
+    """Run a loop whose cycles work for the given times; return when they started, in ms, and the account."""
+    clock, starts = FakeClock(**settings), list[float]()
+
+    def work(now: float) -> bool:
+        starts.append(round(1e3 * (now - 100.0), 6))
+        clock.t += 1e-3 * work_ms[len(starts) - 1]
+        return len(starts) < len(work_ms)
+
+    return starts, run(work, rate, clock=clock)
+
+
+def test_a_loop_keeps_its_phase() -> None:
+    starts, timing = played([1.0, 9.0, 3.0, 9.9, 0.0])
+    assert starts == [0.0, 10.0, 20.0, 30.0, 40.0]
+    assert (timing.cycles, timing.missed, timing.left_out, timing.missed_share) == (5, 0, 0, 0.0)
+    assert timing.period_p50 == pytest.approx(0.01)
+    assert timing.period_worst == pytest.approx(0.01)
+    assert timing.work_worst == pytest.approx(0.0099)
+    assert timing.work_p50 == pytest.approx(0.003)
+
+
+def test_a_little_lateness_delays_the_next_cycle_and_no_more() -> None:
+    starts, timing = played([1.0, 12.0, 1.0, 1.0])
+    assert starts == [0.0, 10.0, 22.0, 30.0]
+    assert (timing.missed, timing.left_out) == (1, 0)
+    assert timing.late_worst == pytest.approx(0.002)
+    assert timing.period_worst == pytest.approx(0.012)
+    assert timing.missed_share == pytest.approx(1 / 4)
+
+
+def test_cycles_whose_time_is_over_are_left_out_and_counted() -> None:
+    """The second cycle is done at 45 ms: its own deadline and those of the two after it are missed."""
+    starts, timing = played([1.0, 35.0, 1.0, 1.0])
+    assert starts == [0.0, 10.0, 45.0, 50.0]
+    assert (timing.cycles, timing.missed, timing.left_out) == (4, 3, 2)
+    assert timing.missed_share == pytest.approx(3 / 6)
+
+
+def test_a_late_sleeper_is_seen_in_the_periods() -> None:
+    starts, timing = played([1.0] * 5, late=lambda sleep: 0.004 if sleep == 1 else 0.0)
+    assert starts == [0.0, 14.0, 20.0, 30.0, 40.0]
+    assert timing.period_worst == pytest.approx(0.014)
+    assert timing.late_worst == pytest.approx(0.004)
+    assert timing.missed == 0
+
+
+def test_a_loop_ends_with_its_time_however_late_it_is() -> None:
+    clock = FakeClock()
+    starts: list[float] = []
+
+    def work(now: float) -> bool:
+        starts.append(now)
+        clock.t += 0.025
+        return True
+
+    timing = run(work, 100.0, seconds=0.1, clock=clock)
+    assert starts[-1] < 100.1
+    assert timing.cycles + timing.left_out == 10
+    assert timing.missed == 10
+
+
+def test_percentiles_are_numpys_and_the_oldest_cycles_are_forgotten() -> None:
+    account, rng = Deadlines(0.01, kept=50), np.random.default_rng(0)
+    starts, ends = np.cumsum(rng.uniform(0.009, 0.011, 80)), []
+    for start in starts:
+        ends.append(start + rng.uniform(0.0, 0.005))
+        account.note(start, start, ends[-1], 0)
+    timing = account.timing()
+    periods = np.array([b - a for a, b in pairwise(starts)])
+    work = np.array(ends) - starts
+    np.testing.assert_allclose([timing.period_p50, timing.period_p99], np.percentile(periods[-50:], [50, 99]))
+    np.testing.assert_allclose([timing.work_p50, timing.work_p99], np.percentile(work[-50:], [50, 99]))
+    assert timing.period_worst == pytest.approx(periods.max())
+    assert timing.cycles == 80
+
+
+def test_reports_come_about_every_second() -> None:
+    clock, told = FakeClock(), list[int]()
+    run(lambda now: True, 10.0, seconds=3.5, clock=clock, on_report=lambda t: told.append(t.cycles))
+    assert told == [11, 21, 31]
+
+
+def test_the_collector_is_off_in_the_loop_and_back_after_it() -> None:
+    seen: list[bool] = []
+
+    def work(now: float) -> bool:
+        seen.append(gc.isenabled())
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(work, 100.0, clock=FakeClock())
+    assert seen == [False]
+    assert gc.isenabled()
+
+
+def test_a_report_is_one_line() -> None:
+    line = str(played([1.0, 35.0, 1.0, 1.0])[1])
+    assert line.startswith("4 cycles; period p50 10.000, p99 ")
+    assert line.endswith("missed 3 (50.000 %)")
+
+
+def test_real_time_passes_at_the_rate() -> None:
+    """No bound on lateness: the machine may be busy. But no cycle comes early, and the average is held."""
+    starts: list[float] = []
+    run(lambda now: starts.append(now) or True, 200.0, seconds=0.25, clock=MonotonicClock(spin=0.0002))  # type: ignore[func-returns-value]
+    due = starts[0] + np.arange(len(starts)) / 200.0
+    assert len(starts) <= 50
+    assert (np.array(starts) >= due - 1e-3).all()
