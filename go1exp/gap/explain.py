@@ -111,6 +111,12 @@ def _explain(
     on_progress("intervals", 0.88)
     theta, drawn = words.finish(search)
     named = words.name_terms(search, theta, drawn, final <= settings.adequate, removed(first, final) > MOST)
+    sure = any(n.status == "certified" for n in named)
+    if named and not sure and first <= settings.adequate:
+        doubtful = ", ".join(n.effect for n in named)
+        warnings.append(f"Withdrawn, since the tolerances explain these logs and nothing else is sure: {doubtful}.")
+        search.withdraw("the tolerances suffice, and resamples of the logs do not agree on it")
+        final, theta, named = search.first, search.theta, ()
     verdict = words.decide(search, first, final)
     excesses = {"null": excess(plain), "box": first, "final": final}
     if len(parts.confirm):

@@ -91,9 +91,14 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
             mine = slice(n * len(STEPS), (n + 1) * len(STEPS))
             best[k] = _longest(scorer, best[k], moves[n], tries[mine], found[mine], windows)
         if turn == 0 and len(models) > 1:
-            gain = {k: origin - np.log(_chi2(best[k])).sum() for k in alive}
+            gain = {k: origin - misfit(best[k]) for k in alive}
             alive = [k for k in alive if gain[k] > 0.0 and gain[k] >= HOPELESS * max(gain.values())]
     return best
+
+
+def misfit(model: Model) -> float:
+    """Return what a fit makes small: the sum of log chi2 over windows and groups."""
+    return float(np.log(_chi2(model)).sum())
 
 
 Move = tuple[list[Probe], Layout, np.ndarray, box.Bounds]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from go1exp.gap import alone, box, evidence, judge, strain
-from go1exp.gap.fit import Model, fit, scores
+from go1exp.gap.fit import Model, fit, misfit, scores
 from go1exp.gap.likelihood import Scorer, Table, table
 from go1exp.gap.replay import Key, Theta
 from go1exp.gap.result import Candidate, GapSettings
@@ -154,7 +154,9 @@ class Search:
                     self.candidates += evidence.absorbed(self.keys, relief, self.theta, settings.shortlist)
                 break
             self.progress(f"fitting candidates for term {stage}", share + 0.06)
-            fitted = self._fitted(beyond if small else found) if straining is None else self._freed(straining)
+            chosen = beyond if small else found
+            near = excess(now) <= settings.adequate
+            fitted = self._fitted(chosen, near) if straining is None else self._freed(straining)
             accepted, inside = self.judged(stage, fitted, train, now, small)
             if accepted is None and (inside is None or len(self.loosened) == LOOSENED):
                 break
@@ -269,14 +271,23 @@ class Search:
         for s in found:
             self.signal[s.variant.effect] = max(self.signal.get(s.variant.effect, 0.0), s.signal)
 
-    def _fitted(self, found: Sequence[Screened]) -> list[Model]:
+    def _fitted(self, found: Sequence[Screened], near: bool) -> list[Model]:
+        """Return models of the best candidates, fitted.
+
+        They start from what screening made of a few windows, and what looks hopeless after a step is given up. Where
+        the model is ``near`` the data both may mislead: effects of the box are also fitted each on its own, from where
+        they are, and the better fit counts.
+        """
         chosen: dict[str, Screened] = {}
         for s in found:
             if len(chosen) < self.settings.shortlist and s.gain > 0.0:
                 chosen.setdefault(s.variant.effect, s)
         models = [Model(effect, s.theta, self.may.also(effect), s.variant.free) for effect, s in chosen.items()]
         assert self.own is not None
-        return fit(self.scorer, models, self.own, self.settings.iterations, self.dt) if models else []
+        fitted = fit(self.scorer, models, self.own, self.settings.iterations, self.dt) if models else []
+        own = {key[0] for key in self.keys} if near else ()
+        again = [self._freed(m.name)[0] if m.name in own else m for m in fitted]
+        return [min(pair, key=misfit) for pair in zip(fitted, again, strict=True)]
 
     def judged(
         self, stage: int, fitted: list[Model], train: np.ndarray, now: np.ndarray, small: bool = False
@@ -315,11 +326,11 @@ class Search:
         self.aliases[accepted.name] = (accepted.name, *(n for n in names if n != accepted.name))
         on_train = judge.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None]))
         every = np.concatenate([on_train, trial.gain], axis=1)
-        self.shares[accepted.name] = self._bag(every, trial.chosen, trial.alias)
+        self.shares[accepted.name] = self._bag(every[~trial.aside], trial.alias[~trial.aside])
         return accepted, inside
 
-    def _bag(self, gain: np.ndarray, chosen: int, alias: np.ndarray) -> float:
-        """Return the share of resampled windows in which the chosen candidate, or its equal, gains most."""
+    def _bag(self, gain: np.ndarray, alias: np.ndarray) -> float:
+        """Return the share of resampled windows in which the chosen candidate or its equal (``alias``) gains most."""
         episode = self.scorer.windows.episode[np.concatenate([self.splits.train, self.splits.select])]
         episode = np.repeat(episode, len(self.scorer.replayer.machine.groups))
         wins = 0
@@ -327,7 +338,7 @@ class Search:
             picked = judge.resampled(episode, self.rng)
             mean = gain[:, picked].mean(axis=1)
             close = mean >= mean.max() - judge.same(mean.max())
-            wins += bool(close[chosen] or close[alias].any())
+            wins += bool(close[alias].any())
         return wins / max(self.settings.bags, 1)
 
     def _eliminate(self, now: np.ndarray) -> None:

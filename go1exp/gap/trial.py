@@ -46,6 +46,7 @@ class Trial:
         alpha: significance that one must have.
         helps: (M,) which do both.
         alias: (M,) which do as well as the best of those that also leave their tolerances.
+        aside: (M,) which do as well too, with more numbers.
         chosen: the one of these to accept; None if there is none, or if one within its tolerance does as well.
     """
 
@@ -59,6 +60,7 @@ class Trial:
     alpha: float
     helps: np.ndarray
     alias: np.ndarray
+    aside: np.ndarray
     chosen: int | None
 
     @property
@@ -129,12 +131,13 @@ def tried(
     sizes = np.array([evidence.size(m.name, m.theta) for m in fitted])
     helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
     fit_for_it = np.flatnonzero(helps & (sizes > (CLEAR if small else 1.0)))
-    chosen, alias = None, np.zeros(len(fitted), dtype=bool)
+    chosen, alias, aside = None, *np.zeros((2, len(fitted)), dtype=bool)
     if len(fit_for_it):
         best = int(max(fit_for_it, key=lambda k: gain[k].mean()))
         alias = judge.equals(gain, best, rng) & np.isin(np.arange(len(fitted)), fit_for_it)
         many = np.array([len(m.keys) for m in fitted])
-        alias &= many == many[alias].min()  # what says the same with more numbers is no rival
+        aside = alias & (many > many[alias].min())  # what says the same with more numbers is no rival
+        alias &= ~aside
         chosen = int(max(np.flatnonzero(alias), key=lambda k: gain[k].mean()))
         inside = gain.mean(axis=1)[helps & (sizes <= 1.0)]
         if len(inside) and inside.max() >= gain[chosen].mean() - judge.same(gain[chosen].mean()):
@@ -143,7 +146,7 @@ def tried(
                 np.zeros(len(fitted), dtype=bool),
             )  # a tolerance does as well: nothing must leave its own
     names = [m.name for m in fitted]
-    return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, chosen)
+    return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, aside, chosen)
 
 
 def _bic(scorer: Scorer, fitted: Sequence[Model], train: np.ndarray) -> np.ndarray:
