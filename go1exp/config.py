@@ -18,6 +18,7 @@ import go1exp.actuator
 import go1exp.effects
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
+from go1exp.backends import BACKENDS, BackendConfig, CpuBackend
 from go1exp.effects.rules import drive_problems
 from go1exp.registry import (
     STRICT,
@@ -68,16 +69,6 @@ class ActionConfig:
 
     scale: Positive
     clip: Positive
-
-
-@dataclass(frozen=True)
-class BackendConfig:
-    """The physics engine: ``cpu`` (MuJoCo's batch) and its threads, 0 for all cores."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    name: Literal["cpu"]
-    threads: CountOrZero
 
 
 @dataclass(frozen=True)
@@ -194,7 +185,7 @@ class ProcessConfig:
 
     Attributes:
         seed: of everything random.
-        device: torch device of policy and update (the environment's is its backend's).
+        device: torch device of policy and update, ``auto`` for that of the environment, which is its backend's.
         torch_threads: threads of torch, 0 for its own choice.
         resume: run folder to continue, or null.
     """
@@ -202,7 +193,7 @@ class ProcessConfig:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
-    device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
+    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     torch_threads: CountOrZero
     resume: str | None
 
@@ -251,12 +242,12 @@ SECTIONS: dict[str, type] = {
     "action": ActionConfig,
     "robot": RobotConfig,
     "terrain": TerrainConfig,
-    "backend": BackendConfig,
+    "backend": CpuBackend,
     "ppo": PPOConfig,
     "logger": LoggerConfig,
     "checkpoint": CheckpointConfig,
 }
-"""Sections of the configuration that are one dataclass each."""
+"""Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
 
 ONE_TERM = ("actuator", "command")
 """Groups of which a configuration uses one member; its key ``term`` names it."""
@@ -305,7 +296,13 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
             continue
         settings = container[name]
         if name in SECTIONS:
-            parts[name], found = _section(SECTIONS[name], settings, name)
+            kind = SECTIONS[name]
+            if name == "backend" and isinstance(settings, Mapping) and "name" in settings:
+                if settings["name"] not in BACKENDS:
+                    problems.append(unknown_name("backend.name", str(settings["name"]), BACKENDS, "engine"))
+                    continue
+                kind = BACKENDS[settings["name"]]
+            parts[name], found = _section(kind, settings, name)
         elif name in MANY_TERMS:
             parts[name], found = _terms(name, settings)
         elif not isinstance(settings, Mapping) or "term" not in settings:

@@ -196,16 +196,18 @@ class MujocoWarp:
         with self._scope():
             self._constants.update(self._model, wp.from_torch(mask, dtype=wp.bool))
 
+    def drain_metrics(self) -> dict[str, float]:
+        """Return the share of environments that lost contacts or constraints since the last call, for want of room."""
+        share = float(self.overflowed().float().mean())
+        self._overflow.zero_()
+        return {"physics/overflow": share}
+
     # ------------------------------------------------------------------ abilities of this backend alone
 
     def overflowed(self) -> Tensor:
-        """(N,) bool, environments that lost contacts or constraints since ``clear_overflow``."""
+        """(N,) bool, environments that lost contacts or constraints since ``drain_metrics``."""
         lost = sum(int(getattr(mjw.OverflowType, name)) for name in LOST)
         return (self._overflow & lost) != 0
-
-    def clear_overflow(self) -> None:
-        """Forget the overflows so far."""
-        self._overflow.zero_()
 
     def capture(self, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
         """Record what ``work()`` does to the device as one CUDA graph.
@@ -229,7 +231,7 @@ class MujocoWarp:
             try:
                 result = work()
             finally:
-                self._recorded = wp.capture_end(stream=warp_stream)  # keeps what warp allocated alive
+                self._recorded = wp.capture_end(stream=warp_stream)  # keeps what was allocated in it
         return graph.replay, result
 
     # ------------------------------------------------------------------ state
@@ -237,18 +239,21 @@ class MujocoWarp:
     def state_dict(self) -> dict[str, Any]:
         """Return the simulations' states and every model field that differs between them, in the CPU backend's form."""
         return {
+            "engine": "warp",
             "state": {name: self._memory[name].clone() for name in STATE_FIELDS},
             "fields": {name: value.clone() for name, value in self._fields.items()},
             "baseline": {name: value.clone() for name, value in self._baseline.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``, of this backend or the CPU's (which keeps some fields that there are not here)."""
+        """Continue from ``state_dict``, of this backend or of the CPU's, which knows further fields."""
+        own = "engine" in state
         for name, value in state["fields"].items():
-            place, attribute = self._place(name)
-            if hasattr(place, attribute):
+            if own or name in self._fields:
                 self.field(name).copy_(value)
         for name, value in state["baseline"].items():
             self._baseline.setdefault(name, torch.empty_like(self.field(name))).copy_(value)
         for name in STATE_FIELDS:
             self._memory[name].copy_(state["state"][name].reshape(self._memory[name].shape))
+        if not own and DERIVED[0] in state["fields"]:
+            self.derive_constants(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))

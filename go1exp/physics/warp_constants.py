@@ -68,12 +68,12 @@ def _inertia(
     iquat: wp.array2d[wp.quat],
     armature: wp.array2d[float],
     out: wp.array3d[float],
-):
+) -> None:
     """Joint-space inertia, one entry a thread."""
     row, i, j = wp.tid()
     if not mask[row]:
         return
-    total = float(0.0)
+    total = wp.float32(0.0)
     for body in range(1, moves.shape[0]):
         if moves[body, i] != 0 and moves[body, j] != 0:
             point = _centre(row, body, xpos, xmat, ipos)
@@ -90,7 +90,7 @@ def _inertia(
 
 
 @wp.kernel(enable_backward=False)
-def _factor(mask: wp.array[wp.bool], inout: wp.array3d[float]):
+def _factor(mask: wp.array[wp.bool], inout: wp.array3d[float]) -> None:
     """Cholesky factor (lower) in place, one row a thread."""
     row = wp.tid()
     if not mask[row]:
@@ -116,7 +116,7 @@ def _responses(
     ipos: wp.array2d[wp.vec3],
     factor: wp.array3d[float],
     out: wp.array2d[float],
-):
+) -> None:
     """J M^-1 J^T = |L^-1 J^T|^2 of a degree of freedom, or of an axis of a body's centre, one a thread."""
     row, k = wp.tid()
     if not mask[row]:
@@ -126,9 +126,9 @@ def _responses(
     body = (k - nv) // 6
     axis = (k - nv) % 6
     point = _centre(row, wp.max(body, 0), xpos, xmat, ipos)
-    total = float(0.0)
+    total = wp.float32(0.0)
     for i in range(nv):
-        value = float(0.0)
+        value = wp.float32(0.0)
         if k < nv:
             if i == k:
                 value = 1.0
@@ -158,7 +158,7 @@ def _weights(
     subtreemass: wp.array2d[float],
     body_invweight0: wp.array2d[wp.vec2],
     dof_invweight0: wp.array2d[float],
-):
+) -> None:
     """Average and write, one body or degree of freedom a thread."""
     row, k = wp.tid()
     if not mask[row]:
@@ -171,7 +171,7 @@ def _weights(
             value = (response[row, first] + response[row, first + 1] + response[row, first + 2]) / 3.0
         dof_invweight0[row, k] = value
     if k < moves.shape[0]:
-        total = float(0.0)
+        total = wp.float32(0.0)
         for other in range(moves.shape[0]):
             if below[k, other] != 0:
                 total += mass[row % mass.shape[0], other]

@@ -131,6 +131,7 @@ class AdaptivePPO(PPO):
     ``after_iteration(ppo)`` is called when an iteration is complete: rollout, update and metrics, nothing half done.
     """
 
+    buffer_class: type[RolloutBuffer] = MeanRolloutBuffer
     rollout_buffer: MeanRolloutBuffer
     policy: GaussianPolicy
 
@@ -153,7 +154,7 @@ class AdaptivePPO(PPO):
             ent_coef=config.entropy,
             vf_coef=config.value_coef,
             max_grad_norm=config.max_grad_norm,
-            rollout_buffer_class=MeanRolloutBuffer,
+            rollout_buffer_class=self.buffer_class,
             policy_kwargs=policy_settings(config),
             seed=seed,
             device=device,
@@ -195,6 +196,10 @@ class AdaptivePPO(PPO):
         self._old_log_std = self.policy.log_std.detach().clone()
         self._kl: list[float] = []
         super().train()
+        self._close_iteration()
+
+    def _close_iteration(self) -> None:
+        """Count the iteration that is complete, and tell of it."""
         self.iteration += 1
         self.logger.record("train/kl", float(np.mean(self._kl)))
         self.logger.record("train/learning_rate", self.policy.optimizer.param_groups[0]["lr"])

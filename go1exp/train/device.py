@@ -1,0 +1,185 @@
+"""PPO that never leaves the GPU: rollouts, advantages and minibatches stay where the environment is.
+
+SB3's loop takes every step through numpy and looks at every environment's info in Python, and its buffer computes
+advantages on the host (docs/benchmarks.md has what that costs). Policy, loss, update, saving, callbacks and logger are
+SB3's here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from go1exp.config import PPOConfig
+from go1exp.env.faults import NumericalFault
+from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, MeanRolloutBuffer
+
+
+class DeviceRolloutBuffer(MeanRolloutBuffer):
+    """A rollout of tensors ``(steps, N, ...)`` on the learner's device, and the episodes that ended in it."""
+
+    policy: GaussianPolicy
+    data: dict[str, Tensor]
+
+    def reset(self) -> None:
+        """Empty the buffer; its memory is made once."""
+        if not hasattr(self, "data"):
+            widths = {"observations": self.obs_shape, "actions": (self.action_dim,), "means": (self.action_dim,)}
+            singles = (
+                "rewards",
+                "starts",
+                "values",
+                "log_probs",
+                "advantages",
+                "returns",
+                "ended",
+                "totals",
+                "lengths",
+            )
+            shapes: dict[str, Any] = {**widths, **dict.fromkeys(singles, ())}
+            size = (self.buffer_size, self.n_envs)
+            self.data = {name: torch.zeros(*size, *shape, device=self.device) for name, shape in shapes.items()}
+        self.pos, self.full, self.generator_ready = 0, False, False
+
+    def store(self, **step: Tensor) -> None:
+        """Keep one step: values (N, ...) by the names of ``data``."""
+        for name, value in step.items():
+            self.data[name][self.pos].copy_(value)
+        self.pos += 1
+        self.full = self.pos == self.buffer_size
+
+    def estimate(self, last_values: Tensor, last_ended: Tensor) -> None:
+        """Compute advantages and returns: generalised advantage estimation (Schulman et al. 2016), as SB3 does.
+
+        Args:
+            last_values: (N,) of the states after the rollout.
+            last_ended: (N,) whether an episode ended in its last step.
+        """
+        d, gain = self.data, torch.zeros_like(last_values)
+        for step in reversed(range(self.buffer_size)):
+            last = step == self.buffer_size - 1
+            going = 1.0 - (last_ended.float() if last else d["starts"][step + 1])
+            after = last_values if last else d["values"][step + 1]
+            delta = d["rewards"][step] + self.gamma * after * going - d["values"][step]
+            gain = delta + self.gamma * self.gae_lambda * going * gain
+            d["advantages"][step].copy_(gain)
+        torch.add(d["advantages"], d["values"], out=d["returns"])
+
+    def episodes(self, most: int) -> list[dict[str, float]]:
+        """Return return ``r`` and length ``l`` of the newest episodes, up to ``most``, oldest first."""
+        rows = self.data["ended"].flatten().nonzero().squeeze(1)[-most:]
+        totals, lengths = (self.data[name].flatten()[rows].tolist() for name in ("totals", "lengths"))
+        return [{"r": r, "l": int(n)} for r, n in zip(totals, lengths, strict=True)]
+
+    def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
+        """Yield shuffled minibatches."""
+        flat = {name: value.flatten(0, 1) for name, value in self.data.items()}
+        total = self.buffer_size * self.n_envs
+        for rows in torch.randperm(total, device=self.device).split(batch_size or total):
+            self.current_means = flat["means"][rows]
+            names = ("observations", "actions", "values", "log_probs", "advantages", "returns")
+            yield RolloutBufferSamples(*(flat[name][rows] for name in names))
+
+    # SB3 wants these two as arrays, for one figure of its log.
+
+    @property
+    def values(self) -> np.ndarray:  # type: ignore[override]
+        """(steps, N) values of the visited states, on the host."""
+        return self.data["values"].cpu().numpy()
+
+    @property
+    def returns(self) -> np.ndarray:  # type: ignore[override]
+        """(steps, N) their returns, on the host."""
+        return self.data["returns"].cpu().numpy()
+
+
+class DevicePPO(AdaptivePPO):
+    """``AdaptivePPO`` on an environment whose tensors are on the learner's own device."""
+
+    buffer_class: type[RolloutBuffer] = DeviceRolloutBuffer
+    rollout_buffer: DeviceRolloutBuffer
+
+    def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str) -> None:
+        # Each new distribution would otherwise look at its parameters, and wait for them.
+        torch.distributions.Distribution.set_default_validate_args(False)
+        super().__init__(config, env, seed, device)
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """Fill the buffer; return whether the callback lets training go on. One wait for the device, at the end."""
+        assert isinstance(env, Go1VecEnv)
+        assert isinstance(rollout_buffer, DeviceRolloutBuffer)
+        core, buffer, policy = env.core, rollout_buffer, self.policy
+        policy.set_training_mode(False)
+        buffer.reset()
+        callback.on_rollout_start()
+        observation = torch.as_tensor(np.asarray(self._last_obs), device=core.device)
+        starts = torch.as_tensor(np.asarray(self._last_episode_starts), device=core.device)
+        for _ in range(n_rollout_steps):
+            with torch.no_grad():
+                actions, values, log_probs = policy(observation)
+                means = policy.last_distribution.distribution.mean
+                result = core.step(actions)
+                # A time limit is no end: what would have come after it counts.
+                beyond = policy.predict_values(result.final_observation).squeeze(1)
+                rewards = result.reward + self.gamma * beyond * result.truncated
+            buffer.store(
+                observations=observation,
+                actions=actions,
+                means=means,
+                rewards=rewards,
+                starts=starts,
+                values=values.squeeze(1),
+                log_probs=log_probs,
+                ended=result.terminated | result.truncated,
+                totals=result.episode_return,
+                lengths=result.episode_length,
+            )
+            observation, starts = result.observation.clone(), result.terminated | result.truncated
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+        with torch.no_grad():
+            buffer.estimate(policy.predict_values(observation).squeeze(1), starts)
+        core.check_so_far()
+        assert self.ep_info_buffer is not None
+        self.ep_info_buffer.extend(buffer.episodes(self._stats_window_size))
+        self._last_obs, self._last_episode_starts = observation.cpu().numpy(), starts.cpu().numpy()
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _check_gradient(self, name: str, parameter: Tensor) -> None:
+        """Note whether the gradient that just arrived is finite; ``train`` looks at the notes."""
+        if parameter.grad is not None:
+            finite = torch.isfinite(parameter.grad.sum())
+            self._finite[name] = self._finite[name] & finite if name in self._finite else finite
+
+    def train(self) -> None:
+        """Update on the rollout, then close the iteration.
+
+        Raises:
+            NumericalFault: if a gradient was not finite; the policy is spoilt by then, the last checkpoint is not.
+        """
+        self._finite: dict[str, Tensor] = {}
+        super().train()
+
+    def _close_iteration(self) -> None:
+        if not torch.stack(list(self._finite.values())).all():
+            name = next(name for name, finite in self._finite.items() if not finite)
+            raise NumericalFault(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}", {})
+        super()._close_iteration()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_finite"]
