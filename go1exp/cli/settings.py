@@ -210,7 +210,7 @@ class BenchSettings:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    suite: Literal["env", "train", "actuator"]
+    suite: Literal["env", "train", "actuator", "gpu"]
     num_envs: Count
     rounds: Count
     seconds: Positive
