@@ -138,7 +138,7 @@ class Go1Core:
         widths = [t.entry.traits["size"] for t in task.observation]
         self.observation_size = sum(widths)
         noise = [t.slots["noise"] for t in task.observation]
-        self._noise = torch.tensor(noise, device=self.device).repeat_interleave(torch.tensor(widths)).float()
+        self._noise = torch.tensor(noise).repeat_interleave(torch.tensor(widths)).float().to(self.device)
         self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
         self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
         for term in self._model_terms:

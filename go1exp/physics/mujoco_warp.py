@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, TypeVar
 
@@ -42,6 +43,17 @@ WARM_UP = 2
 
 LOST = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "HFIELD", "CONTACT_MATCH")
 """Overflows by which contacts or constraints are lost (the others are limits of iterations)."""
+
+
+@dataclass(frozen=True)
+class _Replay:
+    """A CUDA graph, and what owns the memory that it works on."""
+
+    graph: torch.cuda.CUDAGraph
+    kept: tuple[Any, ...]
+
+    def __call__(self) -> None:
+        self.graph.replay()
 
 
 class MujocoWarp:
@@ -231,8 +243,8 @@ class MujocoWarp:
             try:
                 result = work()
             finally:
-                self._recorded = wp.capture_end(stream=warp_stream)  # keeps what was allocated in it
-        return graph.replay, result
+                recorded = wp.capture_end(stream=warp_stream)
+        return _Replay(graph, (self, work, recorded)), result
 
     # ------------------------------------------------------------------ state
 
