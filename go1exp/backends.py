@@ -32,7 +32,6 @@ class WarpBackend:
             shape of the robot is near it: 26 pairs.
         njmax: constraint rows of one environment: 4 for each contact, one for each joint at its stop or with dry
             friction.
-        deterministic: order contacts and sums, so that every run has the same bits.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -42,7 +41,6 @@ class WarpBackend:
     graph: bool
     nconmax: Annotated[int, Field(ge=32, le=1000)]
     njmax: Annotated[int, Field(ge=64, le=2000)]
-    deterministic: bool
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""

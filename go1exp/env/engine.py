@@ -35,7 +35,6 @@ def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: 
         device=config.device,
         nconmax=config.nconmax,
         njmax=config.njmax,
-        deterministic=config.deterministic,
     )
 
 

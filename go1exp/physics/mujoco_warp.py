@@ -1,7 +1,7 @@
 """``backend=warp``: MuJoCo Warp, N simulations on one GPU, its memory shared with torch.
 
 Numbers are float32. Contacts of a step are collected in whatever order the GPU's threads find them, so that sums over
-them differ in the last bits from run to run; ``deterministic`` orders them, for a price.
+them differ in the last bits from run to run (its option to order them left differences when tried).
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ except ImportError as error:
     ) from error
 
 from go1exp.physics.warp_constants import DERIVED, DerivedConstants
+from go1exp.physics.warp_contacts import ContactReadings, without_contact_sensors
 
 T = TypeVar("T")
 
@@ -68,7 +69,6 @@ class MujocoWarp:
         device: str = "cuda",
         nconmax: int = 48,
         njmax: int = 160,
-        deterministic: bool = False,
     ) -> None:
         """Allocate.
 
@@ -79,7 +79,6 @@ class MujocoWarp:
             device: ``cuda``, ``cuda:1`` or, to look for faults slowly, ``cpu``.
             nconmax: contacts, and pairs of shapes near each other, that an environment has room for on average.
             njmax: constraint rows that one environment has room for.
-            deterministic: the same bits in every run.
 
         Raises:
             ConfigError: if the device is not there.
@@ -96,8 +95,11 @@ class MujocoWarp:
         with self._scope():
             self._model = mjw.put_model(supported)
             self._model.opt.warn_overflow = 0  # kernels that print are slow; ``overflowed`` tells
-            self._model.opt.deterministic = deterministic
+            without_contact_sensors(self._model)
+            if not model.dof_damping.any():  # it would factorise the inertia once more for nothing
+                self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
             self._data = mjw.make_data(supported, nworld=num_envs, nconmax=nconmax, njmax=njmax)
+            self._contacts = ContactReadings(supported, sensors, self._data.naconmax)
             self._constants = DerivedConstants(supported, num_envs)
         d = self._data
         self.qpos, self.qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
@@ -134,6 +136,7 @@ class MujocoWarp:
         self._ctrl.copy_(torque)
         with self._scope():
             mjw.step(self._model, self._data)
+            self._contacts.update(self._model, self._data)
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Put the rows of ``mask`` into a state at rest in memory: no warm start, time 0, sensors current.
@@ -149,6 +152,7 @@ class MujocoWarp:
         before = self.sensordata.clone()
         with self._scope():
             mjw.forward(self._model, self._data)
+            self._contacts.update(self._model, self._data)
         self.sensordata.copy_(torch.where(rows, self.sensordata, before))
 
     # ------------------------------------------------------------------ the model
@@ -156,6 +160,8 @@ class MujocoWarp:
     def field(self, name: str) -> Tensor:
         """Live per-environment values of a model field."""
         if name not in self._fields:
+            if name == "dof_damping":
+                self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
             place, attribute = self._place(name)
             shared = getattr(place, attribute)
             own = wp.to_torch(shared).repeat_interleave(self.num_envs, 0)

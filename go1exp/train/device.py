@@ -161,10 +161,13 @@ class DevicePPO(AdaptivePPO):
         return True
 
     def _check_gradient(self, name: str, parameter: Tensor) -> None:
-        """Note whether the gradient that just arrived is finite; ``train`` looks at the notes."""
-        if parameter.grad is not None:
-            finite = torch.isfinite(parameter.grad.sum())
-            self._finite[name] = self._finite[name] & finite if name in self._finite else finite
+        """Do nothing as each gradient arrives: ``train`` looks at all of them in the end."""
+
+    def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *arguments: Any) -> None:
+        """Note which gradients are finite, and set the learning rate of the step about to be taken."""
+        norms = torch.stack(torch._foreach_norm([p.grad for p in self.policy.parameters()]))  # type: ignore[misc]
+        self._finite.logical_and_(torch.isfinite(norms))
+        super()._before_gradient_step(optimizer, *arguments)
 
     def train(self) -> None:
         """Update on the rollout, then close the iteration.
@@ -172,12 +175,12 @@ class DevicePPO(AdaptivePPO):
         Raises:
             NumericalFault: if a gradient was not finite; the policy is spoilt by then, the last checkpoint is not.
         """
-        self._finite: dict[str, Tensor] = {}
+        self._finite = torch.ones(len(list(self.policy.parameters())), dtype=torch.bool, device=self.device)
         super().train()
 
     def _close_iteration(self) -> None:
-        if not torch.stack(list(self._finite.values())).all():
-            name = next(name for name, finite in self._finite.items() if not finite)
+        if not self._finite.all():
+            name = [name for name, _ in self.policy.named_parameters()][int((~self._finite).nonzero()[0])]
             raise NumericalFault(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}", {})
         super()._close_iteration()
 
