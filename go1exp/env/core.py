@@ -70,7 +70,8 @@ class Go1Core:
         model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt, imu=imu, held=held)
         self.backend = make_backend(task.backend, model, sensors, num_envs)
         self.device = self.backend.qpos.device
-        self.random = EnvRandom(seed, num_envs, first_env, self.device)
+        units = getattr(self.backend, "units", None)
+        self.random = EnvRandom(seed, num_envs, first_env, self.device, units=units)
         self._held = held
         self._state = KinematicState.of(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
@@ -97,10 +98,8 @@ class Go1Core:
         self._started = False
         self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
         self._evidence = Evidence()
+        self.captures = isinstance(task.backend, WarpBackend) and task.backend.graph
         self._captured: CapturedStep | None = None
-        if isinstance(task.backend, WarpBackend) and task.backend.graph:
-            parts: Any = (self.backend, self._step, self.action, self.state_dict, self.load_state_dict)
-            self._captured = CapturedStep(*parts)
 
     # ------------------------------------------------------------------ construction
 
@@ -215,10 +214,14 @@ class Go1Core:
         Order: physics, failure and time limit, reward, last observation, resets of ended episodes, new commands,
         pushes, first observation. A push and a new command are therefore seen before they are answered.
         """
-        return self._captured(action) if self._captured else self._step(action)
+        if not self.captures:
+            return self.step_by_call(action)
+        if self._captured is None:
+            self._captured = CapturedStep(self, action)
+        return self._captured(action)
 
-    def _step(self, action: Tensor) -> StepResult:
-        """Do what ``step`` says, call by call."""
+    def step_by_call(self, action: Tensor) -> StepResult:
+        """Do what ``step`` says, call by call: for what is to be part of a larger graph."""
         self._advance_physics(action)
         self.steps += 1
         s = self.snapshot()

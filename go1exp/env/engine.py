@@ -45,37 +45,44 @@ class Captures(Protocol):
         """Run ``work`` a few times, record it, and return the replay and what ``work`` returned, live."""
 
 
-class CapturedStep:
-    """A step that is recorded when it is first called, and replayed from then on.
+class Steps(Protocol):
+    """An environment whose step may be part of a graph."""
 
-    Args:
-        backend: does the recording.
-        step: the step.
-        action: a tensor of the actions' shape.
-        keep: returns everything that the step changes.
-        restore: puts that back: the runs before a recording leave no trace.
+    backend: Any
+
+    def step_by_call(self, action: Tensor) -> StepResult:
+        """Step."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that steps change."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put it back."""
+
+
+def captured(env: Steps, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
+    """Record ``work``, which steps ``env`` call by call, as one graph; the runs before that leave no trace in ``env``.
+
+    Returns:
+        the replay, and what ``work`` returned, written anew by each replay.
     """
+    backend: Captures = env.backend
+    state = env.state_dict()
+    recorded = backend.capture(work)
+    env.load_state_dict(state)
+    return recorded
 
-    def __init__(
-        self,
-        backend: Captures,
-        step: Callable[[Tensor], StepResult],
-        action: Tensor,
-        keep: Callable[[], dict[str, Any]],
-        restore: Callable[[dict[str, Any]], None],
-    ) -> None:
-        self._backend, self._step, self._keep, self._restore = backend, step, keep, restore
+
+class CapturedStep:
+    """The step of an environment as one graph."""
+
+    def __init__(self, env: Steps, action: Tensor) -> None:
+        """Record it for actions (N, A) like this one."""
         self._action = torch.zeros_like(action)
-        self._replay: Callable[[], None] | None = None
-        self._result: StepResult | None = None
+        self._replay, self._result = captured(env, lambda: env.step_by_call(self._action))
 
     def __call__(self, action: Tensor) -> StepResult:
         """Step; the result's tensors are always the same ones."""
-        if self._replay is None:
-            state = self._keep()
-            self._replay, self._result = self._backend.capture(lambda: self._step(self._action))
-            self._restore(state)
         self._action.copy_(action)
         self._replay()
-        assert self._result is not None
         return self._result

@@ -33,6 +33,7 @@ except ImportError as error:
 
 from go1exp.physics.warp_constants import DERIVED, DerivedConstants
 from go1exp.physics.warp_contacts import ContactReadings, without_contact_sensors
+from go1exp.physics.warp_random import units_kernel
 
 T = TypeVar("T")
 
@@ -226,6 +227,18 @@ class MujocoWarp:
         """(N,) bool, environments that lost contacts or constraints since ``drain_metrics``."""
         lost = sum(int(getattr(mjw.OverflowType, name)) for name in LOST)
         return (self._overflow & lost) != 0
+
+    def units(self, key: Tensor, counter: Tensor, count: int) -> Tensor:
+        """Do what ``go1exp.randomness.unit_numbers`` does, in one kernel."""
+        out = torch.empty(len(key), count, device=self.device)
+        with self._scope():
+            wp.launch(
+                units_kernel,
+                out.shape,
+                inputs=[wp.from_torch(key), wp.from_torch(counter)],
+                outputs=[wp.from_torch(out)],
+            )
+        return out
 
     def capture(self, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
         """Record what ``work()`` does to the device as one CUDA graph.

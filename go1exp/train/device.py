@@ -7,7 +7,7 @@ SB3's here too.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from go1exp.config import PPOConfig
+from go1exp.env.core import Go1Core
+from go1exp.env.engine import captured
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, MeanRolloutBuffer
@@ -48,14 +50,16 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
             shapes: dict[str, Any] = {**widths, **dict.fromkeys(singles, ())}
             size = (self.buffer_size, self.n_envs)
             self.data = {name: torch.zeros(*size, *shape, device=self.device) for name, shape in shapes.items()}
+            self._next = torch.zeros(1, dtype=torch.int64, device=self.device)  # on the device: steps are replayed
+        self._next.zero_()
         self.pos, self.full, self.generator_ready = 0, False, False
 
     def store(self, **step: Tensor) -> None:
-        """Keep one step: values (N, ...) by the names of ``data``."""
+        """Keep one step: values (N, ...) by the names of ``data``. The caller counts with ``pos``."""
         for name, value in step.items():
-            self.data[name][self.pos].copy_(value)
-        self.pos += 1
-        self.full = self.pos == self.buffer_size
+            kept = self.data[name]
+            kept.index_copy_(0, self._next, value.to(kept.dtype).unsqueeze(0))
+        self._next.add_(1).remainder_(self.buffer_size)
 
     def estimate(self, last_values: Tensor, last_ended: Tensor) -> None:
         """Compute advantages and returns: generalised advantage estimation (Schulman et al. 2016), as SB3 does.
@@ -113,49 +117,79 @@ class DevicePPO(AdaptivePPO):
         torch.distributions.Distribution.set_default_validate_args(False)
         super().__init__(config, env, seed, device)
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._observation = torch.zeros(self.n_envs, *self.rollout_buffer.obs_shape, device=self.device)
+        self._starts = torch.zeros(self.n_envs, dtype=torch.bool, device=self.device)
+        self._replay: Callable[[], None] | None = None
+
+    def _collect_step(self) -> None:
+        """Act on the observation, step, keep both; in place, so that it can be replayed as a graph."""
+        core, policy = self._core(), self.policy
+        with torch.no_grad():
+            actions, values, log_probs = policy(self._observation)
+            result = core.step_by_call(actions)
+            # A time limit is no end: what would have come after it counts.
+            beyond = policy.predict_values(result.final_observation).squeeze(1)
+            ended = result.terminated | result.truncated
+            self.rollout_buffer.store(
+                observations=self._observation,
+                actions=actions,
+                means=policy.last_distribution.distribution.mean,
+                rewards=result.reward + self.gamma * beyond * result.truncated,
+                starts=self._starts,
+                values=values.squeeze(1),
+                log_probs=log_probs,
+                ended=ended,
+                totals=result.episode_return,
+                lengths=result.episode_length,
+            )
+            self._observation.copy_(result.observation)
+            self._starts.copy_(ended)
+
+    def _core(self) -> Go1Core:
+        env = self.get_env()
+        assert isinstance(env, Go1VecEnv)
+        return env.core
+
+    def _stepper(self) -> Callable[[], None]:
+        """Return what makes one step of a rollout: the graph of it, recorded at the first call."""
+        if not self._core().captures:
+            return self._collect_step
+        if self._replay is None:
+            before = self._observation.clone(), self._starts.clone(), torch.cuda.get_rng_state(self.device)
+            self._replay, _ = captured(self._core(), self._collect_step)
+            self._observation.copy_(before[0])
+            self._starts.copy_(before[1])
+            torch.cuda.set_rng_state(before[2], self.device)
+            self.rollout_buffer.reset()
+        return self._replay
+
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
         """Fill the buffer; return whether the callback lets training go on. One wait for the device, at the end."""
-        assert isinstance(env, Go1VecEnv)
-        assert isinstance(rollout_buffer, DeviceRolloutBuffer)
-        core, buffer, policy = env.core, rollout_buffer, self.policy
-        policy.set_training_mode(False)
+        buffer = self.rollout_buffer
+        self.policy.set_training_mode(False)
+        self._observation.copy_(torch.as_tensor(np.asarray(self._last_obs)))
+        self._starts.copy_(torch.as_tensor(np.asarray(self._last_episode_starts)))
         buffer.reset()
         callback.on_rollout_start()
-        observation = torch.as_tensor(np.asarray(self._last_obs), device=core.device)
-        starts = torch.as_tensor(np.asarray(self._last_episode_starts), device=core.device)
+        step = self._stepper()
         for _ in range(n_rollout_steps):
-            with torch.no_grad():
-                actions, values, log_probs = policy(observation)
-                means = policy.last_distribution.distribution.mean
-                result = core.step(actions)
-                # A time limit is no end: what would have come after it counts.
-                beyond = policy.predict_values(result.final_observation).squeeze(1)
-                rewards = result.reward + self.gamma * beyond * result.truncated
-            buffer.store(
-                observations=observation,
-                actions=actions,
-                means=means,
-                rewards=rewards,
-                starts=starts,
-                values=values.squeeze(1),
-                log_probs=log_probs,
-                ended=result.terminated | result.truncated,
-                totals=result.episode_return,
-                lengths=result.episode_length,
-            )
-            observation, starts = result.observation.clone(), result.terminated | result.truncated
+            step()
+            buffer.pos += 1
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
+        buffer.full = buffer.pos == buffer.buffer_size
         with torch.no_grad():
-            buffer.estimate(policy.predict_values(observation).squeeze(1), starts)
-        core.check_so_far()
+            buffer.estimate(self.policy.predict_values(self._observation).squeeze(1), self._starts)
+        self._core().check_so_far()
         assert self.ep_info_buffer is not None
         self.ep_info_buffer.extend(buffer.episodes(self._stats_window_size))
-        self._last_obs, self._last_episode_starts = observation.cpu().numpy(), starts.cpu().numpy()
+        self._last_obs, self._last_episode_starts = self._observation.cpu().numpy(), self._starts.cpu().numpy()
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
@@ -176,7 +210,10 @@ class DevicePPO(AdaptivePPO):
             NumericalFault: if a gradient was not finite; the policy is spoilt by then, the last checkpoint is not.
         """
         self._finite = torch.ones(len(list(self.policy.parameters())), dtype=torch.bool, device=self.device)
+        before = torch.get_float32_matmul_precision()
+        torch.set_float32_matmul_precision("high" if self.config.matmul_precision == "tf32" else "highest")
         super().train()
+        torch.set_float32_matmul_precision(before)
 
     def _close_iteration(self) -> None:
         if not self._finite.all():
@@ -185,4 +222,4 @@ class DevicePPO(AdaptivePPO):
         super()._close_iteration()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_finite"]
+        return [*super()._excluded_save_params(), "_finite", "_replay", "_observation", "_starts"]
