@@ -117,8 +117,7 @@ class PPOConfig:
         orthogonal_init: SB3's initial weights (gain sqrt(2), last layer of the actor 0.01); else PyTorch's, as rsl_rl.
         hidden: layers of actor and critic each.
         activation: between them.
-        matmul_precision: of the update: ``highest`` is float32; ``bf16`` runs its matrix products in bfloat16, ``tf32``
-            those on a GPU with ten bits of mantissa.
+        matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -144,7 +143,7 @@ class PPOConfig:
     orthogonal_init: bool
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
     activation: Literal["elu", "relu", "tanh"]
-    matmul_precision: Literal["highest", "tf32", "bf16"]
+    matmul_precision: Literal["highest", "bf16"]
 
 
 @dataclass(frozen=True)

@@ -198,9 +198,9 @@ class DevicePPO(AdaptivePPO):
         """Do nothing as each gradient arrives: ``train`` looks at all of them in the end."""
 
     def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *arguments: Any) -> None:
-        """Note which gradients are finite, and set the learning rate of the step about to be taken."""
+        """Note whether the gradients are finite, and set the learning rate of the step about to be taken."""
         norms = torch.stack(torch._foreach_norm([p.grad for p in self.policy.parameters()]))  # type: ignore[misc]
-        self._finite.logical_and_(torch.isfinite(norms))
+        self._finite.logical_and_(torch.isfinite(norms).all())
         super()._before_gradient_step(optimizer, *arguments)
 
     def train(self) -> None:
@@ -209,16 +209,12 @@ class DevicePPO(AdaptivePPO):
         Raises:
             NumericalFault: if a gradient was not finite; the policy is spoilt by then, the last checkpoint is not.
         """
-        self._finite = torch.ones(len(list(self.policy.parameters())), dtype=torch.bool, device=self.device)
-        before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision("high" if self.config.matmul_precision == "tf32" else "highest")
+        self._finite = torch.ones((), dtype=torch.bool, device=self.device)
         super().train()
-        torch.set_float32_matmul_precision(before)
 
     def _close_iteration(self) -> None:
-        if not self._finite.all():
-            name = [name for name, _ in self.policy.named_parameters()][int((~self._finite).nonzero()[0])]
-            raise NumericalFault(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}", {})
+        if not self._finite:
+            raise NumericalFault("gradient of the policy", f"in iteration {self.iteration + 1}", {})
         super()._close_iteration()
 
     def _excluded_save_params(self) -> list[str]:
