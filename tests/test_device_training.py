@@ -51,7 +51,8 @@ def test_advantages_and_returns_are_those_of_sb3(learner: Callable[..., DevicePP
     assert d["starts"].any()
     for k in range(6):
         arrays = [d[name][k].numpy() for name in ("observations", "actions", "rewards", "starts")]
-        theirs.add(*arrays, d["values"][k], d["log_probs"][k])
+        observation, action, reward, start = arrays
+        theirs.add(observation, action, reward, start, d["values"][k], d["log_probs"][k])
     last, ended = torch.randn(8), torch.rand(8) < 0.5
     theirs.compute_returns_and_advantage(last, ended.numpy())
     ours.estimate(last, ended)
@@ -113,6 +114,7 @@ def test_a_gradient_that_is_not_finite_stops_training(learner: Callable[..., Dev
     ppo = learner()
     ppo.learn(48)
     weight = ppo.policy.action_net.weight
+    assert isinstance(weight, torch.Tensor)
     weight.register_hook(lambda gradient: gradient * torch.nan)
     with pytest.raises(NumericalFault, match="gradient of the policy is not finite in iteration 2"):
         ppo.learn(48, reset_num_timesteps=False)
