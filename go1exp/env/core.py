@@ -20,6 +20,7 @@ from go1exp.env.engine import CapturedStep, make_backend
 from go1exp.env.evidence import Evidence, accuse
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.mdp.actions import clipped, joint_target
+from go1exp.mdp.clearance import lift
 from go1exp.mdp.foot_timers import FootTimers
 from go1exp.mdp.ground import GroundHeight
 from go1exp.mdp.kinematics import KinematicState
@@ -196,6 +197,8 @@ class Go1Core:
         fresh.joint_pos.copy_(self._nominal)
         for term in self._state_terms:
             term(fresh, self.random.stream(f"rand.{term.key}"))
+        if self._held is None:
+            lift(fresh, self._ground if self._bounded else None)
         self.backend.reset(mask, qpos, qvel)
         self.feet.reset(mask)
         for tensor in (self.action, self.previous_action, self.joint_acc):
