@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class UniformVelocity(Memory):
     """Velocities drawn uniformly per axis, held for a random time, sometimes zero (paper, section II-B.1)."""
 
-    memory = ("value", "time_left")
+    memory: tuple[str, ...] = ("value", "time_left")
 
     def __init__(
         self,
