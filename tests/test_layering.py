@@ -43,6 +43,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "registry.py": (*FOREIGN, "torch", "go1exp"),
     "randomness.py": (*FOREIGN, "go1exp"),
     "memory.py": (*FOREIGN, "go1exp"),
+    "threads.py": (*FOREIGN, "go1exp"),
     "terrain.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "config.py": (*FOREIGN, "omegaconf", "go1exp.compose", *UP),
     "gym.py": ("stable_baselines3", "hydra", "omegaconf", "mujoco", *up("env")),

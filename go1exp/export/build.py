@@ -7,7 +7,7 @@ import hashlib
 import importlib.metadata
 import json
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from go1exp.export.trace import record
 from go1exp.joint_values import spread
 from go1exp.registry import Term
 from go1exp.robot import RobotConfig
+from go1exp.threads import one_thread
 from go1exp.train import run_folder
 
 PACKAGES = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy", "mujoco-core")
@@ -73,7 +74,7 @@ def build(
     config = parse_train(run_folder.read_config(run))
     network, about = load_network(run, config.ppo, checkpoint)
     module = DeployedPolicy(network, config.task.observation, config.task.action)
-    with _one_thread():
+    with one_thread():
         model = to_onnx(module)
 
         def policy(observation: Tensor) -> Tensor:
@@ -157,14 +158,3 @@ def _versions(run: Path) -> dict[str, Any]:
         "packages": packages,
         "run": json.loads(meta.read_text()) if meta.is_file() else None,
     }
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch work with one thread, so that its sums have one order, and then with as many as before."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

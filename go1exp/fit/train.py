@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -14,6 +13,7 @@ from torch.nn.functional import mse_loss
 
 from go1exp.fit.dataset import Rows
 from go1exp.fit.settings import FitError, FitSettings
+from go1exp.threads import one_thread
 
 OnEpoch = Callable[[int, int, float, float], None]
 """``on_epoch(done, total, train, validation)``: epochs, and root mean square errors in N m."""
@@ -69,7 +69,7 @@ def train(
     left = rows.y - output_mean - z @ skip
     output_std = float(left.std()) or 1.0
     left_validation = validation.y - output_mean - (validation.x - mean) / std @ skip
-    with _alone():
+    with one_thread():
         net, curve, best = _descend(
             torch.tensor(z, dtype=torch.float32),
             torch.tensor(left / output_std, dtype=torch.float32),
@@ -157,14 +157,3 @@ def _build(features: int, hidden: tuple[int, ...], draws: torch.Generator) -> to
                 values.uniform_(-(wide**-0.5), wide**-0.5, generator=draws)
         layers += [layer, torch.nn.Softsign()]
     return torch.nn.Sequential(*layers[:-1])
-
-
-@contextmanager
-def _alone() -> Iterator[None]:
-    """One thread: fastest for minibatches this small, and sums come in the same order on every machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -9,7 +9,6 @@ from dataclasses import asdict, replace
 from importlib.metadata import version
 
 import numpy as np
-import torch
 
 from go1exp import __version__
 from go1exp.gap import verdict as words
@@ -29,6 +28,7 @@ from go1exp.gap.trial import excess, removed
 from go1exp.gap.windows import Windows
 from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
+from go1exp.threads import one_thread
 
 MOST = 0.75
 """Share of the excess that terms must remove before the first of them is certified although a gap remains."""
@@ -51,14 +51,9 @@ def explain(
         settings: how; the defaults if None.
         on_progress: told what goes on and which share of the work is done.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # its arrays are small here: more threads wait for each other longer than they work
-    try:
-        machine = hung(config) if isinstance(config, RobotConfig) else config
-        with tolerances_of(machine):
-            return _explain(recordings, machine, settings or GapSettings(), on_progress)
-    finally:
-        torch.set_num_threads(threads)
+    machine = hung(config) if isinstance(config, RobotConfig) else config
+    with one_thread(), tolerances_of(machine):
+        return _explain(recordings, machine, settings or GapSettings(), on_progress)
 
 
 def _explain(

@@ -50,8 +50,8 @@ TELL: tuple[tuple[frozenset[str], str], ...] = (
 
 
 LAW = 0.04
-"""Relative standard deviation of a value because no robot follows a law of the library exactly: with it, the intervals
-of 26 sealed effects (265 values) held 89 % of the truths; with 2 %, 76 %."""
+"""Relative standard deviation of a value because no robot follows a law of the library exactly: the intervals of sealed
+effects (265 values), widened to it, hold 89 % of the truths; with 2 %, 76 %."""
 
 
 def advice(aliases: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
