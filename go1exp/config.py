@@ -101,8 +101,9 @@ class PPOConfig:
         steps: policy steps per environment and iteration.
         epochs: passes over a rollout.
         minibatches: gradient steps per pass; must divide num_envs x steps.
-        learning_rate: of Adam; the first value if the schedule is adaptive.
-        schedule: ``adaptive`` steers the rate by the KL divergence (rsl_rl's rule), ``fixed`` keeps it.
+        learning_rate: of Adam; the first value unless the schedule is fixed.
+        schedule: ``adaptive`` steers the rate by the KL divergence (rsl_rl's rule), ``fixed`` keeps it, ``linear``
+            lowers it to the least of ``learning_rate_range`` over the iterations.
         desired_kl: the divergence per update that ``adaptive`` aims at.
         learning_rate_range: its bounds.
         gamma: discount factor.
@@ -128,7 +129,7 @@ class PPOConfig:
     epochs: Count
     minibatches: Count
     learning_rate: Positive
-    schedule: Literal["adaptive", "fixed"]
+    schedule: Literal["adaptive", "fixed", "linear"]
     desired_kl: Positive
     learning_rate_range: tuple[Positive, Positive]
     gamma: Fraction

@@ -52,6 +52,13 @@ def adapted_rate(rate: float, kl: float, desired: float, bounds: tuple[float, fl
     return rate
 
 
+def linear_rate(config: PPOConfig, done: int) -> float:
+    """Return the learning rate of the iteration after ``done`` ones: from ``learning_rate`` to the least allowed."""
+    left = max(0.0, 1.0 - done / config.iterations)
+    least = config.learning_rate_range[0]
+    return least + left * (config.learning_rate - least)
+
+
 def policy_settings(config: PPOConfig) -> dict[str, Any]:
     """Return the keyword arguments of ``GaussianPolicy`` that a configuration stands for."""
     return {
@@ -195,6 +202,8 @@ class AdaptivePPO(PPO):
         """Update on the rollout, then close the iteration."""
         self._old_log_std = self.policy.log_std.detach().clone()
         self._kl: list[float] = []
+        if self.config.schedule == "linear":
+            self.policy.optimizer.param_groups[0]["lr"] = linear_rate(self.config, self.iteration)
         super().train()
         self._close_iteration()
 
