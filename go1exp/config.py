@@ -18,6 +18,7 @@ import go1exp.actuator
 import go1exp.effects
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
+from go1exp.backends import BACKENDS, BackendConfig, CpuBackend
 from go1exp.effects.rules import drive_problems
 from go1exp.registry import (
     STRICT,
@@ -71,16 +72,6 @@ class ActionConfig:
 
 
 @dataclass(frozen=True)
-class BackendConfig:
-    """The physics engine: ``cpu`` (MuJoCo's batch) and its threads, 0 for all cores."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    name: Literal["cpu"]
-    threads: CountOrZero
-
-
-@dataclass(frozen=True)
 class TaskConfig:
     """One environment: everything that shapes what a policy sees, does and is paid for."""
 
@@ -110,8 +101,9 @@ class PPOConfig:
         steps: policy steps per environment and iteration.
         epochs: passes over a rollout.
         minibatches: gradient steps per pass; must divide num_envs x steps.
-        learning_rate: of Adam; the first value if the schedule is adaptive.
-        schedule: ``adaptive`` steers the rate by the KL divergence (rsl_rl's rule), ``fixed`` keeps it.
+        learning_rate: of Adam; the first value unless the schedule is fixed.
+        schedule: ``adaptive`` steers the rate by the KL divergence (rsl_rl's rule), ``fixed`` keeps it, ``linear``
+            lowers it to the least of ``learning_rate_range`` over the iterations.
         desired_kl: the divergence per update that ``adaptive`` aims at.
         learning_rate_range: its bounds.
         gamma: discount factor.
@@ -137,7 +129,7 @@ class PPOConfig:
     epochs: Count
     minibatches: Count
     learning_rate: Positive
-    schedule: Literal["adaptive", "fixed"]
+    schedule: Literal["adaptive", "fixed", "linear"]
     desired_kl: Positive
     learning_rate_range: tuple[Positive, Positive]
     gamma: Fraction
@@ -194,7 +186,7 @@ class ProcessConfig:
 
     Attributes:
         seed: of everything random.
-        device: torch device of policy and update (the environment's is its backend's).
+        device: torch device of policy and update, ``auto`` for that of the environment, which is its backend's.
         torch_threads: threads of torch, 0 for its own choice.
         resume: run folder to continue, or null.
     """
@@ -202,7 +194,7 @@ class ProcessConfig:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
-    device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
+    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     torch_threads: CountOrZero
     resume: str | None
 
@@ -251,12 +243,12 @@ SECTIONS: dict[str, type] = {
     "action": ActionConfig,
     "robot": RobotConfig,
     "terrain": TerrainConfig,
-    "backend": BackendConfig,
+    "backend": CpuBackend,
     "ppo": PPOConfig,
     "logger": LoggerConfig,
     "checkpoint": CheckpointConfig,
 }
-"""Sections of the configuration that are one dataclass each."""
+"""Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
 
 ONE_TERM = ("actuator", "command")
 """Groups of which a configuration uses one member; its key ``term`` names it."""
@@ -305,7 +297,13 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
             continue
         settings = container[name]
         if name in SECTIONS:
-            parts[name], found = _section(SECTIONS[name], settings, name)
+            kind = SECTIONS[name]
+            if name == "backend" and isinstance(settings, Mapping) and "name" in settings:
+                if settings["name"] not in BACKENDS:
+                    problems.append(unknown_name("backend.name", str(settings["name"]), BACKENDS, "engine"))
+                    continue
+                kind = BACKENDS[settings["name"]]
+            parts[name], found = _section(kind, settings, name)
         elif name in MANY_TERMS:
             parts[name], found = _terms(name, settings)
         elif not isinstance(settings, Mapping) or "term" not in settings:

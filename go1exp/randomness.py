@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -40,21 +41,35 @@ def _mix(z: Tensor) -> Tensor:
     return z ^ _shift_right(z, 31)
 
 
+Units = Callable[["Tensor", "Tensor", int], "Tensor"]
+
+
+def unit_numbers(key: Tensor, counter: Tensor, count: int) -> Tensor:
+    """Return the ``count`` numbers (N, count) after ``counter`` (1,), float32, uniform in [0, 1), of ``key`` (N, 1)."""
+    index = counter + torch.arange(1, count + 1, device=key.device)
+    bits = _mix(key + index * _GAMMA)
+    return _shift_right(bits, 40).to(torch.float32) * 2.0**-24
+
+
 class Stream:
     """The numbers of one consumer: one independent sequence per environment."""
 
-    def __init__(self, key: Tensor) -> None:
-        """Start at the beginning; ``key`` (N, 1) int64 is the environments' hash for this stream."""
+    def __init__(self, key: Tensor, units: Units | None = None) -> None:
+        """Start at the beginning.
+
+        Args:
+            key: (N, 1) int64, the environments' hash for this stream.
+            units: does the arithmetic of ``unit_numbers``, faster.
+        """
         self.key = key
+        self._units = units or unit_numbers
         self.counter = torch.zeros(1, dtype=torch.int64, device=key.device)
 
     def uniform(self, *shape: int, low: float | Tensor = 0.0, high: float | Tensor = 1.0) -> Tensor:
         """Draw ``(N, *shape)`` float32, uniform from low to high (reached by rounding only); the bounds broadcast."""
         count = math.prod(shape)
-        index = self.counter + torch.arange(1, count + 1, device=self.key.device)
+        unit = self._units(self.key, self.counter, count).reshape(-1, *shape)
         self.counter += count
-        bits = _mix(self.key + index * _GAMMA)
-        unit = (_shift_right(bits, 40).to(torch.float32) * 2.0**-24).reshape(-1, *shape)
         return low + (high - low) * unit
 
     def normal(self, *shape: int) -> Tensor:
@@ -76,6 +91,7 @@ class EnvRandom:
         first_env: number of the first environment, so that env 7 of a batch can be replayed alone.
         device: where the numbers are wanted.
         alike: give every environment the numbers of the first: one robot, many times.
+        units: does the arithmetic of ``unit_numbers``, faster.
     """
 
     def __init__(
@@ -86,9 +102,10 @@ class EnvRandom:
         device: str | torch.device = "cpu",
         *,
         alike: bool = False,
+        units: Units | None = None,
     ) -> None:
         self.num_envs, self.first_env, self.device = num_envs, first_env, torch.device(device)
-        self._alike = alike
+        self._alike, self._units = alike, units
         self._streams: dict[str, Stream] = {}
         self.seed = seed
 
@@ -102,7 +119,7 @@ class EnvRandom:
     def stream(self, name: str) -> Stream:
         """Return the stream of the consumer ``name``, always the same object."""
         if name not in self._streams:
-            self._streams[name] = Stream(self._key(name))
+            self._streams[name] = Stream(self._key(name), self._units)
         return self._streams[name]
 
     def reseed(self, seed: int) -> None:

@@ -39,6 +39,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "errors.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "types.py": (*FOREIGN, "go1exp.mdp", *UP),
+    "backends.py": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     "registry.py": (*FOREIGN, "torch", "go1exp"),
     "randomness.py": (*FOREIGN, "go1exp"),
     "memory.py": (*FOREIGN, "go1exp"),
@@ -49,6 +50,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "joint_values.py": (*FOREIGN, "torch", "go1exp"),
     "rotation.py": (*FOREIGN, "go1exp"),
     "delay_line.py": (*FOREIGN, "go1exp.registry", "go1exp.robot", "go1exp.mdp", *UP),
+    "constants.py": (*FOREIGN, "go1exp"),
     "drive.py": (*FOREIGN, "go1exp.registry", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
     # recordings, which need no robot and no engine
     "recording.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),

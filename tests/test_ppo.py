@@ -23,7 +23,7 @@ from go1exp.env.core import Go1Core
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.registry import ConfigError
 from go1exp.train import trainer
-from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, policy_settings
+from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, linear_rate, policy_settings
 from go1exp.types import StepResult
 
 TINY = (
@@ -246,6 +246,16 @@ def test_the_rate_of_every_gradient_step_follows_from_the_divergences(adaptive: 
     assert (np.diff(got) < 0).any()
     assert ppo.logger.name_to_value["train/learning_rate"] == got[-1]
     assert ppo.logger.name_to_value["train/kl"] == pytest.approx(np.mean(watched.kl[-1]))
+
+
+def test_a_linear_schedule_ends_at_the_least_rate() -> None:
+    bounds = "ppo.learning_rate_range=[0.0001, 0.01]"
+    ppo = slider_ppo("ppo.schedule=linear", "ppo.iterations=4", "ppo.learning_rate=0.002", bounds)
+    rates = [linear_rate(ppo.config, k) for k in range(6)]
+    assert rates == pytest.approx([0.002, 0.001525, 0.00105, 0.000575, 0.0001, 0.0001], rel=1e-12)
+    for rate in rates[:2]:
+        ppo.learn(1)
+        assert ppo.policy.optimizer.param_groups[0]["lr"] == rate
 
 
 def test_a_fixed_schedule_keeps_the_rate_whatever_the_divergence() -> None:

@@ -16,6 +16,7 @@ from mujoco.batch import Batch
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from go1exp import robot
+from go1exp.backends import CpuBackend
 from go1exp.bench.measure import Subject, rates, ratio
 from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
@@ -48,6 +49,7 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
     """
     terrain = build_terrain(task.terrain)
     model, _ = build_model(task.robot, terrain, task.sim.physics_dt)
+    assert isinstance(task.backend, CpuBackend)
     batch = Batch(model, num_envs, nthread=task.backend.threads)
     qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
     batch.bind("sensordata")

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.registry import ConfigError
 
 if TYPE_CHECKING:
-    from go1exp.config import TaskConfig
+    from go1exp.config import TaskConfig, TrainConfig
 
 BARS = {
     "env_over_bare": (0.75, "environment over bare mujoco.batch of the same model"),
@@ -19,6 +20,13 @@ BARS = {
     "net_over_pd": (0.65, "environment with actuator=net over actuator=pd"),
     "effects_over_none": (0.80, "environment with five joint effects over none"),
     "record_s": (20.0, "seconds to record 60 s of a hung robot with three gain sets (at most)"),
+    "gpu_env_over_bare": (0.70, "environment over bare mujoco-warp of the same model"),
+    "gpu_net_over_bare": (0.55, "the same with an actuator net"),
+    "gpu_train_over_env": (0.65, "training over environment"),
+    "gpu_train_over_numpy": (1.0, "training over training through SB3's own loop"),
+    "paper_minutes": (30.0, "minutes for the paper's 491 M steps (at most)"),
+    "first_update_cold_s": (60.0, "seconds from start to first update, nothing compiled (at most)"),
+    "first_update_warm_s": (15.0, "seconds from start to first update, kernels compiled (at most)"),
     "memory_per_env_kb": (100.0, "memory per environment beyond the first, kB (at most)"),
 }
 """Figures with a goal: its value and what it is. Lower limits, but where they say `at most`."""
@@ -32,7 +40,8 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.compose import compose
     from go1exp.config import parse_train
 
-    overrides = [f"backend.threads={settings.threads}", *settings.overrides]
+    on_gpu = settings.suite == "gpu"
+    overrides = ["backend=warp" if on_gpu else f"backend.threads={settings.threads}", *settings.overrides]
     config = parse_train(compose("train", overrides))
 
     from go1exp.bench import env, train
@@ -44,6 +53,8 @@ def _task(container: dict[str, Any]) -> None:
         figures = env.run(config.task, overrides, *timing)
     elif settings.suite == "train":
         figures = train.run(config, *timing)
+    elif on_gpu:
+        figures = _gpu(config, overrides, timing)
     else:
         figures = _actuator(config.task, timing)
     about = " ".join(settings.overrides) or "defaults"
@@ -70,6 +81,18 @@ def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
     wanted = {f.name for f in fields(RecordSettings)}
     settings = parse(RecordSettings, {k: v for k, v in record.items() if k in wanted})
     return actuator.run(task, settings.sensors, settings.physics_dt, *timing)
+
+
+def _gpu(config: TrainConfig, overrides: list[str], timing: tuple[Any, ...]) -> dict[str, float]:
+    """Run the suite that needs a GPU, and name that."""
+    import torch
+
+    if not torch.cuda.is_available():
+        raise ConfigError(["suite=gpu: torch finds no CUDA device"])
+    from go1exp.bench import gpu
+
+    print(gpu.gpu())
+    return gpu.run(config, overrides, *timing)
 
 
 APP = App("bench", _task)

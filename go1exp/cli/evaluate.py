@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 from go1exp.cli import other_robot
@@ -12,11 +11,11 @@ from go1exp.registry import ConfigError
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import EvalSettings, checkpoint_file, parse, run_folder
+    from go1exp.cli.settings import EvalSettings, checkpoint_file, parse, trained
 
     other, container = other_robot.split(container)
     settings = parse(EvalSettings, container)
-    run = run_folder(settings.run)
+    run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
 
     grid_is_empty = not all((settings.grid.x, settings.grid.y, settings.grid.yaw))
@@ -27,16 +26,15 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
 
-    trained, policy, about = load_run(run, checkpoint)
+    of_run, policy, about = load_run(run, checkpoint)
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
     config = EvalConfig.of(settings, commands=commands)
-    task = other_robot.replaced(trained.task, other)
+    task = other_robot.replaced(of_run.task, other)
     report = {
         "policy": about,
         "robot": other_robot.described(other),
         **evaluate(task, policy, config, spinner(1, "evaluating")),
     }
-    out = Path(settings.out) if settings.out else run / "eval.json"
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(report, indent=2) + "\n")
     print(table.text(report))

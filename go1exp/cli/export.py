@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from go1exp.cli.app import App, spinner
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import ExportSettings, checkpoint_file, parse, run_folder
+    from go1exp.cli.settings import ExportSettings, checkpoint_file, parse, trained
 
     settings = parse(ExportSettings, container)
-    run = run_folder(settings.run)
+    run, out = trained(settings.run, settings.policy, "bundle.zip", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
-    out = Path(settings.out) if settings.out else run / "bundle.zip"
 
     from go1exp.cli.logs import writable
     from go1exp.deploy.bundle import loads

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 from go1exp.cli import other_robot
@@ -11,11 +10,11 @@ from go1exp.cli.app import App, spinner
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import PlaySettings, checkpoint_file, parse, run_folder
+    from go1exp.cli.settings import PlaySettings, checkpoint_file, parse, trained
 
     other, container = other_robot.split(container)
     settings = parse(PlaySettings, container)
-    run = run_folder(settings.run)
+    run, out = trained(settings.run, settings.policy, "play.mp4", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
 
     from go1exp.env.core import Go1Core
@@ -25,16 +24,15 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
     from go1exp.evaluate.stick import picture
 
-    trained, policy, _ = load_run(run, checkpoint)
+    of_run, policy, _ = load_run(run, checkpoint)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
     shown = EvalConfig.of(settings, commands=(settings.velocity,), **whole)
-    task = other_robot.replaced(trained.task, other)
+    task = other_robot.replaced(of_run.task, other)
     core = Go1Core(evaluation_task(task, shown), 1, settings.seed, noise=settings.noise)
     if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
         video.live(core, policy)
         return
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)
-    out = Path(settings.out) if settings.out else run / "play.mp4"
     progress = spinner(1, "filming")
     try:
         frames = list(video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress))

@@ -41,7 +41,7 @@ def _task(container: dict[str, Any]) -> None:
     import go1exp.excitations
     import go1exp.record.policy  # noqa: F401  (registers every excitation)
     from go1exp import robot
-    from go1exp.cli.settings import RecordSettings, parse, run_folder
+    from go1exp.cli.settings import RecordSettings, parse, trained
     from go1exp.config import parse_parts
     from go1exp.effects.rules import drive_problems, has_gains
 
@@ -60,13 +60,13 @@ def _task(container: dict[str, Any]) -> None:
     except ConfigError as error:
         problems += error.problems
     else:
-        if any(m.entry.name == POLICY for m in motions) and settings.run is None:
-            problems.append("run: required for excitation=[policy], such as run=runs/NAME")
+        if any(m.entry.name == POLICY for m in motions) and not (settings.run or settings.policy):
+            problems.append("run: required for excitation=[policy], such as run=runs/NAME, or policy=paper")
         if motions and all(m.entry.name == POLICY for m in motions):
             problems += _unused(settings)
     if problems:
         raise ConfigError(problems)
-    walk = run_folder(settings.run) if settings.run else None
+    walk = trained(settings.run, settings.policy, "", "")[0] if settings.run or settings.policy else None
 
     from go1exp import recording
     from go1exp.cli.logs import writable
@@ -85,10 +85,10 @@ def _task(container: dict[str, Any]) -> None:
     if walk and len(driven) < len(motions):
         from go1exp.evaluate.policy import load_run
 
-        trained, policy, _ = load_run(walk)
+        of_run, policy, _ = load_run(walk)
         names = [f"policy_{settings.seed}_{k}" for k in range(settings.episodes)]
         hang = settings.hang[0] if settings.support == "hung" else None
-        taught = simulate.Walk(trained.task, policy, names, settings.seconds, hang)
+        taught = simulate.Walk(of_run.task, policy, names, settings.seconds, hang)
         show = spinner(1, "recording a policy")
         recordings += simulate.play_policy(rig, taught, settings.sensors, settings.seed, show)
     for r in recordings:

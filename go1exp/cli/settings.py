@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from go1exp import data_root
 from go1exp.gap.result import GapSettings
 from go1exp.record.plan import Wishes
 from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
@@ -48,7 +49,8 @@ class EvalSettings:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    run: RunFolder
+    run: RunFolder | None
+    policy: str | None
     checkpoint: str | None
     grid: Grid
     episodes: Count
@@ -74,7 +76,8 @@ class PlaySettings:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    run: RunFolder
+    run: RunFolder | None
+    policy: str | None
     checkpoint: str | None
     velocity: tuple[float, float, float]
     seconds: Positive
@@ -93,6 +96,7 @@ class RecordSettings(Wishes):
     """``conf/record.yaml`` without the groups and the excitations."""
 
     run: str | None
+    policy: str | None
     episodes: Count
     physics_dt: Annotated[float, Field(gt=0, le=0.002)]
     out: str
@@ -137,7 +141,8 @@ class ExportSettings:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    run: RunFolder
+    run: RunFolder | None
+    policy: str | None
     checkpoint: str | None
     seconds: Annotated[float, Field(gt=0, le=600)]
     seed: Annotated[int, Field(ge=0)]
@@ -210,7 +215,7 @@ class BenchSettings:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    suite: Literal["env", "train", "actuator"]
+    suite: Literal["env", "train", "actuator", "gpu"]
     num_envs: Count
     rounds: Count
     seconds: Positive
@@ -225,6 +230,37 @@ def run_folder(path: str, key: str = "run") -> Path:
     if not (folder / "config.yaml").is_file():
         raise ConfigError([f"{key} = {path!r}: not a run folder (it has no config.yaml)"])
     return folder
+
+
+def shipped_policies() -> dict[str, Path]:
+    """Return the run folders of the policies that come with the package, by name."""
+    return {f.parent.name: f.parent for f in sorted((data_root() / "assets" / "policies").glob("*/config.yaml"))}
+
+
+def trained(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[Path, Path]:
+    """Return the folder of the run or of the shipped policy that is meant, and the file that results go to.
+
+    Args:
+        run: run folder.
+        policy: name of a shipped policy, in its place.
+        file: what the results are called, in the run folder; those of a shipped policy go to the present one.
+        out: the user's own file.
+
+    Raises:
+        ConfigError: unless there is exactly one of the two.
+    """
+    if run is None and policy is None:
+        raise ConfigError([f"run: required, such as {REQUIRED['run']}, or a shipped policy, such as policy=paper"])
+    if run is not None and policy is not None:
+        raise ConfigError([f"run = {run!r} and policy = {policy!r}: only one of them"])
+    if policy is None:
+        assert run is not None
+        folder = run_folder(run)
+        return folder, Path(out or folder / file)
+    there = shipped_policies()
+    if policy not in there:
+        raise ConfigError([f"policy = {policy!r}: no such policy; there are {', '.join(there) or 'none'}"])
+    return there[policy], Path(out or f"{policy}_{file}")
 
 
 def checkpoint_file(run: Path, name: str | None) -> Path | None:

@@ -11,12 +11,12 @@ from omegaconf import OmegaConf
 
 from go1exp.cli.app import STOPPED, App, discard, run_dir
 from go1exp.cli.settings import run_folder as existing
-from go1exp.compose import key_values
+from go1exp.compose import config_folder, key_values
 from go1exp.registry import ConfigError, Expected
 
-RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "backend.threads", "device")
+RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "backend")
 """Settings that a resumed run may change: none of them changes what was computed so far (the last three may change
-what comes after in the last bits)."""
+what comes after in the last bits, and another engine rounds differently). ``backend`` and all that is in it."""
 
 
 def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
@@ -29,7 +29,9 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
         key, _, value = override.partition("=")
         if key == "resume" or key.lstrip("+").startswith("hydra"):
             continue
-        if key in RESUMABLE:
+        if key == "backend":
+            config.backend = OmegaConf.load(f"{config_folder()}/backend/{value}.yaml")
+        elif key in RESUMABLE or key.startswith("backend."):
             config.merge_with_dotlist([f"{key}={value}"])
         else:
             refused.append(f"{override}: a resumed run keeps its configuration; only {', '.join(RESUMABLE)} may change")
@@ -48,7 +50,7 @@ def _refuse_other(run: Path, container: dict[str, Any]) -> None:
         return
     old, new = OmegaConf.create(run_folder.read_as_written(run)), OmegaConf.create(container)
     for key in RESUMABLE:
-        OmegaConf.update(old, key, OmegaConf.select(new, key))
+        OmegaConf.update(old, key, OmegaConf.select(new, key), merge=False)
     before, after = (key_values(OmegaConf.to_container(c)) for c in (old, new))
     differ = sorted(k for k in {*before, *after} if before.get(k) != after.get(k))
     if differ:

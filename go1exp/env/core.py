@@ -14,16 +14,17 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.config import BackendConfig, TaskConfig
-from go1exp.env.faults import NumericalFault
+from go1exp.backends import WarpBackend
+from go1exp.config import TaskConfig
+from go1exp.env.engine import CapturedStep, make_backend
+from go1exp.env.evidence import Evidence, accuse
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.mdp.actions import clipped, joint_target
+from go1exp.mdp.clearance import lift
 from go1exp.mdp.foot_timers import FootTimers
 from go1exp.mdp.ground import GroundHeight
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.physics.backend import PhysicsBackend
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import Sensors, build_model
+from go1exp.physics.scene import build_model
 from go1exp.randomness import EnvRandom
 from go1exp.rotation import projected_gravity, rotate_inverse
 from go1exp.terrain import build_terrain
@@ -34,11 +35,6 @@ THIGHS, CALVES, TRUNK = slice(0, 4), slice(4, 8), slice(8, 13)
 
 MAP_MARGIN = 1.0
 """Distance from the edge of a height field at which an episode ends, m."""
-
-
-def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
-    """Build the physics engine that the configuration names."""
-    return MujocoCpu(model, sensors, num_envs, config.threads)
 
 
 class Go1Core:
@@ -75,7 +71,8 @@ class Go1Core:
         model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt, imu=imu, held=held)
         self.backend = make_backend(task.backend, model, sensors, num_envs)
         self.device = self.backend.qpos.device
-        self.random = EnvRandom(seed, num_envs, first_env, self.device)
+        units = getattr(self.backend, "units", None)
+        self.random = EnvRandom(seed, num_envs, first_env, self.device, units=units)
         self._held = held
         self._state = KinematicState.of(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
@@ -100,6 +97,10 @@ class Go1Core:
         self._calf_touched = torch.zeros_like(self._foot_contact[..., 0])
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
         self._started = False
+        self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
+        self._evidence = Evidence()
+        self.captures = isinstance(task.backend, WarpBackend) and task.backend.graph
+        self._captured: CapturedStep | None = None
 
     # ------------------------------------------------------------------ construction
 
@@ -118,7 +119,8 @@ class Go1Core:
         self.level = torch.zeros_like(env)
         self._max_level = rows - 1
         self._bounded = t.config.kind != "flat"
-        self._map = to_device(t.extent)
+        extent = to_device(t.extent)
+        self._map = extent[[0, 2]] + MAP_MARGIN, extent[[1, 3]] - MAP_MARGIN
         start = self.task.curriculum[0]().start_level_max if self.task.curriculum else self._max_level
         self._start_levels = min(start, self._max_level) + 1
 
@@ -136,7 +138,7 @@ class Go1Core:
         widths = [t.entry.traits["size"] for t in task.observation]
         self.observation_size = sum(widths)
         noise = [t.slots["noise"] for t in task.observation]
-        self._noise = torch.tensor(noise, device=self.device).repeat_interleave(torch.tensor(widths)).float()
+        self._noise = torch.tensor(noise).repeat_interleave(torch.tensor(widths)).float().to(self.device)
         self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
         self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
         for term in self._model_terms:
@@ -195,6 +197,8 @@ class Go1Core:
         fresh.joint_pos.copy_(self._nominal)
         for term in self._state_terms:
             term(fresh, self.random.stream(f"rand.{term.key}"))
+        if self._held is None:
+            lift(fresh, self._ground if self._bounded else None)
         self.backend.reset(mask, qpos, qvel)
         self.feet.reset(mask)
         for tensor in (self.action, self.previous_action, self.joint_acc):
@@ -213,6 +217,14 @@ class Go1Core:
         Order: physics, failure and time limit, reward, last observation, resets of ended episodes, new commands,
         pushes, first observation. A push and a new command are therefore seen before they are answered.
         """
+        if not self.captures:
+            return self.step_by_call(action)
+        if self._captured is None:
+            self._captured = CapturedStep(self, action)
+        return self._captured(action)
+
+    def step_by_call(self, action: Tensor) -> StepResult:
+        """Do what ``step`` says, call by call: for what is to be part of a larger graph."""
         self._advance_physics(action)
         self.steps += 1
         s = self.snapshot()
@@ -224,6 +236,8 @@ class Go1Core:
         episode_return, episode_length = self.episode_return.clone(), self.steps - self._first_step
         self._last_qpos.copy_(self.backend.qpos)
         self._last_qvel.copy_(self.backend.qvel)
+        if self._deferred:
+            self._evidence.note(self._suspects(final_observation), episode_length)
 
         ended = terminated | truncated
         self._move_levels(ended)
@@ -266,7 +280,7 @@ class Go1Core:
         if not self._bounded:
             return self._nobody()
         xy = self._state.base_pos_w[:, :2]
-        low, high = self._map[[0, 2]] + MAP_MARGIN, self._map[[1, 3]] - MAP_MARGIN
+        low, high = self._map
         return ((xy < low) | (xy > high)).any(-1)
 
     def _reward(self, s: Snapshot) -> Tensor:
@@ -340,38 +354,31 @@ class Go1Core:
 
     def check(self, result: StepResult) -> None:
         """Raise NumericalFault if anything in the step is not finite. Waits for the device."""
-        if torch.isfinite(result.reward.sum() + result.final_observation.sum()):
-            return
+        if not torch.isfinite(result.reward.sum() + result.final_observation.sum()):
+            accuse(self._suspects(result.final_observation), result.episode_length)
+
+    def check_so_far(self) -> None:
+        """Raise NumericalFault if anything in any step on a GPU was not finite. Waits for the device."""
+        self._evidence.check()
+
+    def _suspects(self, observation: Tensor) -> dict[str, Tensor]:
+        """What may not be finite after a step, causes first."""
         named = {"action": self._last_action, "qpos": self._last_qpos, "qvel": self._last_qvel}
         named |= {f"reward.{t.key}": self.term_values[:, k] for k, t in enumerate(self._rewards)}
-        named |= {"observation": result.final_observation}
-        for name, values in named.items():
-            bad = ~torch.isfinite(values.reshape(self.num_envs, -1)).all(-1)
-            if bad.any():
-                env = int(bad.nonzero()[0])
-                dump = {key: value[env].cpu().numpy() for key, value in named.items()}
-                raise NumericalFault(name, f"in environment {env} at step {int(result.episode_length[env])}", dump)
+        return {**named, "observation": observation}
 
     def drain_metrics(self, steps: int) -> dict[str, float]:
-        """Return means since the last call, ``steps`` policy steps ago: each reward term per second, the level."""
+        """Return means since the last call, ``steps`` policy steps ago: reward terms per second, the level, ..."""
         rates = (self.reward_sums / (steps * self.num_envs * self.task.sim.policy_dt)).tolist()
         self.reward_sums.zero_()
         metrics = {f"reward/{t.key}": rate for t, rate in zip(self._rewards, rates, strict=True)}
         if self._bounded:
             metrics["curriculum/terrain_level"] = float(self.level.float().mean())
-        return metrics
+        return metrics | self.backend.drain_metrics()
 
     _BUFFERS = (
-        "action",
-        "previous_action",
-        "target",
-        "joint_acc",
-        "spawn",
-        "steps",
-        "_first_step",
-        "episode_return",
-        "reward_sums",
-        "level",
+        *("action", "previous_action", "target", "joint_acc", "spawn"),
+        *("steps", "_first_step", "episode_return", "reward_sums", "level"),
     )
 
     def _parts(self) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         if seed is not None:
             self.core.reseed(seed)
-        return self.core.reset()[0].numpy().copy(), {}
+        return self.core.reset()[0].cpu().numpy().copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action (12,) for one policy period."""
@@ -66,7 +66,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         self.core.check(result)
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         last = result.final_observation if terminated or truncated else result.observation
-        return last[0].numpy().copy(), float(result.reward[0]), terminated, truncated, {}
+        return last[0].cpu().numpy().copy(), float(result.reward[0]), terminated, truncated, {}
 
     def render(self) -> np.ndarray | None:
         """Return a picture (480, 640, 3) uint8 if the render mode is ``rgb_array``."""

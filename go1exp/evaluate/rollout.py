@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from go1exp.backends import CpuBackend
 from go1exp.config import TaskConfig, time_rules
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.policy import Policy
@@ -59,7 +60,7 @@ class EvalConfig:
 
 
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
-    """Return the task in which a policy trained on ``task`` is judged.
+    """Return the task in which a policy trained on ``task`` is judged: on the CPU, wherever it was trained.
 
     Raises:
         ConfigError: if the times do not divide each other.
@@ -71,6 +72,8 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
         raise ConfigError(problems)
     fixed = Term("command", members("command")["fixed_velocity"], {})
     changes: dict[str, Any] = {"sim": sim, "command": fixed, "curriculum": ()}
+    if not isinstance(task.backend, CpuBackend):
+        changes["backend"] = CpuBackend("cpu", 0)
     if not config.randomize:
         changes["rand"] = ()
         changes["effect"] = tuple(dataclasses.replace(e, slots={**e.slots, "spread": {}}) for e in task.effect)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from torch import Tensor
 
+from go1exp.backends import CpuBackend
 from go1exp.config import TaskConfig
 from go1exp.deploy.metadata import Port
 from go1exp.effects.base import Measured
@@ -39,11 +40,10 @@ def readings(core: Go1Core) -> dict[str, Tensor]:
 
 
 def traced_task(task: TaskConfig, seconds: float) -> TaskConfig:
-    """Return the task in which a trace is recorded: that of training, in one piece and on one thread."""
+    """Return the task in which a trace is recorded: that of training, in one piece, on the CPU and on one thread."""
     period = task.sim.policy_dt
     sim = dataclasses.replace(task.sim, episode_s=(round(seconds / period) + 2) * period, spread_starts=False)
-    backend = dataclasses.replace(task.backend, threads=1)
-    return dataclasses.replace(task, sim=sim, backend=backend, curriculum=())
+    return dataclasses.replace(task, sim=sim, backend=CpuBackend("cpu", threads=1), curriculum=())
 
 
 def record(

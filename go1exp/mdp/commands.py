@@ -8,7 +8,7 @@ import torch
 
 from go1exp.memory import Memory
 from go1exp.randomness import Stream
-from go1exp.registry import Fraction, PositiveRange, Range, command
+from go1exp.registry import Fraction, Positive, PositiveRange, Range, command
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class UniformVelocity(Memory):
     """Velocities drawn uniformly per axis, held for a random time, sometimes zero (paper, section II-B.1)."""
 
-    memory = ("value", "time_left")
+    memory: tuple[str, ...] = ("value", "time_left")
 
     def __init__(
         self,
@@ -45,8 +45,49 @@ class UniformVelocity(Memory):
         due = (self.time_left <= 1e-6) | restart
         draw = self._stream.uniform(4, low=self._low, high=self._high)
         standing = self._stream.uniform(1) < self._standing_fraction
-        self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * ~standing, self.value))
+        self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * ~standing * self.share(), self.value))
         self.time_left.copy_(torch.where(due, draw[:, 3], self.time_left))
+
+    def share(self) -> Tensor | float:
+        """Share of the ranges that velocities are drawn from."""
+        return 1.0
+
+
+@command("widening_velocity")
+class WideningVelocity(UniformVelocity):
+    """Uniform velocities whose ranges grow with the time that an environment has been trained: slow commands first.
+
+    A robot that cannot walk yet earns next to nothing for trying to reach 2 m/s, and learns to ignore the command.
+    """
+
+    memory = ("value", "time_left", "age")
+
+    def __init__(
+        self,
+        stream: Stream,
+        *,
+        start: Fraction = 0.35,
+        over: Positive = 500.0,
+        lin_vel_x: Range = (-2.0, 3.0),
+        lin_vel_y: Range = (-1.5, 1.5),
+        ang_vel_z: Range = (-1.5, 1.5),
+        hold_time: PositiveRange = (0.3, 10.0),
+        standing_fraction: Fraction = 0.1,
+    ) -> None:
+        """Keep the ranges; velocities are drawn from the share ``start`` of them first, from all after ``over`` s."""
+        ranges = {"lin_vel_x": lin_vel_x, "lin_vel_y": lin_vel_y, "ang_vel_z": ang_vel_z, "hold_time": hold_time}
+        super().__init__(stream, **ranges, standing_fraction=standing_fraction)
+        self._start, self._over = start, over
+        self.age = torch.zeros(len(stream.key), device=stream.key.device)
+
+    def advance(self, dt: float, restart: Tensor) -> None:
+        """Let ``dt`` s pass; draw anew where the time is up or ``restart`` (N,) bool is set."""
+        self.age += dt
+        super().advance(dt, restart)
+
+    def share(self) -> Tensor:
+        """(N, 1) of the ranges that velocities are drawn from."""
+        return (self._start + (1.0 - self._start) * self.age / self._over).clamp(max=1.0).unsqueeze(1)
 
 
 @command("fixed_velocity")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
-
 from go1exp import robot
+from go1exp.constants import constant_like
 from go1exp.types import Snapshot
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+NOMINAL_STANCE = tuple(robot.NOMINAL_STANCE.tolist())
 
 SYNC_PAIRS = ((1, 2), (0, 3))
 """Legs of a trot that move together: front left with rear right, front right with rear left (``robot.LEGS``)."""
@@ -27,7 +28,7 @@ def is_moving(s: Snapshot, speed_threshold: float) -> Tensor:
 
 def joint_deviation(s: Snapshot) -> Tensor:
     """(N, 12) joint angle minus nominal stance, rad."""
-    return s.joint_pos - torch.as_tensor(robot.NOMINAL_STANCE, dtype=s.joint_pos.dtype, device=s.joint_pos.device)
+    return s.joint_pos - constant_like(NOMINAL_STANCE, s.joint_pos)
 
 
 def foot_speed_xy(s: Snapshot) -> Tensor:

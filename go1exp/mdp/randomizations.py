@@ -15,6 +15,7 @@ import torch
 from pydantic import AfterValidator, Field
 
 from go1exp import robot
+from go1exp.constants import constant_like
 from go1exp.drive import ModelFields
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.randomness import Stream
@@ -23,6 +24,9 @@ from go1exp.rotation import quat_from_rotvec, quat_multiply
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+JOINT_POS_LIMITS = tuple(tuple(bound) for bound in robot.JOINT_POS_LIMITS.T.tolist())
+"""Lower and upper, rad."""
 
 FEET = tuple(f"{leg}_foot" for leg in robot.LEGS)
 Operation = Literal["set", "add", "scale"]
@@ -157,8 +161,8 @@ def joint_positions(
     """
     draw = stream.uniform(robot.NUM_JOINTS, low=range[0], high=range[1])
     q = state.joint_pos * (1.0 + draw) if operation == "scale" else state.joint_pos + draw
-    limits = torch.as_tensor(robot.JOINT_POS_LIMITS, dtype=q.dtype, device=q.device)
-    state.joint_pos.copy_(torch.minimum(torch.maximum(q, limits[:, 0]), limits[:, 1]))
+    low, high = (constant_like(bound, q) for bound in JOINT_POS_LIMITS)
+    state.joint_pos.copy_(torch.minimum(torch.maximum(q, low), high))
 
 
 @randomization("joint_velocities", kind="state")

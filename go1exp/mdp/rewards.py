@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
+from go1exp.constants import constant_like
 from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS, foot_speed_xy, is_moving, joint_deviation
 from go1exp.registry import Fraction, NonNegative, Positive, reward
 from go1exp.types import Snapshot
@@ -184,8 +185,8 @@ def joint_position_limit(s: Snapshot, *, soft_factor: Fraction = 0.95) -> Tensor
 
     Printed for the upper limit alone; both ends count here.
     """
-    limits = torch.as_tensor(robot.soft_limits(soft_factor), dtype=s.joint_pos.dtype, device=s.joint_pos.device)
-    outside = (s.joint_pos <= limits[:, 0]) | (s.joint_pos >= limits[:, 1])
+    low, high = (constant_like(tuple(bound), s.joint_pos) for bound in robot.soft_limits(soft_factor).T.tolist())
+    outside = (s.joint_pos <= low) | (s.joint_pos >= high)
     return outside.sum(-1).to(s.joint_pos.dtype)
 
 
@@ -195,7 +196,7 @@ def joint_velocity_limit(s: Snapshot, *, limit: tuple[Positive, Positive, Positi
 
     Printed for positive speed alone; both directions count here.
     """
-    top = torch.as_tensor(robot.per_joint(limit), dtype=s.joint_vel.dtype, device=s.joint_vel.device)
+    top = constant_like(tuple(robot.per_joint(limit).tolist()), s.joint_vel)
     return (s.joint_vel.abs() >= top).sum(-1).to(s.joint_vel.dtype)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
+from go1exp.constants import constant_like
 from go1exp.mdp.derived import foot_speed_xy, joint_deviation
 from go1exp.registry import NonNegative, Positive, reward
 from go1exp.types import Snapshot
@@ -60,7 +61,7 @@ def joint_deviation_literal(s: Snapshot) -> Tensor:
 @reward("joint_position_limit_literal")
 def joint_position_limit_literal(s: Snapshot) -> Tensor:
     """As printed: number of joints at or above the upper hard limit, 0 to 12."""
-    top = torch.as_tensor(robot.JOINT_POS_LIMITS[:, 1], dtype=s.joint_pos.dtype, device=s.joint_pos.device)
+    top = constant_like(tuple(robot.JOINT_POS_LIMITS[:, 1].tolist()), s.joint_pos)
     return (s.joint_pos >= top).sum(-1).to(s.joint_pos.dtype)
 
 
@@ -69,5 +70,5 @@ def joint_velocity_limit_literal(
     s: Snapshot, *, limit: tuple[Positive, Positive, Positive] = robot.VELOCITY_LIMIT
 ) -> Tensor:
     """As printed: number of joints with qd >= limit (hip, thigh, calf, rad/s), positive speeds only, 0 to 12."""
-    top = torch.as_tensor(robot.per_joint(limit), dtype=s.joint_vel.dtype, device=s.joint_vel.device)
+    top = constant_like(tuple(robot.per_joint(limit).tolist()), s.joint_vel)
     return (s.joint_vel >= top).sum(-1).to(s.joint_vel.dtype)

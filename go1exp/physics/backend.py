@@ -62,8 +62,11 @@ class PhysicsBackend(Protocol):
     def derive_constants(self, mask: Tensor) -> None:
         """Recompute what follows from masses and inertias (``mj_setConst``) in the rows of ``mask``."""
 
+    def drain_metrics(self) -> dict[str, float]:
+        """Return figures about the engine since the last call, for a log."""
+
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue bit for bit, per-environment model fields included."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``."""
+        """Continue from ``state_dict``, of any backend."""

@@ -96,6 +96,10 @@ class MujocoCpu:
         """Return environment ``env``'s state as an MjData of ``env_model``, to render or inspect it."""
         return self._batch.get_data(env)
 
+    def drain_metrics(self) -> dict[str, float]:
+        """Nothing to tell: MuJoCo makes room for whatever there is."""
+        return {}
+
     def state_dict(self) -> dict[str, Any]:
         """Return the simulations' states and every model field that differs between them, derived ones included."""
         expanded = {name: self._batch.expanded(name) for name in sorted(MODEL_FIELDS)}
@@ -106,9 +110,12 @@ class MujocoCpu:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``, bit for bit."""
+        """Continue from ``state_dict``: bit for bit if it is of this backend, else from the same state and model."""
         for name, value in state["fields"].items():
             self.field(name).copy_(value)
-        self._baseline = {name: value.clone() for name, value in state["baseline"].items()}
+        self._baseline = {n: v.to(self.field(n).dtype, copy=True) for n, v in state["baseline"].items()}
         for name in STATE_FIELDS:
-            self._batch.bind(name)[:] = state["state"][name].numpy()
+            live = self._batch.bind(name)
+            live[:] = state["state"][name].numpy().reshape(live.shape)
+        if "engine" in state:  # another engine derives fewer constants from the model, and in float32
+            self._batch.set_const()

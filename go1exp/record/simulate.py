@@ -14,9 +14,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from go1exp import __version__, robot
-from go1exp.config import BackendConfig, TaskConfig, time_rules
+from go1exp.backends import BackendConfig
+from go1exp.config import TaskConfig, time_rules
 from go1exp.effects.rules import drives, has_gains
-from go1exp.env.core import Go1Core, make_backend
+from go1exp.env.core import Go1Core
+from go1exp.env.engine import make_backend
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.joint_values import spread
 from go1exp.physics.scene import build_model

@@ -52,6 +52,13 @@ def adapted_rate(rate: float, kl: float, desired: float, bounds: tuple[float, fl
     return rate
 
 
+def linear_rate(config: PPOConfig, done: int) -> float:
+    """Return the learning rate of the iteration after ``done`` ones: from ``learning_rate`` to the least allowed."""
+    left = max(0.0, 1.0 - done / config.iterations)
+    least = config.learning_rate_range[0]
+    return least + left * (config.learning_rate - least)
+
+
 def policy_settings(config: PPOConfig) -> dict[str, Any]:
     """Return the keyword arguments of ``GaussianPolicy`` that a configuration stands for."""
     return {
@@ -131,6 +138,7 @@ class AdaptivePPO(PPO):
     ``after_iteration(ppo)`` is called when an iteration is complete: rollout, update and metrics, nothing half done.
     """
 
+    buffer_class: type[RolloutBuffer] = MeanRolloutBuffer
     rollout_buffer: MeanRolloutBuffer
     policy: GaussianPolicy
 
@@ -153,7 +161,7 @@ class AdaptivePPO(PPO):
             ent_coef=config.entropy,
             vf_coef=config.value_coef,
             max_grad_norm=config.max_grad_norm,
-            rollout_buffer_class=MeanRolloutBuffer,
+            rollout_buffer_class=self.buffer_class,
             policy_kwargs=policy_settings(config),
             seed=seed,
             device=device,
@@ -194,7 +202,13 @@ class AdaptivePPO(PPO):
         """Update on the rollout, then close the iteration."""
         self._old_log_std = self.policy.log_std.detach().clone()
         self._kl: list[float] = []
+        if self.config.schedule == "linear":
+            self.policy.optimizer.param_groups[0]["lr"] = linear_rate(self.config, self.iteration)
         super().train()
+        self._close_iteration()
+
+    def _close_iteration(self) -> None:
+        """Count the iteration that is complete, and tell of it."""
         self.iteration += 1
         self.logger.record("train/kl", float(np.mean(self._kl)))
         self.logger.record("train/learning_rate", self.policy.optimizer.param_groups[0]["lr"])

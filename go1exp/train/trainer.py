@@ -21,6 +21,7 @@ from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.registry import ConfigError, Expected
 from go1exp.train import checkpoint, metrics
+from go1exp.train.device import DevicePPO
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
 
@@ -40,7 +41,9 @@ def build(config: TrainConfig) -> AdaptivePPO:
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)
     core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=config.task.sim.spread_starts)
-    return AdaptivePPO(config.ppo, Go1VecEnv(core), config.process.seed, config.process.device)
+    device = str(core.device) if config.process.device == "auto" else config.process.device
+    learner = DevicePPO if core.device.type == torch.device(device).type == "cuda" else AdaptivePPO
+    return learner(config.ppo, Go1VecEnv(core), config.process.seed, device)
 
 
 def try_out(config: TrainConfig) -> None:

@@ -1,0 +1,81 @@
+"""Put the policy of a run beside the package: ``python -m benchmarks.ship_policy run=RUN name=NAME [episodes=31]``.
+
+Writes ``assets/policies/NAME``: the run's configuration and origin, its curves (every tenth iteration), a checkpoint
+that holds the policy alone (what only training needs stays behind), and evaluations on the CPU engine: on flat ground
+with noise, with nothing random (``rand=none``), with noise at 100 Hz, and on the ground of training with all that
+training does to a robot.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from go1exp import data_root
+from go1exp.evaluate import table
+from go1exp.evaluate.policy import load_run
+from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
+from go1exp.train import checkpoint
+
+GRID = {
+    "x": (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0),
+    "y": (-1.0, -0.5, 0.5, 1.0),
+    "yaw": (-1.2, -0.6, 0.6, 1.2, 1.8),
+}
+"""Commands, one axis at a time, m/s and rad/s."""
+
+HARDER: dict[str, dict[str, Any]] = {
+    "flat": {"noise": True},
+    "none": {},
+    "flat_100_hz": {"noise": True, "policy_dt": 0.01},
+    "training_ground": {"noise": True, "randomize": True, "push": True, "train_ground": True},
+}
+"""Evaluation -> what is on in it."""
+
+
+EVERY = 10
+"""Iterations between rows of the shipped curves."""
+
+
+def shipped(run: Path, to: Path) -> None:
+    """Copy what a shipped policy needs: configuration, origin, curves, the policy's weights."""
+    state, path = checkpoint.load_latest(run)
+    (to / "checkpoints").mkdir(parents=True, exist_ok=True)
+    for old in (to / "checkpoints").glob("*"):
+        old.unlink()
+    kept = {name: state[name] for name in ("format", "policy", "iteration", "num_timesteps")}
+    torch.save(kept, to / "checkpoints" / path.name)
+    for name in ("config.yaml", "meta.json"):
+        shutil.copyfile(run / name, to / name)
+    head, *rows = (run / "metrics.csv").read_text().splitlines(keepends=True)
+    (to / "metrics.csv").write_text("".join([head, *rows[9::EVERY]]))
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Copy and evaluate."""
+    given = dict(a.split("=", 1) for a in arguments if "=" in a)
+    if not {"run", "name"} <= set(given) <= {"run", "name", "episodes"}:
+        raise SystemExit("usage: python -m benchmarks.ship_policy run=RUN name=NAME [episodes=31]")
+    to = data_root() / "assets" / "policies" / given["name"]
+    shipped(Path(given["run"]), to)
+    config, policy, about = load_run(to)
+    about["file"] = str(Path(about["file"]).relative_to(data_root()))
+    usual = {"duration_s": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}
+    off = dict.fromkeys(("noise", "randomize", "push", "train_ground"), False)
+    commands = grid(GRID["x"], GRID["y"], GRID["yaw"], cross=False)
+    for name, on in HARDER.items():
+        print(f"== {name}", flush=True)
+        wanted = EvalConfig(commands, int(given.get("episodes", 31)), **{**usual, **off, **on})
+        report = {"policy": about, **evaluate(config.task, policy, wanted)}
+        (to / f"eval_{name}.json").write_text(json.dumps(report, indent=1) + "\n")
+        print(table.text(report), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

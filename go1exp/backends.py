@@ -1,0 +1,54 @@
+"""Which physics engine, and how it is set up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import ConfigDict, Field
+
+from go1exp.registry import STRICT
+
+
+@dataclass(frozen=True)
+class CpuBackend:
+    """MuJoCo's batch on a thread pool; ``threads`` 0 takes all cores."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: Literal["cpu"]
+    threads: Annotated[int, Field(ge=0)]
+
+
+@dataclass(frozen=True)
+class WarpBackend:
+    """MuJoCo Warp on one GPU.
+
+    Attributes:
+        name: ``warp``.
+        device: ``cuda``, one of several as ``cuda:1``, or ``cpu``, slow, to look for faults.
+        graph: run the whole policy step as one CUDA graph.
+        nconmax: contacts and near pairs of shapes per environment, on average over the batch. Over a height field every
+            shape of the robot is near it: 26 pairs.
+        njmax: constraint rows of one environment: 4 for each contact, one for each joint at its stop or with dry
+            friction.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: Literal["warp"]
+    device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
+    graph: bool
+    nconmax: Annotated[int, Field(ge=32, le=1000)]
+    njmax: Annotated[int, Field(ge=64, le=2000)]
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.graph and self.device == "cpu":
+            raise ValueError("graph = True: a CUDA graph needs a CUDA device; use graph=false with device=cpu")
+
+
+BackendConfig = CpuBackend | WarpBackend
+
+BACKENDS: dict[str, type] = {"cpu": CpuBackend, "warp": WarpBackend}
+"""By their names, which are also the choices of the group ``backend``."""

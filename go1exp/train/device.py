@@ -1,0 +1,221 @@
+"""PPO that never leaves the GPU: rollouts, advantages and minibatches stay where the environment is.
+
+SB3's loop takes every step through numpy and looks at every environment's info in Python, and its buffer computes
+advantages on the host (docs/benchmarks.md has what that costs). Policy, loss, update, saving, callbacks and logger are
+SB3's here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from go1exp.config import PPOConfig
+from go1exp.env.core import Go1Core
+from go1exp.env.engine import captured
+from go1exp.env.faults import NumericalFault
+from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, MeanRolloutBuffer
+
+
+class DeviceRolloutBuffer(MeanRolloutBuffer):
+    """A rollout of tensors ``(steps, N, ...)`` on the learner's device, and the episodes that ended in it."""
+
+    policy: GaussianPolicy
+    data: dict[str, Tensor]
+
+    def reset(self) -> None:
+        """Empty the buffer; its memory is made once."""
+        if not hasattr(self, "data"):
+            widths = {"observations": self.obs_shape, "actions": (self.action_dim,), "means": (self.action_dim,)}
+            singles = (
+                "rewards",
+                "starts",
+                "values",
+                "log_probs",
+                "advantages",
+                "returns",
+                "ended",
+                "totals",
+                "lengths",
+            )
+            shapes: dict[str, Any] = {**widths, **dict.fromkeys(singles, ())}
+            size = (self.buffer_size, self.n_envs)
+            self.data = {name: torch.zeros(*size, *shape, device=self.device) for name, shape in shapes.items()}
+            self._next = torch.zeros(1, dtype=torch.int64, device=self.device)  # on the device: steps are replayed
+        self._next.zero_()
+        self.pos, self.full, self.generator_ready = 0, False, False
+
+    def store(self, **step: Tensor) -> None:
+        """Keep one step: values (N, ...) by the names of ``data``. The caller counts with ``pos``."""
+        for name, value in step.items():
+            kept = self.data[name]
+            kept.index_copy_(0, self._next, value.to(kept.dtype).unsqueeze(0))
+        self._next.add_(1).remainder_(self.buffer_size)
+
+    def estimate(self, last_values: Tensor, last_ended: Tensor) -> None:
+        """Compute advantages and returns: generalised advantage estimation (Schulman et al. 2016), as SB3 does.
+
+        Args:
+            last_values: (N,) of the states after the rollout.
+            last_ended: (N,) whether an episode ended in its last step.
+        """
+        d, gain = self.data, torch.zeros_like(last_values)
+        for step in reversed(range(self.buffer_size)):
+            last = step == self.buffer_size - 1
+            going = 1.0 - (last_ended.float() if last else d["starts"][step + 1])
+            after = last_values if last else d["values"][step + 1]
+            delta = d["rewards"][step] + self.gamma * after * going - d["values"][step]
+            gain = delta + self.gamma * self.gae_lambda * going * gain
+            d["advantages"][step].copy_(gain)
+        torch.add(d["advantages"], d["values"], out=d["returns"])
+
+    def episodes(self, most: int) -> list[dict[str, float]]:
+        """Return return ``r`` and length ``l`` of the newest episodes, up to ``most``, oldest first."""
+        rows = self.data["ended"].flatten().nonzero().squeeze(1)[-most:]
+        totals, lengths = (self.data[name].flatten()[rows].tolist() for name in ("totals", "lengths"))
+        return [{"r": r, "l": int(n)} for r, n in zip(totals, lengths, strict=True)]
+
+    def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
+        """Yield shuffled minibatches."""
+        flat = {name: value.flatten(0, 1) for name, value in self.data.items()}
+        total = self.buffer_size * self.n_envs
+        for rows in torch.randperm(total, device=self.device).split(batch_size or total):
+            self.current_means = flat["means"][rows]
+            names = ("observations", "actions", "values", "log_probs", "advantages", "returns")
+            yield RolloutBufferSamples(*(flat[name][rows] for name in names))
+
+    # SB3 wants these two as arrays, for one figure of its log.
+
+    @property
+    def values(self) -> np.ndarray:  # type: ignore[override]
+        """(steps, N) values of the visited states, on the host."""
+        return self.data["values"].cpu().numpy()
+
+    @property
+    def returns(self) -> np.ndarray:  # type: ignore[override]
+        """(steps, N) their returns, on the host."""
+        return self.data["returns"].cpu().numpy()
+
+
+class DevicePPO(AdaptivePPO):
+    """``AdaptivePPO`` on an environment whose tensors are on the learner's own device."""
+
+    buffer_class: type[RolloutBuffer] = DeviceRolloutBuffer
+    rollout_buffer: DeviceRolloutBuffer
+
+    def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str) -> None:
+        # Each new distribution would otherwise look at its parameters, and wait for them.
+        torch.distributions.Distribution.set_default_validate_args(False)
+        super().__init__(config, env, seed, device)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._observation = torch.zeros(self.n_envs, *self.rollout_buffer.obs_shape, device=self.device)
+        self._starts = torch.zeros(self.n_envs, dtype=torch.bool, device=self.device)
+        self._replay: Callable[[], None] | None = None
+
+    def _collect_step(self) -> None:
+        """Act on the observation, step, keep both; in place, so that it can be replayed as a graph."""
+        core, policy = self._core(), self.policy
+        with torch.no_grad():
+            actions, values, log_probs = policy(self._observation)
+            result = core.step_by_call(actions)
+            # A time limit is no end: what would have come after it counts.
+            beyond = policy.predict_values(result.final_observation).squeeze(1)
+            ended = result.terminated | result.truncated
+            self.rollout_buffer.store(
+                observations=self._observation,
+                actions=actions,
+                means=policy.last_distribution.distribution.mean,
+                rewards=result.reward + self.gamma * beyond * result.truncated,
+                starts=self._starts,
+                values=values.squeeze(1),
+                log_probs=log_probs,
+                ended=ended,
+                totals=result.episode_return,
+                lengths=result.episode_length,
+            )
+            self._observation.copy_(result.observation)
+            self._starts.copy_(ended)
+
+    def _core(self) -> Go1Core:
+        env = self.get_env()
+        assert isinstance(env, Go1VecEnv)
+        return env.core
+
+    def _stepper(self) -> Callable[[], None]:
+        """Return what makes one step of a rollout: the graph of it, recorded at the first call."""
+        if not self._core().captures:
+            return self._collect_step
+        if self._replay is None:
+            before = self._observation.clone(), self._starts.clone(), torch.cuda.get_rng_state(self.device)
+            self._replay, _ = captured(self._core(), self._collect_step)
+            self._observation.copy_(before[0])
+            self._starts.copy_(before[1])
+            torch.cuda.set_rng_state(before[2], self.device)
+            self.rollout_buffer.reset()
+        return self._replay
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """Fill the buffer; return whether the callback lets training go on. One wait for the device, at the end."""
+        buffer = self.rollout_buffer
+        self.policy.set_training_mode(False)
+        self._observation.copy_(torch.as_tensor(np.asarray(self._last_obs)))
+        self._starts.copy_(torch.as_tensor(np.asarray(self._last_episode_starts)))
+        buffer.reset()
+        callback.on_rollout_start()
+        step = self._stepper()
+        for _ in range(n_rollout_steps):
+            step()
+            buffer.pos += 1
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+        buffer.full = buffer.pos == buffer.buffer_size
+        with torch.no_grad():
+            buffer.estimate(self.policy.predict_values(self._observation).squeeze(1), self._starts)
+        self._core().check_so_far()
+        assert self.ep_info_buffer is not None
+        self.ep_info_buffer.extend(buffer.episodes(self._stats_window_size))
+        self._last_obs, self._last_episode_starts = self._observation.cpu().numpy(), self._starts.cpu().numpy()
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _check_gradient(self, name: str, parameter: Tensor) -> None:
+        """Do nothing as each gradient arrives: ``train`` looks at all of them in the end."""
+
+    def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *arguments: Any) -> None:
+        """Note whether the gradients are finite, and set the learning rate of the step about to be taken."""
+        norms = torch.stack(torch._foreach_norm([p.grad for p in self.policy.parameters()]))  # type: ignore[misc]
+        self._finite.logical_and_(torch.isfinite(norms).all())
+        super()._before_gradient_step(optimizer, *arguments)
+
+    def train(self) -> None:
+        """Update on the rollout, then close the iteration.
+
+        Raises:
+            NumericalFault: if a gradient was not finite; the policy is spoilt by then, the last checkpoint is not.
+        """
+        self._finite = torch.ones((), dtype=torch.bool, device=self.device)
+        super().train()
+
+    def _close_iteration(self) -> None:
+        if not self._finite:
+            raise NumericalFault("gradient of the policy", f"in iteration {self.iteration + 1}", {})
+        super()._close_iteration()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_finite", "_replay", "_observation", "_starts"]

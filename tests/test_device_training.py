@@ -1,0 +1,140 @@
+"""Training on the device: the same numbers as SB3's own buffer and loop, and what it owes when something goes wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.buffers import RolloutBuffer
+
+from go1exp.compose import compose
+from go1exp.config import TrainConfig, parse_train
+from go1exp.env.core import Go1Core
+from go1exp.env.faults import NumericalFault
+from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.train import checkpoint
+from go1exp.train.device import DevicePPO
+from go1exp.train.ppo import AdaptivePPO
+
+SMALL = (
+    *("ppo=paper", "ppo.num_envs=8", "ppo.steps=6", "ppo.hidden=[16,8]", "sim.episode_s=0.2"),
+    *("backend.threads=1", "torch_threads=1", "logger=local"),
+)
+
+
+@pytest.fixture
+def config() -> TrainConfig:
+    return parse_train(compose("train", SMALL))
+
+
+@pytest.fixture
+def learner(config: TrainConfig) -> Callable[..., Any]:
+    """Build a learner of a class on a new environment, all on the CPU: the law is that of the GPU."""
+
+    def make(kind: type[AdaptivePPO] = DevicePPO) -> Any:
+        core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
+        return kind(config.ppo, Go1VecEnv(core), 0, "cpu")
+
+    return make
+
+
+def test_advantages_and_returns_are_those_of_sb3(learner: Callable[..., DevicePPO]) -> None:
+    ppo = learner()
+    ppo.learn(48)
+    ours = ppo.rollout_buffer
+    theirs = RolloutBuffer(6, ppo.observation_space, ppo.action_space, "cpu", ours.gae_lambda, ours.gamma, 8)
+    d = ours.data
+    assert d["starts"].any()
+    for k in range(6):
+        arrays = [d[name][k].numpy() for name in ("observations", "actions", "rewards", "starts")]
+        observation, action, reward, start = arrays
+        theirs.add(observation, action, reward, start, d["values"][k], d["log_probs"][k])
+    last, ended = torch.randn(8), torch.rand(8) < 0.5
+    theirs.compute_returns_and_advantage(last, ended.numpy())
+    ours.estimate(last, ended)
+    np.testing.assert_allclose(d["advantages"].numpy(), theirs.advantages, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(d["returns"].numpy(), theirs.returns, rtol=1e-6, atol=1e-6)
+
+
+def test_a_rollout_holds_what_sb3s_own_loop_collects(learner: Callable[..., Any]) -> None:
+    """Same seed, same first rollout: observations, actions, rewards with the value beyond a time limit, episodes."""
+    mine, theirs = learner(), learner(AdaptivePPO)
+    for ppo in (mine, theirs):
+        ppo.train = lambda: None
+        torch.manual_seed(1)
+        ppo.learn(48)
+    data = mine.rollout_buffer.data
+    for name in ("observations", "actions", "rewards", "values", "log_probs", "advantages", "returns", "means"):
+        wanted = getattr(theirs.rollout_buffer, name)
+        np.testing.assert_allclose(data[name].numpy(), wanted, rtol=1e-5, atol=1e-5, err_msg=name)
+    np.testing.assert_array_equal(data["starts"].numpy(), theirs.rollout_buffer.episode_starts)
+    assert [e["l"] for e in mine.ep_info_buffer] == [e["l"] for e in theirs.ep_info_buffer]
+    assert [e["r"] for e in mine.ep_info_buffer] == pytest.approx([e["r"] for e in theirs.ep_info_buffer], rel=1e-5)
+    np.testing.assert_array_equal(mine._last_obs, theirs._last_obs)
+
+
+def test_minibatches_hold_every_sample_once(learner: Callable[..., DevicePPO]) -> None:
+    ppo = learner()
+    ppo.learn(48)
+    wanted = ppo.rollout_buffer.data["log_probs"].flatten().sort().values
+    got = torch.cat([batch.old_log_prob for batch in ppo.rollout_buffer.get(12)])
+    assert torch.equal(got.sort().values, wanted)
+
+
+def test_training_stopped_and_resumed_is_training_in_one_go(learner: Callable[..., DevicePPO], tmp_path: Path) -> None:
+    straight = learner()
+    straight.learn(48 * 4)
+    first = learner()
+    first.learn(48 * 2)
+    checkpoint.save(first, tmp_path, keep=1)
+    second = learner()
+    state, _ = checkpoint.load_latest(tmp_path)
+    checkpoint.restore(second, state)
+    second.learn(48 * 2, reset_num_timesteps=False)
+    assert second.iteration == straight.iteration == 4
+    for (name, a), b in zip(straight.policy.state_dict().items(), second.policy.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+
+
+def test_a_checkpoint_goes_from_one_learner_to_the_other(learner: Callable[..., Any], tmp_path: Path) -> None:
+    first, second = learner(), learner(AdaptivePPO)
+    first.learn(48)
+    checkpoint.save(first, tmp_path, keep=1)
+    checkpoint.restore(second, checkpoint.load_latest(tmp_path)[0])
+    second.learn(48, reset_num_timesteps=False)
+    assert second.iteration == 2
+    assert second.num_timesteps == 96
+
+
+def test_a_gradient_that_is_not_finite_stops_training(learner: Callable[..., DevicePPO]) -> None:
+    ppo = learner()
+    ppo.learn(48)
+    weight = ppo.policy.action_net.weight
+    assert isinstance(weight, torch.Tensor)
+    weight.register_hook(lambda gradient: gradient * torch.nan)
+    with pytest.raises(NumericalFault, match="gradient of the policy is not finite in iteration 2"):
+        ppo.learn(48, reset_num_timesteps=False)
+
+
+def test_a_fault_in_the_environment_is_found_after_the_rollout_with_its_moment(learner: Callable[..., Any]) -> None:
+    ppo = learner()
+    core = ppo.get_env().core
+    core._deferred = True  # as on a GPU
+    ppo.learn(48)
+    step, count = core.step_by_call, [0]
+
+    def break_one(action: torch.Tensor) -> Any:
+        count[0] += 1
+        if count[0] == 3:
+            core.backend.qvel[5, 7] = torch.nan
+        return step(action)
+
+    core.step_by_call = break_one
+    with pytest.raises(NumericalFault, match="qpos is not finite in environment 5") as fault:
+        ppo.learn(48, reset_num_timesteps=False)
+    assert not np.isfinite(fault.value.dump["qpos"]).all()
+    assert np.isfinite(fault.value.dump["action"]).all()
