@@ -25,9 +25,9 @@ PACKAGE = ROOT / "go1exp" / "estimation"
 NAME = "_kalman" + str(sysconfig.get_config_var("EXT_SUFFIX"))
 
 # No fused multiply-add: every machine rounds alike.
-FLAGS = "-std=c++17 -shared -fPIC -fvisibility=hidden -ffp-contract=off -Wall -Wextra".split()
+FLAGS = ["-std=c++17", "-shared", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off", "-Wall", "-Wextra"]
 FAST = ["-O2", "-DNDEBUG"]
-SANITISE = "-O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all".split()
+SANITISE = ["-O1", "-g", "-fno-omit-frame-pointer", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 SANITISE += ["-DEIGEN_RUNTIME_NO_MALLOC"]  # with Eigen's assertions on, an update that allocates aborts
 
 
@@ -49,6 +49,7 @@ def includes() -> list[Path]:
         files = importlib.metadata.files("cmeel-eigen") or []
     except importlib.metadata.PackageNotFoundError:
         files = []
+    # (sysconfig's paths do not know packages under pip's build isolation)
     places = [Path(str(f.locate())).resolve().parents[1] for f in files if f.parts[-2:] == ("Eigen", "Dense")]
     places += [Path(p) for p in ("/usr/include/eigen3", "/usr/local/include/eigen3") if (Path(p) / "Eigen").is_dir()]
     if not places:
@@ -63,16 +64,17 @@ def compile_filter(folder: Path, sanitise: bool = False) -> Path:
         MissingToolError: if a compiler or a header is missing.
         subprocess.CalledProcessError: if the source does not compile.
     """
-    compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("clang++") or shutil.which("c++")
+    wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["g++", "clang++", "c++"]
+    compiler = next((name.split() for name in wanted if shutil.which(name.split()[0])), None)
     if compiler is None:
-        raise MissingToolError("no C++ compiler (Debian: g++); CXX names another")
+        raise MissingToolError(f"no C++ compiler: {', '.join(wanted)} not found (Debian: g++; CXX names another)")
     folder.mkdir(parents=True, exist_ok=True)
     out, partial = folder / NAME, folder / f".{NAME}.part"
     options = [*FLAGS, *(SANITISE if sanitise else FAST), *(part for i in includes() for part in ("-isystem", str(i)))]
     if sys.platform == "darwin":
         options += ["-undefined", "dynamic_lookup"]
     try:
-        subprocess.run([*compiler.split(), *options, str(PACKAGE / "cpp/bindings.cpp"), "-o", str(partial)], check=True)
+        subprocess.run([*compiler, *options, str(PACKAGE / "cpp/bindings.cpp"), "-o", str(partial)], check=True)
         partial.replace(out)
     finally:
         partial.unlink(missing_ok=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from collections.abc import Callable
@@ -50,18 +51,22 @@ CONFIGS = {
 def random_motion(config: FilterConfig, rows: int, seed: int) -> np.ndarray:
     """Samples (rows, 51) that mean nothing, but visit every branch: swing, slip, gaps, late and broken samples."""
     rng = np.random.default_rng(seed)
-    rest = np.concatenate([STANCE[3 * k : 3 * k + 3] if leg.kind == "chain" else leg.centre for k, leg in enumerate(config.legs)])
+    rest = np.concatenate(
+        [STANCE[3 * k : 3 * k + 3] if leg.kind == "chain" else leg.centre for k, leg in enumerate(config.legs)]
+    )
     t = np.cumsum(rng.choice([0.002, 0.01, 0.2, 0.0, -0.003], p=[0.6, 0.36, 0.01, 0.02, 0.01], size=rows))
     phase = 12.0 * t[:, None]
     found = np.empty((rows, WIDTH))
     found[:, readings.T] = t
     found[:, readings.QUAT] = Rotation.from_rotvec(rng.normal(0, 0.1, (rows, 3))).as_quat(scalar_first=True)
     found[:, readings.GYRO] = rng.normal(0, 0.5, (rows, 3))
-    found[:, readings.ACC] = GRAVITY + rng.normal(0, 2.0, (rows, 3)) * rng.choice([1, 20], p=[0.99, 0.01], size=(rows, 1))
+    found[:, readings.ACC] = GRAVITY + rng.normal(0, 2.0, (rows, 3)) * rng.choice(
+        [1, 20], p=[0.99, 0.01], size=(rows, 1)
+    )
     found[:, readings.Q] = rest + 0.1 * np.sin(phase + np.arange(12)) + rng.normal(0, 0.01, (rows, 12))
     found[:, readings.QD] = 1.2 * np.cos(phase + np.arange(12)) + rng.normal(0, 0.1, (rows, 12))
     found[:, readings.TAU] = rng.normal(0, 6.0, (rows, 12)) + [0.0, 0.0, 6.0] * 4
-    found[:, readings.FOOT_FORCE] = 60 * np.sin(phase + [0, np.pi, np.pi, 0]) + rng.normal(0, 3.0, (rows, 4))
+    found[:, readings.FOOT_FORCE] = 60 * np.sin(phase + np.array([0, np.pi, np.pi, 0])) + rng.normal(0, 3.0, (rows, 4))
     broken = rng.random(rows) < 0.02
     found[broken, rng.integers(0, WIDTH, broken.sum())] = rng.choice([np.nan, np.inf, -np.inf], broken.sum())
     return found
@@ -99,7 +104,7 @@ def joints_for(config: FilterConfig, feet_b: np.ndarray, guess: np.ndarray) -> n
 
 @cache
 def stroll(config: FilterConfig, seconds: float, dt: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
-    """A trunk that sways over feet that never lift, yawing and rolling: samples without noise, and the true velocity."""
+    """A trunk that sways, yaws and rolls over feet that never lift: samples without noise, and the true velocity."""
     t = np.arange(0, seconds, dt)
     feet_w = np.array([foot(leg, q)[0] for leg, q in zip(config.legs, STANCE.reshape(4, 3), strict=True)])
     imu, w = np.array(config.imu_position), 2.0
@@ -118,13 +123,24 @@ def stroll(config: FilterConfig, seconds: float, dt: float = 0.01) -> tuple[np.n
 
     rows, truth, q, h = [], [], STANCE.copy(), 1e-4
     for now in t:
-        r, turn = pose(now)
+        _, turn = pose(now)
         q = legs(now, q)
         qd = (legs(now + h, q) - legs(now - h, q)) / (2 * h)
         acc = (imu_place(now + h) - 2 * imu_place(now) + imu_place(now - h)) / h**2
         gyro = (turn.inv() * pose(now + h)[1]).as_rotvec() / h
         speed = (pose(now + h)[0] - pose(now - h)[0]) / (2 * h)
-        rows.append(sample(now, turn.as_quat(scalar_first=True), gyro, turn.inv().apply(acc + GRAVITY), q, qd, None, np.full(4, 30.0)))
+        rows.append(
+            sample(
+                now,
+                turn.as_quat(scalar_first=True),
+                gyro,
+                turn.inv().apply(acc + GRAVITY),
+                q,
+                qd,
+                None,
+                np.full(4, 30.0),
+            )
+        )
         truth.append(turn.inv().apply(speed))
     return np.array(rows), np.array(truth)
 
@@ -137,7 +153,7 @@ def exact(**changes: object) -> FilterConfig:
 
 def standing(t: float, **changes: np.ndarray) -> np.ndarray:
     given = {"quat": LEVEL, "gyro": np.zeros(3), "acc": GRAVITY, "q": STANCE, "qd": np.zeros(12)}
-    return sample(t, **{**given, "foot_force": np.full(4, 30.0), **changes})  # type: ignore[arg-type]
+    return sample(t, **{**given, "foot_force": np.full(4, 30.0), **changes})
 
 
 # ---------------------------------------------------------------------- kinematics
@@ -260,7 +276,9 @@ def test_all_feet_contradicting_makes_it_give_way() -> None:
     for k in range(1, 16):
         q = joints_for(config, feet - [0.012 * k, 0, 0], q)
         slopes = [foot(leg, one)[1] for leg, one in zip(config.legs, q.reshape(4, 3), strict=True)]
-        rows.append(standing(1.99 + k * 0.01, q=q, qd=np.concatenate([np.linalg.solve(J, [-1.2, 0, 0]) for J in slopes])))
+        rows.append(
+            standing(1.99 + k * 0.01, q=q, qd=np.concatenate([np.linalg.solve(J, [-1.2, 0, 0]) for J in slopes]))
+        )
     found = make_filter(config).run(np.array(rows))
     assert abs(found[202, 3]) < 0.3
     assert found[-1, 3] == pytest.approx(1.2, abs=0.1)
@@ -271,7 +289,8 @@ def test_all_feet_contradicting_makes_it_give_way() -> None:
 
 @pytest.mark.parametrize(
     ("column", "bad"),
-    [(c, b) for c in (0, 1, 6, 9, 14, 30, 48) for b in (np.nan, np.inf, -np.inf)] + [(c, 1e300) for c in (1, 6, 9, 14, 30)],
+    [(c, b) for c in (0, 1, 6, 9, 14, 30, 48) for b in (np.nan, np.inf, -np.inf)]
+    + [(c, 1e300) for c in (1, 6, 9, 14, 30)],
 )
 def test_what_no_sensor_reads_is_refused_and_changes_nothing(column: int, bad: float) -> None:
     fast = make_filter(go1())
@@ -372,13 +391,33 @@ def test_rolling_feet_need_chains() -> None:
 
 def test_a_missing_extension_says_how_to_build_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "go1exp.estimation._kalman", None)
-    with pytest.raises(EstimatorError, match="C\\+\\+17 compiler.*make setup"):
+    with pytest.raises(EstimatorError, match=r"C\+\+17 compiler.*make setup"):
         make_filter(go1())
+
+
+def test_building_without_a_compiler_says_so_and_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    source = data_root() / "hatch_build.py"
+    if not source.is_file():
+        pytest.skip("not a checkout")
+    hook = runpy.run_path(str(source))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CXX", raising=False)
+    with pytest.raises(RuntimeError, match=r"no C\+\+ compiler: g\+\+, clang\+\+"):
+        hook["compile_filter"](tmp_path / "out")
+    monkeypatch.setenv("CXX", "no-such-compiler -O0")
+    with pytest.raises(RuntimeError, match="no-such-compiler"):
+        hook["compile_filter"](tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_filter_needs_nothing_heavy() -> None:
     heavy = "('torch', 'mujoco', 'stable_baselines3', 'hydra', 'omegaconf', 'scipy', 'pyarrow')"
-    code = f"import sys; from go1exp.estimation import *; make_filter(go1()); print([m for m in {heavy} if m in sys.modules])"
+    code = (
+        "import sys; from go1exp.estimation import *; make_filter(go1()); "
+        f"print([m for m in {heavy} if m in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], cwd=data_root(), capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "[]", done.stderr
 

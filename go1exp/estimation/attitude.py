@@ -9,7 +9,9 @@ GRAVITY = 9.81
 """m/s2"""
 
 
-def levelled(t: np.ndarray, gyro: np.ndarray, acc: np.ndarray, *, seconds: float = 10.0, first: float = 0.2) -> np.ndarray:
+def levelled(
+    t: np.ndarray, gyro: np.ndarray, acc: np.ndarray, *, seconds: float = 10.0, first: float = 0.2
+) -> np.ndarray:
     """Return the attitude ``(T, 4)``, w-x-y-z, body to world, of a complementary filter (Mahony et al. 2008, eq. 32).
 
     Each step turns by the gyro, and by the angle between measured and known vertical over ``seconds``. Heading starts

@@ -182,7 +182,9 @@ def go1(**changes: Any) -> FilterConfig:
 
 def scaler(**changes: Any) -> FilterConfig:
     """Return the settings of UCLA's SCALER (legs FL FR RR RL), whose five-bar legs are calibrated polynomials."""
-    return from_json((data_root() / "assets/estimation/scaler.json").read_text(), "assets/estimation/scaler.json", changes)
+    return from_json(
+        (data_root() / "assets/estimation/scaler.json").read_text(), "assets/estimation/scaler.json", changes
+    )
 
 
 def from_json(text: str, where: str, changes: dict[str, Any] | None = None) -> FilterConfig:

@@ -16,7 +16,12 @@ MOST = ((column.GYRO, 1e2), (column.ACC, 1e3), (column.Q, 1e2), (column.QD, 1e3)
 
 
 class NumpyFilter:
-    """State ``x``: IMU position r and velocity v, accelerometer bias b, feet p0..p3, ground height g (22,), world frame; ``P`` its covariance."""
+    """The filter.
+
+    Attributes:
+        x: IMU position r and velocity v, accelerometer bias b, feet p0..p3, ground height g (22,), world frame.
+        P: its covariance (22, 22).
+    """
 
     def __init__(self, config: FilterConfig) -> None:
         self.c, self.x, self.P = config, np.zeros(22), np.zeros((22, 22))
@@ -64,7 +69,9 @@ class NumpyFilter:
         self.moving = (np.cross(w, p - c.imu_position) + np.einsum("lij,lj->li", J, qd)) @ R.T
         self.rolling = c.foot_radius * np.cross((w + np.einsum("lij,lj->li", turn, qd)) @ R.T, [0, 0, 1.0])
         JJ = R @ J @ J.transpose(0, 2, 1) @ R.T
-        AA = np.einsum("li,li->l", self.arm, self.arm)[:, None, None] * np.eye(3) - np.einsum("li,lj->lij", self.arm, self.arm)
+        AA = np.einsum("li,li->l", self.arm, self.arm)[:, None, None] * np.eye(3) - np.einsum(
+            "li,lj->lij", self.arm, self.arm
+        )
         self.place_noise = c.joint_noise**2 * JJ + c.attitude_noise**2 * AA + c.leg_noise**2 * np.eye(3)
         self.speed_noise = c.joint_speed_noise**2 * JJ + c.gyro_noise**2 * AA
         self.speed_noise += c.foot_speed_noise**2 * np.diag(self.uneven)

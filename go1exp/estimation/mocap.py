@@ -54,7 +54,9 @@ def truth(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     valid = data.numbers("mocap_valid") > 0
     t, position = data.numbers("mocap_t")[valid], data.numbers("mocap_pos", 3)[valid]
     attitude = Rotation.from_quat(data.numbers("mocap_quat_xyzw", 4)[valid])
-    heading = np.unwrap(_heading((attitude * Rotation.from_matrix(data.numbers("mocap_to_body_rot", 3)).inv()).as_matrix()))
+    heading = np.unwrap(
+        _heading((attitude * Rotation.from_matrix(data.numbers("mocap_to_body_rot", 3)).inv()).as_matrix())
+    )
     grid = np.arange(t[0], t[-1], GRID)
     place = interp1d(t, position, axis=0)(grid)
     velocity = savgol_filter(place, WINDOW, 3, deriv=1, delta=GRID, axis=0)
