@@ -13,12 +13,15 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from go1exp import data_root, robot
+from go1exp.compose import compose
+from go1exp.config import parse_task
 from go1exp.estimation import (
     WIDTH,
     EstimatorError,
@@ -35,7 +38,12 @@ from go1exp.estimation import (
 )
 from go1exp.estimation.kalman import NumpyFilter
 from go1exp.estimation.legs import foot
-from go1exp.registry import ConfigError
+from go1exp.estimation.replay import estimate
+from go1exp.record.plan import Episode, make_motion
+from go1exp.record.sensors import Channel, SensorConfig
+from go1exp.record.simulate import Rig, play
+from go1exp.recording import VECTORS
+from go1exp.registry import ConfigError, bind
 
 GRAVITY = np.array([0.0, 0.0, 9.81])
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -422,7 +430,28 @@ def test_the_filter_needs_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]", done.stderr
 
 
-# ---------------------------------------------------------------------- a real robot
+# ---------------------------------------------------------------------- robots, simulated and real
+
+
+@pytest.mark.parametrize("source", ["force", "torque"])
+def test_a_simulated_go1_that_squats_is_followed(source: Literal["force", "torque"]) -> None:
+    """Holds the conventions of model, sensors and filter together: axes, signs, the IMU's place, feet and forces."""
+    task = parse_task(compose("train", ["terrain=flat", "backend.threads=1"]))
+    rig = Rig(task.robot, task.actuator, (), task.terrain, task.backend, 0.002)
+    still = Channel(0.0, 0.0)
+    sensors = SensorConfig(500.0, 0.0, 0.0, *[still] * 7, truth=True)
+    squat, _ = bind("excitation", "squat", {"move": [0.35, 0.5]}, "squat")
+    assert squat is not None
+    episode = Episode("squat", "squat", make_motion(squat, 3.0, 500.0, 0), 60.0, 1.5, None, None, 0)
+    (recording,) = play(rig, [episode], sensors, 0, lambda *_: None)
+    found = estimate(recording, go1(contact_source=source))
+    attitude = Rotation.from_quat(recording.block(*VECTORS["base_quat"]), scalar_first=True)
+    velocity = attitude.inv().apply(recording.block(*VECTORS["base_lin_vel"]))
+    error = (found.velocity_b - velocity)[250:]
+    assert np.sqrt((velocity[250:] ** 2).sum(axis=1).mean()) > 0.1
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.02
+    height = recording.block("base_pos_z_w")[:, 0]
+    assert np.abs(found.position_w[250:, 2] - height[250:]).max() < 0.02
 
 
 def test_on_the_real_scaler_it_beats_leg_odometry_by_far() -> None:
