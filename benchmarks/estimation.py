@@ -4,8 +4,8 @@
 2. ``scaler``: the walks of a real robot under motion capture, beside plain leg odometry; FOLDER holds ``run_*.npz``
    (default: ``scaler_walk_mocap`` in ``../shared/data`` beside the repository, or in GO1EXP_DATA). With
    ``--leave-one-out`` the setting that distance depends on most, ``foot_drift``, is chosen for each run on the others.
-3. ``sim``: a simulated Go1 under the policy of ``--run`` with random commands up to 1.5 m/s, sensors at 500 Hz with
-   the standard deviations of the paper's Table II, on flat ground and on the paper's terrain; without a run it squats.
+3. ``sim``: a simulated Go1 under the policy of ``--run`` with random commands up to 1.5 m/s (and straight on at
+   1.5 m/s), sensors at 500 Hz with the standard deviations of the paper's Table II, on flat ground and on the paper's terrain; without a run it squats.
 
 The error of a velocity is the root mean square over time of its components (x, y, z of the trunk) and of all three
 together (the length of the error); the first half second is left out.
@@ -42,6 +42,8 @@ COMMANDS = {
     "hold_time": [3.0, 10.0],
     "standing_fraction": 0.1,
 }
+
+FAST = {"lin_vel_x": 1.5, "lin_vel_y": 0.0, "ang_vel_z": 0.0}
 
 STD = 1 / np.sqrt(3)
 """Standard deviation of a uniform distribution of half-width 1."""
@@ -154,12 +156,15 @@ def simulated(run: Path | None, seconds: float, robots: int) -> None:
         from go1exp.evaluate.policy import load_run
 
         trained, policy, _ = load_run(run)
-        command, problems = bind("command", "uniform_velocity", COMMANDS, "command")
-        assert command is not None, problems
         count, length = (1, seconds) if ground == "flat" else (robots, seconds / robots)
-        names = [f"{ground}_{k}" for k in range(count)]
-        walk = Walk(replace(trained.task, command=command), policy, names, length, None)
-        score(play_policy(rig, walk, SENSORS, 0, lambda *_: None), ground)
+        walks = [("uniform_velocity", COMMANDS, [f"{ground}_{k}" for k in range(count)], length)]
+        if ground == "flat":
+            walks.append(("fixed_velocity", FAST, ["flat_fast"], min(length, 60.0)))
+        for name, parameters, names, length in walks:
+            command, problems = bind("command", name, parameters, "command")
+            assert command is not None, problems
+            walk = Walk(replace(trained.task, command=command), policy, names, length, None)
+            score(play_policy(rig, walk, SENSORS, 0, lambda *_: None), ground)
 
 
 def main() -> None:

@@ -292,6 +292,35 @@ def test_all_feet_contradicting_makes_it_give_way() -> None:
     assert found[-1, 3] == pytest.approx(1.2, abs=0.1)
 
 
+def sinking_steps(config: FilterConfig, slope: float) -> np.ndarray:
+    """A trunk that climbs at 0.5 m/s on a slope while each foot on the ground gives way, upward, at 0.05 m/s."""
+    start = np.array([foot(leg, q)[0] for leg, q in zip(config.legs, STANCE.reshape(4, 3), strict=True)])
+    start[:, 2] = start[:, 2].mean() + slope * start[:, 0]
+    rows, q = [], STANCE.copy()
+    velocity = np.array([-0.5, 0.0, -0.5 * slope + 0.05])  # of a standing foot against the trunk
+    for k in range(1000):
+        now, half = 0.01 * k, k // 20 % 2
+        pair = np.array([half, 1 - half, 1 - half, half], dtype=bool)
+        since = 0.01 * (k % 20) - 0.1
+        feet = start + np.where(pair[:, None], since, -since) * np.array([-0.5, 0.0, -0.5 * slope])
+        feet[pair, 2] += 0.05 * (since + 0.1)
+        q = joints_for(config, feet, q)
+        slopes = [foot(leg, one)[1] for leg, one in zip(config.legs, q.reshape(4, 3), strict=True)]
+        qd = np.concatenate([np.linalg.solve(J, velocity) for J in slopes])
+        rows.append(standing(now, q=q, qd=qd, foot_force=np.where(pair, 60.0, 0.0)))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3])
+def test_ground_that_gives_way_does_not_make_the_trunk_sink(slope: float) -> None:
+    config = go1(foot_radius=0.0)
+    rows = sinking_steps(config, slope)
+    found = make_filter(config).run(rows)[500:, 3:6].mean(axis=0)
+    np.testing.assert_allclose(found, [0.5, 0.0, 0.5 * slope], atol=0.02)
+    without = make_filter(go1(foot_radius=0.0, level_noise=0.0)).run(rows)[500:, 3:6].mean(axis=0)
+    assert without[2] < 0.5 * slope - 0.04
+
+
 # ---------------------------------------------------------------------- what sensors do to it
 
 

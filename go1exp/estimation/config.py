@@ -87,7 +87,8 @@ class FilterConfig:
         foot_speed_noise: of a foot on the ground, horizontally, m/s; 0 leaves joint velocities out of the correction.
         sinking: how many times more a foot moves vertically than the two above: ground and sole give way at each step.
         level_noise: difference in height of a foot just set down from the ground so far, m; 0 for no such rule.
-        ground_walk: how the ground's height changes under a walking robot, m per root second.
+        ground_walk: how the ground's height under the robot departs from its slope, m per root second.
+        slope_walk: how the slope changes, per root second (and its standard deviation at the start).
         initial_speed: of the trunk at the start and after a gap, m/s.
         initial_bias: of the accelerometer's offset, m/s2.
         gate: squared Mahalanobis distance (3 degrees of freedom) beyond which a foot slips (16.3: one in a thousand).
@@ -116,6 +117,7 @@ class FilterConfig:
     sinking: Positive
     level_noise: NonNegative
     ground_walk: NonNegative
+    slope_walk: NonNegative
     initial_speed: Positive
     initial_bias: NonNegative
     gate: Positive
@@ -171,6 +173,7 @@ def go1(**changes: Any) -> FilterConfig:
         "sinking": 30.0,
         "level_noise": 0.03,
         "ground_walk": 0.05,
+        "slope_walk": 0.1,
         "initial_speed": 0.5,
         "initial_bias": 0.2,
         "gate": 16.3,

@@ -19,12 +19,13 @@ class NumpyFilter:
     """The filter.
 
     Attributes:
-        x: IMU position r and velocity v, accelerometer bias b, feet p0..p3, ground height g (22,), world frame.
-        P: its covariance (22, 22).
+        x: IMU position r and velocity v, accelerometer bias b, feet p0..p3, ground below r: height g, slope m (24,),
+            world frame.
+        P: its covariance (24, 24).
     """
 
     def __init__(self, config: FilterConfig) -> None:
-        self.c, self.x, self.P = config, np.zeros(22), np.zeros((22, 22))
+        self.c, self.x, self.P = config, np.zeros(24), np.zeros((24, 24))
         self.running, self.t, self.late, self.unseen = False, -np.inf, 0, 0.0
         self.age, self.contact = np.zeros(4), np.zeros(4)
 
@@ -45,7 +46,8 @@ class NumpyFilter:
         dt, self.t, self.late = s[0] - self.t, s[0], 0
         self._look_at_feet(s, speeds)
         if not self.running:
-            self.running, self.P[3:6, 3:6], self.P[21, 21] = True, c.initial_speed**2 * np.eye(3), c.level_noise**2
+            self.running, self.P[3:6, 3:6] = True, c.initial_speed**2 * np.eye(3)
+            self.P[21:, 21:] = np.diag([c.level_noise, c.slope_walk, c.slope_walk]) ** 2
             self.P[6:9, 6:9], self.x[2] = c.initial_bias**2 * np.eye(3), c.foot_radius - self.arm[:, 2].min()
         if late or dt > c.longest_gap:
             if np.isfinite(dt):
@@ -99,18 +101,20 @@ class NumpyFilter:
 
     def _predict(self, acc: np.ndarray, dt: float) -> None:
         c, eye = self.c, np.eye(3)
-        a = self.R @ (acc - self.x[6:9]) - GRAVITY
+        a, v = self.R @ (acc - self.x[6:9]) - GRAVITY, self.x[3:5].copy()
+        self.x[21] += dt * self.x[22:] @ v
         self.x[:3] += dt * self.x[3:6] + dt**2 / 2 * a
         self.x[3:6] += dt * a
-        F = np.eye(22)
+        F = np.eye(24)
+        F[21, 22:], F[21, 3:5] = dt * v, dt * self.x[22:]
         F[:3, 3:6], F[:3, 6:9], F[3:6, 6:9] = dt * eye, -(dt**2) / 2 * self.R, -dt * self.R
         n = c.acceleration_noise**2 * (1 + ((np.linalg.norm(acc) - GRAVITY[2]) / c.impact_acceleration) ** 2)
-        Q = np.zeros((22, 22))
+        Q = np.zeros((24, 24))
         Q[:6, :6] = n * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], eye)
         Q[6:9, 6:9] = c.bias_walk**2 * dt * eye
         drift = c.foot_drift / np.maximum(self.contact, c.contact_least)
         Q[9:21, 9:21] = np.diag(np.outer(drift**2 * dt, self.uneven).ravel())
-        Q[21, 21] = c.ground_walk**2 * dt
+        Q[21:, 21:] = np.diag([c.ground_walk, c.slope_walk, c.slope_walk]) ** 2 * dt
         self.x[9:21] += dt * self.rolling.ravel()
         self.P = F @ self.P @ F.T + Q
 
@@ -125,11 +129,11 @@ class NumpyFilter:
                 self._level(leg)
             holds, at = True, slice(9 + 3 * leg, 12 + 3 * leg)
             if c.foot_speed_noise > 0:
-                H = np.eye(22)[3:6]
+                H = np.eye(24)[3:6]
                 R = self.speed_noise[leg] / self.contact[leg] ** 2
                 holds = self._apply(H, R, self.rolling[leg] - self.moving[leg] - H @ self.x, robust=True)
             if holds:
-                H = np.eye(22)[at] - np.eye(22)[:3]
+                H = np.eye(24)[at] - np.eye(24)[:3]
                 holds = self._apply(H, self.place_noise[leg], self.arm[leg] - H @ self.x, robust=False)
             if not holds:
                 self._anchor(leg)
@@ -139,7 +143,8 @@ class NumpyFilter:
             self._widen_speed()
 
     def _level(self, leg: int) -> None:
-        H = np.eye(22)[[11 + 3 * leg]] - np.eye(22)[[21]]
+        H = np.eye(24)[[11 + 3 * leg]] - np.eye(24)[[21]]
+        H[0, 22:] = self.x[:2] - self.x[9 + 3 * leg : 11 + 3 * leg]
         self._apply(H, self.c.level_noise**2 * np.eye(1), self.c.foot_radius - H @ self.x, robust=False)
 
     def _apply(self, H: np.ndarray, R: np.ndarray, error: np.ndarray, robust: bool) -> bool:

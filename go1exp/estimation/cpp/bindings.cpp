@@ -112,6 +112,7 @@ PYBIND11_MODULE(_kalman, m) {
       .def_readwrite("sinking", &Settings::sinking)
       .def_readwrite("level_noise", &Settings::level_noise)
       .def_readwrite("ground_walk", &Settings::ground_walk)
+      .def_readwrite("slope_walk", &Settings::slope_walk)
       .def_readwrite("initial_speed", &Settings::initial_speed)
       .def_readwrite("initial_bias", &Settings::initial_bias)
       .def_readwrite("gate", &Settings::gate)

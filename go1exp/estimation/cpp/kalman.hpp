@@ -1,8 +1,8 @@
 // Velocity of a legged robot's trunk from its IMU, its joints and its feet's contacts: a linear Kalman
 // filter in the world frame. docs/estimation.md derives it; go1exp/estimation/kalman.py is the same law in NumPy.
 //
-// State x (22): position r and velocity v of the IMU, bias b of its accelerometer (IMU frame), feet p0..p3, height g of
-// the ground.
+// State x (24): position r and velocity v of the IMU, bias b of its accelerometer (IMU frame), feet p0..p3, height g of
+// the ground below r and its slope m along x and y.
 // Every matrix has a fixed size: an update allocates nothing and throws nothing.
 #pragma once
 
@@ -16,7 +16,7 @@ namespace go1exp {
 constexpr int kLegs = 4;
 constexpr int kJoints = 3 * kLegs;
 constexpr int kGround = 9 + 3 * kLegs;
-constexpr int kStates = kGround + 1;
+constexpr int kStates = kGround + 3;
 constexpr double kGravity = 9.81;  // m/s2
 
 // No sensor of a legged robot reads more: a finite number beyond them is as broken as NaN (chosen).
@@ -42,7 +42,7 @@ struct Settings {
   double contact_low = 0.0, contact_high = 1.0, contact_least = 0.1, settle = 0.0;
   double acceleration_noise = 1.0, impact_acceleration = 1.0, bias_walk = 0.0;
   double attitude_noise = 0.0, gyro_noise = 0.0, joint_noise = 0.0, joint_speed_noise = 0.0;
-  double leg_noise = 0.01, foot_drift = 0.01, foot_speed_noise = 0.0, sinking = 1.0, level_noise = 0.0, ground_walk = 0.0;
+  double leg_noise = 0.01, foot_drift = 0.01, foot_speed_noise = 0.0, sinking = 1.0, level_noise = 0.0, ground_walk = 0.0, slope_walk = 0.0;
   double initial_speed = 0.1, initial_bias = 0.1;
   double gate = 16.0, longest_gap = 0.1, lost_after = 0.5;
 };
@@ -174,6 +174,7 @@ class Filter {
     P_.block<3, 3>(3, 3).diagonal().setConstant(c_.initial_speed * c_.initial_speed);
     P_.block<3, 3>(6, 6).diagonal().setConstant(c_.initial_bias * c_.initial_bias);
     P_(kGround, kGround) = c_.level_noise * c_.level_noise;
+    P_.block<2, 2>(kGround + 1, kGround + 1).diagonal().setConstant(c_.slope_walk * c_.slope_walk);
     double lowest = arm_[0][2];
     for (int leg = 1; leg < kLegs; ++leg) lowest = std::min(lowest, arm_[leg][2]);
     x_[2] = c_.foot_radius - lowest;  // the world's origin: on the ground, below the IMU
@@ -200,6 +201,11 @@ class Filter {
 
   void predict(const Vec3& acc, double dt) {
     const Vec3 a = rot_ * (acc - x_.segment<3>(6)) - kGravity * Vec3::UnitZ();
+    // The ground below rises by m . v dt; v's row is still the old one here.
+    const Eigen::Vector2d along = dt * x_.segment<2>(3), rise = dt * x_.segment<2>(kGround + 1);
+    x_[kGround] += rise.dot(x_.segment<2>(3));
+    P_.row(kGround) += along.transpose() * P_.middleRows<2>(kGround + 1) + rise.transpose() * P_.middleRows<2>(3);
+    P_.col(kGround) += P_.middleCols<2>(kGround + 1) * along + P_.middleCols<2>(3) * rise;
     x_.head<3>() += dt * x_.segment<3>(3) + 0.5 * dt * dt * a;
     x_.segment<3>(3) += dt * a;
     // P = F P F': r takes dt v - dt2/2 R b, v takes -dt R b
@@ -216,6 +222,7 @@ class Filter {
     P_.block<3, 3>(3, 3).diagonal().array() += n * dt;
     P_.block<3, 3>(6, 6).diagonal().array() += c_.bias_walk * c_.bias_walk * dt;
     P_(kGround, kGround) += c_.ground_walk * c_.ground_walk * dt;
+    P_.block<2, 2>(kGround + 1, kGround + 1).diagonal().array() += c_.slope_walk * c_.slope_walk * dt;
     for (int leg = 0; leg < kLegs; ++leg) {
       const double drift = c_.foot_drift / std::max(contact_[leg], c_.contact_least);
       x_.segment<3>(9 + 3 * leg) += dt * rolling_[leg];
@@ -241,12 +248,13 @@ class Filter {
     if (unseen_ > c_.lost_after) widen_speed();
   }
 
-  // A foot that has just been set down is about as high as the ground was: what keeps the height from drifting.
+  // A foot that has just been set down is where the ground was, give or take: this keeps the height from drifting.
   void level(int leg) {
     const int at = 9 + 3 * leg + 2;
-    const double error = c_.foot_radius + x_[kGround] - x_[at];
-    const State Ph = P_.col(at) - P_.col(kGround);
-    const double S = Ph[at] - Ph[kGround] + c_.level_noise * c_.level_noise;
+    const Eigen::Vector2d away = x_.segment<2>(at - 2) - x_.head<2>();
+    const double error = c_.foot_radius + x_[kGround] + x_.segment<2>(kGround + 1).dot(away) - x_[at];
+    const State Ph = P_.col(at) - P_.col(kGround) - P_.middleCols<2>(kGround + 1) * away;
+    const double S = Ph[at] - Ph[kGround] - Ph.segment<2>(kGround + 1).dot(away) + c_.level_noise * c_.level_noise;
     if (error * error > c_.gate * S) return;  // a step
     x_ += Ph * (error / S);
     P_ -= Ph * (Ph.transpose() / S);
