@@ -4,8 +4,9 @@
 2. ``scaler``: the walks of a real robot under motion capture, beside plain leg odometry; FOLDER holds ``run_*.npz``
    (default: ``scaler_walk_mocap`` in ``../shared/data`` beside the repository, or in GO1EXP_DATA). With
    ``--leave-one-out`` the setting that distance depends on most, ``foot_drift``, is chosen for each run on the others.
-3. ``sim``: a simulated Go1 under the policy of ``--run`` with random commands up to 1.5 m/s (and straight on at
-   1.5 m/s), sensors at 500 Hz with the standard deviations of the paper's Table II, on flat ground and on the paper's terrain; without a run it squats.
+3. ``sim``: a simulated Go1 under the policy of ``--run`` with random commands up to 1.5 m/s (and straight on
+   at 1.5 m/s), sensors at 500 Hz with the standard deviations of the paper's Table II, on flat ground and on the
+   paper's terrain; without a run it squats.
 
 The error of a velocity is the root mean square over time of its components (x, y, z of the trunk) and of all three
 together (the length of the error); the first half second is left out.
@@ -35,7 +36,7 @@ from go1exp.record.simulate import Rig, Walk, play, play_policy
 from go1exp.recording import VECTORS, Recording
 from go1exp.registry import bind
 
-COMMANDS = {
+COMMANDS: dict[str, object] = {
     "lin_vel_x": [-0.5, 1.5],
     "lin_vel_y": [-0.5, 0.5],
     "ang_vel_z": [-1.0, 1.0],
@@ -43,7 +44,7 @@ COMMANDS = {
     "standing_fraction": 0.1,
 }
 
-FAST = {"lin_vel_x": 1.5, "lin_vel_y": 0.0, "ang_vel_z": 0.0}
+FAST: dict[str, object] = {"lin_vel_x": 1.5, "lin_vel_y": 0.0, "ang_vel_z": 0.0}
 
 STD = 1 / np.sqrt(3)
 """Standard deviation of a uniform distribution of half-width 1."""

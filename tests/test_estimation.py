@@ -468,7 +468,7 @@ def test_a_simulated_go1_that_squats_is_followed(source: Literal["force", "torqu
     task = parse_task(compose("train", ["terrain=flat", "backend.threads=1"]))
     rig = Rig(task.robot, task.actuator, (), task.terrain, task.backend, 0.002)
     still = Channel(0.0, 0.0)
-    sensors = SensorConfig(500.0, 0.0, 0.0, *[still] * 7, truth=True)
+    sensors = SensorConfig(500.0, 0.0, 0.0, still, still, still, still, still, still, still, truth=True)
     squat, _ = bind("excitation", "squat", {"move": [0.35, 0.5]}, "squat")
     assert squat is not None
     episode = Episode("squat", "squat", make_motion(squat, 3.0, 500.0, 0), 60.0, 1.5, None, None, 0)

@@ -78,6 +78,8 @@ class FilterConfig:
         acceleration_noise: of the accelerometer and of what attitude errors make of gravity, m/s2 per root hertz.
         impact_acceleration: excess of the measured acceleration over gravity that doubles its noise, m/s2.
         bias_walk: of the accelerometer's offset, m/s2 per root second.
+        attitude_time: time within which the attitude, turned by the gyro, is drawn to the reported one, s; 0 takes it
+            as it is reported.
         attitude_noise: error of the attitude, rad.
         gyro_noise: rad/s.
         joint_noise: of a joint angle, rad.
@@ -107,6 +109,7 @@ class FilterConfig:
     acceleration_noise: Positive
     impact_acceleration: Positive
     bias_walk: NonNegative
+    attitude_time: NonNegative
     attitude_noise: NonNegative
     gyro_noise: NonNegative
     joint_noise: NonNegative
@@ -163,6 +166,7 @@ def go1(**changes: Any) -> FilterConfig:
         "acceleration_noise": 0.03,
         "impact_acceleration": 10.0,
         "bias_walk": 0.01,
+        "attitude_time": 0.1,
         "attitude_noise": 0.029,
         "gyro_noise": 0.006,
         "joint_noise": 0.029,

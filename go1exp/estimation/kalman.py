@@ -29,6 +29,7 @@ class NumpyFilter:
         self.running, self.t, self.late, self.unseen = False, -np.inf, 0, 0.0
         self.age, self.contact = np.zeros(4), np.zeros(4)
 
+        self.attitude, self.R = Rotation.identity(), np.eye(3)
         self.uneven = np.array([1.0, 1.0, config.sinking**2])
 
     def update(self, s: np.ndarray) -> Status:
@@ -44,12 +45,14 @@ class NumpyFilter:
         if 0 < self.late < MOST_LATE:
             return Status.LATE
         dt, self.t, self.late = s[0] - self.t, s[0], 0
+        anew = late or dt > c.longest_gap
+        self._turn(s[column.QUAT], s[column.GYRO], np.inf if anew else dt)
         self._look_at_feet(s, speeds)
         if not self.running:
             self.running, self.P[3:6, 3:6] = True, c.initial_speed**2 * np.eye(3)
             self.P[21:, 21:] = np.diag([c.level_noise, c.slope_walk, c.slope_walk]) ** 2
             self.P[6:9, 6:9], self.x[2] = c.initial_bias**2 * np.eye(3), c.foot_radius - self.arm[:, 2].min()
-        if late or dt > c.longest_gap:
+        if anew:
             if np.isfinite(dt):
                 self._widen_speed()
             for leg in range(4):
@@ -60,9 +63,16 @@ class NumpyFilter:
         self._correct(dt)
         return Status.OK
 
+    def _turn(self, quat: np.ndarray, gyro: np.ndarray, dt: float) -> None:
+        attitude = Rotation.from_quat(quat, scalar_first=True)
+        if np.isfinite(dt) and self.c.attitude_time > 0:
+            turned = (self.attitude * Rotation.from_quat([*(0.5 * dt * gyro), 1.0])).as_quat()
+            keep, reported = np.exp(-dt / self.c.attitude_time), attitude.as_quat()
+            attitude = Rotation.from_quat(keep * turned + (1 - keep) * np.copysign(1, turned @ reported) * reported)
+        self.attitude, self.R = attitude, attitude.as_matrix()
+
     def _look_at_feet(self, s: np.ndarray, speeds: bool) -> None:
-        c, w = self.c, s[column.GYRO]
-        R = self.R = Rotation.from_quat(s[column.QUAT], scalar_first=True).as_matrix()
+        c, R, w = self.c, self.R, s[column.GYRO]
         self.w = w
         feet = [foot(leg, q) for leg, q in zip(c.legs, s[column.Q].reshape(4, 3), strict=True)]
         p, J, turn = (np.array(part) for part in zip(*feet, strict=True))

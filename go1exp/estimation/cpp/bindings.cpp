@@ -102,6 +102,7 @@ PYBIND11_MODULE(_kalman, m) {
       .def_readwrite("acceleration_noise", &Settings::acceleration_noise)
       .def_readwrite("impact_acceleration", &Settings::impact_acceleration)
       .def_readwrite("bias_walk", &Settings::bias_walk)
+      .def_readwrite("attitude_time", &Settings::attitude_time)
       .def_readwrite("attitude_noise", &Settings::attitude_noise)
       .def_readwrite("gyro_noise", &Settings::gyro_noise)
       .def_readwrite("joint_noise", &Settings::joint_noise)

@@ -41,7 +41,7 @@ struct Settings {
   Source contact_source = Source::force;
   double contact_low = 0.0, contact_high = 1.0, contact_least = 0.1, settle = 0.0;
   double acceleration_noise = 1.0, impact_acceleration = 1.0, bias_walk = 0.0;
-  double attitude_noise = 0.0, gyro_noise = 0.0, joint_noise = 0.0, joint_speed_noise = 0.0;
+  double attitude_time = 0.0, attitude_noise = 0.0, gyro_noise = 0.0, joint_noise = 0.0, joint_speed_noise = 0.0;
   double leg_noise = 0.01, foot_drift = 0.01, foot_speed_noise = 0.0, sinking = 1.0, level_noise = 0.0, ground_walk = 0.0, slope_walk = 0.0;
   double initial_speed = 0.1, initial_bias = 0.1;
   double gate = 16.0, longest_gap = 0.1, lost_after = 0.5;
@@ -79,6 +79,7 @@ class Filter {
     unseen_ = 0.0;
     late_ = 0;
     time_ = -std::numeric_limits<double>::infinity();
+    attitude_.setIdentity();
     rot_.setIdentity();
     gyro_.setZero();
   }
@@ -92,13 +93,14 @@ class Filter {
     late_ = 0;
     time_ = s.t;
     gyro_ = s.gyro;
-    rot_ = Eigen::Quaterniond(s.quat[0], s.quat[1], s.quat[2], s.quat[3]).normalized().toRotationMatrix();
+    const bool anew = !running_ || late || dt > c_.longest_gap;
+    turn(s, anew ? std::numeric_limits<double>::infinity() : dt);
     look_at_feet(s);
     if (!running_) {
       start();
       return Status::started;
     }
-    if (late || dt > c_.longest_gap) {  // what the trunk did meanwhile is not known: keep the place, ask the feet anew
+    if (anew) {  // what the trunk did meanwhile is not known: keep the place, ask the feet anew
       widen_speed();
       for (int leg = 0; leg < kLegs; ++leg) anchor(leg);
       age_.setZero();
@@ -130,6 +132,22 @@ class Filter {
                                                              : true;
     return std::isfinite(s.t) && std::abs(s.quat.norm() - 1.0) < 0.1 && within(s.gyro, kMostTurning) &&
            within(s.acc, kMostAcceleration) && within(s.q, kMostAngle) && (!speeds_ || within(s.qd, kMostSpeed)) && loads;
+  }
+
+  // Attitude: the last one turned by the gyro, drawn towards the one that the IMU reports within attitude_time.
+  void turn(const Sample& s, double dt) {
+    Eigen::Quaterniond reported(s.quat[0], s.quat[1], s.quat[2], s.quat[3]);
+    reported.normalize();
+    if (std::isfinite(dt) && c_.attitude_time > 0.0) {
+      const Vec3 half = 0.5 * dt * s.gyro;
+      const Eigen::Quaterniond turned = attitude_ * Eigen::Quaterniond(1.0, half[0], half[1], half[2]).normalized();
+      const double keep = std::exp(-dt / c_.attitude_time), sign = turned.dot(reported) < 0.0 ? -1.0 : 1.0;
+      attitude_.coeffs() = keep * turned.coeffs() + (1.0 - keep) * sign * reported.coeffs();
+      attitude_.normalize();
+    } else {
+      attitude_ = reported;
+    }
+    rot_ = attitude_.toRotationMatrix();
   }
 
   // Feet against the IMU, in the world's axes: s_, their velocity u_ with the IMU held, that of a rolling foot, noises.
@@ -299,6 +317,7 @@ class Filter {
   int late_;
   State x_;
   Covariance P_;
+  Eigen::Quaterniond attitude_;
   Mat3 rot_;
   Vec3 gyro_;
   Vec4 contact_, age_;
