@@ -13,15 +13,15 @@ LOCK_VENV := build/lock-venv
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check bench lock clean
+.PHONY: help setup demo test check sanitise bench lock clean
 
 help: ## list the verbs
 	@echo "usage: make VERB"
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-6s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
-setup: $(OK) ## make .venv with the locked packages and go1exp in it (redone when pyproject.toml or the lock changes)
+setup: $(OK) ## make .venv with the locked packages and go1exp in it (redone when pyproject.toml, the lock or C++ changes)
 
-$(OK): pyproject.toml requirements/lock.txt
+$(OK): pyproject.toml requirements/lock.txt hatch_build.py $(wildcard go1exp/estimation/cpp/*)
 	@$(PY) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "go1exp needs Python 3.11 or newer with venv, but '$(PY)' is missing, older or has no venv."; \
 	  echo "Install python3.11 or name one: make setup PY=/path/to/python3.11"; exit 1; } >&2
@@ -34,6 +34,7 @@ $(OK): pyproject.toml requirements/lock.txt
 	@$(PIP) install -qq --require-hashes --no-deps -r requirements/lock.txt
 	@echo "setup 4/5: go1exp itself, editable"
 	@$(PIP) install -qq --no-build-isolation --no-deps -e .
+	@$(BIN)/python -c 'from go1exp.estimation import compiled; compiled()' 2>&1 | tail -n 1
 	@echo "setup 5/5: check that the packages fit together"
 	@$(PIP) check
 	@touch $@
@@ -60,6 +61,13 @@ check: setup ## formatting, lint and types; changes nothing
 	@echo "check 3/3: mypy"
 	@$(BIN)/mypy
 
+sanitise: setup ## the C++ filter once under the address and undefined-behaviour sanitisers
+	@echo "sanitise 1/2: build"
+	@$(BIN)/python hatch_build.py --sanitise build/sanitise
+	@echo "sanitise 2/2: the motions of tests/test_estimation.py, C++ against NumPy"
+	@LD_PRELOAD="$$($${CXX:-g++} -print-file-name=libasan.so)" ASAN_OPTIONS=detect_leaks=0 \
+	  $(BIN)/python tests/test_estimation.py build/sanitise
+
 bench: setup ## measure the speed of the environment, of training, of nets and effects
 	@echo "bench 1/3: environment"
 	@$(BIN)/go1exp bench suite=env
@@ -82,5 +90,5 @@ lock: ## resolve requirements/base.in into requirements/lock.txt, keeping the pi
 
 clean: ## remove .venv, build products and caches; keeps runs/ and outputs/
 	@echo "clean: $(VENV), build products and caches"
-	@rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) build dist *.egg-info go1exp/estimation/_kalman.*.so .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find go1exp tests -name __pycache__ -type d -prune -exec rm -rf {} +

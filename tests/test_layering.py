@@ -57,6 +57,8 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "importers/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     "audit/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     "excitations/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    # what the robot's computer runs
+    "estimation/": (*FOREIGN, "torch", "omegaconf", "go1exp.config", "go1exp.mdp", *UP),
     "compose.py": ("mujoco", "gymnasium", "stable_baselines3", "torch", "go1exp.config", *UP),
     # the MDP knows no engine, the engine no MDP
     "mdp/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.actuator", *UP),

@@ -1,0 +1,218 @@
+"""What the filter must know about a robot and its sensors. Plain data: it comes from JSON, and a bundle carries it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+
+from go1exp import data_root
+from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, explain
+from go1exp.robot import FOOT_RADIUS, HIP_OFFSET, LEGS, LINK_LENGTHS
+
+Vector = tuple[float, float, float]
+PositiveVector = tuple[Positive, Positive, Positive]
+
+POLYNOMIAL_TERMS = 35
+"""Monomials u0^i u1^j u2^k with i + j + k <= 4; i slowest, k fastest."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class ChainLeg:
+    """A leg whose hip turns about x, and thigh and calf about y; it hangs straight down at zero angles.
+
+    Attributes:
+        hip: where the hip's axis meets the thigh's plane at no abduction offset, trunk frame, m.
+        lengths: from the hip's axis sideways to the thigh (left is positive), thigh, calf, m.
+    """
+
+    hip: Vector
+    lengths: Vector
+    kind: Literal["chain"] = "chain"
+
+
+@dataclass(frozen=True, config=STRICT)
+class PolynomialLeg:
+    """A leg of any mechanism, calibrated: foot position as a polynomial of degree four in the three joint angles.
+
+    Attributes:
+        centre: angles about which it is written, rad.
+        scale: u = (q - centre) / scale, rad.
+        x: coefficients of the foot's x in the trunk's frame, m.
+        y: of its y.
+        z: of its z.
+    """
+
+    centre: Vector
+    scale: PositiveVector
+    x: Annotated[tuple[float, ...], Field(min_length=POLYNOMIAL_TERMS, max_length=POLYNOMIAL_TERMS)]
+    y: Annotated[tuple[float, ...], Field(min_length=POLYNOMIAL_TERMS, max_length=POLYNOMIAL_TERMS)]
+    z: Annotated[tuple[float, ...], Field(min_length=POLYNOMIAL_TERMS, max_length=POLYNOMIAL_TERMS)]
+    kind: Literal["polynomial"] = "polynomial"
+
+
+LegConfig = Annotated[ChainLeg | PolynomialLeg, Field(discriminator="kind")]
+
+
+@dataclass(frozen=True, config=STRICT)
+class FilterConfig:
+    """The filter's settings; ``docs/estimation.md`` has the equations they stand in.
+
+    Noises are standard deviations per sample, but for those "per root second", which grow with the time between
+    samples. ``kinematics`` below means the foot's position that the joint angles give.
+
+    Attributes:
+        legs: four legs; their order is that of every array.
+        imu_position: of the accelerometer in the trunk's frame, m. IMU axes are the trunk's.
+        foot_radius: of a foot that rolls, m; 0 for a point. Rolling needs ``ChainLeg`` and joint velocities.
+        contact_source: ``force`` (foot sensors, N), ``torque`` (the vertical force that the joint torques balance, N)
+            or ``height`` (minus the height of a foot above the mean of the two lowest, trunk frame, m: for robots that
+            feel nothing, on flat ground).
+        contact_low: source's value at which a foot carries nothing.
+        contact_high: value from which on it is trusted in full; contact grows linearly between the two.
+        contact_least: contact below which a foot is in the air, above 0.
+        settle: time after touch-down for which a foot is not yet trusted, s (impact gating).
+        acceleration_noise: of the accelerometer and of what attitude errors make of gravity, m/s2 per root hertz.
+        impact_acceleration: excess of the measured acceleration over gravity that doubles its noise, m/s2.
+        bias_walk: of the accelerometer's offset, m/s2 per root second.
+        attitude_time: time within which the attitude, turned by the gyro, is drawn to the reported one, s; 0 takes it
+            as it is reported.
+        attitude_noise: error of the attitude, rad.
+        gyro_noise: rad/s.
+        joint_noise: of a joint angle, rad.
+        joint_speed_noise: of a joint velocity, rad/s.
+        leg_noise: of the kinematics beside the angles' error: flexing, m.
+        foot_drift: of a foot on the ground, horizontally, m per root second; slip that is too slow to see.
+        foot_speed_noise: of a foot on the ground, horizontally, m/s; 0 leaves joint velocities out of the correction.
+        sinking: how many times more a foot moves vertically than the two above: ground and sole give way at each step.
+        level_noise: difference in height of a foot just set down from the ground so far, m; 0 for no such rule.
+        ground_walk: how the ground's height under the robot departs from its slope, m per root second.
+        slope_walk: how the slope changes, per root second (and its standard deviation at the start).
+        initial_speed: of the trunk at the start and after a gap, m/s.
+        initial_bias: of the accelerometer's offset, m/s2.
+        gate: squared Mahalanobis distance (3 degrees of freedom) beyond which a foot slips (16.3: one in a thousand).
+        longest_gap: time without samples beyond which speed and feet are learnt anew, s.
+        lost_after: time for which every foot on the ground contradicts the filter before it gives way, s.
+    """
+
+    legs: tuple[LegConfig, LegConfig, LegConfig, LegConfig]
+    imu_position: Vector
+    foot_radius: NonNegative
+    contact_source: Literal["force", "torque", "height"]
+    contact_low: float
+    contact_high: float
+    contact_least: Annotated[float, Field(gt=0, le=1)]
+    settle: NonNegative
+    acceleration_noise: Positive
+    impact_acceleration: Positive
+    bias_walk: NonNegative
+    attitude_time: NonNegative
+    attitude_noise: NonNegative
+    gyro_noise: NonNegative
+    joint_noise: NonNegative
+    joint_speed_noise: NonNegative
+    leg_noise: Positive
+    foot_drift: Positive
+    foot_speed_noise: NonNegative
+    sinking: Positive
+    level_noise: NonNegative
+    ground_walk: NonNegative
+    slope_walk: NonNegative
+    initial_speed: Positive
+    initial_bias: NonNegative
+    gate: Positive
+    longest_gap: Positive
+    lost_after: Positive
+
+    @model_validator(mode="after")
+    def _consistent(self) -> FilterConfig:
+        if self.contact_low >= self.contact_high:
+            raise ValueError("contact_high: must exceed contact_low")
+        if self.foot_radius > 0 and any(leg.kind != "chain" for leg in self.legs):
+            raise ValueError("foot_radius: only the feet of chains roll; set it to 0")
+        return self
+
+
+_CONFIG = TypeAdapter(FilterConfig)
+
+
+def go1_legs() -> tuple[ChainLeg, ChainLeg, ChainLeg, ChainLeg]:
+    """Return the legs of the Go1 in its order FR FL RR RL (dimensions: ``go1exp.robot``)."""
+    (x, y), (side, thigh, calf) = HIP_OFFSET, LINK_LENGTHS
+    signs = [(1.0 if leg[0] == "F" else -1.0, 1.0 if leg[1] == "L" else -1.0) for leg in LEGS]
+    fr, fl, rr, rl = (ChainLeg((front * x, left * y, 0.0), (left * side, thigh, calf)) for front, left in signs)
+    return fr, fl, rr, rl
+
+
+def go1(**changes: Any) -> FilterConfig:
+    """Return the settings of the Go1; keyword arguments replace some.
+
+    Kinematics and the IMU's place are the vendor's; joint, gyro and attitude noise are the standard deviations of the
+    paper's Table II (uniform 0.05 rad, 0.1 rad/s, 0.01 rad/s and 0.05). The rest was chosen on simulated walks, see
+    ``docs/estimation.md``.
+    """
+    usual: dict[str, Any] = {
+        "legs": go1_legs(),
+        "imu_position": (-0.01592, -0.06659, -0.00617),
+        "foot_radius": FOOT_RADIUS,
+        "contact_source": "force",
+        "contact_low": 5.0,
+        "contact_high": 25.0,
+        "contact_least": 0.1,
+        "settle": 0.01,
+        "acceleration_noise": 0.03,
+        "impact_acceleration": 10.0,
+        "bias_walk": 0.01,
+        "attitude_time": 0.1,
+        "attitude_noise": 0.029,
+        "gyro_noise": 0.006,
+        "joint_noise": 0.029,
+        "joint_speed_noise": 0.058,
+        "leg_noise": 0.002,
+        "foot_drift": 0.02,
+        "foot_speed_noise": 0.2,
+        "sinking": 30.0,
+        "level_noise": 0.03,
+        "ground_walk": 0.05,
+        "slope_walk": 0.1,
+        "initial_speed": 0.5,
+        "initial_bias": 0.2,
+        "gate": 16.3,
+        "longest_gap": 0.1,
+        "lost_after": 0.5,
+    }
+    return FilterConfig(**{**usual, **changes})
+
+
+def scaler(**changes: Any) -> FilterConfig:
+    """Return the settings of UCLA's SCALER (legs FL FR RR RL), whose five-bar legs are calibrated polynomials."""
+    return from_json(
+        (data_root() / "assets/estimation/scaler.json").read_text(), "assets/estimation/scaler.json", changes
+    )
+
+
+def from_json(text: str, where: str, changes: dict[str, Any] | None = None) -> FilterConfig:
+    """Read settings from a JSON object; ``changes`` replace some.
+
+    Raises:
+        ConfigError: if something is missing, unknown or of a wrong value; ``where`` names the text.
+    """
+    try:
+        return _CONFIG.validate_json(json.dumps({**json.loads(text), **(changes or {})}))
+    except json.JSONDecodeError as error:
+        raise ConfigError([f"{where}: not JSON ({error})"]) from error
+    except ValidationError as error:
+        raise ConfigError(explain(error, where, FilterConfig.__dataclass_fields__)) from error
+
+
+def load(path: Path) -> FilterConfig:
+    """Read settings from a JSON file (see ``from_json``)."""
+    return from_json(Path(path).read_text(), str(path))
+
+
+def to_json(config: FilterConfig) -> str:
+    """Write settings as JSON, for a bundle or a file of one's own."""
+    return _CONFIG.dump_json(config, indent=1).decode()

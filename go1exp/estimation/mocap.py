@@ -1,0 +1,115 @@
+"""The filter beside plain leg odometry on SCALER's walks under motion capture (``scaler_walk_mocap``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import interp1d
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
+
+from go1exp.estimation import FilterConfig
+from go1exp.estimation import readings as column
+from go1exp.estimation.legs import foot
+from go1exp.estimation.replay import SCALER_LOG, Log, estimate, samples
+from go1exp.importers import import_recordings
+from go1exp.importers.source import load_npz
+
+GRID = 0.01
+"""Step at which motion capture is differentiated and compared, s."""
+
+WINDOW = 15
+"""Samples over which a cubic is fitted to its positions (Savitzky-Golay): 0.15 s, a third of a stride."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One run.
+
+    Attributes:
+        run: its name.
+        truth_distance: between start and end by motion capture, m.
+        filter_rmse: of the forward velocity, m/s, over the whole run.
+        filter_distance: (distance by the filter) / truth - 1.
+        odometry_rmse: the same two of leg odometry.
+        odometry_distance: ...
+    """
+
+    run: str
+    truth_distance: float
+    filter_rmse: float
+    filter_distance: float
+    odometry_rmse: float
+    odometry_distance: float
+
+
+def truth(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times (T,), s, positions (T, 3), m, and forward speed (T,), m/s, by motion capture.
+
+    Forward is the trunk's x axis without its slope. Lost samples are bridged by straight lines.
+    """
+    data = load_npz(path)
+    valid = data.numbers("mocap_valid") > 0
+    t, position = data.numbers("mocap_t")[valid], data.numbers("mocap_pos", 3)[valid]
+    attitude = Rotation.from_quat(data.numbers("mocap_quat_xyzw", 4)[valid])
+    heading = np.unwrap(
+        _heading((attitude * Rotation.from_matrix(data.numbers("mocap_to_body_rot", 3)).inv()).as_matrix())
+    )
+    grid = np.arange(t[0], t[-1], GRID)
+    place = interp1d(t, position, axis=0)(grid)
+    velocity = savgol_filter(place, WINDOW, 3, deriv=1, delta=GRID, axis=0)
+    return grid, place, _forward(velocity, np.interp(grid, t, heading))
+
+
+def _heading(rotation: np.ndarray) -> np.ndarray:
+    return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+
+
+def _forward(velocity_w: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    return np.cos(heading) * velocity_w[:, 0] + np.sin(heading) * velocity_w[:, 1]
+
+
+def odometry(rows: np.ndarray, config: FilterConfig) -> np.ndarray:
+    """Return the trunk's velocity (T, 3) in the world by legs alone: the mean of what the two lowest feet say.
+
+    Args:
+        rows: samples (T, 51).
+        config: for its legs.
+    """
+    t, q = rows[:, column.T], rows[:, column.Q].reshape(-1, 4, 3)
+    feet = np.array([[foot(leg, angles)[0] for leg, angles in zip(config.legs, row, strict=True)] for row in q])
+    speed = np.gradient(feet, t, axis=0) + np.cross(rows[:, None, column.GYRO], feet)
+    low = np.argsort(feet[:, :, 2], axis=1)[:, :2]
+    mean = -np.take_along_axis(speed, low[:, :, None], axis=1).mean(axis=1)
+    return Rotation.from_quat(rows[:, column.QUAT], scalar_first=True).apply(mean)
+
+
+def judge(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Judgement:
+    """Compare filter and odometry with motion capture, from 0.05 s after a run's start to its end.
+
+    Odometry gets the same joint angles at the same times as the filter.
+    """
+    (recording,) = import_recordings("scaler_walk_mocap", path, {})
+    found, rows = estimate(recording, config, log), samples(recording, log)
+    rotation = Rotation.from_quat(found.quat, scalar_first=True)
+    heading = _heading(rotation.as_matrix())
+    leg_velocity = odometry(rows, config)
+    leg_place = np.cumsum(leg_velocity * np.gradient(found.t)[:, None], axis=0)
+    grid, place, speed = truth(path)
+    within = (grid >= found.t[0] + 0.05) & (grid <= found.t[-1])
+    grid, place, speed = grid[within], place[within], speed[within]
+    distance = _distance(place)
+
+    def errors(velocity_w: np.ndarray, position_w: np.ndarray) -> tuple[float, float]:
+        error = np.interp(grid, found.t, _forward(velocity_w, heading)) - speed
+        return float(np.sqrt(np.mean(error**2))), _distance(interp1d(found.t, position_w, axis=0)(grid)) / distance - 1
+
+    filtered = errors(rotation.apply(found.velocity_b), found.position_w)
+    return Judgement(path.stem, distance, *filtered, *errors(leg_velocity, leg_place))
+
+
+def _distance(place: np.ndarray) -> float:
+    """From first to last, in the plane."""
+    return float(np.linalg.norm(place[-1, :2] - place[0, :2]))

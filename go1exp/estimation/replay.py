@@ -1,0 +1,107 @@
+"""The filter on a recording: what a robot would have known at each sample, from the log alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.estimation import FilterConfig, make_filter
+from go1exp.estimation import readings as column
+from go1exp.estimation.attitude import GRAVITY, levelled
+from go1exp.recording import FOOT_FORCE, VECTORS, Recording, RecordingError
+
+JOINTS = 12
+
+
+@dataclass(frozen=True)
+class Log:
+    """How a logger departs from the format, where it does.
+
+    Attributes:
+        joint_lead_s: joint angles are this much ahead of the IMU: they are used when the IMU has caught up, s.
+        reversed_acceleration: the accelerometer reports gravity right, and all other acceleration with its sign turned
+            (gravity was added where it is to be taken off).
+        levelling_s: see ``attitude.levelled``, used where the log has no ``imu_quat``, s.
+    """
+
+    joint_lead_s: float = 0.0
+    reversed_acceleration: bool = False
+    levelling_s: float = 10.0
+
+
+SCALER_LOG = Log(joint_lead_s=0.085, reversed_acceleration=True)
+"""``scaler_walk_mocap``. Against motion capture its acceleration, less gravity, correlates with -0.6 to -0.9 on every
+axis and in every run; its joints move 80 to 90 ms before IMU and body do, and stop as much earlier."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the filter made of a log; rows as in the recording.
+
+    Attributes:
+        t: s (T,).
+        position_w: of the trunk's origin, m (T, 3); the world begins below the first sample, heading as the IMU says.
+        velocity_b: of the trunk's origin in its own axes, m/s (T, 3).
+        quat: attitude that was used, w-x-y-z (T, 4).
+        contact: of each foot, 0 to 1 (T, 4).
+        status: what became of each sample, ``Status`` (T,).
+    """
+
+    t: np.ndarray
+    position_w: np.ndarray
+    velocity_b: np.ndarray
+    quat: np.ndarray
+    contact: np.ndarray
+    status: np.ndarray
+
+
+def samples(recording: Recording, log: Log | None = None) -> np.ndarray:
+    """Return the log as the filter's input, ``(T, 51)``; what it lacks is NaN.
+
+    Raises:
+        RecordingError: if the robot has not twelve joints, or the IMU or the joint angles are missing.
+    """
+    log = log or Log()
+    joints = recording.meta.joints
+    if len(joints) != JOINTS:
+        raise RecordingError(f"{recording.meta.episode}: has {len(joints)} joints; the filter is for legs of 4 x 3")
+    t = recording.t
+    rows = np.full((len(t), column.WIDTH), np.nan)
+    rows[:, column.T] = t
+    gyro, acc = (recording.block(*VECTORS[f"imu_{name}"]) for name in ("gyro", "acc"))
+    if VECTORS["imu_quat"][0] in recording.channels:
+        quat = recording.block(*VECTORS["imu_quat"])
+    else:
+        quat = levelled(t, gyro, acc, seconds=log.levelling_s)
+    if log.reversed_acceleration:
+        acc = 2 * GRAVITY * _vertical(quat) - acc
+    rows[:, column.GYRO], rows[:, column.ACC], rows[:, column.QUAT] = gyro, acc, quat
+    for place, name in ((column.Q, "q"), (column.QD, "qd"), (column.TAU, "tau_est")):
+        if name == "q" or recording.has(name):
+            values = recording.joint(name)
+            if log.joint_lead_s:
+                values = np.stack([np.interp(t - log.joint_lead_s, t, one) for one in values.T], axis=1)
+            rows[:, place] = values
+    feet = [FOOT_FORCE + joint.split("_")[0] for joint in joints[::3]]
+    if all(foot in recording.channels for foot in feet):
+        rows[:, column.FOOT_FORCE] = recording.block(*feet)
+    return rows
+
+
+def _vertical(quat: np.ndarray) -> np.ndarray:
+    """World's z axis in the body's (T, 3)."""
+    w, x, y, z = quat.T
+    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+
+
+def estimate(recording: Recording, config: FilterConfig, log: Log | None = None) -> Estimate:
+    """Run the compiled filter over a recording.
+
+    Raises:
+        RecordingError: if something is missing (see ``samples``).
+        EstimatorError: if the filter is not built.
+    """
+    rows = samples(recording, log)
+    found = make_filter(config).run(rows)
+    return Estimate(rows[:, column.T], found[:, :3], found[:, 3:6], rows[:, column.QUAT], found[:, 6:10], found[:, 10])
