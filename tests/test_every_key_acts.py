@@ -374,6 +374,8 @@ def variants(program: str, container: dict[str, Any], key: str, walk: Walk) -> d
     value = get(resolved(container), key)
     if special := OTHER.get(f"{program}:{key}"):
         return {key: [put(container, key, v) for v in special(walk)]}
+    if key == "policy":  # in place of a run
+        return {key: [put(put(container, "run", None), key, "paper")]}
     if value == {}:
         return {key: [drop(container, key)]}
     if key.endswith(".term") and key.split(".")[0] in (*MANY_TERMS, *ONE_TERM):
@@ -478,7 +480,7 @@ class Walk:
         if leaf.program in ("eval", "play", "export"):
             return [f"run={self.trained('run')}"]
         if leaf.program == "record":
-            walk = ["excitation=[policy]", f"run={self.trained('run')}"] if leaf.key in ("run", "episodes") else []
+            walk = ["excitation=[policy]", f"run={self.trained('run')}"] if leaf.key in ("run", "policy", "episodes") else []
             stand = ["support=ground"] if leaf.key == "sensors.truth" else []  # a held trunk does not move
             return ["backend.threads=1", *walk, *stand]
         if leaf.program == "record_audit":
