@@ -480,7 +480,11 @@ class Walk:
         if leaf.program in ("eval", "play", "export"):
             return [f"run={self.trained('run')}"]
         if leaf.program == "record":
-            walk = ["excitation=[policy]", f"run={self.trained('run')}"] if leaf.key in ("run", "policy", "episodes") else []
+            walk = (
+                ["excitation=[policy]", f"run={self.trained('run')}"]
+                if leaf.key in ("run", "policy", "episodes")
+                else []
+            )
             stand = ["support=ground"] if leaf.key == "sensors.truth" else []  # a held trunk does not move
             return ["backend.threads=1", *walk, *stand]
         if leaf.program == "record_audit":

@@ -343,8 +343,7 @@ class Go1Core:
 
     def _observe(self, s: Snapshot) -> Tensor:
         """(N, O) the configured observation of a snapshot, with its noise if that is on."""
-        if self.plant.effects.senses:
-            s = self.plant.sense(s)
+        s = self.plant.sense(s) if self.plant.effects.senses else s
         clean = torch.cat([t(s) for t in self.task.observation], dim=-1)
         if not self.noise:
             return clean

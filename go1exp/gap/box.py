@@ -209,3 +209,16 @@ def moved(theta: Theta, layout: Layout, columns: Sequence[Probe], x: np.ndarray,
         full[layout.joint[i] if layout.joint[i] >= 0 else slice(None)] += x[i]
         found[probe.key] = full.clip(p.low, p.high)
     return found
+
+
+def without(theta: Theta, name: str) -> Theta:
+    """Return the values without a term; a part of the box goes back inside."""
+    found = {}
+    for key, value in theta.items():
+        if key[0] == name:
+            p = param(key)
+            if name not in (*BOX, *ON_FEET) or not math.isfinite(p.tolerance):
+                continue
+            value = value.clip(p.null - p.tolerance, p.null + p.tolerance)
+        found[key] = value
+    return found

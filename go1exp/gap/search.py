@@ -344,7 +344,7 @@ class Search:
     def _eliminate(self, now: np.ndarray) -> None:
         """Drop terms without which the rest does as well."""
         for name in [t for t in self.terms if t != self.single and len(self.terms) > 1]:
-            rest = replace(self, terms=[t for t in self.terms if t != name], theta=_without(self.theta, name))
+            rest = replace(self, terms=[t for t in self.terms if t != name], theta=box.without(self.theta, name))
             rest.settle(1)
             without = self.held_out(rest.theta)
             gain = judge.gains(without, now[None])
@@ -358,7 +358,7 @@ class Search:
         for name in [t for t in self.terms if SIMPLER.get(t, t) not in self.terms]:
             other = SIMPLER[name]
             terms = [other if t == name else t for t in self.terms]
-            rest = replace(self, terms=terms, theta=_without(self.theta, name))
+            rest = replace(self, terms=terms, theta=box.without(self.theta, name))
             rest.settle(2)
             before, now = self.held_out(self.nominal), self.held_out(self.theta)
             gain, less = judge.gains(before, np.stack([now, self.held_out(rest.theta)])).mean(axis=1)
@@ -395,16 +395,3 @@ class Search:
         found = np.broadcast_to(value, (len(self.scorer.windows.joints),)).copy()
         found[mine] = found[mine].clip(p.null - p.tolerance, p.null + p.tolerance)
         return found
-
-
-def _without(theta: Theta, name: str) -> Theta:
-    """Return the values without a term; a part of the box goes back inside."""
-    found = {}
-    for key, value in theta.items():
-        if key[0] == name:
-            p = box.param(key)
-            if name not in (*box.BOX, *box.ON_FEET) or not math.isfinite(p.tolerance):
-                continue
-            value = value.clip(p.null - p.tolerance, p.null + p.tolerance)
-        found[key] = value
-    return found

@@ -1,0 +1,66 @@
+"""Every policy that comes with the package loads without its training, and walks as its table says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from go1exp.cli.settings import shipped_policies, trained
+from go1exp.evaluate.policy import load_run
+from go1exp.evaluate.rollout import EvalConfig, evaluate
+from go1exp.registry import ConfigError
+from go1exp.train import checkpoint
+
+NAMES = sorted(shipped_policies())
+
+
+def test_there_is_the_papers() -> None:
+    assert "paper" in NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_policy_walks_as_its_table_says(name: str) -> None:
+    folder = shipped_policies()[name]
+    config, policy, about = load_run(folder)
+    table = json.loads((folder / "eval_none.json").read_text())
+    assert table["policy"]["num_timesteps"] == about["num_timesteps"]
+    said = {tuple(c["command"]): c for c in table["commands"]}
+    wanted = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.2)]
+    off = dict.fromkeys(("noise", "randomize", "push", "train_ground"), False)
+    brief = EvalConfig(tuple(wanted), 2, duration_s=4.0, settle_s=2.0, policy_dt=None, seed=5, **off)
+    found = evaluate(config.task, policy, brief)
+    assert found["falls"] == 0
+    for row, command in zip(found["commands"], wanted, strict=True):
+        for axis in ("x", "y", "yaw"):
+            assert row["mean"][axis] == pytest.approx(said[command]["mean"][axis], abs=0.08), (command, axis)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_policy_brings_nothing_that_only_training_needs(name: str) -> None:
+    folder = shipped_policies()[name]
+    (file,) = checkpoint.checkpoints(folder)
+    state = checkpoint.read(file)
+    assert set(state) == {"format", "policy", "iteration", "num_timesteps"}
+    assert all(isinstance(v, torch.Tensor) for v in state["policy"].values())
+    assert sum(f.stat().st_size for f in folder.rglob("*")) < 5e6
+
+
+def test_what_is_wrong_with_the_choice_is_said(tmp_path: Path) -> None:
+    for given, said in (
+        ((None, None), "run: required, such as run=runs/NAME, or a shipped policy, such as policy=paper"),
+        ((str(tmp_path), "paper"), "only one of them"),
+        ((None, "papr"), "policy = 'papr': no such policy; there are paper"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            trained(given[0], given[1], "eval.json", None)
+        assert said in caught.value.problems[0]
+
+
+def test_results_of_a_shipped_policy_do_not_go_into_the_package() -> None:
+    folder, out = trained(None, "paper", "eval.json", None)
+    assert (folder / "config.yaml").is_file()
+    assert out == Path("paper_eval.json")
+    assert trained(None, "paper", "eval.json", "mine.json")[1] == Path("mine.json")
