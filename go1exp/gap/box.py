@@ -167,6 +167,22 @@ def bounds(
     return Bounds(low, high, centre, weight)
 
 
+RIDGES = (1e-9, 1e-7, 1e-5)
+"""What is added to a diagonal of ones: sums of float32 products of columns that say nearly the same can be indefinite."""
+
+
+def _definite(matrix: np.ndarray) -> np.ndarray:
+    """Return a matrix with a diagonal of ones (n, n), made positive definite by the least of the ridges that does."""
+    for ridge in RIDGES:
+        found = matrix + ridge * np.eye(len(matrix))
+        try:
+            np.linalg.cholesky(found)
+        except np.linalg.LinAlgError:
+            continue
+        return found
+    raise np.linalg.LinAlgError("normal equations are indefinite by far more than their rounding")
+
+
 def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:
     """Return the bounded minimum of x' A x - 2 b' x + weight (x - centre)^2.
 
@@ -176,7 +192,7 @@ def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:
         limits: of x.
     """
     scale = 1.0 / np.sqrt(np.diag(matrix) + limits.weight)
-    full = (matrix + np.diag(limits.weight)) * scale[:, None] * scale + 1e-9 * np.eye(len(scale))
+    full = _definite((matrix + np.diag(limits.weight)) * scale[:, None] * scale)
     aim = (right + limits.weight * limits.centre) * scale
     low, high = limits.low / scale, limits.high / scale
     # The primal-dual active set method (Hintermueller, Ito and Kunisch, 2002) needs a few solutions of equations where
