@@ -168,7 +168,7 @@ def bounds(
 
 
 RIDGES = (1e-9, 1e-7, 1e-5)
-"""What is added to a diagonal of ones: sums of float32 products of columns that say nearly the same can be indefinite."""
+"""What is added to a diagonal of ones: float32 sums of products of columns that say the same can be indefinite."""
 
 
 def _definite(matrix: np.ndarray) -> np.ndarray:
