@@ -217,6 +217,11 @@ class Leaf:
         return self.file.startswith("experiment/")
 
     @property
+    def term(self) -> str:
+        """Path of the term that the leaf is a parameter of."""
+        return ".".join(self.key.split(".")[:2])
+
+    @property
     def choice(self) -> list[str]:
         """Overrides that bring the file into the configuration."""
         group, _, choice = self.file.partition("/")
@@ -234,13 +239,19 @@ def flat(node: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield path, node
 
 
+def read(file: str, conf: Path = CONF) -> dict[str, Any]:
+    """What a file holds, without the choices that it makes."""
+    content = OmegaConf.to_container(OmegaConf.load(conf / f"{file}.yaml"))
+    assert isinstance(content, dict)
+    content.pop("defaults", None)
+    return {str(key): value for key, value in content.items()}
+
+
 def read_leaves(conf: Path = CONF) -> list[Leaf]:
     found = []
     for file in sorted(conf.rglob("*.yaml")):
         name = file.relative_to(conf).with_suffix("").as_posix()
-        content = OmegaConf.to_container(OmegaConf.load(file))
-        assert isinstance(content, dict)
-        content.pop("defaults", None)
+        content = read(name, conf)
         group = name.split("/")[0].replace("randomization", "rand") if "/" in name else ""
         prefix = "" if group == "experiment" else group
         found += [Leaf(name, key, value) for key, value in flat(content, prefix) if content]
@@ -269,6 +280,14 @@ def get(container: Mapping[str, Any], key: str) -> Any:
     for part in key.split("."):
         container = container[part]
     return container
+
+
+def has(container: Mapping[str, Any], key: str) -> bool:
+    try:
+        get(container, key)
+    except KeyError:
+        return False
+    return True
 
 
 def put(container: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
@@ -524,7 +543,9 @@ class Walk:
     def dead(self, leaf: Leaf) -> list[str]:
         """The leaf, or the elements of it, that make no difference."""
         before = self.setup(leaf)
-        if leaf.overlay and leaf.key not in SMALL["train"]:  # what an experiment sets is itself the other value
+        if leaf.overlay and not has(before, leaf.key):  # of a term that the experiment adds
+            before = put(before, leaf.term, get(read(leaf.file), leaf.term))
+        elif leaf.overlay and leaf.key not in SMALL["train"]:  # what an experiment sets is itself the other value
             return self.idle("train", before, leaf.key, {leaf.key: [put(before, leaf.key, leaf.value)]})
         return self.idle(leaf.program, before, leaf.key, variants(leaf.program, before, leaf.key, self))
 
@@ -916,16 +937,6 @@ def test_every_key_acts(leaf: Leaf, walk: Walk) -> None:
 
 def test_exemptions_are_needed() -> None:
     assert not stale(EXEMPT, (leaf.name for leaf in LEAVES))
-    only_choices = [leaf for leaf in LEAVES if EXEMPT.get(leaf.name, "").startswith("there is no other")]
-    assert len(only_choices) == 1
-
-
-@pytest.mark.parametrize("name", [name for name, why in EXEMPT.items() if why.startswith("there is no other")])
-def test_an_only_choice_is_still_the_only_one(name: str, walk: Walk) -> None:
-    leaf = next(leaf for leaf in LEAVES if leaf.name == name)
-    before = walk.setup(leaf)
-    (others,) = variants(leaf.program, before, leaf.key, walk).values()
-    assert not [other for other in others if not complaints(leaf.program, other)]
 
 
 def test_the_tables_hold_no_keys_that_are_gone() -> None:
