@@ -26,8 +26,9 @@ from go1exp.effects.rules import drive_problems
 from go1exp.errors import Expected
 from go1exp.registry import ConfigError, as_json, explain
 from go1exp.robot import JOINTS
-from go1exp.sim_robot.machine import Robot, SimConfig
+from go1exp.sim_robot.machine import Robot
 from go1exp.sim_robot.server import TRUTH, Server
+from go1exp.sim_robot.settings import SimConfig
 
 
 def task_of(bundle: str, other: dict[str, Any]) -> TaskConfig:
@@ -59,6 +60,14 @@ def sim_config(given: dict[str, Any]) -> SimConfig:
         raise ConfigError(explain(error, "sim", SimConfig.__dataclass_fields__)) from None
 
 
+def _line(descriptor: int) -> bytes:
+    """Read a line byte by byte, so that nothing behind it waits in a buffer where ``select`` would not see it."""
+    text = b""
+    while not text.endswith(b"\n") and (part := os.read(descriptor, 1)):
+        text += part
+    return text
+
+
 def _say(what: str, **content: Any) -> None:
     sys.stdout.write(json.dumps({"what": what, **content}) + "\n")
     sys.stdout.flush()
@@ -70,14 +79,14 @@ def main() -> int:
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: ended.append(number))
     torch.set_num_threads(1)
-    given = json.loads(sys.stdin.buffer.raw.readline())  # type: ignore[attr-defined]  # unbuffered: select sees the rest
+    given = json.loads(_line(sys.stdin.fileno()))
     try:
         config = sim_config(given.get("sim", {}))
         task = task_of(given["bundle"], given.get("robot", {}))
         server = Server(Robot(task, config), config, given.get("port", 0))
-    except (Expected, OSError) as error:
-        lines = error.problems if isinstance(error, ConfigError) else [str(error)]
-        _say("refused", message="; ".join(lines))
+    except (ConfigError, Expected, OSError) as error:
+        lines = error.problems if isinstance(error, ConfigError) else []
+        _say("refused", message=str(error), problems=lines)
         return 1
     _say("listening", port=server.port, pid=os.getpid())
 

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
-
 import numpy as np
 import torch
-from pydantic import ConfigDict, Field
 
 from go1exp import robot
 from go1exp.config import TaskConfig
@@ -19,7 +15,8 @@ from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
 from go1exp.randomness import EnvRandom
 from go1exp.record.tape import sample
-from go1exp.registry import STRICT, ConfigError, Fraction, NonNegative
+from go1exp.registry import ConfigError
+from go1exp.sim_robot.settings import SimConfig
 from go1exp.terrain import TerrainConfig, build_terrain
 
 TICK = 0.002
@@ -42,19 +39,6 @@ LYING_HEIGHT = 0.12
 
 SETTLE_S = 1.0
 """Time that it is given to come to rest before anybody may speak to it, s of its own clock."""
-
-
-@dataclass(frozen=True)
-class SimConfig:
-    """How the simulated robot is set up; ``conf/deploy.yaml`` says what each means."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    start: Literal["standing", "lying", "hung"] = "standing"
-    noise: NonNegative = 1.0
-    delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    loss: Annotated[Fraction, Field(lt=1)] = 0.0
-    seed: Annotated[int, Field(ge=0)] = 0
 
 
 class Robot:

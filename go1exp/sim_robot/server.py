@@ -13,7 +13,8 @@ import numpy as np
 from go1exp.deploy import wire
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.udp import HOST
-from go1exp.sim_robot.machine import TICK, Robot, SimConfig
+from go1exp.sim_robot.machine import TICK, Robot
+from go1exp.sim_robot.settings import SimConfig
 
 MOST_AT_ONCE = 10
 """Ticks that are made up for at once after a delay; beyond that the robot's time stands still (its clock tells)."""
