@@ -146,7 +146,8 @@ class Log:
             channels |= dict(zip(joint_channels(name, joints), states.part(name)[kept].T, strict=True))
         channels |= dict(zip(joint_channels("q_target", joints), targets.T, strict=True))
         quat = states.part("imu_quat")[kept]
-        quat = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+        length = np.linalg.norm(quat, axis=1, keepdims=True)
+        quat = quat / np.where(length > 0.5, length, np.nan)  # an IMU that has not started has no attitude
         vectors = {"imu_quat": quat} | {name: states.part(name)[kept] for name in ("imu_gyro", "imu_acc")}
         for name, values in vectors.items():
             channels |= dict(zip(VECTORS[name], values.T, strict=True))

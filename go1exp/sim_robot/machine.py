@@ -138,7 +138,7 @@ class Robot:
 
     def step(self) -> None:
         """Advance by a tick; drives that nobody has commanded for ``SILENCE`` brake."""
-        if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE:
+        if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE + 1e-9:
             self.braking = True
             self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
         self._plant.step(self._target)
