@@ -116,7 +116,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("train event.push.interval=[3,1]", ("event.push.interval = [3, 1]", "low must not exceed high")),
         ("eval run=x episodes=0", ("episodes = 0", "greater than or equal to 1")),
         ("eval run=x settle_s=30", ("settle_s = 30.0", "duration_s = 20.0")),
-        ("bench suite=fast", ("suite = 'fast'", "'env', 'train' or 'actuator'")),
+        ("bench suite=fast", ("suite = 'fast'", "'env', 'train'", "'deploy'")),
         # a misspelt choice
         ("train rand=tabel1", ("rand=tabel1", "did you mean 'table1'?")),
         ("train experiment=ablation/no_gat", ("experiment=ablation/no_gat", "did you mean 'ablation/no_gait'")),

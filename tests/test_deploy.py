@@ -11,10 +11,11 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ from go1exp.deploy.estimate import BLIND_S, KalmanEstimator, settings
 from go1exp.deploy.job import Job, do
 from go1exp.deploy.launch import RefusedError, RobotError
 from go1exp.deploy.log import About, Log, Ring
-from go1exp.deploy.messages import LowCmd, LowState
+from go1exp.deploy.messages import Link, LowCmd, LowState
 from go1exp.deploy.safety import RULES
 from go1exp.deploy.udp import UdpLink
 from go1exp.deploy.walk import FAULTS, STATUS, Plan
@@ -194,8 +195,6 @@ def test_a_link_drops_garbage_and_what_is_late_and_counts_it(
 def test_a_link_says_when_a_state_arrived_not_when_it_was_read(
     pair: tuple[UdpLink, socket.socket, tuple[str, int]],
 ) -> None:
-    import time
-
     link, other, address = pair
     other.sendto(wire.pack_state(make_state(), 1), address)
     time.sleep(0.05)
@@ -476,6 +475,24 @@ def test_a_robot_that_never_speaks_is_waited_for_and_not_commanded(file: str, tm
     assert done.recording is None
     assert done.account["fault"]["t"] - BEGIN == pytest.approx(0.3, abs=0.03)
     assert done.account["first_command_after_s"] is None or done.world.obeyed
+
+
+def test_a_link_that_breaks_ends_the_walk_with_a_log(file: str) -> None:
+    sent: list[LowCmd] = []
+    calls = iter(range(100))
+
+    def receive() -> list[LowState]:
+        if next(calls) == 5:
+            raise RobotError("the SDK failed")
+        return [make_state(time.perf_counter(), clock=math.nan, in_force=-1)]
+
+    link = SimpleNamespace(receive=receive, send=sent.append, close=lambda: None)
+    outcome = walk.go(load(file), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0))
+    assert outcome.fault is not None
+    assert (outcome.fault.name, outcome.fault.message) == ("runtime", "RobotError: the SDK failed")
+    assert outcome.status == STATUS["runtime"]
+    assert [command.damping for command in sent] == [False] * 5 + [True]
+    assert outcome.log.states.count == 5
 
 
 def test_every_fault_has_a_status_of_its_own() -> None:
@@ -860,3 +877,16 @@ def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytes
     with pytest.raises(RefusedError, match=r"sim\.loss = 2"):
         do(Job(file, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_bench_measures_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
+    from go1exp.bench import deploy
+
+    monkeypatch.setattr(deploy, "RATE", 100.0)
+    monkeypatch.setenv("PYTHONPATH", str(data_root()))
+    rounds: list[tuple[int, int]] = []
+    figures = deploy.run(compose("train", SMALL), 1, 1, 0.5, lambda *done: rounds.append(done))
+    assert rounds == [(1, 1)]
+    assert 0 < figures["command_p50_ms"] <= figures["command_p99_ms"]
+    assert figures["policy_us"] > 1
+    assert 20 < figures["memory_mb"] < 400

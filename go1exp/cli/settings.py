@@ -250,7 +250,7 @@ class BenchSettings:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    suite: Literal["env", "train", "actuator", "gpu"]
+    suite: Literal["env", "train", "actuator", "deploy", "gpu"]
     num_envs: Count
     rounds: Count
     seconds: Positive

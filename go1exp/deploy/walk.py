@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -175,7 +176,13 @@ def _go(
             if plan.seconds is not None and controller.phase == "walking" and walked > plan.seconds - 0.5 / rate:
                 ended = True
                 controller.finish(now)
-        return controller.cycle(now)
+        try:
+            return controller.cycle(now)
+        except Exception as error:  # of the link or the log: nothing else gets out of a cycle
+            safety.fail("runtime", f"{type(error).__name__}: {error}", now)
+            with contextlib.suppress(Exception):
+                link.send(safety.damping(None))
+            return False
 
     def report(timing: Timing) -> None:
         speed = "" if np.isnan(last).any() else f"; estimate {last[0]:+.2f} {last[1]:+.2f} {last[2]:+.2f} m/s"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 import socket
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -135,10 +136,11 @@ class Server:
     def serve(self, going: Callable[[], bool], seconds: float | None = None) -> Timing:
         """Run in real time while ``going``; return how the time was kept."""
         clock = MonotonicClock()
-        begin, calls = clock.now() - TICK * self.counts.ticks, 0
+        begin, calls = math.inf, 0
 
         def work(now: float) -> bool:
             nonlocal begin, calls
+            begin = min(begin, now - TICK * self.counts.ticks) if calls == 0 else begin
             due = int((now - begin) / TICK) + 1 - self.counts.ticks
             if due > MOST_AT_ONCE:
                 late = (due - MOST_AT_ONCE) * TICK
