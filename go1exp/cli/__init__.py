@@ -39,7 +39,7 @@ POSITIONAL: dict[str, tuple[str, ...]] = {
 }
 """Settings that may be given by position alone; ``files`` takes all that are left."""
 
-ALIASES = {"deploy": {"robot": "link", "command": "commands"}}
+ALIASES = {"deploy": {"robot": "link", "command": "commands"}, "eval": {"observation": "trunk_velocity"}}
 """Settings by the names that users give them where a group of choices has that name; Hydra would take that one."""
 
 VALUED = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn")

@@ -62,6 +62,7 @@ class EvalSettings:
     randomize: bool
     push: bool
     train_ground: bool
+    trunk_velocity: Literal["exact", "estimated"]
     policy_dt: Annotated[float, Field(gt=0, le=0.1)] | None
     seed: Annotated[int, Field(ge=0)]
     out: str | None

@@ -146,11 +146,9 @@ class Robot:
 
 
 def turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """Return the attitude w-x-y-z, turned by a small rotation vector (3,), rad, in its own axes."""
-    half = 0.5 * by
-    w, x, y, z = quat
-    a, b, c = half
-    new = np.array(
-        [w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a]
-    )
-    return new / np.linalg.norm(new)
+    """Return attitudes (..., 4), w-x-y-z, turned by small rotation vectors (..., 3), rad, in their own axes."""
+    w, x, y, z = np.moveaxis(quat, -1, 0)
+    a, b, c = np.moveaxis(0.5 * by, -1, 0)
+    parts = (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)
+    new = np.stack(parts, axis=-1)
+    return new / np.linalg.norm(new, axis=-1, keepdims=True)
