@@ -874,6 +874,11 @@ def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytes
     assert "No such file" in capfd.readouterr().err
     assert main([file, "--command", "fast", "--out", str(tmp_path)]) == 1
     assert capfd.readouterr().err.startswith("go1exp.deploy: command 'fast': must be three numbers")
+    assert main([file, "--robot", "dog", "--out", str(tmp_path)]) == 1
+    assert "robot=dog: must be sim, go1, or the port" in capfd.readouterr().err
+    with pytest.raises(SystemExit):
+        main([file, "--rate", "-5"])
+    assert "-5: must be greater than 0" in capfd.readouterr().err
     with pytest.raises(RefusedError, match=r"sim\.loss = 2"):
         do(Job(file, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
     assert list(tmp_path.iterdir()) == []

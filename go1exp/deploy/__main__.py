@@ -11,23 +11,40 @@ from go1exp.errors import Expected
 FAILED = 1
 
 
+def positive(text: str) -> float:
+    """Read a number greater than 0; raise argparse's error otherwise."""
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text}: must be greater than 0")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Read a number of at least 0; raise argparse's error otherwise."""
+    return 0.0 if float(text) == 0.0 else positive(text)
+
+
 def arguments(given: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser("python -m go1exp.deploy", description="Run a bundle's policy on a robot.")
     parser.add_argument("bundle", help="file that go1exp export wrote")
     parser.add_argument("--robot", default="sim", help="sim, go1, or the port where a simulated robot listens")
-    parser.add_argument("--rate", type=float, help="Hz of policy and commands; that of training if left out")
-    parser.add_argument("--seconds", type=float, help="s under the policy; until it is stopped if left out")
+    parser.add_argument("--rate", type=positive, help="Hz of policy and commands; that of training if left out")
+    parser.add_argument("--seconds", type=positive, help="s under the policy; until it is stopped if left out")
     parser.add_argument(
         "--command", default="0,0,0", help="x,y,yaw (m/s, rad/s), FILE.csv, sinusoid, keyboard, gamepad"
     )
     parser.add_argument("--amplitude", default="1,0.3,0.8", help="of the sinusoid")
-    parser.add_argument("--period", type=float, default=10.0, help="of the sinusoid, s")
-    parser.add_argument("--stand-up", type=float, default=2.0, help="s from the first pose to the nominal stance")
-    parser.add_argument("--brake", type=float, default=2.0, help="s for which the drives brake at the end")
-    parser.add_argument("--keep", type=float, default=120.0, help="newest seconds that the log has room for")
-    parser.add_argument("--stale", type=float, default=0.03, help="s without a state after which the robot is lost")
-    parser.add_argument("--spin", type=float, default=0.0, help="s before each cycle for which the core is kept busy")
+    parser.add_argument("--period", type=positive, default=10.0, help="of the sinusoid, s")
+    parser.add_argument(
+        "--stand-up", type=not_negative, default=2.0, help="s from the first pose to the nominal stance"
+    )
+    parser.add_argument("--brake", type=not_negative, default=2.0, help="s for which the drives brake at the end")
+    parser.add_argument("--keep", type=positive, default=120.0, help="newest seconds that the log has room for")
+    parser.add_argument("--stale", type=positive, default=0.03, help="s without a state after which the robot is lost")
+    parser.add_argument(
+        "--spin", type=not_negative, default=0.0, help="s before each cycle for which the core is kept busy"
+    )
     parser.add_argument("--out", default="deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
     sim.add_argument("--start", choices=("standing", "lying", "hung"), default="standing")

@@ -75,6 +75,8 @@ def _reached(job: Job, say: Say) -> Iterator[_Robot]:
             finally:
                 udp.close()
     else:
+        if not (job.robot.isascii() and job.robot.isdigit() and 0 < int(job.robot) < 2**16):
+            raise RobotError(f"robot={job.robot}: must be sim, go1, or the port where a simulated robot listens")
         udp = UdpLink(int(job.robot))
         try:
             yield _Robot(udp, simulated=True)
