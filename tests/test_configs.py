@@ -343,6 +343,7 @@ VERBS: dict[str, type] = {
     "gap": settings.GapVerb,
     "export": settings.ExportSettings,
     "export_check": settings.ExportCheckSettings,
+    "deploy": settings.DeploySettings,
     "fit-actuator": settings.FitActuatorSettings,
     "list": settings.ListSettings,
     "bench": settings.BenchSettings,

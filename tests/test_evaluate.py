@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from go1exp.env.core import Go1Core
 from go1exp.evaluate import table
 from go1exp.evaluate.policy import Policy, load_policy
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
+from go1exp.registry import ConfigError
 from go1exp.train import checkpoint, run_folder, trainer
 
 MakeTask = Callable[..., TaskConfig]
@@ -61,6 +63,31 @@ def topple(rows: Sequence[int], after: int = 0) -> Policy:
 @pytest.fixture
 def task(make_task: MakeTask) -> TaskConfig:
     return make_task("backend.threads=1")
+
+
+def test_an_estimated_velocity_stands_in_the_place_of_the_true_one(make_task: MakeTask) -> None:
+    """A robot that sways: but for the velocity it sees what it would see anyway, and the estimate follows the truth."""
+    task = make_task("backend.threads=1")
+    seen: dict[str, list[Tensor]] = {"exact": [], "estimated": []}
+    for how, kept in seen.items():
+
+        def sway(observation: Tensor, kept: list[Tensor] = kept) -> Tensor:
+            kept.append(observation.clone())
+            swing = 1.5 * math.sin(2 * math.pi * 1.5 * 0.02 * len(kept))
+            return torch.tensor([0.0, swing, -swing] * 4).repeat(len(observation), 1)
+
+        evaluate(task, sway, settings(trunk_velocity=how, duration_s=2.0))
+    exact, estimated = (torch.stack(kept) for kept in seen.values())
+    assert torch.equal(exact[:, :, 3:], estimated[:, :, 3:])
+    assert not torch.equal(exact[:, :, :3], estimated[:, :, :3])
+    assert exact[25:, :, :3].abs().max() > 0.1
+    assert (exact - estimated)[25:, :, :3].square().mean().sqrt() < 0.05
+
+
+def test_a_policy_that_does_not_see_the_velocity_cannot_be_given_an_estimate(make_task: MakeTask) -> None:
+    task = make_task("backend.threads=1", "~observation.base_linear_velocity")
+    with pytest.raises(ConfigError, match="the policy does not see base_linear_velocity"):
+        evaluate(task, stand, settings(trunk_velocity="estimated"))
 
 
 # ---------------------------------------------------------------------- statistics

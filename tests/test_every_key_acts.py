@@ -42,12 +42,14 @@ from go1exp.cli.record import RIG
 from go1exp.compose import config_folder, register_groups
 from go1exp.config import MANY_TERMS, ONE_TERM, parse_parts, parse_train
 from go1exp.deploy.bundle import loads
+from go1exp.deploy.walk import STATUS
 from go1exp.env.core import Go1Core
 from go1exp.export.build import build
 from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.registry import ConfigError, Range
+from go1exp.registry import ConfigError, Expected, Range
 from go1exp.train import run_folder, trainer
 from go1exp.types import Snapshot
+from tests.lockstep import lockstep
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
 
@@ -63,6 +65,7 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
+    "deploy.yaml:hydra": "Hydra's own settings",
     "model/go1.yaml:model": "the Go1 is that of the group robot",
     **{
         f"model/{name}.yaml:model": "a robot that is not simulated here; test_gap_machines.py shows what its keys do"
@@ -133,6 +136,7 @@ SMALL: dict[str, dict[str, Any]] = {
     },
     "export": {"seconds": 0.1},
     "export_check": {},
+    "deploy": {"seconds": 0.2, "stand_up": 0.06, "brake": 0.06, "patience": 0.1, "keep": 0.2},
     "list": {},
     "bench": {"num_envs": 4, "rounds": 1, "seconds": 0.1, "threads": 1},
 }
@@ -174,6 +178,8 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "export:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "export:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "export_check:file": lambda walk: [str(walk.exported("other", "seed=5"))],
+    "deploy:bundle": lambda walk: [str(walk.exported("other", "seed=5"))],
+    "deploy:rate": lambda walk: [100.0],
     "list:group": lambda walk: ["reward"],
     "bench:overrides": lambda walk: [["sim.physics_dt=0.004"]],
 }
@@ -341,6 +347,7 @@ SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
     "gap": (settings.GapVerb, ("robot", "model")),
     "export": (settings.ExportSettings, ()),
     "export_check": (settings.ExportCheckSettings, ()),
+    "deploy": (settings.DeploySettings, ("actuator", "effect")),
     "list": (settings.ListSettings, ()),
     "bench": (settings.BenchSettings, ()),
 }
@@ -514,6 +521,9 @@ class Walk:
             return [f"recordings={self.recorded('five', FIVE)}"]
         if leaf.program == "export_check":
             return [f"file={self.exported('run')}"]
+        if leaf.program == "deploy":
+            swings = ["commands=sinusoid"] if leaf.key.startswith("sinusoid.") else []
+            return [f"bundle={self.exported('run')}", *swings]
         if leaf.program == "gap":
             return [f"logs={self.recorded('held', HELD)}"]
         return []
@@ -868,6 +878,30 @@ def check_trace(container: dict[str, Any], walk: Walk) -> Trace:
     yield "said", [re.sub(r"\S+\.zip", "", line) for line in said.splitlines()]
 
 
+def deploy_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """Walks at a time of their own, with a robot that speaks, one that falls silent, and one that never speaks.
+
+    What its drives were told, cycle by cycle, and what was logged, but for the account, which repeats settings.
+    """
+    from go1exp.cli.deploy import APP
+
+    for silent_from in (np.inf, 0.08, 0.0):
+        with lockstep(lambda state, begin=silent_from: state if state.clock < begin else None) as world:  # type: ignore[misc]
+            try:
+                _, files = outcome(APP, container, walk, (0, *STATUS.values()))
+            except Expected as error:
+                yield "refused", str(error)
+                return
+        yield "clock", world.spins
+        yield "folders", sorted({Path(name).parent.as_posix() for name in files})
+        for name, content in sorted(files.items()):
+            if name.endswith(".npz"):
+                cycles = dict(np.load(io.BytesIO(content)))
+                yield "cycles", {name: values for name, values in cycles.items() if name != "phases"}
+            if name.endswith(".parquet"):
+                yield from recorded({name: content})
+
+
 def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
     from go1exp.cli.listing import APP
 
@@ -916,6 +950,7 @@ TRACES: dict[str, Callable[[dict[str, Any], Walk], Trace]] = {
     "gap": gap_trace,
     "export": export_trace,
     "export_check": check_trace,
+    "deploy": deploy_trace,
     "list": list_trace,
     "bench": bench_trace,
 }

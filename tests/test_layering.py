@@ -23,7 +23,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
 
 FOREIGN = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra")
-OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "export", "bench", "cli")
+OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "export", "sim_robot", "bench", "cli")
 
 
 def up(*but: str) -> tuple[str, ...]:
@@ -94,6 +94,12 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
         *(*FOREIGN, "torch", "onnx", "omegaconf", "pydantic", "scipy", "rich", "go1exp.registry", "go1exp.config"),
         *("go1exp.robot", "go1exp.types", "go1exp.compose", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
     ),
+    # the simulated robot: the runtime's messages on one side, the plant on the other
+    "sim_robot/": (
+        *("mujoco", "gymnasium", "stable_baselines3", "hydra", "omegaconf", "go1exp.compose"),
+        *up("physics", "env", "record", "sim_robot"),
+    ),
+    "sim_robot/settings.py": (*FOREIGN, "torch", "go1exp.config", *up("sim_robot")),
     "evaluate/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
 }
@@ -287,7 +293,7 @@ def test_every_public_name_is_documented(name: str) -> None:
 
 
 def test_only_what_talks_to_people_prints() -> None:
-    talkers = ("cli/", "train/", "evaluate/")
+    talkers = ("cli/", "train/", "evaluate/", "deploy/__main__.py")
     printing = {
         f"{name}:{node.lineno}"
         for name, file in RELATIVE.items()

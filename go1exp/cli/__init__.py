@@ -16,6 +16,7 @@ VERBS = {
     "record": "drive the simulated robot and log it; audit recordings, import others",
     "gap": "find where simulation and recordings disagree, name the missing effect, add it",
     "export": "pack a trained policy into one sealed file for the robot; check such a file",
+    "deploy": "run a bundle's policy in real time on a robot, or on a simulated one in another process",
     "fit-actuator": "learn an actuator net from recordings",
     "list": "list terms, groups and their choices, one line each",
     "bench": "measure speed as ratios in one run",
@@ -33,9 +34,13 @@ POSITIONAL: dict[str, tuple[str, ...]] = {
     "record_import": ("source", "path"),
     "export_check": ("file",),
     "gap": ("stage",),
+    "deploy": ("bundle",),
     "list": ("group",),
 }
 """Settings that may be given by position alone; ``files`` takes all that are left."""
+
+ALIASES = {"deploy": {"robot": "link", "command": "commands"}, "eval": {"observation": "trunk_velocity"}}
+"""Settings by the names that users give them where a group of choices has that name; Hydra would take that one."""
 
 VALUED = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn")
 """Options of Hydra whose value is the word after them."""
@@ -84,7 +89,8 @@ def _by_name(verb: str, arguments: list[str]) -> list[str]:
     keys = list(POSITIONAL.get(verb, ()))
     words: list[str] = []
     rest: list[str] = []
-    for before, word in zip(["", *arguments], arguments, strict=False):
+    for before, given in zip(["", *arguments], arguments, strict=False):
+        word = _own_name(verb, given)
         own = "=" in word or word.startswith(("-", "~")) or before in VALUED
         (rest if own or not keys else words).append(word)
     named = []
@@ -94,6 +100,12 @@ def _by_name(verb: str, arguments: list[str]) -> list[str]:
         if words:
             named.append(f"{key}={_quoted(words.pop(0))}")
     return [*rest, *named, *words]
+
+
+def _own_name(verb: str, word: str) -> str:
+    """Return an override with the key that the verb's configuration has for it."""
+    key, equals, value = word.partition("=")
+    return ALIASES.get(verb, {}).get(key, key) + equals + value
 
 
 def _quoted(word: str) -> str:

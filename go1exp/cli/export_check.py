@@ -82,9 +82,18 @@ def summary(bundle: Bundle) -> list[tuple[str, str]]:
         ("rates", f"policy {1 / about.policy_dt:g} Hz, drives {1 / about.physics_dt:g} Hz (in training)"),
         ("action", f"target = nominal stance + {about.action_scale:g} rad x action, cut at +-{about.action_clip:g}"),
         ("commands", ranges or "unknown"),
-        ("estimator", ", ".join(f"{k} {v:g}" for k, v in about.estimator.items()) or "no settings of its own"),
+        ("estimator", estimator(about.estimator)),
         ("exported by", f"go1exp {versions.get('go1exp')}, Python {versions.get('python')}, {packages}"),
     ]
+
+
+def estimator(settings: dict[str, Any]) -> str:
+    """Return the estimator's settings in a line, without its legs."""
+    plain = {name: value for name, value in settings.items() if not isinstance(value, list | dict)}
+    told = (
+        f"{name} {value:g}" if isinstance(value, float | int) else f"{name} {value}" for name, value in plain.items()
+    )
+    return ", ".join(told) or "no settings of its own: those of a Go1"
 
 
 APP = App("export_check", _task, title="export check")

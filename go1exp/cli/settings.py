@@ -13,6 +13,7 @@ from go1exp import data_root
 from go1exp.gap.result import GapSettings
 from go1exp.record.plan import Wishes
 from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
+from go1exp.sim_robot.settings import SimConfig
 
 T = TypeVar("T")
 
@@ -24,6 +25,7 @@ REQUIRED = {
     "path": "go1exp record import go2_in_air PATH",
     "recordings": "recordings=recordings",
     "logs": "logs=recordings",
+    "bundle": "go1exp deploy runs/NAME/bundle.zip",
 }
 """Settings without a default, and how they are given."""
 
@@ -60,6 +62,7 @@ class EvalSettings:
     randomize: bool
     push: bool
     train_ground: bool
+    trunk_velocity: Literal["exact", "estimated"]
     policy_dt: Annotated[float, Field(gt=0, le=0.1)] | None
     seed: Annotated[int, Field(ge=0)]
     out: str | None
@@ -159,6 +162,39 @@ class ExportCheckSettings:
 
 
 @dataclass(frozen=True)
+class SinusoidSettings:
+    """Sines of all three velocities: amplitudes m/s, m/s, rad/s, and their period, s."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    amplitude: tuple[float, float, float]
+    period: Positive
+
+
+@dataclass(frozen=True)
+class DeploySettings:
+    """``conf/deploy.yaml`` without the groups."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    bundle: Annotated[str, Field(min_length=1)]
+    link: Literal["sim", "go1"]
+    commands: tuple[float, float, float] | str
+    sinusoid: SinusoidSettings
+    rate: Annotated[float, Field(ge=10, le=1000)] | None
+    seconds: Positive | None
+    stand_up: NonNegative
+    brake: NonNegative
+    patience: Positive
+    keep: Annotated[float, Field(gt=0, le=3600)]
+    stale: Positive
+    spin: Annotated[float, Field(ge=0, le=0.01)]
+    sim: SimConfig
+    truth: bool
+    out: str
+
+
+@dataclass(frozen=True)
 class FitActuatorSettings:
     """``conf/fit-actuator.yaml``; what they mean and further rules are in ``go1exp.fit.FitSettings``."""
 
@@ -215,7 +251,7 @@ class BenchSettings:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    suite: Literal["env", "train", "actuator", "gpu"]
+    suite: Literal["env", "train", "actuator", "deploy", "gpu"]
     num_envs: Count
     rounds: Count
     seconds: Positive

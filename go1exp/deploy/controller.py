@@ -43,6 +43,7 @@ class Cycle:
         velocity: (3,) the command as the policy saw it.
         base_lin_vel: (3,) the estimate; NaN before the first.
         observation: (O,) what the network saw; None unless walking.
+        fresh: the states that came since the last cycle, oldest first.
     """
 
     t: float
@@ -52,6 +53,7 @@ class Cycle:
     velocity: np.ndarray
     base_lin_vel: np.ndarray
     observation: np.ndarray | None
+    fresh: Sequence[LowState] = ()
 
 
 class Controller:
@@ -139,8 +141,18 @@ class Controller:
             self._target = sent.joint_target
             self._link.send(sent)
         command = sent if heard else None
-        self._on_cycle(Cycle(now, self.phase, self._state, command, self._velocity, self._base, self._observation))
+        about = (self._velocity, self._base, self._observation, fresh)
+        self._on_cycle(Cycle(now, self.phase, self._state, command, *about))
         return self.phase != "damping" or now - self._since < self._brake
+
+    def finish(self, now: float) -> None:
+        """End the walk without a fault: from the next cycle on the drives brake, and then there is no next one."""
+        if self.phase != "damping":
+            self.phase, self._since = "damping", now
+
+    def walked(self, now: float) -> float:
+        """Return the time since walking began, s; 0 unless it is going on."""
+        return now - self._since if self.phase == "walking" else 0.0
 
     def _wanted(self, now: float, fresh: Sequence[LowState]) -> LowCmd | None:
         """Return what the present phase asks for; None if it asks for nothing."""

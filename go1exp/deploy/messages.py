@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -22,6 +23,9 @@ class LowState:
         imu_gyro: (3,) rad/s, trunk frame.
         imu_acc: (3,) specific force, m/s2, trunk frame.
         foot_force: (4,) in the sensor's own unit, not calibrated.
+        clock: the robot's own clock when it was measured, s; NaN if the robot tells none.
+        in_force: number of the newest command that the drives had then, counted from 1 by the link as it sends; 0 for
+            none yet, -1 if the robot does not tell.
     """
 
     t: float
@@ -32,6 +36,8 @@ class LowState:
     imu_gyro: np.ndarray
     imu_acc: np.ndarray
     foot_force: np.ndarray
+    clock: float = math.nan
+    in_force: int = -1
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class Metadata:
         physics_dt: period of the drives in training, s.
         command_ranges: lowest and highest command in training by name (m/s, m/s, rad/s); empty if there are none.
         conventions: frames, order of quaternions and signs, in words.
-        estimator: settings of the state estimator; empty until one is chosen.
+        estimator: settings of the state estimator (``go1exp.estimation.FilterConfig`` as JSON); empty: those of a Go1.
         trained: the policy's origin.
     """
 
@@ -89,7 +89,7 @@ class Metadata:
     physics_dt: float
     command_ranges: dict[str, tuple[float, float]]
     conventions: dict[str, str]
-    estimator: dict[str, float]
+    estimator: dict[str, Any]
     trained: Trained
 
     def __post_init__(self) -> None:
@@ -137,6 +137,8 @@ def _built(kind: type[T], content: Any, path: str) -> T:
 
 def _value(kind: Any, given: Any, path: str) -> Any:
     """Return ``given`` as the annotated type; lists stand for tuples."""
+    if kind is Any:
+        return given
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (types.UnionType, Union):  # only "or None" occurs
         return None if given is None else _value(inner[0], given, path)

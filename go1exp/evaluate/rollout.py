@@ -6,13 +6,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 from go1exp.backends import CpuBackend
 from go1exp.config import TaskConfig, time_rules
 from go1exp.env.core import Go1Core
+from go1exp.evaluate.estimated import EstimatedVelocity
 from go1exp.evaluate.policy import Policy
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.registry import ConfigError, Term, members
@@ -39,6 +40,7 @@ class EvalConfig:
         train_ground: the ground of training; else flat.
         policy_dt: another period of the policy, s, or None for that of training.
         seed: of everything random.
+        trunk_velocity: what the policy sees of it: ``exact``, or ``estimated`` by the filter from the robot's sensors.
     """
 
     commands: tuple[Command, ...]
@@ -51,6 +53,7 @@ class EvalConfig:
     train_ground: bool
     policy_dt: float | None
     seed: int
+    trunk_velocity: Literal["exact", "estimated"] = "exact"
 
     @classmethod
     def of(cls, settings: Any, **changes: Any) -> EvalConfig:
@@ -93,7 +96,9 @@ def evaluate(
     ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is told the progress in steps.
     """
     count = len(config.commands) * config.episodes
-    core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise)
+    estimated = config.trunk_velocity == "estimated"
+    core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=estimated)
+    seen = EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
     assert isinstance(core.command, FixedVelocity)
     commands = torch.tensor(config.commands, dtype=torch.float32)
     core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
@@ -108,7 +113,7 @@ def evaluate(
     velocity_sum = torch.zeros(count, 3, dtype=torch.float64)
     square_sum = torch.zeros(count, 3, dtype=torch.float64)
     for step in range(steps):
-        result = core.step(policy(observation))
+        result = core.step(policy(seen(observation)))
         core.check(result)
         observation = result.observation
         fell |= alive & result.terminated

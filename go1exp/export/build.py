@@ -20,6 +20,7 @@ from go1exp.config import TaskConfig, parse_train
 from go1exp.deploy import bundle
 from go1exp.deploy.metadata import Metadata, Trained
 from go1exp.effects.rules import drives
+from go1exp.estimation import go1, to_json
 from go1exp.evaluate.policy import load_network
 from go1exp.export.graph import DeployedPolicy, ExportError, blocks, to_onnx
 from go1exp.export.trace import record
@@ -114,7 +115,7 @@ def metadata(task: TaskConfig, module: DeployedPolicy, about: dict[str, Any]) ->
         physics_dt=task.sim.physics_dt,
         command_ranges=command_ranges(task.command),
         conventions=CONVENTIONS,
-        estimator={},
+        estimator=json.loads(to_json(go1())),
         trained=Trained(
             checkpoint=file.name,
             sha256=hashlib.sha256(file.read_bytes()).hexdigest(),

@@ -20,7 +20,7 @@ from go1exp.gap.trial import excess
 from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
 
-UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
+UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m", "imu_gyro": "rad/s", "imu_acc": "m/s2"}
 
 
 @dataclass(frozen=True)

@@ -41,43 +41,44 @@ class Tape:
         """Take a sample before a step, with the target that takes force now."""
         if self._step % self._every == 0 and not self.full:
             row = self._step // self._every
-            for name, value in self._sample(target).items():
+            for name, value in (sample(self._plant, target) | {"torque_enable": self.enabled}).items():
                 now = value.cpu().numpy()
                 if name not in self._kept:
                     self._kept[name] = np.zeros((self._rows, *now.shape), now.dtype)
                 self._kept[name][row] = now
         self._step += 1
 
-    def _sample(self, target: Tensor) -> dict[str, Tensor]:
-        plant, blocks = self._plant, self._plant.backend.sensors
-        readings = plant.backend.sensordata
-        quat = readings[:, blocks.imu_quat]
-        seen = plant.effects.measure(
-            Measured(
-                plant.q, plant.speed(), gyro=readings[:, blocks.imu_gyro], acc=readings[:, blocks.imu_acc], quat=quat
-            )
-        )
-        assert seen.gyro is not None
-        assert seen.acc is not None
-        assert seen.quat is not None
-        contact = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))
-        found = {
-            "q": seen.joint_pos,
-            "qd": seen.joint_vel,
-            "q_target": target,
-            "tau_est": plant.torque,
-            "gyro": seen.gyro,
-            "acc": seen.acc,
-            "quat": seen.quat,
-            "foot_force": contact[..., 1:].norm(dim=-1),
-            "torque_enable": self.enabled,
+
+def sample(plant: Plant, target: Tensor) -> dict[str, Tensor]:
+    """Return what the sensors of N robots would say at this moment without their noise, and the truth; (N, ...) each.
+
+    ``target`` (N, J) is the one that takes force now. A free trunk's pose and velocity are ``base_...``.
+    """
+    blocks, readings = plant.backend.sensors, plant.backend.sensordata
+    quat = readings[:, blocks.imu_quat]
+    seen = plant.effects.measure(
+        Measured(plant.q, plant.speed(), gyro=readings[:, blocks.imu_gyro], acc=readings[:, blocks.imu_acc], quat=quat)
+    )
+    assert seen.gyro is not None
+    assert seen.acc is not None
+    assert seen.quat is not None
+    contact = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))
+    found = {
+        "q": seen.joint_pos,
+        "qd": seen.joint_vel,
+        "q_target": target,
+        "tau_est": plant.torque,
+        "gyro": seen.gyro,
+        "acc": seen.acc,
+        "quat": seen.quat,
+        "foot_force": contact[..., 1:].norm(dim=-1),
+    }
+    qpos, qvel = plant.backend.qpos, plant.backend.qvel
+    if qpos.shape[1] > robot.NUM_JOINTS:
+        found |= {
+            "base_pos": qpos[:, :3],
+            "base_quat": qpos[:, 3:7],
+            "base_lin_vel": qvel[:, :3],
+            "base_ang_vel": qvel[:, 3:6],
         }
-        qpos, qvel = plant.backend.qpos, plant.backend.qvel
-        if qpos.shape[1] > robot.NUM_JOINTS:
-            found |= {
-                "base_pos": qpos[:, :3],
-                "base_quat": qpos[:, 3:7],
-                "base_lin_vel": qvel[:, :3],
-                "base_ang_vel": qvel[:, 3:6],
-            }
-        return found
+    return found

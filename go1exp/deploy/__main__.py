@@ -1,0 +1,88 @@
+"""``python -m go1exp.deploy FILE ...``: ``go1exp deploy`` without Hydra, for the robot's own computer."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from go1exp.errors import Expected
+
+FAILED = 1
+
+
+def positive(text: str) -> float:
+    """Read a number greater than 0; raise argparse's error otherwise."""
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text}: must be greater than 0")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Read a number of at least 0; raise argparse's error otherwise."""
+    return 0.0 if float(text) == 0.0 else positive(text)
+
+
+def arguments(given: Sequence[str]) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser("python -m go1exp.deploy", description="Run a bundle's policy on a robot.")
+    parser.add_argument("bundle", help="file that go1exp export wrote")
+    parser.add_argument("--robot", default="sim", help="sim, go1, or the port where a simulated robot listens")
+    parser.add_argument("--rate", type=positive, help="Hz of policy and commands; that of training if left out")
+    parser.add_argument("--seconds", type=positive, help="s under the policy; until it is stopped if left out")
+    parser.add_argument(
+        "--command", default="0,0,0", help="x,y,yaw (m/s, rad/s), FILE.csv, sinusoid, keyboard, gamepad"
+    )
+    parser.add_argument("--amplitude", default="1,0.3,0.8", help="of the sinusoid")
+    parser.add_argument("--period", type=positive, default=10.0, help="of the sinusoid, s")
+    parser.add_argument(
+        "--stand-up", type=not_negative, default=2.0, help="s from the first pose to the nominal stance"
+    )
+    parser.add_argument("--brake", type=not_negative, default=2.0, help="s for which the drives brake at the end")
+    parser.add_argument("--keep", type=positive, default=120.0, help="newest seconds that the log has room for")
+    parser.add_argument("--stale", type=positive, default=0.03, help="s without a state after which the robot is lost")
+    parser.add_argument(
+        "--spin", type=not_negative, default=0.0, help="s before each cycle for which the core is kept busy"
+    )
+    parser.add_argument("--out", default="deploy", help="folder of the logs")
+    sim = parser.add_argument_group("with --robot sim")
+    sim.add_argument("--start", choices=("standing", "lying", "hung"), default="standing")
+    sim.add_argument("--noise", type=float, default=1.0, help="times that of the paper's Table II")
+    sim.add_argument("--delay", type=float, default=0.0, help="of datagrams, each way, s")
+    sim.add_argument("--loss", type=float, default=0.0, help="share of datagrams that get lost, each way")
+    sim.add_argument("--seed", type=int, default=0)
+    sim.add_argument("--truth", action="store_true", help="also write the true motion into the recording")
+    return parser.parse_args(given)
+
+
+def main(given: Sequence[str]) -> int:
+    """Walk as the command line says; return the exit status."""
+    found = arguments(given)
+    from go1exp.deploy.commands import Wish, parsed
+    from go1exp.deploy.job import Job, do
+    from go1exp.deploy.walk import Plan
+
+    try:
+        amplitude = tuple(float(part) for part in found.amplitude.split(","))
+        wish = Wish(parsed(found.command), amplitude, found.period)
+        plan = Plan(
+            rate=found.rate,
+            seconds=found.seconds,
+            wish=wish,
+            stand_up=found.stand_up,
+            brake=found.brake,
+            keep=found.keep,
+            stale=found.stale,
+            spin=found.spin,
+        )
+        sim = {name: getattr(found, name) for name in ("start", "noise", "delay", "loss", "seed")}
+        job = Job(found.bundle, found.robot, plan, found.out, sim, truth=found.truth)
+        return do(job, lambda line: print(line, flush=True))
+    except (Expected, OSError, ValueError) as error:
+        print(f"go1exp.deploy: {error}", file=sys.stderr)
+        return FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,330 @@
+"""Where commanded velocities come from: numbers, a file, a sine, keys, a gamepad; all within the bundle's ranges.
+
+A source is called with the time since walking began, s, and returns the velocity (3,): x and y in m/s, yaw in rad/s,
+in the trunk's frame. ``poll`` is called in every cycle, before walking too; ``close`` gives back what was taken.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib
+import math
+import os
+import select
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from go1exp.errors import Expected
+
+AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+"""Names of the ranges in a bundle's metadata, in the order of a command."""
+
+Stop = Callable[[str], None]
+"""``Safety.stop``: told who wants the end."""
+
+
+class CommandError(Expected):
+    """A source of commands that cannot be had; the message says why and what would help."""
+
+
+class Source(Protocol):
+    """Gives commanded velocities."""
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the velocity (3,) at ``t`` s since walking began."""
+
+    def poll(self) -> None:
+        """Look whether somebody wants something, without waiting."""
+
+    def close(self) -> None:
+        """Give back what was taken."""
+
+
+class Constant:
+    """The same velocity for all time."""
+
+    def __init__(self, velocity: Sequence[float]) -> None:
+        """Keep the velocity (3,).
+
+        Raises:
+            CommandError: if it is not three finite numbers.
+        """
+        self._velocity = np.array(velocity, dtype=float)
+        if self._velocity.shape != (3,) or not np.isfinite(self._velocity).all():
+            raise CommandError(f"command {list(velocity)}: must be three finite numbers: x m/s, y m/s, yaw rad/s")
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return it."""
+        return self._velocity
+
+    def poll(self) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+
+class Table(Constant):
+    """Rows of a CSV file, each held until the next one's time; zero before the first."""
+
+    def __init__(self, path: Path) -> None:
+        """Read columns t, x, y, yaw (s, m/s, m/s, rad/s), with or without a line of names.
+
+        Raises:
+            CommandError: if a row is not four finite numbers, times do not grow, or there is none.
+            OSError: if the file cannot be read.
+        """
+        rows: list[list[float]] = []
+        with Path(path).open(newline="") as file:
+            for line, cells in enumerate(csv.reader(file), start=1):
+                if not cells or cells[0].lstrip().startswith("#"):
+                    continue
+                try:
+                    rows.append([float(cell) for cell in cells])
+                except ValueError:
+                    if rows or [cell.strip() for cell in cells] != ["t", "x", "y", "yaw"]:
+                        raise CommandError(f"{path}:{line}: {','.join(cells)!r} must be t,x,y,yaw in numbers") from None
+                    continue
+                if len(cells) != 4 or not all(map(math.isfinite, rows[-1])):
+                    raise CommandError(f"{path}:{line}: must be four finite numbers: t,x,y,yaw")
+                if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
+                    raise CommandError(f"{path}:{line}: t = {rows[-1][0]:g} does not come after {rows[-2][0]:g}")
+        if not rows:
+            raise CommandError(f"{path}: no rows; each must be t,x,y,yaw")
+        super().__init__((0.0, 0.0, 0.0))
+        table = np.array(rows)
+        self._times, self._rows = table[:, 0], table[:, 1:]
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the row in force."""
+        k = int(np.searchsorted(self._times, t + 1e-9)) - 1
+        return self._rows[k] if k >= 0 else self._velocity
+
+
+class Sinusoid(Constant):
+    """All three velocities on sines of one period, as in the paper's velocity experiment."""
+
+    def __init__(self, amplitude: Sequence[float], period: float) -> None:
+        """Keep amplitudes (3,), m/s, m/s and rad/s, and the period, s.
+
+        Raises:
+            CommandError: if they are no finite numbers, or the period is not positive.
+        """
+        super().__init__(amplitude)
+        if not (period > 0 and math.isfinite(period)):
+            raise CommandError(f"period {period}: must be a positive number of seconds")
+        self._rate = 2.0 * math.pi / period
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return their values."""
+        return self._velocity * math.sin(self._rate * t)
+
+
+STEPS = {
+    **dict.fromkeys(("w", "W", "\x1b[A", "\x1bOA"), (0.1, 0.0, 0.0)),
+    **dict.fromkeys(("s", "S", "\x1b[B", "\x1bOB"), (-0.1, 0.0, 0.0)),
+    **dict.fromkeys(("a", "A"), (0.0, 0.1, 0.0)),
+    **dict.fromkeys(("d", "D"), (0.0, -0.1, 0.0)),
+    **dict.fromkeys(("\x1b[D", "\x1bOD"), (0.0, 0.0, 0.2)),
+    **dict.fromkeys(("\x1b[C", "\x1bOC"), (0.0, 0.0, -0.2)),
+}
+"""What a key adds: m/s, m/s, rad/s."""
+
+ENDS = {"\x1b": "the Esc key", "q": "the q key", "Q": "the q key"}
+"""Keys that stop the robot; Q, which turns in many a game, is one of them, since in a terminal it means the end."""
+
+KEYS = "W S or up down: forward, back; A D: left, right; left right: turn; space: zero; Esc or q: stop"
+
+
+class Keyboard(Constant):
+    """Keys of the terminal change the velocity in steps; space makes it zero, Esc or q stops the robot."""
+
+    def __init__(self, stop: Stop, limit: Callable[[np.ndarray], np.ndarray], descriptor: int | None = None) -> None:
+        """Take the terminal's keys one by one; ``limit`` keeps what they add up to within the ranges.
+
+        Raises:
+            CommandError: if there is no terminal.
+        """
+        super().__init__((0.0, 0.0, 0.0))
+        import termios
+        import tty
+
+        try:
+            self._keys = sys.stdin.fileno() if descriptor is None else descriptor
+            self._before = termios.tcgetattr(self._keys)
+            tty.setcbreak(self._keys)
+        except (OSError, ValueError, termios.error) as error:
+            raise CommandError(f"command=keyboard: standard input is no terminal ({error})") from None
+        self._stop, self._limit = stop, limit
+        self._open = True
+
+    def poll(self) -> None:
+        """Read the keys that were pressed."""
+        while self._open and select.select([self._keys], [], [], 0)[0]:
+            data = os.read(self._keys, 64)
+            if not data:
+                self._stop("the end of the terminal")
+                return
+            for key in keys_of(data.decode(errors="replace")):
+                self._press(key)
+
+    def _press(self, key: str) -> None:
+        if key in ENDS:
+            self._stop(ENDS[key])
+        elif key == " ":
+            self._velocity = np.zeros(3)
+        elif key in STEPS:
+            self._velocity = self._limit(np.round(self._velocity + STEPS[key], 6))
+
+    def close(self) -> None:
+        """Give the terminal back as it was."""
+        if self._open:
+            import termios
+
+            self._open = False
+            termios.tcsetattr(self._keys, termios.TCSADRAIN, self._before)
+
+
+def keys_of(text: str) -> list[str]:
+    """Cut what a terminal sent into keys: an arrow is three characters, Esc alone is one."""
+    found, place = [], 0
+    while place < len(text):
+        size = 3 if text[place] == "\x1b" and text[place + 1 : place + 2] in ("[", "O") else 1
+        found.append(text[place : place + size])
+        place += size
+    return found
+
+
+DEAD = 0.1
+"""Share of a stick's way about its middle that counts as nothing."""
+
+
+class Gamepad(Constant):
+    """Sticks of a gamepad: left for x and y, right for yaw; any of the first two buttons stops the robot."""
+
+    def __init__(self, stop: Stop, ranges: np.ndarray) -> None:
+        """Take the first gamepad; a stick's full way is the range's end.
+
+        Raises:
+            CommandError: if pygame is not installed, or there is no gamepad.
+        """
+        super().__init__((0.0, 0.0, 0.0))
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        try:
+            pygame: Any = importlib.import_module("pygame")
+        except ImportError:
+            raise CommandError("command=gamepad: needs pygame (pip install pygame); or use command=keyboard") from None
+        pygame.init()
+        if not pygame.joystick.get_count():
+            pygame.quit()
+            raise CommandError("command=gamepad: no gamepad is connected; or use command=keyboard")
+        self._pygame = pygame
+        self._pad = pygame.joystick.Joystick(0)
+        self._stop, self._ranges = stop, ranges
+
+    def poll(self) -> None:
+        """Read sticks and buttons."""
+        for event in self._pygame.event.get():
+            if event.type == self._pygame.JOYDEVICEREMOVED:
+                self._stop("the gamepad, which is gone")
+        if self._pad.get_button(0) or self._pad.get_button(1):
+            self._stop("a button of the gamepad")
+        last = self._pad.get_numaxes() - 1
+        sticks = -np.array([self._pad.get_axis(min(axis, last)) for axis in (1, 0, 3)])
+        self._velocity = stretched(sticks, self._ranges)
+
+    def close(self) -> None:
+        """Let it go."""
+        self._pygame.quit()
+
+
+def stretched(sticks: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    """Return the velocity (3,) of sticks (3,) from -1 to 1: the middle is zero, the ends are those of ranges (3, 2)."""
+    moved = np.where(np.abs(sticks) < DEAD, 0.0, sticks)
+    return np.where(moved < 0, -moved * np.minimum(ranges[:, 0], 0.0), moved * np.maximum(ranges[:, 1], 0.0))
+
+
+class Limited:
+    """A source within ranges.
+
+    Attributes:
+        cut: cycles in which each axis was cut, (3,).
+    """
+
+    def __init__(self, source: Source, ranges: np.ndarray) -> None:
+        """Keep the commands of ``source`` within ``ranges`` (3, 2)."""
+        self._source, self._ranges = source, ranges
+        self.cut = np.zeros(3, dtype=np.int64)
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the command, cut; what is no number stays none, which the controller treats as a fault."""
+        asked = self._source(t)
+        given = np.clip(asked, self._ranges[:, 0], self._ranges[:, 1])
+        self.cut += asked != given
+        return given
+
+    def poll(self) -> None:
+        """Ask the source to look."""
+        self._source.poll()
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+
+def ranges_of(given: Mapping[str, tuple[float, float]]) -> np.ndarray:
+    """Return lowest and highest command (3, 2) of a bundle's metadata.
+
+    An axis that the bundle says nothing of is not limited, since nobody knows what was trained.
+    """
+    return np.array([given.get(name, (-math.inf, math.inf)) for name in AXES], dtype=float)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Which source: three numbers, a file's name, ``sinusoid``, ``keyboard`` or ``gamepad``; and the sine's numbers."""
+
+    command: tuple[float, ...] | str
+    amplitude: tuple[float, ...] = (1.0, 0.3, 0.8)
+    period: float = 10.0
+
+
+def make(wish: Wish, ranges: np.ndarray, stop: Stop) -> Limited:
+    """Return the source that is wished for, within ``ranges`` (3, 2).
+
+    Raises:
+        CommandError: if it cannot be had.
+        OSError: if its file cannot be read.
+    """
+    source: Source
+    if not isinstance(wish.command, str):
+        source = Constant(wish.command)
+    elif wish.command == "sinusoid":
+        source = Sinusoid(wish.amplitude, wish.period)
+    elif wish.command == "keyboard":
+        source = Keyboard(stop, lambda velocity: np.clip(velocity, ranges[:, 0], ranges[:, 1]))
+    elif wish.command == "gamepad":
+        finite = np.where(np.isfinite(ranges), ranges, np.sign(ranges))
+        source = Gamepad(stop, finite)
+    elif Path(wish.command).suffix == ".csv":
+        source = Table(Path(wish.command))
+    else:
+        raise CommandError(
+            f"command {wish.command!r}: must be three numbers such as [0.5,0.0,0.0], a file.csv, "
+            "sinusoid, keyboard or gamepad"
+        )
+    return Limited(source, ranges)
+
+
+def parsed(text: str) -> tuple[float, ...] | str:
+    """Read a command from a word of the command line: ``0.5,0,0`` is three numbers, anything else a name."""
+    with contextlib.suppress(ValueError):
+        return tuple(float(part) for part in text.strip("[]()").split(","))
+    return text

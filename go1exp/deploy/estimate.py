@@ -1,0 +1,100 @@
+"""The Kalman filter of ``go1exp.estimation`` as the controller's estimator."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from go1exp.deploy.messages import LowState
+from go1exp.estimation import FilterConfig, Status, from_json, go1, make_filter, sample
+
+FASTEST = 10.0
+"""No Go1 is so fast, m/s: an estimate beyond it has diverged (its joints' top speed gives some 6 m/s)."""
+
+BLIND_S = 0.1
+"""Time for which the filter may refuse all samples before its last estimate is too old, s."""
+
+TORQUE = {"contact_source": "torque", "contact_low": 10.0, "contact_high": 40.0}
+"""Contact from the joints' torques, for a robot whose foot sensors are not calibrated (``docs/estimation.md``)."""
+
+Fail = Callable[[str, str, float], None]
+"""``Safety.fail``: name of the fault, what was wrong, the runtime's clock."""
+
+
+def settings(given: Mapping[str, Any], **changes: Any) -> FilterConfig:
+    """Return the filter's settings from a bundle's metadata; a Go1's if it has none; ``changes`` replace some.
+
+    Raises:
+        go1exp.registry.ConfigError: if something is missing, unknown or of a wrong value.
+    """
+    if not given:
+        return go1(**changes)
+    return from_json(json.dumps(dict(given)), "estimator", changes)
+
+
+class KalmanEstimator:
+    """Velocity of the trunk from every state of the robot.
+
+    Attributes:
+        refused: samples that the filter left out, by its word for it.
+        restarts: times that it learnt the speed anew after a gap.
+    """
+
+    def __init__(self, config: FilterConfig, fail: Fail) -> None:
+        """Build the filter; ``fail`` is told when it cannot be believed any more.
+
+        Raises:
+            go1exp.estimation.EstimatorError: if the compiled filter is missing.
+        """
+        self._filter, self._fail = make_filter(config), fail
+        self._velocity = np.full(3, np.nan)
+        self._since: float | None = None
+        self.refused = {Status.LATE.name: 0, Status.INVALID.name: 0}
+        self.restarts = 0
+
+    def update(self, state: LowState) -> np.ndarray:
+        """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame.
+
+        It is NaN before the first good state. A sample that is no sample leaves the last estimate in force for
+        ``BLIND_S``: the reading itself is the safety's matter.
+        """
+        clock = state.t if math.isnan(state.clock) else state.clock
+        row = sample(
+            clock,
+            state.imu_quat,
+            state.imu_gyro,
+            state.imu_acc,
+            state.joint_pos,
+            state.joint_vel,
+            state.joint_torque,
+            state.foot_force,
+        )
+        status = Status(self._filter.update(row))
+        if status.name in self.refused:
+            self.refused[status.name] += 1
+            self._since = state.t if self._since is None else self._since
+            if state.t - self._since > BLIND_S:
+                self._fail(
+                    "estimator", f"the filter has refused every sample for {BLIND_S:g} s ({status.name})", state.t
+                )
+            return self._velocity
+        self._since = None
+        self.restarts += status is Status.RESTARTED
+        velocity = np.array(self._filter.velocity_b)
+        speed = float(np.linalg.norm(velocity))
+        if not speed <= FASTEST:  # NaN too
+            self._fail("estimator", f"the filter has diverged: it says {speed:g} m/s", state.t)
+        self._velocity = velocity
+        return velocity
+
+
+class NoEstimator:
+    """For a policy that does not ask for the velocity: nothing is estimated."""
+
+    def update(self, state: LowState) -> np.ndarray:
+        """Return NaN."""
+        return np.full(3, np.nan)

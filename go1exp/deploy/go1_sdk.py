@@ -1,0 +1,154 @@
+"""A link to the real Go1 through the vendor's SDK (``unitree_legged_sdk`` 3.8, its binding ``robot_interface``).
+
+It has been run against a stand-in with the binding's names only, never on hardware. Names, ports and rates are those of
+the SDK's own low-level example.
+"""
+
+from __future__ import annotations
+
+import importlib
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from go1exp.deploy.launch import RobotError
+from go1exp.deploy.messages import LowCmd, LowState
+from go1exp.deploy.safety import DEFAULT_KD
+
+MODULE = "robot_interface"
+NOTICE = "note: robot=go1 has never been run on a robot; hang it up first, and keep a hand on its switch"
+
+LOW_LEVEL, LOCAL_PORT, ROBOT, ROBOT_PORT = 0xFF, 8080, "192.168.123.10", 8007
+SERVO = 0x0A
+"""A motor's mode in which it obeys gains and targets."""
+
+POWER_LEVEL = 5
+"""Of the SDK's own PowerProtect, out of 10: 500 W, as in ``SafetyConfig.power``."""
+
+PERIOD = 0.002
+"""Of the exchange with the robot, s."""
+
+SILENCE = 0.05
+"""The drives are told to brake when the runtime has not commanded anything for so long, s."""
+
+JOINTS = 12
+
+
+class SdkLink:
+    """Exchanges states and commands every 2 ms in a thread of its own, whatever the runtime's rate.
+
+    The SDK is spoken to by that thread alone. If the runtime stops commanding, the drives brake.
+    """
+
+    def __init__(self, sdk: Any = None) -> None:
+        """Open the way; ``sdk`` stands for the module in tests.
+
+        Raises:
+            RobotError: if the binding is not there.
+        """
+        self._sdk = _module() if sdk is None else sdk
+        self._udp = self._sdk.UDP(LOW_LEVEL, LOCAL_PORT, ROBOT, ROBOT_PORT)
+        self._guard = self._sdk.Safety(self._sdk.LeggedType.Go1)
+        self._command, self._state = self._sdk.LowCmd(), self._sdk.LowState()
+        self._udp.InitCmdData(self._command)
+        self._arrived: deque[LowState] = deque(maxlen=1000)
+        self._wanted: tuple[LowCmd, float] | None = None
+        self._tick: int | None = None
+        self._failure: BaseException | None = None
+        self._going = True
+        self._thread = threading.Thread(target=self._pump, name="go1", daemon=True)
+        self._thread.start()
+
+    def receive(self) -> Sequence[LowState]:
+        """Return the states that have arrived since the last call, oldest first.
+
+        Raises:
+            RobotError: if the exchange with the robot has ended.
+        """
+        if self._failure is not None:
+            raise RobotError(f"the SDK failed: {type(self._failure).__name__}: {self._failure}")
+        found = []
+        while self._arrived:
+            found.append(self._arrived.popleft())
+        return found
+
+    def send(self, command: LowCmd) -> None:
+        """Hand over a command; it goes out within 2 ms, and again every 2 ms."""
+        self._wanted = (command, time.perf_counter())
+
+    def close(self) -> None:
+        """End the exchange, after a last command to brake."""
+        self._going = False
+        self._thread.join(1.0)
+
+    def _pump(self) -> None:
+        due = time.perf_counter()
+        try:
+            while self._going:
+                self.exchange(time.perf_counter())
+                due = max(due + PERIOD, time.perf_counter() - PERIOD)
+                time.sleep(max(due - time.perf_counter(), 0.0))
+            self._wanted = None
+            self.exchange(time.perf_counter())
+        except BaseException as error:
+            self._failure = error
+
+    def exchange(self, now: float) -> None:
+        """Take a state if there is a new one, and send what is wanted; ``now`` in s."""
+        self._udp.Recv()
+        self._udp.GetRecv(self._state)
+        tick = int(self._state.tick)
+        if tick != self._tick and tick != 0:  # zero until something has come
+            self._tick = tick
+            self._arrived.append(_read(self._state, now))
+        if self._tick is not None or self._wanted is not None:
+            self._fill(now)  # before, the empty command goes out, as in the example: a robot answers who speaks
+        self._udp.SetSend(self._command)
+        self._udp.Send()
+
+    def _fill(self, now: float) -> None:
+        """Write what is wanted into the SDK's command; braking if nothing is, or not any more."""
+        wanted = self._wanted
+        stale = wanted is None or now - wanted[1] > SILENCE
+        for k in range(JOINTS):
+            motor = self._command.motorCmd[k]
+            motor.mode, motor.dq, motor.tau = SERVO, 0.0, 0.0
+            if stale or wanted is None:
+                motor.q, motor.Kp, motor.Kd = float(self._state.motorState[k].q), 0.0, DEFAULT_KD
+            else:
+                command = wanted[0]
+                motor.q, motor.Kp, motor.Kd = (
+                    float(part[k]) for part in (command.joint_target, command.kp, command.kd)
+                )
+        self._guard.PositionLimit(self._command)
+        self._guard.PowerProtect(self._command, self._state, POWER_LEVEL)
+
+
+def _read(state: Any, now: float) -> LowState:
+    """Return the SDK's state; its tick is no clock (its unit differs between versions)."""
+    motors = [state.motorState[k] for k in range(JOINTS)]
+    return LowState(
+        t=now,
+        joint_pos=np.array([motor.q for motor in motors]),
+        joint_vel=np.array([motor.dq for motor in motors]),
+        joint_torque=np.array([motor.tauEst for motor in motors]),
+        imu_quat=np.array(state.imu.quaternion, dtype=float),
+        imu_gyro=np.array(state.imu.gyroscope, dtype=float),
+        imu_acc=np.array(state.imu.accelerometer, dtype=float),
+        foot_force=np.array([float(state.footForce[k]) for k in range(4)]),
+    )
+
+
+def _module() -> Any:
+    try:
+        return importlib.import_module(MODULE)
+    except ImportError as error:
+        raise RobotError(
+            f"robot=go1: no module {MODULE!r} ({error}). It is the Python binding of the vendor's unitree_legged_sdk "
+            "3.8 (branch for the Go1): build it on this computer and put its folder into PYTHONPATH. "
+            "This way to the robot has never been run on hardware; robot=sim needs nothing"
+        ) from None

@@ -1,0 +1,158 @@
+"""A walk from beginning to end, as both command lines start it: bundle, robot, walk, log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from go1exp.deploy import bundle as bundles
+from go1exp.deploy.commands import KEYS, make, ranges_of
+from go1exp.deploy.launch import RobotError, SimulatedRobot
+from go1exp.deploy.log import About
+from go1exp.deploy.messages import Link
+from go1exp.deploy.udp import UdpLink
+from go1exp.deploy.walk import Plan, account, go, save, velocity_errors
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do.
+
+    Attributes:
+        bundle: the file.
+        robot: ``sim``, ``go1``, or the port of this machine at which a simulated robot listens already.
+        plan: how to walk.
+        out: folder of the logs.
+        sim: how the simulated robot is set up (``go1exp.sim_robot.machine.SimConfig``).
+        other: its ``actuator`` and ``effect``, if not those of training.
+        truth: also write the simulated trunk's true motion into the recording.
+    """
+
+    bundle: str
+    robot: str
+    plan: Plan
+    out: str
+    sim: Mapping[str, Any] = field(default_factory=dict)
+    other: Mapping[str, Any] = field(default_factory=dict)
+    truth: bool = False
+
+
+@dataclass
+class _Robot:
+    """The robot at the other end, and whatever must be closed with it."""
+
+    link: Link
+    simulated: bool
+    process: SimulatedRobot | None = None
+
+
+@contextmanager
+def _reached(job: Job, say: Say) -> Iterator[_Robot]:
+    """Open the way to the robot, and close it."""
+    if job.robot == "go1":
+        from go1exp.deploy.go1_sdk import NOTICE, SdkLink
+
+        link = SdkLink()
+        say(NOTICE)
+        try:
+            yield _Robot(link, simulated=False)
+        finally:
+            link.close()
+    elif job.robot == "sim":
+        say("starting the simulated robot")
+        with SimulatedRobot(job.bundle, job.sim, job.other) as process:
+            udp = UdpLink(process.port)
+            try:
+                yield _Robot(udp, True, process)
+            finally:
+                udp.close()
+    else:
+        if not (job.robot.isascii() and job.robot.isdigit() and 0 < int(job.robot) < 2**16):
+            raise RobotError(f"robot={job.robot}: must be sim, go1, or the port where a simulated robot listens")
+        udp = UdpLink(int(job.robot))
+        try:
+            yield _Robot(udp, simulated=True)
+        finally:
+            udp.close()
+
+
+def do(job: Job, say: Say) -> int:
+    """Walk, write the log, and return the exit status: 0 if it walked to the end, else that of the fault.
+
+    Raises:
+        go1exp.errors.Expected: if bundle, robot, commands or estimator cannot be had.
+        OSError: if a file cannot be read or written.
+    """
+    bundle = bundles.load(job.bundle)
+    about, plan = bundle.metadata, job.plan
+    if about.kp is None or about.kd is None:
+        raise RobotError(f"{job.bundle}: knows no gains of its drives (those of an actuator net that says none)")
+    make(plan.wish, ranges_of(about.command_ranges), lambda who: None).close()  # before anything is started
+    if not about.command_ranges:
+        say("note: the bundle knows no range of commands, so none is cut")
+    if plan.rate is not None and abs(plan.rate * about.policy_dt - 1.0) > 1e-6:
+        say(f"note: the policy was trained at {1 / about.policy_dt:g} Hz and runs at {plan.rate:g} Hz")
+    if plan.wish.command == "keyboard":
+        say(KEYS)
+    with _reached(job, say) as robot:
+        contact = None if robot.simulated else "torque"
+        outcome = go(bundle, robot.link, plan, contact=contact, on_second=say)
+        traffic = getattr(robot.link, "traffic", None)
+    more: dict[str, Any] = {"robot": job.robot, "link": None if traffic is None else vars(traffic)}
+    truth: Mapping[str, np.ndarray] = {}
+    if robot.process is not None:
+        truth, more["simulated_robot"] = robot.process.truth, robot.process.report
+        more["velocity"] = velocity_errors(outcome.log, truth)
+    content = account(bundle, plan, outcome, more)
+    where = About(
+        metadata=about,
+        kp=np.array(about.kp),
+        kd=np.array(about.kd),
+        simulated=robot.simulated,
+        newton=robot.simulated,
+        episode=_free(Path(job.out), time.strftime("walk_%Y-%m-%d_%H-%M-%S")),
+        notes="ends where the drives begin to brake",
+    )
+    files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None)
+    say(str(outcome.timing))
+    for line in told(content):
+        say(line)
+    say(f"written to {', '.join(map(str, files))}")
+    say(f"fault: {outcome.fault}" if outcome.fault else f"walked for {outcome.walked:.1f} s, to the end")
+    return outcome.status
+
+
+def told(content: Mapping[str, Any]) -> list[str]:
+    """Return lines on how fast it walked and how well the simulated robot kept real time."""
+    lines = []
+    if velocity := content.get("velocity"):
+        mean, rmse, off = (
+            " ".join(f"{value:+.3f}" if name == "mean" else f"{value:.3f}" for value in velocity[name])
+            for name in ("mean", "estimate_rmse", "tracking_rmse")
+        )
+        lines.append(f"true velocity {mean} m/s over {velocity['distance']:.1f} m; RMSE of the estimate {rmse}")
+        lines.append(f"RMSE against the command: x, y {off.rsplit(' ', 1)[0]} m/s, yaw {off.rsplit(' ', 1)[1]} rad/s")
+    if robot := content.get("simulated_robot"):
+        timing = robot["timing"]
+        lines.append(
+            f"simulated robot: {robot['ticks']} ticks of 2 ms, {1e3 * robot['slipped']:.0f} ms behind real time, "
+            f"latest {1e3 * timing['late_worst']:.1f} ms; {robot['lost']} datagrams lost on the way"
+        )
+    return lines
+
+
+def _free(folder: Path, name: str) -> str:
+    """Return ``name``, with a number behind it if there is such a log already."""
+    found, number = name, 1
+    while list(folder.glob(f"{found}.*")):
+        number += 1
+        found = f"{name}_{number}"
+    return found

@@ -1,0 +1,138 @@
+"""Starts the simulated robot's process and ends it; the runtime itself stays free of what that needs."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from go1exp.errors import Expected
+
+PATIENCE = 120.0
+"""Time for the robot's process to come up, s: a busy machine needs a while for torch."""
+
+
+class RobotError(Expected):
+    """The robot cannot be had; the message says why."""
+
+
+class RefusedError(RobotError):
+    """The simulated robot was set up wrongly.
+
+    Attributes:
+        problems: a line on each.
+    """
+
+    def __init__(self, problems: list[str]) -> None:
+        """Keep the lines."""
+        super().__init__("; ".join(problems))
+        self.problems = problems
+
+
+class SimulatedRobot:
+    """A simulated Go1 in a process of its own, that listens at a port of this machine.
+
+    Attributes:
+        port: where it listens.
+        report: its account of the walk, after ``close``: datagrams, and how it kept real time.
+        truth: the trunk's true motion by column, with ``clock``, after ``close``; empty for a robot that hangs.
+    """
+
+    def __init__(self, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], port: int = 0) -> None:
+        """Start it and wait until it listens.
+
+        Args:
+            bundle: the file; the robot in it is that of training.
+            sim: how it is set up (``go1exp.sim_robot.machine.SimConfig``).
+            other: other choices of ``actuator`` and ``effect``; None keeps those of training.
+            port: where to listen; any that is free if 0.
+
+        Raises:
+            RefusedError: if its settings are wrong.
+            RobotError: if it does not come up.
+        """
+        self._folder = tempfile.TemporaryDirectory(prefix="go1exp-")
+        self._truth = Path(self._folder.name) / "truth.npz"
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "go1exp.sim_robot"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            start_new_session=True,  # a key in the terminal is for the runtime alone
+        )
+        self.report: dict[str, Any] = {}
+        self.truth: dict[str, np.ndarray] = {}
+        given = {"bundle": bundle, "sim": dict(sim), "robot": dict(other), "port": port, "truth": str(self._truth)}
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write((json.dumps(given) + "\n").encode())
+            self._process.stdin.flush()
+            answer = self._answer(PATIENCE)
+        except OSError:
+            answer = {}
+        except BaseException:
+            self.close()
+            raise
+        if answer.get("what") != "listening":
+            self.close()
+            if answer.get("problems"):
+                raise RefusedError(answer["problems"])
+            raise RobotError(f"robot=sim: {answer.get('message') or 'its process ended before it listened'}")
+        self.port = int(answer["port"])
+        self.pid = self._process.pid
+
+    def _answer(self, patience: float) -> dict[str, Any]:
+        """Return the next line that it says; empty if there is none in time."""
+        assert self._process.stdout is not None
+        until, text = time.monotonic() + patience, b""
+        while not text.endswith(b"\n"):
+            left = until - time.monotonic()
+            if left <= 0 or not select.select([self._process.stdout], [], [], left)[0]:
+                return {}
+            part = os.read(self._process.stdout.fileno(), 65536)
+            if not part:
+                return {}
+            text += part
+        found: dict[str, Any] = json.loads(text)
+        return found
+
+    def close(self) -> None:
+        """End it and take its account."""
+        if self._process.returncode is not None:
+            return
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.close()  # which is what it waits for
+            self.report = self._answer(10.0)
+            self._process.wait(10.0)
+        except (OSError, subprocess.TimeoutExpired):
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        if self._truth.is_file():
+            with np.load(self._truth) as file:
+                rows, columns = file["rows"], [str(name) for name in file["columns"]]
+            if len(rows) and not np.isnan(rows).any():
+                self.truth = dict(zip(columns, rows.T, strict=True))
+        self._folder.cleanup()
+
+    def __enter__(self) -> SimulatedRobot:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()

@@ -1,0 +1,215 @@
+"""Everything that happened on a walk, kept in arrays that exist before it begins, and written when it is over."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from go1exp import __version__
+from go1exp.deploy.controller import PHASES, Cycle
+from go1exp.deploy.metadata import Metadata
+
+if TYPE_CHECKING:
+    from go1exp.recording import Recording
+
+STATES_PER_S = 500.0
+"""States that a Go1 sends in a second."""
+
+STATE = (
+    *(("t", 1), ("clock", 1), ("in_force", 1), ("q", 12), ("qd", 12), ("tau_est", 12)),
+    *(("imu_quat", 4), ("imu_gyro", 3), ("imu_acc", 3), ("foot_force", 4)),
+)
+CYCLE = (("t", 1), ("phase", 1), ("number", 1), ("damping", 1), ("q_target", 12), ("command", 3), ("estimate", 3))
+"""What a row holds: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0."""
+
+
+class Ring:
+    """The newest rows of numbers, in an array of fixed size."""
+
+    def __init__(self, parts: tuple[tuple[str, int], ...], size: int) -> None:
+        """Make room for ``size`` rows of ``parts``; every page of it is touched now."""
+        self._rows = np.full((size, sum(width for _, width in parts)), np.nan)
+        self.columns, place = {}, 0
+        for name, width in parts:
+            self.columns[name] = slice(place, place + width)
+            place += width
+        self.count = 0
+
+    def next(self) -> np.ndarray:
+        """Return the row to be filled next; the oldest, once all are full."""
+        row: np.ndarray = self._rows[self.count % len(self._rows)]
+        self.count += 1
+        return row
+
+    @property
+    def overwritten(self) -> int:
+        """Rows that had to make room."""
+        return max(self.count - len(self._rows), 0)
+
+    def rows(self) -> np.ndarray:
+        """Return the rows that are kept, oldest first."""
+        if self.count <= len(self._rows):
+            return self._rows[: self.count]
+        return np.roll(self._rows, -(self.count % len(self._rows)), axis=0)
+
+    def part(self, name: str) -> np.ndarray:
+        """Return a part of all rows that are kept, (T, width), or (T,) if its width is 1."""
+        found = self.rows()[:, self.columns[name]]
+        return found[:, 0] if found.shape[1] == 1 else found
+
+
+@dataclass(frozen=True)
+class About:
+    """What a log says of where it comes from.
+
+    Attributes:
+        metadata: of the bundle.
+        kp: (J,) N m/rad, in force while standing up and walking.
+        kd: (J,) N m s/rad.
+        simulated: not measured on hardware.
+        newton: the feet's readings are in newtons; if not, they are left out of the recording.
+        episode: the recording's name.
+        notes: whatever a reader must know.
+    """
+
+    metadata: Metadata
+    kp: np.ndarray
+    kd: np.ndarray
+    simulated: bool
+    newton: bool
+    episode: str
+    notes: str = ""
+
+
+class Log:
+    """Told of every cycle; writes nothing until it is asked.
+
+    Attributes:
+        states: every state that came.
+        cycles: every cycle.
+        phases: when each phase began, s of the runtime's clock.
+        first_command: when the first command went out, s; None before.
+    """
+
+    def __init__(self, rate: float, keep: float) -> None:
+        """Make room for ``keep`` s at ``rate`` cycles per second; of a longer walk the newest are kept."""
+        self.states = Ring(STATE, math.ceil(keep * STATES_PER_S) + 1)
+        self.cycles = Ring(CYCLE, math.ceil(keep * rate) + 1)
+        self.phases: dict[str, float] = {}
+        self.first_command: float | None = None
+        self._sent = 0
+
+    def note(self, cycle: Cycle) -> None:
+        """Keep a cycle and the states that came in it."""
+        for state in cycle.fresh:
+            row = self.states.next()
+            row[0], row[1], row[2] = state.t, state.clock, state.in_force
+            row[3:15], row[15:27], row[27:39] = state.joint_pos, state.joint_vel, state.joint_torque
+            row[39:43], row[43:46], row[46:49], row[49:53] = (
+                *(state.imu_quat, state.imu_gyro, state.imu_acc),
+                state.foot_force,
+            )
+        row = self.cycles.next()
+        row[0], row[1], row[2], row[3] = cycle.t, PHASES.index(cycle.phase), 0, False
+        row[4:16] = np.nan
+        if cycle.command is not None:
+            self._sent += 1
+            self.first_command = cycle.t if self.first_command is None else self.first_command
+            row[2], row[3], row[4:16] = self._sent, cycle.command.damping, cycle.command.joint_target
+        row[16:19], row[19:22] = cycle.velocity, cycle.base_lin_vel
+        self.phases.setdefault(cycle.phase, cycle.t)
+
+    def recording(self, about: About, truth: Mapping[str, np.ndarray] | None = None) -> Recording | None:
+        """Return the walk from the first command in force to the first that brakes; None if there was none.
+
+        Args:
+            about: where it comes from.
+            truth: columns of the format by name, with ``clock``, s; rows are joined where the clocks are the same.
+        """
+        from go1exp.recording import FOOT_FORCE, VECTORS, Meta, Recording, joint_channels
+
+        states, rows = self.states, self._in_force()
+        if rows is None:
+            return None
+        kept, targets = rows
+        clock = states.part("clock")[kept]
+        t = states.part("t")[kept] if np.isnan(clock).any() else clock
+        channels: dict[str, np.ndarray] = {}
+        joints = about.metadata.joints
+        for name in ("q", "qd", "tau_est"):
+            channels |= dict(zip(joint_channels(name, joints), states.part(name)[kept].T, strict=True))
+        channels |= dict(zip(joint_channels("q_target", joints), targets.T, strict=True))
+        quat = states.part("imu_quat")[kept]
+        length = np.linalg.norm(quat, axis=1, keepdims=True)
+        quat = quat / np.where(length > 0.5, length, np.nan)  # an IMU that has not started has no attitude
+        vectors = {"imu_quat": quat} | {name: states.part(name)[kept] for name in ("imu_gyro", "imu_acc")}
+        for name, values in vectors.items():
+            channels |= dict(zip(VECTORS[name], values.T, strict=True))
+        if about.newton:
+            feet = states.part("foot_force")[kept]
+            channels |= {FOOT_FORCE + leg: feet[:, k] for k, leg in enumerate(about.metadata.legs)}
+        if truth is not None:
+            channels |= _joined(truth, clock)
+        good = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
+        good &= np.isfinite(np.stack([values for name, values in channels.items()])).all(axis=0)
+        if good.sum() < 2:
+            return None
+        channels = {"t": t, **channels}
+        notes = [about.notes, "" if (states.part("in_force")[kept] >= 0).all() else UNKNOWN_DELAY]
+        notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
+        meta = Meta(
+            robot=about.metadata.robot,
+            joints=joints,
+            rate_hz=float(np.round(1.0 / np.median(np.diff(t[good])), 3)),
+            base="floating",
+            base_quat=None,
+            kp=tuple(map(float, about.kp)),
+            kd=tuple(map(float, about.kd)),
+            tau_limit=about.metadata.torque_limit,
+            excitation="policy",
+            episode=about.episode,
+            repeat_of=None,
+            source="simulated" if about.simulated else "measured",
+            tool="go1exp deploy",
+            versions={"go1exp": __version__, "onnxruntime": metadata.version("onnxruntime")},
+            notes="; ".join(note for note in notes if note),
+        )
+        return Recording(meta, {name: np.ascontiguousarray(values[good]) for name, values in channels.items()})
+
+    def _in_force(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return which states fall under a command of standing up or walking (T,), and its target, row by row."""
+        sent = self.cycles.part("number") > 0
+        if not sent.any() or not self.states.count:
+            return None
+        number, at = self.cycles.part("number")[sent], self.cycles.part("t")[sent]
+        damping, target = self.cycles.part("damping")[sent] > 0, self.cycles.part("q_target")[sent]
+        known = self.states.part("in_force")
+        # Where the robot does not tell what it obeys, it is taken to be the newest that was sent.
+        by_number, by_time = np.searchsorted(number, known), np.searchsorted(at, self.states.part("t"), "right") - 1
+        k = np.where(known >= 0, by_number, by_time)
+        there = (k >= 0) & (k < len(number)) & (known != 0) & ((known < 0) | (known >= number[0]))
+        place = np.clip(k, 0, len(number) - 1)
+        there &= ~damping[place]
+        return (there, target[place[there]]) if there.any() else None
+
+
+UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell what it obeys, and the way takes time"
+
+
+def _joined(truth: Mapping[str, np.ndarray], clock: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the true columns at the times of a clock; NaN where they are unknown."""
+    found = np.clip(np.searchsorted(truth["clock"], clock - 1e-6), 0, len(truth["clock"]) - 1)
+    same = np.abs(truth["clock"][found] - clock) < 1e-6
+    return {name: np.where(same, values[found], np.nan) for name, values in truth.items() if name != "clock"}
+
+
+def write_cycles(path: Path, log: Log) -> None:
+    """Write the cycles as NumPy's archive: velocities commanded and estimated, targets, phases; the runtime's clock."""
+    content: dict[str, Any] = {name: log.cycles.part(name) for name, _ in CYCLE}
+    np.savez(path, phases=np.array(PHASES), **content)

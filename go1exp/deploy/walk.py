@@ -1,0 +1,314 @@
+"""One walk from the opened link to the last word of the account: the runtime's parts joined, and its log written."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from go1exp.deploy.bundle import Bundle
+from go1exp.deploy.commands import Limited, Wish, make, ranges_of
+from go1exp.deploy.controller import Controller, Cycle, Estimator
+from go1exp.deploy.estimate import KalmanEstimator, NoEstimator, settings
+from go1exp.deploy.log import About, Log, write_cycles
+from go1exp.deploy.loop import MonotonicClock, Timing, run
+from go1exp.deploy.messages import Link
+from go1exp.deploy.safety import RULES, Fault, Safety, SafetyConfig
+
+FAULTS = (*RULES, "no_state", "estimator", "command", "runtime")
+FIRST_STATUS = 20
+STATUS = {name: FIRST_STATUS + k for k, name in enumerate(FAULTS)}
+"""Exit status of a walk that a fault ended, by its name."""
+
+UNKNOWN_FAULT = FIRST_STATUS - 1
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to walk.
+
+    Attributes:
+        rate: cycles per second, at which the policy runs; None: that of training.
+        seconds: time under the policy, s; None: until somebody stops it.
+        wish: where commands come from.
+        stand_up: time to the nominal stance, s.
+        brake: time for which the drives brake at the end, s.
+        patience: time to wait for the robot, s.
+        keep: newest seconds of a walk that the log has room for.
+        stale: age of the newest state at which the robot counts as lost, s.
+        spin: time before each cycle for which the core is kept busy, s; steadier, at the price of that core.
+    """
+
+    rate: float | None = None
+    seconds: float | None = None
+    wish: Wish = field(default_factory=lambda: Wish((0.0, 0.0, 0.0)))
+    stand_up: float = 2.0
+    brake: float = 2.0
+    patience: float = 5.0
+    keep: float = 120.0
+    stale: float = SafetyConfig.stale
+    spin: float = 0.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a walk.
+
+    Attributes:
+        fault: what ended it; None if it went on to its end.
+        walked: time under the policy, s.
+        timing: how the loop kept its time.
+        log: everything else.
+        safety: with what was cut.
+        commands: with what was cut.
+        estimator: what it refused, by its word for it.
+        memory_mb: resident when the walk ended.
+    """
+
+    fault: Fault | None
+    walked: float
+    timing: Timing
+    log: Log
+    safety: Safety
+    commands: Limited
+    estimator: dict[str, int]
+    memory_mb: float | None
+
+    @property
+    def status(self) -> int:
+        """Exit status: 0 if it walked to the end."""
+        return 0 if self.fault is None else STATUS.get(self.fault.name, UNKNOWN_FAULT)
+
+
+def estimator_of(bundle: Bundle, safety: Safety, contact: str | None) -> Estimator:
+    """Return the estimator that a bundle's policy wants.
+
+    ``contact`` is ``torque`` for a robot whose feet's sensors are not calibrated; None leaves the bundle's choice.
+
+    Raises:
+        go1exp.registry.ConfigError: if the bundle's settings are not such.
+        go1exp.estimation.EstimatorError: if the compiled filter is missing.
+    """
+    from go1exp.deploy.estimate import TORQUE
+
+    if all(port.name != "base_lin_vel_b" for port in bundle.policy.inputs):
+        return NoEstimator()
+    changes: dict[str, Any] = TORQUE if contact == "torque" else {}
+    return KalmanEstimator(settings(bundle.metadata.estimator, **changes), safety.fail)
+
+
+def go(
+    bundle: Bundle,
+    link: Link,
+    plan: Plan,
+    *,
+    contact: str | None = None,
+    on_second: Callable[[str], None] = lambda line: None,
+) -> Outcome:
+    """Walk. The link stays open; SIGINT and SIGTERM stop the robot meanwhile.
+
+    Raises:
+        go1exp.errors.Expected: if commands or the estimator cannot be had; nothing has been sent then.
+        OSError: if the file of commands cannot be read.
+    """
+    about = bundle.metadata
+    safety = Safety(
+        about.joints, np.array(about.joint_limits), np.array(about.torque_limit), SafetyConfig(stale=plan.stale)
+    )
+    estimator = estimator_of(bundle, safety, contact)
+    rate = plan.rate or 1.0 / about.policy_dt
+    room = plan.keep
+    if plan.seconds is not None:
+        room = min(room, plan.seconds + plan.stand_up + plan.brake + plan.patience + 1.0)
+    log = Log(rate, room)
+    commands = make(plan.wish, ranges_of(about.command_ranges), safety.stop)
+    try:
+        return _go(bundle, link, plan, rate, safety, estimator, log, commands, on_second)
+    finally:
+        commands.close()
+
+
+def _go(
+    bundle: Bundle,
+    link: Link,
+    plan: Plan,
+    rate: float,
+    safety: Safety,
+    estimator: Estimator,
+    log: Log,
+    commands: Limited,
+    on_second: Callable[[str], None],
+) -> Outcome:
+    walked, ended, last = 0.0, False, [0.0, 0.0, 0.0]
+
+    def on_cycle(cycle: Cycle) -> None:
+        log.note(cycle)
+        last[:] = cycle.base_lin_vel
+
+    controller = Controller(
+        *(bundle, link, commands, estimator, safety),
+        stand_up=plan.stand_up,
+        brake=plan.brake,
+        patience=plan.patience,
+        on_cycle=on_cycle,
+    )
+
+    def work(now: float) -> bool:
+        nonlocal walked, ended
+        commands.poll()
+        if safety.fault is None and not ended:
+            walked = max(walked, controller.walked(now))
+            # Half a period early: the next cycle would be the first one too many.
+            if plan.seconds is not None and controller.phase == "walking" and walked > plan.seconds - 0.5 / rate:
+                ended = True
+                controller.finish(now)
+        try:
+            return controller.cycle(now)
+        except Exception as error:  # of the link or the log: nothing else gets out of a cycle
+            safety.fail("runtime", f"{type(error).__name__}: {error}", now)
+            with contextlib.suppress(Exception):
+                link.send(safety.damping(None))
+            return False
+
+    def report(timing: Timing) -> None:
+        speed = "" if np.isnan(last).any() else f"; estimate {last[0]:+.2f} {last[1]:+.2f} {last[2]:+.2f} m/s"
+        on_second(f"{controller.phase}: {timing}{speed}")
+
+    with stopping(safety):
+        timing = run(work, rate, None, MonotonicClock(plan.spin), report)
+    refused = dict(getattr(estimator, "refused", {}), RESTARTED=getattr(estimator, "restarts", 0))
+    fault = None if ended else safety.fault  # what happens to a robot that lies down is not the walk's end
+    return Outcome(fault, walked, timing, log, safety, commands, refused, resident())
+
+
+@contextmanager
+def stopping(safety: Safety) -> Iterator[None]:
+    """Let signals stop the robot; leave their handlers as they were."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        safety.stop(signal.Signals(number).name)
+
+    before = {number: signal.signal(number, stop) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def resident() -> float | None:
+    """Return this process's resident memory, MB; None where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return None
+    return pages * resource.getpagesize() / 1e6
+
+
+def age() -> float | None:
+    """Return how long this process has lived, s, to 10 ms; None where the system does not tell."""
+    try:
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - int(fields[19]) / os.sysconf("SC_CLK_TCK")
+    except (OSError, AttributeError):
+        return None
+
+
+def account(bundle: Bundle, plan: Plan, outcome: Outcome, more: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a walk as plain data."""
+    log, fault = outcome.log, outcome.fault
+    joints = bundle.metadata.joints
+    start = log.first_command
+    lived = age()
+    return {
+        "bundle": {"file": bundle.source, "sha256": bundle.seal},
+        "ended": "walked to the end" if fault is None else fault.name,
+        "fault": None if fault is None else asdict(fault),
+        "status": outcome.status,
+        "walked_s": outcome.walked,
+        "phases": log.phases,
+        "rate": plan.rate or 1.0 / bundle.metadata.policy_dt,
+        "trained_rate": 1.0 / bundle.metadata.policy_dt,
+        "timing": {**asdict(outcome.timing), "missed_share": outcome.timing.missed_share},
+        "clamped": dict(zip(joints, map(int, outcome.safety.clamped), strict=True)),
+        "commands_cut": dict(zip(("x", "y", "yaw"), map(int, outcome.commands.cut), strict=True)),
+        "estimator": outcome.estimator,
+        "first_command_after_s": None if start is None or lived is None else lived - (time.perf_counter() - start),
+        "memory_mb": outcome.memory_mb,
+        "log": {"states": log.states.count, "overwritten": log.states.overwritten},
+        **more,
+    }
+
+
+def save(
+    folder: Path, about: About, outcome: Outcome, content: dict[str, Any], truth: Mapping[str, np.ndarray] | None
+) -> list[Path]:
+    """Write NAME.json, NAME.npz and, if the robot was commanded, NAME.parquet; return the files.
+
+    Raises:
+        OSError: if one cannot be written.
+        go1exp.recording.RecordingError: if what was logged is no recording.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / f"{about.episode}.json", folder / f"{about.episode}.npz"]
+    files[0].write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")  # first: nothing else is as small
+    write_cycles(files[1], outcome.log)
+    recording = outcome.log.recording(about, truth)
+    if recording is not None:
+        from go1exp import recording as format_
+
+        files.append(folder / f"{about.episode}.parquet")
+        format_.write(files[-1], recording)
+    return files
+
+
+def velocity_errors(log: Log, truth: Mapping[str, np.ndarray]) -> dict[str, Any] | None:
+    """Compare estimate and command with the truth, cycle by cycle while walking; None if there is nothing to compare.
+
+    Returns:
+        ``mean`` true velocity (3,), m/s in the trunk's frame; RMSE of the estimate, ``estimate_rmse`` (3,), and of the
+        walk against its command after a second, ``tracking_rmse``: x and y in m/s, yaw in rad/s; ``distance``, m.
+    """
+    from go1exp.deploy.controller import PHASES
+
+    known = np.isfinite(log.states.part("clock"))
+    at = log.cycles.part("t")
+    walking = (log.cycles.part("phase") == PHASES.index("walking")) & np.isfinite(log.cycles.part("estimate")).all(1)
+    if not known.any() or not walking.any() or not truth:
+        return None
+    newest = np.searchsorted(log.states.part("t")[known], at[walking], "right") - 1
+    clock = log.states.part("clock")[known][np.maximum(newest, 0)]
+    k = np.clip(np.searchsorted(truth["clock"], clock - 1e-6), 0, len(truth["clock"]) - 1)
+    w, x, y, z = (truth[f"base_quat_{part}"][k] for part in "wxyz")
+    v = np.stack([truth[f"base_lin_vel_{axis}_w"][k] for axis in "xyz"], axis=1)
+    turn = np.stack([x, y, z], axis=1)
+    # R' v = v - 2 w (u x v) + 2 u x (u x v), u the vector part
+    cross = np.cross(turn, v)
+    body = v - 2.0 * w[:, None] * cross + 2.0 * np.cross(turn, cross)
+    true = np.column_stack([body[:, :2], truth["base_ang_vel_z_b"][k]])
+    late = at[walking] - at[walking][0] >= min(1.0, 0.5 * (at[walking][-1] - at[walking][0]))
+    off = true[late] - log.cycles.part("command")[walking][late]
+    place = np.stack([truth["base_pos_x_w"][k], truth["base_pos_y_w"][k]], axis=1)
+    return {
+        "mean": body[late].mean(axis=0).tolist(),
+        "estimate_rmse": np.sqrt(np.mean((log.cycles.part("estimate")[walking] - body) ** 2, axis=0)).tolist(),
+        "tracking_rmse": np.sqrt(np.mean(off**2, axis=0)).tolist(),
+        "distance": float(np.linalg.norm(place[-1] - place[0])),
+    }

@@ -1,0 +1,72 @@
+"""The trunk's velocity as the robot would know it: from its sensors through the Kalman filter, not from the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from go1exp.env.core import Go1Core
+from go1exp.estimation import WIDTH, go1, make_filter
+from go1exp.estimation import readings as column
+from go1exp.record.tape import sample
+from go1exp.registry import ConfigError
+from go1exp.sim_robot.machine import NOISE, OWN_NOISE, turned
+
+TERM = "base_linear_velocity"
+
+
+class EstimatedVelocity:
+    """A filter for each robot of an environment, given its sensors in every physics step."""
+
+    def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
+        """Listen to the plant of ``core``, which must have been built with ``imu=True``, from its next step on.
+
+        Args:
+            core: the environment.
+            noise: give the sensors the noise of the paper's Table II, and accelerometer and feet that of a logger.
+            seed: of it.
+
+        Raises:
+            ConfigError: if the policy does not see the velocity.
+            go1exp.estimation.EstimatorError: if the filter is not built.
+        """
+        names = [term.entry.name for term in core.task.observation]
+        sizes = [term.entry.traits["size"] for term in core.task.observation]
+        if TERM not in names:
+            raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
+        start = sum(sizes[: names.index(TERM)])
+        self._columns = slice(start, start + 3)
+        self._filters = [make_filter(go1()) for _ in range(core.num_envs)]
+        self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
+        self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])
+        core.plant.observer = self._listen
+
+    def put(self, observation: Tensor) -> Tensor:
+        """Return the observation (N, O) with the estimated velocity in the place of the true one."""
+        found = np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])
+        changed = observation.clone()
+        changed[:, self._columns] = torch.as_tensor(found, dtype=observation.dtype)
+        return changed
+
+    def _listen(self, target: Tensor) -> None:
+        """Give every filter a sample, before a step."""
+        true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}
+        rows = np.full((len(self._filters), WIDTH), np.nan)
+
+        def even(name: str, size: int) -> np.ndarray:
+            return self._noise * NOISE[name] * self._rng.uniform(-1.0, 1.0, (len(rows), size))
+
+        def normal(name: str, size: int) -> np.ndarray:
+            return self._noise * OWN_NOISE[name] * self._rng.standard_normal((len(rows), size))
+
+        rows[:, column.T] = self._steps * self._dt
+        rows[:, column.QUAT] = turned(true["quat"], even("attitude", 3))
+        rows[:, column.GYRO] = true["gyro"] + even("imu_gyro", 3)
+        rows[:, column.ACC] = true["acc"] + normal("imu_acc", 3)
+        rows[:, column.Q] = true["q"] + even("joint_pos", 12)
+        rows[:, column.QD] = true["qd"] + even("joint_vel", 12)
+        rows[:, column.FOOT_FORCE] = np.maximum(true["foot_force"] + normal("foot_force", 4), 0.0)
+        for one, row in zip(self._filters, rows, strict=True):
+            one.update(row)
+        self._steps += 1

@@ -1,0 +1,106 @@
+"""The simulated robot's process: ``python -m go1exp.sim_robot``, which ``go1exp deploy`` starts.
+
+Its settings come as a line of JSON on standard input, and the end of that input is its own end, so that no robot
+outlives whoever started it. It answers with a line of JSON when it listens, and with its account at the end.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import TypeAdapter, ValidationError
+
+from go1exp.config import TaskConfig, parse_parts, parse_train
+from go1exp.deploy.archive import unpack
+from go1exp.deploy.bundle import CONFIG, MEMBERS
+from go1exp.effects.rules import drive_problems
+from go1exp.errors import Expected
+from go1exp.registry import ConfigError, as_json, explain
+from go1exp.robot import JOINTS
+from go1exp.sim_robot.machine import Robot
+from go1exp.sim_robot.server import TRUTH, Server
+from go1exp.sim_robot.settings import SimConfig
+
+
+def task_of(bundle: str, other: dict[str, Any]) -> TaskConfig:
+    """Return the task that a bundle's policy was trained in, with other choices of actuator and effects if given.
+
+    Raises:
+        BundleError: if the file is no bundle.
+        ConfigError: if its configuration or the choices are refused.
+    """
+    import dataclasses
+
+    members = unpack(Path(bundle).read_bytes(), MEMBERS, bundle)
+    task = parse_train(json.loads(members[CONFIG])).task
+    chosen = {name: value for name, value in other.items() if value is not None}
+    parts, problems = parse_parts(chosen, tuple(chosen))
+    if not problems:
+        task = dataclasses.replace(task, **parts)
+        problems = drive_problems(task.actuator, task.effect, JOINTS)
+    if problems:
+        raise ConfigError(problems)
+    return task
+
+
+def sim_config(given: dict[str, Any]) -> SimConfig:
+    """Check the settings of the simulated robot; raise ConfigError with every problem."""
+    try:
+        return TypeAdapter(SimConfig).validate_json(as_json(given))
+    except ValidationError as error:
+        raise ConfigError(explain(error, "sim", SimConfig.__dataclass_fields__)) from None
+
+
+def _line(descriptor: int) -> bytes:
+    """Read a line byte by byte, so that nothing behind it waits in a buffer where ``select`` would not see it."""
+    text = b""
+    while not text.endswith(b"\n") and (part := os.read(descriptor, 1)):
+        text += part
+    return text
+
+
+def _say(what: str, **content: Any) -> None:
+    sys.stdout.write(json.dumps({"what": what, **content}) + "\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    """Serve until standard input ends or SIGTERM comes; return the exit status."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a key in the terminal is for the runtime, which then ends this
+    ended: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: ended.append(number))
+    torch.set_num_threads(1)
+    given = json.loads(_line(sys.stdin.fileno()))
+    try:
+        config = sim_config(given.get("sim", {}))
+        task = task_of(given["bundle"], given.get("robot", {}))
+        server = Server(Robot(task, config), config, given.get("port", 0))
+    except (ConfigError, Expected, OSError) as error:
+        lines = error.problems if isinstance(error, ConfigError) else []
+        _say("refused", message=str(error), problems=lines)
+        return 1
+    _say("listening", port=server.port, pid=os.getpid())
+
+    def going() -> bool:
+        return not ended and not select.select([sys.stdin], [], [], 0)[0]
+
+    server.serve(going)
+    if given.get("truth"):
+        rows = server.truth.rows()
+        np.savez(given["truth"], rows=rows, columns=np.array(["clock", *TRUTH]))
+    _say("ended", **asdict(server.counts))
+    server.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

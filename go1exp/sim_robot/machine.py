@@ -1,0 +1,154 @@
+"""The simulated Go1's body and drives, one tick of 2 ms at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from go1exp import robot
+from go1exp.config import TaskConfig
+from go1exp.deploy.messages import LowCmd, LowState
+from go1exp.deploy.safety import DEFAULT_KD
+from go1exp.effects.rules import has_gains
+from go1exp.env.plant import Plant, drive_setup
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import build_model
+from go1exp.randomness import EnvRandom
+from go1exp.record.tape import sample
+from go1exp.registry import ConfigError
+from go1exp.sim_robot.settings import SimConfig
+from go1exp.terrain import TerrainConfig, build_terrain
+
+TICK = 0.002
+"""Period of the drives and of the states that the robot sends, s: the vendor's SDK has 500 Hz."""
+
+SILENCE = 0.05
+"""The drives brake when no command has come for so long, s."""
+
+NOISE = {"joint_pos": 0.05, "joint_vel": 0.1, "imu_gyro": 0.01, "attitude": 0.05}
+"""Half-widths of the paper's Table II: rad, rad/s, rad/s, and of projected gravity, taken as a rotation in rad."""
+
+OWN_NOISE = {"imu_acc": 0.1, "foot_force": 2.0}
+"""Standard deviations of what Table II does not have, m/s2 and N, as in ``conf/record.yaml``."""
+
+LYING = (0.0, 1.3, -2.65)
+"""Hip, thigh, calf of a robot that lies on its belly, rad."""
+
+LYING_HEIGHT = 0.12
+"""Of its trunk when it is put down, m."""
+
+SETTLE_S = 1.0
+"""Time that it is given to come to rest before anybody may speak to it, s of its own clock."""
+
+
+class Robot:
+    """One Go1 with its sensors.
+
+    Attributes:
+        clock: its own time, s.
+        braking: its drives only brake, because nobody has commanded them for too long or because they were told to.
+    """
+
+    def __init__(self, task: TaskConfig, config: SimConfig) -> None:
+        """Put the task's robot, with its drives and effects, where ``config.start`` says, at rest.
+
+        Raises:
+            ConfigError: if its drives have no gains, which commands set.
+        """
+        if not has_gains(task.actuator):
+            raise ConfigError([f"actuator: {task.actuator.entry.name!r} has no kp and kd to command; use actuator=pd"])
+        self._config, self._rng = config, np.random.default_rng(config.seed)
+        held = (1.0, 0.0, 0.0, 0.0) if config.start == "hung" else None
+        model, blocks = build_model(task.robot, build_terrain(TerrainConfig()), TICK, imu=True, held=held)
+        backend = MujocoCpu(model, blocks, 1, threads=1)
+        random = EnvRandom(config.seed, 1, device=backend.qpos.device)
+        self._plant = Plant(backend, drive_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
+        self._plant.startup()
+        own = self._plant.actuator
+        self._own_gains = tuple(getattr(own, name).numpy().ravel().copy() for name in ("kp", "kd"))
+        self.clock, self.braking = 0.0, False
+        self._commanded, self._in_force = -np.inf, 0
+        self._place()
+
+    def _place(self) -> None:
+        """Set the first state down and let it come to rest; the robot holds it with its own gains until it is told."""
+        plant, start = self._plant, self._config.start
+        joints = np.tile(LYING, robot.NUM_LEGS) if start == "lying" else robot.NOMINAL_STANCE
+        qpos, qvel = torch.zeros_like(plant.backend.qpos), torch.zeros_like(plant.backend.qvel)
+        qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(joints)
+        if start != "hung":
+            qpos[:, 2] = LYING_HEIGHT if start == "lying" else robot.NOMINAL_HEIGHT
+            qpos[:, 3] = 1.0
+        everyone = torch.ones(1, dtype=torch.bool)
+        plant.backend.reset(everyone, qpos, qvel)
+        self._target = qpos[:, -robot.NUM_JOINTS :].clone()
+        plant.reset(everyone, self._target)
+        self._gains = self._own_gains
+        self._set_gains(*((np.zeros(robot.NUM_JOINTS), self._braking_kd) if start == "lying" else self._own_gains))
+        for _ in range(round(SETTLE_S / TICK)):
+            plant.step(self._target)
+        plant.effects.reset(everyone)  # what drifts begins now
+
+    _braking_kd = np.full(robot.NUM_JOINTS, DEFAULT_KD)
+
+    def _set_gains(self, kp: np.ndarray, kd: np.ndarray) -> None:
+        """Give the drives gains, if they have others."""
+        if all(np.array_equal(own, new) for own, new in zip(self._gains, (kp, kd), strict=True)):
+            return
+        self._gains = (np.array(kp), np.array(kd))
+        rows = (torch.as_tensor(values).unsqueeze(0) for values in self._gains)
+        self._plant.set_gains(*(row.to(self._plant.q.dtype) for row in rows))
+
+    def obey(self, command: LowCmd, number: int) -> None:
+        """Take a command into force, whose number its sender gave it."""
+        self._commanded, self._in_force = self.clock, number
+        self.braking = command.damping
+        self._target = torch.tensor(command.joint_target, dtype=self._plant.q.dtype).unsqueeze(0)
+        self._set_gains(command.kp, command.kd)
+
+    def sense(self) -> tuple[LowState, np.ndarray]:
+        """Return what the sensors say now, and the truth (13,): trunk's place, attitude and velocities.
+
+        The truth is in the columns of ``TRUTH``; NaN for a robot that hangs.
+        """
+        true = {name: values[0].numpy() for name, values in sample(self._plant, self._target).items()}
+        rng, share = self._rng, self._config.noise
+
+        def even(name: str, size: int) -> np.ndarray:
+            return rng.uniform(-1.0, 1.0, size) * share * NOISE[name]
+
+        def normal(name: str, size: int) -> np.ndarray:
+            return rng.standard_normal(size) * share * OWN_NOISE[name]
+
+        state = LowState(
+            t=self.clock,
+            clock=self.clock,
+            in_force=self._in_force,
+            joint_pos=true["q"] + even("joint_pos", 12),
+            joint_vel=true["qd"] + even("joint_vel", 12),
+            joint_torque=true["tau_est"],
+            imu_quat=turned(true["quat"], even("attitude", 3)),
+            imu_gyro=true["gyro"] + even("imu_gyro", 3),
+            imu_acc=true["acc"] + normal("imu_acc", 3),
+            foot_force=np.maximum(true["foot_force"] + normal("foot_force", 4), 0.0),
+        )
+        if "base_pos" not in true:
+            return state, np.full(13, np.nan)
+        return state, np.concatenate([true[name] for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel")])
+
+    def step(self) -> None:
+        """Advance by a tick; drives that nobody has commanded for ``SILENCE`` brake."""
+        if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE + 1e-9:
+            self.braking = True
+            self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
+        self._plant.step(self._target)
+        self.clock = round(self.clock / TICK + 1) * TICK
+
+
+def turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Return attitudes (..., 4), w-x-y-z, turned by small rotation vectors (..., 3), rad, in their own axes."""
+    w, x, y, z = np.moveaxis(quat, -1, 0)
+    a, b, c = np.moveaxis(0.5 * by, -1, 0)
+    parts = (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)
+    new = np.stack(parts, axis=-1)
+    return new / np.linalg.norm(new, axis=-1, keepdims=True)

@@ -1,0 +1,214 @@
+"""The simulated robot behind a UDP socket, in real time, over a network that may delay and lose."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import socket
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from go1exp.deploy import wire
+from go1exp.deploy.loop import MonotonicClock, Timing, run
+from go1exp.deploy.udp import HOST
+from go1exp.sim_robot.machine import TICK, Robot
+from go1exp.sim_robot.settings import SimConfig
+
+MOST_AT_ONCE = 10
+"""Ticks that are made up for at once after a delay; beyond that the robot's time stands still (its clock tells)."""
+
+TRUTH = (
+    *("base_pos_x_w", "base_pos_y_w", "base_pos_z_w", "base_quat_w", "base_quat_x", "base_quat_y", "base_quat_z"),
+    *("base_lin_vel_x_w", "base_lin_vel_y_w", "base_lin_vel_z_w"),
+    *("base_ang_vel_x_b", "base_ang_vel_y_b", "base_ang_vel_z_b"),
+)
+"""Columns of the truth, named as in a recording."""
+
+CHUNK = 5000
+ASK_EVERY = 20
+"""Calls between two questions whether to go on."""
+
+
+class Network:
+    """Delays and loses datagrams: each of them by itself, with the same odds both ways."""
+
+    def __init__(self, delay: float, loss: float, rng: np.random.Generator) -> None:
+        """Delay by ``delay`` s and lose a share ``loss``."""
+        self._delay, self._loss, self._rng = delay, loss, rng
+        self._way: list[tuple[float, int, bytes]] = []
+        self._count = 0
+        self.lost = 0
+
+    def put(self, now: float, data: bytes) -> None:
+        """Hand a datagram over at ``now``, s."""
+        if self._loss and self._rng.random() < self._loss:
+            self.lost += 1
+            return
+        self._count += 1
+        heapq.heappush(self._way, (now + self._delay, self._count, data))
+
+    def take(self, now: float) -> list[bytes]:
+        """Return the datagrams that are there by ``now``, in the order in which they arrive."""
+        found = []
+        while self._way and self._way[0][0] <= now + 1e-9:
+            found.append(heapq.heappop(self._way)[2])
+        return found
+
+
+class Truth:
+    """The trunk's true motion by the robot's clock, kept in pieces so that nothing is ever moved."""
+
+    def __init__(self) -> None:
+        self._pieces = [np.zeros((CHUNK, 1 + len(TRUTH)))]
+        self._rows = 0
+
+    def add(self, clock: float, values: np.ndarray) -> None:
+        """Keep a row."""
+        if self._rows == CHUNK:
+            self._pieces.append(np.zeros_like(self._pieces[0]))
+            self._rows = 0
+        row = self._pieces[-1][self._rows]
+        row[0], row[1:] = clock, values
+        self._rows += 1
+
+    def rows(self) -> np.ndarray:
+        """Return everything: clock, and the columns of ``TRUTH``, (T, 14)."""
+        return np.concatenate([*self._pieces[:-1], self._pieces[-1][: self._rows]])
+
+
+@dataclass
+class Counts:
+    """What happened at the robot's end; datagrams by what became of them, and how real time was kept.
+
+    Attributes:
+        commands: taken into force.
+        old: commands that came after a newer one.
+        foreign: datagrams that were no message, or came from somebody else.
+        states: sent.
+        lost: datagrams that the simulated network lost.
+        slipped: time by which the robot's clock fell behind for good, s.
+        ticks: of 2 ms, that were simulated.
+    """
+
+    commands: int = 0
+    old: int = 0
+    foreign: int = 0
+    states: int = 0
+    lost: int = 0
+    slipped: float = 0.0
+    ticks: int = 0
+    timing: dict[str, Any] = field(default_factory=dict)
+
+
+class Server:
+    """A robot at a port of this machine.
+
+    Attributes:
+        port: where it listens.
+        counts: what has happened.
+        truth: the trunk's true motion.
+    """
+
+    def __init__(self, robot: Robot, config: SimConfig, port: int = 0) -> None:
+        """Listen at ``port``, or at any that is free if 0.
+
+        Raises:
+            OSError: if the port is taken.
+        """
+        self._robot = robot
+        rng = np.random.default_rng([config.seed, 1])
+        self._here, self._back = (Network(config.delay, config.loss, rng) for _ in range(2))
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind((HOST, port))
+        except OSError:
+            self._socket.close()
+            raise
+        self.port: int = self._socket.getsockname()[1]
+        self._peer: tuple[str, int] | None = None
+        self._last = 0
+        self.counts, self.truth = Counts(), Truth()
+
+    def serve(self, going: Callable[[], bool], seconds: float | None = None) -> Timing:
+        """Run in real time while ``going``; return how the time was kept."""
+        clock = MonotonicClock()
+        begin, calls = math.inf, 0
+
+        def work(now: float) -> bool:
+            nonlocal begin, calls
+            begin = min(begin, now - TICK * self.counts.ticks) if calls == 0 else begin
+            due = int((now - begin) / TICK) + 1 - self.counts.ticks
+            if due > MOST_AT_ONCE:
+                late = (due - MOST_AT_ONCE) * TICK
+                begin, due = begin + late, MOST_AT_ONCE
+                self.counts.slipped += late
+            for _ in range(due):
+                self.tick()
+            calls += 1
+            return calls % ASK_EVERY != 0 or going()
+
+        timing = run(work, 1.0 / TICK, seconds, clock)
+        self.counts.timing = asdict(timing)
+        self.counts.lost = self._here.lost + self._back.lost
+        return timing
+
+    def tick(self) -> None:
+        """Listen, obey the newest command, send what the sensors say, and move on by a tick."""
+        robot, now = self._robot, self._robot.clock
+        self._listen(now)
+        for data in self._here.take(now):
+            self._obey(data)
+        state, true = robot.sense()
+        self.truth.add(now, true)
+        if self._peer is not None:
+            self._back.put(now, wire.pack_state(state, self.counts.ticks))
+            for data in self._back.take(now):
+                self._send(data)
+        robot.step()
+        self.counts.ticks += 1
+
+    def _listen(self, now: float) -> None:
+        while True:
+            try:
+                data, sender = self._socket.recvfrom(wire.COMMAND_SIZE + 1)
+            except BlockingIOError:
+                return
+            except ConnectionRefusedError:
+                continue  # an earlier state found nobody
+            about = wire.head(data)
+            if about is None or about.kind == wire.STATE or self._peer not in (None, sender):
+                self.counts.foreign += 1
+                continue
+            self._peer = sender  # whoever speaks first
+            if about.kind == wire.COMMAND:
+                self._here.put(now, data)
+
+    def _obey(self, data: bytes) -> None:
+        about = wire.head(data)
+        assert about is not None  # it was looked at when it came
+        if wire.newer(about.number, self._last) <= 0:
+            self.counts.old += 1
+            return
+        command = wire.unpack_command(data, about)
+        if not all(np.isfinite(values).all() for values in (command.joint_target, command.kp, command.kd)):
+            self.counts.foreign += 1
+            return
+        self._last = about.number
+        self.counts.commands += 1
+        self._robot.obey(command, about.number)
+
+    def _send(self, data: bytes) -> None:
+        assert self._peer is not None
+        try:
+            self._socket.sendto(data, self._peer)
+            self.counts.states += 1
+        except (BlockingIOError, ConnectionRefusedError):
+            pass
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._socket.close()

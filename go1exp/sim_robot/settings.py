@@ -1,0 +1,31 @@
+"""How the simulated robot is set up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import ConfigDict, Field
+
+from go1exp.registry import STRICT, Fraction, NonNegative
+
+
+@dataclass(frozen=True)
+class SimConfig:
+    """How the simulated robot is set up.
+
+    Attributes:
+        start: on its feet in the nominal stance, on its belly, or hung up so that no foot reaches the ground.
+        noise: of its sensors, as a multiple of the paper's Table II.
+        delay: of datagrams, each way, s.
+        loss: share of the datagrams that get lost, each way.
+        seed: of noise, loss and drawn effects.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    start: Literal["standing", "lying", "hung"] = "standing"
+    noise: NonNegative = 1.0
+    delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    loss: Annotated[Fraction, Field(lt=1)] = 0.0
+    seed: Annotated[int, Field(ge=0)] = 0

@@ -1,0 +1,132 @@
+"""The runtime and the simulated robot in one process and one thread, over their real sockets, at a time of their own.
+
+Time passes only while the runtime sleeps, and then the robot ticks: the same arguments give the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from go1exp.deploy import job, udp, walk
+from go1exp.deploy.loop import Deadlines
+from go1exp.deploy.messages import LowCmd, LowState
+from go1exp.sim_robot.__main__ import sim_config, task_of
+from go1exp.sim_robot.machine import TICK, Robot
+from go1exp.sim_robot.server import TRUTH, Server
+
+BEGIN = 100.0
+"""The runtime's clock at the start, s."""
+
+Spoil = Callable[[LowState], LowState | None]
+
+
+class World:
+    """What there is while a walk is played.
+
+    Attributes:
+        now: the time, s.
+        robot: at the other end; None before it is started.
+        obeyed: by number, what the robot has taken into force.
+        targets: of each tick: the robot's clock, the target in force, and whether it braked.
+        spins: what the runtime's clocks were asked to spin.
+        closed: the simulated robot was closed.
+    """
+
+    def __init__(self, spoil: Spoil) -> None:
+        self.now, self.spoil = BEGIN, spoil
+        self.robot: Robot | None = None
+        self.server: Server | None = None
+        self.obeyed: dict[int, LowCmd] = {}
+        self.targets: list[tuple[float, np.ndarray, bool]] = []
+        self.spins: list[float] = []
+        self.closed = False
+
+    def pass_until(self, when: float) -> None:
+        while self.now + TICK <= when + 1e-9:
+            if self.server is not None and not self.closed:
+                self.server.tick()
+            self.now += TICK
+        self.now = max(self.now, when)
+
+
+class Listening(Robot):
+    """A robot that tells what it obeys, and whose sensors may be spoilt."""
+
+    world: World
+
+    def obey(self, command: LowCmd, number: int) -> None:
+        self.world.obeyed[number] = command
+        super().obey(command, number)
+
+    def sense(self) -> tuple[LowState, np.ndarray]:
+        state, true = super().sense()
+        self.world.targets.append((self.clock, self._target[0].numpy().copy(), self.braking))
+        spoilt = self.world.spoil(state)
+        if spoilt is None:
+            raise SilentError(true)
+        return spoilt, true
+
+
+class SilentError(Exception):
+    """This state does not go out."""
+
+
+class Mutable(Server):
+    """A robot that may fall silent."""
+
+    def tick(self) -> None:
+        try:
+            super().tick()
+        except SilentError:
+            self._robot.step()
+            self.counts.ticks += 1
+
+
+class InProcess:
+    """Stands for ``SimulatedRobot``."""
+
+    def __init__(self, world: World, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+        config = sim_config(dict(sim))
+        robot = Listening(task_of(bundle, dict(other)), config)
+        robot.world, world.robot = world, robot
+        self.world, self._server = world, Mutable(robot, config)
+        world.server = self._server
+        self.port = self._server.port
+        self.report: dict[str, Any] = {}
+        self.truth: dict[str, np.ndarray] = {}
+
+    def __enter__(self) -> InProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.world.closed = True
+        empty = Deadlines(TICK, 1).timing()
+        self.report = asdict(self._server.counts) | {"timing": asdict(empty)}
+        rows = self._server.truth.rows()
+        if not np.isnan(rows).any():
+            self.truth = dict(zip(("clock", *TRUTH), rows.T, strict=True))
+        self._server.close()
+
+
+@contextmanager
+def lockstep(spoil: Spoil = lambda state: state) -> Iterator[World]:
+    """Let ``go1exp.deploy.job.do`` play at a time of its own; ``spoil`` changes what sensors say, None is silence."""
+    world = World(spoil)
+
+    def clock(spin: float) -> Any:
+        world.spins.append(spin)
+        return SimpleNamespace(now=lambda: world.now, sleep_until=world.pass_until)
+
+    told = SimpleNamespace(perf_counter=lambda: world.now, time=lambda: 0.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(udp, "time", told)  # stamps of arrival are not believed, and states are as old as the last cycle
+        patch.setattr(walk, "MonotonicClock", clock)
+        patch.setattr(job, "SimulatedRobot", lambda *given: InProcess(world, *given))
+        yield world

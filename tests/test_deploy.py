@@ -1,0 +1,897 @@
+"""The runtime as a whole: datagrams, the simulated robot, commands, estimate, log, the verb, and every fault."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import pty
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from go1exp import cli, data_root, recording, robot
+from go1exp.audit import audit
+from go1exp.compose import compose
+from go1exp.config import parse_train
+from go1exp.deploy import go1_sdk, walk, wire
+from go1exp.deploy.bundle import load
+from go1exp.deploy.commands import (
+    CommandError,
+    Keyboard,
+    Sinusoid,
+    Table,
+    Wish,
+    keys_of,
+    make,
+    parsed,
+    ranges_of,
+    stretched,
+)
+from go1exp.deploy.controller import PHASES, Cycle
+from go1exp.deploy.estimate import BLIND_S, KalmanEstimator, settings
+from go1exp.deploy.job import Job, do
+from go1exp.deploy.launch import RefusedError, RobotError
+from go1exp.deploy.log import About, Log, Ring
+from go1exp.deploy.messages import Link, LowCmd, LowState
+from go1exp.deploy.safety import RULES
+from go1exp.deploy.udp import UdpLink
+from go1exp.deploy.walk import FAULTS, STATUS, Plan
+from go1exp.estimation import from_json, go1, make_filter, sample, to_json
+from go1exp.export.build import build
+from go1exp.gap.prepare import unusable
+from go1exp.gap.standing import StandingGo1
+from go1exp.sim_robot.__main__ import sim_config, task_of
+from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
+from go1exp.sim_robot.server import Network, Server
+from go1exp.train import run_folder, trainer
+from tests.lockstep import BEGIN, Spoil, lockstep
+
+SMALL = (
+    "ppo.num_envs=4",
+    "ppo.steps=4",
+    "ppo.minibatches=2",
+    "ppo.epochs=1",
+    "ppo.hidden=[16,8]",
+    "ppo.iterations=2",
+    "backend.threads=1",
+    "torch_threads=1",
+    "logger.tensorboard=false",
+)
+BUSY = 5.0
+"""Age of a state, s, at which a robot counts as lost where real time passes: the machine may be busy."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two tiny iterations: its policy hardly moves, so that a robot stands."""
+    run = tmp_path_factory.mktemp("deploy") / "run"
+    container = compose("train", (*SMALL, "actuator.kp=35", "actuator.kd=0.7"))
+    run_folder.write(run, container)
+    trainer.train(parse_train(container), container, run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def file(run: Path) -> str:
+    """Its bundle."""
+    path = run / "walk.zip"
+    path.write_bytes(build(run, seconds=0.2))
+    return str(path)
+
+
+def make_state(t: float = 0.0, **changes: Any) -> LowState:
+    rng = np.random.default_rng(abs(int(1e6 * t)))
+    usual: dict[str, Any] = {
+        "joint_pos": robot.NOMINAL_STANCE + 0.01 * rng.normal(size=12),
+        "joint_vel": rng.normal(size=12),
+        "joint_torque": rng.normal(size=12),
+        "imu_quat": np.array([1.0, 0.0, 0.0, 0.0]),
+        "imu_gyro": 0.1 * rng.normal(size=3),
+        "imu_acc": np.array([0.0, 0.0, 9.81]),
+        "foot_force": np.full(4, 30.0),
+    }
+    return LowState(t, **{**usual, "clock": t, "in_force": 0, **changes})
+
+
+def make_command(**changes: Any) -> LowCmd:
+    return dataclasses.replace(LowCmd(robot.NOMINAL_STANCE.copy(), np.full(12, 20.0), np.full(12, 0.5)), **changes)
+
+
+# ---------------------------------------------------------------------- datagrams
+
+
+def test_a_state_and_a_command_come_through_the_wire_bit_for_bit() -> None:
+    state = make_state(0.123, in_force=77)
+    data = wire.pack_state(state, 2**32 + 5)
+    about = wire.head(data)
+    assert about is not None
+    assert (about.kind, about.number, about.clock) == (wire.STATE, 5, 0.123)
+    assert len(data) == wire.STATE_SIZE
+    again = wire.unpack_state(data, about, 9.0)
+    assert (again.t, again.clock, again.in_force) == (9.0, 0.123, 77)
+    for name, _ in wire.STATE_PARTS:
+        assert getattr(again, name).tobytes() == getattr(state, name).tobytes(), name
+    for damping in (False, True):
+        command = make_command(damping=damping, kp=np.arange(12.0))
+        data = wire.pack_command(command, 3, 1.5)
+        about = wire.head(data)
+        assert about is not None
+        back = wire.unpack_command(data, about)
+        assert back.damping is damping
+        for name, _ in wire.COMMAND_PARTS:
+            assert getattr(back, name).tobytes() == getattr(command, name).tobytes(), name
+    with pytest.raises(ValueError, match=r"kp: has shape \(3,\)"):
+        wire.pack_command(make_command(kp=np.zeros(3)), 1, 0.0)
+
+
+def garbage() -> list[bytes]:
+    good = wire.pack_state(make_state(), 1)
+    changed = [good[:k] + bytes([good[k] ^ 0x55]) + good[k + 1 :] for k in (0, 3, 4, 5)]  # magic, version, kind
+    rng = np.random.default_rng(0)
+    clockless = wire.HEAD.pack(wire.MAGIC, wire.VERSION, wire.STATE, 0, 1, math.nan) + good[wire.HEAD.size :]
+    noise = [rng.bytes(int(size)) for size in (0, 1, 19, 20, 21, *rng.integers(0, 2000, 50), wire.STATE_SIZE)]
+    return [good[:-1], good + b"\0", good[: wire.HEAD.size], clockless, *changed, *noise]
+
+
+def test_what_is_no_message_has_no_head() -> None:
+    assert wire.head(wire.pack_state(make_state(), 1)) is not None
+    assert [data for data in garbage() if wire.head(data) is not None] == []
+
+
+def test_numbers_are_compared_across_their_new_beginning() -> None:
+    assert wire.newer(5, 3) == 2
+    assert wire.newer(3, 5) == -2
+    assert wire.newer(1, 2**32 - 1) == 2
+    assert wire.newer(2**32 - 1, 1) == -2
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[UdpLink, socket.socket, tuple[str, int]]]:
+    """A link, and a robot's socket that has been greeted by it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        other.settimeout(5.0)
+        link = UdpLink(other.getsockname()[1])
+        assert link.receive() == []
+        data, address = other.recvfrom(100)
+        about = wire.head(data)
+        assert about is not None
+        assert about.kind == wire.HELLO
+        yield link, other, address
+        link.close()
+
+
+def test_a_link_drops_garbage_and_what_is_late_and_counts_it(
+    pair: tuple[UdpLink, socket.socket, tuple[str, int]],
+) -> None:
+    link, other, address = pair
+    for data in garbage():
+        other.sendto(data, address)
+    other.sendto(wire.pack_command(make_command(), 1, 0.0), address)  # a message, but no state
+    assert link.receive() == []
+    assert link.traffic.foreign == len(garbage()) + 1
+    for number in (7, 8, 8, 6, 11, 10):
+        other.sendto(wire.pack_state(make_state(0.001 * number), number), address)
+    found = link.receive()
+    assert [round(1e3 * state.clock) for state in found] == [7, 8, 11]
+    assert (link.traffic.received, link.traffic.late, link.traffic.lost) == (3, 3, 2)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(wire.pack_state(make_state(), 12), address)
+    assert link.receive() == []  # the kernel lets nobody else through
+    assert link.traffic.foreign == len(garbage()) + 1
+
+
+def test_a_link_says_when_a_state_arrived_not_when_it_was_read(
+    pair: tuple[UdpLink, socket.socket, tuple[str, int]],
+) -> None:
+    link, other, address = pair
+    other.sendto(wire.pack_state(make_state(), 1), address)
+    time.sleep(0.05)
+    before = time.perf_counter()
+    (state,) = link.receive()
+    assert before - state.t >= 0.045 or before <= state.t  # or the kernel gives no stamps
+    assert state.t <= time.perf_counter()
+
+
+def test_a_robot_that_is_gone_is_no_error_of_the_link() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(("127.0.0.1", 0))
+        port = gone.getsockname()[1]
+    link = UdpLink(port)
+    for _ in range(5):
+        link.send(make_command())
+        assert link.receive() == []
+    assert link.traffic.sent == 5
+    link.close()
+
+
+# ---------------------------------------------------------------------- the simulated robot
+
+
+@pytest.mark.parametrize("start", ["standing", "lying", "hung"])
+def test_a_robot_begins_at_rest(file: str, start: str) -> None:
+    made = Robot(task_of(file, {}), sim_config({"start": start, "noise": 0.0}))
+    state, true = made.sense()
+    assert np.abs(state.joint_vel).max() < 0.3
+    np.testing.assert_allclose(np.linalg.norm(state.imu_acc), 9.81, rtol=0.02)
+    assert (state.foot_force > 15.0).all() == (start == "standing")
+    assert np.isnan(true).all() == (start == "hung")
+    height = {"standing": (0.25, 0.33), "lying": (0.04, 0.1)}.get(start)
+    if height:
+        assert height[0] < true[2] < height[1]
+
+
+def test_drives_obey_and_brake_when_nobody_speaks(file: str) -> None:
+    made = Robot(task_of(file, {}), sim_config({"start": "hung", "noise": 0.0}))
+    target = robot.NOMINAL_STANCE + 0.1
+    made.obey(make_command(joint_target=target, kp=np.full(12, 40.0), kd=np.full(12, 1.0)), 5)
+    for _ in range(500):
+        made.obey(make_command(joint_target=target, kp=np.full(12, 40.0), kd=np.full(12, 1.0)), 5)
+        made.step()
+    assert made.sense()[0].in_force == 5
+    np.testing.assert_allclose(made.sense()[0].joint_pos, target, atol=0.03)
+    for tick in range(round(SILENCE / TICK) + 5):
+        assert made.braking == (tick * TICK > SILENCE + 1e-9), tick
+        made.step()
+    assert made.braking
+    before = made.sense()[0]
+    made.step()
+    after = made.sense()[0]
+    np.testing.assert_allclose(after.joint_torque, -2.0 * before.joint_vel, atol=0.1)
+    made.obey(make_command(), 6)  # whoever speaks again is heard
+    assert not made.braking
+
+
+def test_noise_is_that_of_table_ii(file: str) -> None:
+    loud, quiet = (Robot(task_of(file, {}), sim_config({"noise": noise})) for noise in (1.0, 0.0))
+    truth = quiet.sense()[0]
+    states = [loud.sense()[0] for _ in range(1000)]
+    for name in ("joint_pos", "joint_vel", "imu_gyro"):
+        off = np.array([getattr(state, name) for state in states]) - getattr(truth, name)
+        assert np.abs(off).max() <= NOISE[name] + 1e-6
+        assert np.abs(off).max() > 0.99 * NOISE[name]
+        np.testing.assert_allclose(off.std(), NOISE[name] / math.sqrt(3), rtol=0.05)
+    quats = np.array([state.imu_quat for state in states])
+    np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1.0, atol=1e-12)
+    assert turned(np.array([1.0, 0, 0, 0]), np.array([0.02, 0, 0])) == pytest.approx([1, 0.01, 0, 0], abs=1e-4)
+
+
+def test_a_network_delays_and_loses() -> None:
+    way = Network(0.01, 0.0, np.random.default_rng(0))
+    way.put(0.0, b"a")
+    way.put(0.002, b"b")
+    assert [way.take(t) for t in (0.009, 0.01, 0.011, 0.02)] == [[], [b"a"], [], [b"b"]]
+    way = Network(0.0, 0.25, np.random.default_rng(0))
+    for k in range(4000):
+        way.put(float(k), b"")
+    assert len(way.take(1e9)) == 4000 - way.lost
+    assert way.lost == pytest.approx(1000, abs=100)
+
+
+def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) -> None:
+    server = Server(Robot(task_of(file, {}), sim_config({})), sim_config({}))
+    mine, other = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    to = ("127.0.0.1", server.port)
+    server.tick()
+    for number in (3, 5, 4):
+        mine.sendto(wire.pack_command(make_command(), number, 0.0), to)
+    other.sendto(wire.pack_command(make_command(), 9, 0.0), to)
+    mine.sendto(wire.pack_command(make_command(kp=np.full(12, np.nan)), 10, 0.0), to)
+    mine.sendto(wire.pack_state(make_state(), 11), to)
+    mine.sendto(b"G1XP", to)
+    server.tick()
+    counts = server.counts
+    assert (counts.commands, counts.old, counts.foreign) == (2, 1, 4)
+    mine.settimeout(5.0)
+    data = mine.recv(2000)
+    about = wire.head(data)
+    assert about is not None
+    assert wire.unpack_state(data, about, 0.0).in_force == 5
+    for opened in (mine, other, server):
+        opened.close()
+
+
+def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Path]) -> None:
+    task = task_of(file, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
+    with pytest.raises(Exception, match="'net' has no kp and kd to command"):
+        Robot(task, sim_config({}))
+
+
+# ---------------------------------------------------------------------- the whole chain, at a time of its own
+
+
+def play(
+    file: str, out: Path, spoil: Spoil = lambda state: state, *, job: dict[str, Any] | None = None, **plan: Any
+) -> SimpleNamespace:
+    """Walk; return status, what was said, the account, the recording, the cycles and the world."""
+    usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "brake": 0.1, "wish": Wish((0.4, 0.0, 0.0))}
+    said: list[str] = []
+    with lockstep(spoil) as world:
+        status = do(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), said.append)
+    (account,) = out.glob("*.json")
+    kept = list(out.glob("*.parquet"))
+    with np.load(next(out.glob("*.npz"))) as cycles:
+        found = {name: cycles[name] for name in cycles.files}
+    return SimpleNamespace(
+        status=status,
+        said=said,
+        account=json.loads(account.read_text()),
+        recording=recording.read(kept[0]) if kept else None,
+        cycles=found,
+        world=world,
+    )
+
+
+def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> None:
+    done = play(file, tmp_path, job={"sim": {"noise": 0.0}, "truth": True})
+    assert done.status == 0
+    assert done.account["ended"] == "walked to the end"
+    assert done.said[-1] == "walked for 1.0 s, to the end"
+    assert done.account["walked_s"] == pytest.approx(1.0)
+    phases = [PHASES[int(k)] for k in done.cycles["phase"]]
+    counts = [phases.count(name) for name in PHASES]
+    assert counts[:3] == [1, 10, 50]
+    assert counts[3] in (6, 7)  # for 0.1 s, both ends included, if rounding lets them
+    assert done.account["timing"]["missed"] == 0
+    assert list(done.account["phases"]) == list(PHASES)
+
+    r = done.recording
+    assert (r.meta.source, r.meta.tool, r.meta.excitation, r.meta.base) == (
+        *("simulated", "go1exp deploy"),
+        *("policy", "floating"),
+    )
+    assert r.meta.kp == (35.0,) * 12
+    assert r.meta.rate_hz == pytest.approx(500.0)
+    assert len(r.t) == 600
+    np.testing.assert_allclose(np.diff(r.t), TICK, atol=1e-9)
+    # What the log says was in force is what the robot had, tick by tick.
+    had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
+    targets = np.array([had[round(t / TICK)] for t in r.t])
+    assert r.joint("q_target").tobytes() == targets.tobytes()
+    # Drives: torque = kp (target - q) - kd qd, one tick later.
+    torque = 35.0 * (r.joint("q_target") - r.joint("q")) - 0.7 * r.joint("qd")
+    assert np.abs(torque[:-1] - r.joint("tau_est")[1:])[np.diff(targets, axis=0).max(axis=1) == 0].mean() < 0.05
+    assert r.block("base_pos_z_w").min() > 0.2
+    velocity = done.account["velocity"]
+    assert np.max(velocity["estimate_rmse"]) < 0.05
+    assert done.account["estimator"] == {"LATE": 0, "INVALID": 0, "RESTARTED": 0}
+    assert done.account["link"]["lost"] == done.account["link"]["foreign"] == 0
+    assert done.account["simulated_robot"]["commands"] == done.account["link"]["sent"] - 1  # nobody waits for the last
+    # The drives brake at the end, and nobody says otherwise after that.
+    assert done.world.robot.braking
+    assert done.world.obeyed[max(done.world.obeyed)].damping
+
+
+def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(file: str, tmp_path: Path) -> None:
+    done = play(file, tmp_path, job={"sim": {"noise": 0.1}, "other": {"effect": {"coulomb": {"bound": 0.4}}}})
+    assert "coulomb" not in done.recording.meta.notes
+    assert not any(name.startswith("base_") for name in done.recording.channels)
+    assert unusable(done.recording, audit(done.recording), StandingGo1(task_of(file, {}).robot)) == []
+
+
+def test_the_same_walk_gives_the_same_numbers(file: str, tmp_path: Path) -> None:
+    one, two = (play(file, tmp_path / name, seconds=0.3, job={"sim": {"loss": 0.1}}) for name in ("a", "b"))
+    for name, values in one.recording.channels.items():
+        assert values.tobytes() == two.recording.channels[name].tobytes(), name
+    assert one.account["link"]["lost"] > 5
+
+
+def test_delay_and_loss_are_in_the_log_as_the_robot_lived_them(file: str, tmp_path: Path) -> None:
+    done = play(file, tmp_path, job={"sim": {"delay": 0.006, "loss": 0.05, "noise": 0.0}})
+    assert done.status == 0
+    assert done.account["link"]["lost"] > 5
+    had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
+    r = done.recording
+    assert len(r.t) < 590
+    assert r.joint("q_target").tobytes() == np.array([had[round(t / TICK)] for t in r.t]).tobytes()
+
+
+@pytest.mark.parametrize("rate", [100.0, 200.0, 400.0])
+def test_another_rate_is_the_policys(file: str, tmp_path: Path, rate: float) -> None:
+    done = play(file, tmp_path, rate=rate, seconds=0.2)
+    assert done.status == 0
+    assert done.said[0] == f"note: the policy was trained at 50 Hz and runs at {rate:g} Hz"
+    walking = done.cycles["phase"] == PHASES.index("walking")
+    assert walking.sum() == round(0.2 * rate)
+    assert len(np.unique(done.cycles["q_target"][walking], axis=0)) > 0.9 * walking.sum()
+
+
+def test_a_robot_gets_up_from_its_belly(file: str, tmp_path: Path) -> None:
+    done = play(file, tmp_path, stand_up=1.0, seconds=0.5, job={"sim": {"start": "lying"}, "truth": True})
+    assert done.status == 0
+    height = done.recording.block("base_pos_z_w")[:, 0]
+    assert height[0] < 0.1
+    assert height[-1] > 0.22
+
+
+# ---------------------------------------------------------------------- faults on the way
+
+
+def from_(clock: float, what: Callable[[LowState], LowState | None]) -> Spoil:
+    return lambda state: state if state.clock < clock - 1e-9 else what(state)
+
+
+def kill(number: int) -> Callable[[LowState], LowState]:
+    def stop(state: LowState) -> LowState:
+        os.kill(os.getpid(), number)
+        return state
+
+    return stop
+
+
+def leaning(state: LowState) -> LowState:
+    return dataclasses.replace(state, imu_quat=np.array([math.cos(0.6), math.sin(0.6), 0.0, 0.0]))
+
+
+def odd(**changes: Any) -> Callable[[LowState], LowState]:
+    return lambda state: dataclasses.replace(state, **changes)
+
+
+FAULTY: list[tuple[str, Callable[[LowState], LowState | None], str]] = [
+    ("stale_state", lambda state: None, "ms old"),
+    ("not_finite", odd(joint_pos=np.full(12, np.nan)), "joint_pos of FR_hip is nan"),
+    ("attitude", odd(imu_quat=np.zeros(4)), "length is 0.000"),
+    ("tilt", leaning, "leans by 69 degrees"),
+    ("joint_range", odd(joint_pos=robot.NOMINAL_STANCE + 1.5), "beyond its stop"),
+    ("torque", odd(joint_torque=np.full(12, 60.0)), "reports 60.0 N m"),
+    ("power", odd(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 5.0)), "1200 W"),
+    ("operator_stop", kill(signal.SIGTERM), "asked for by SIGTERM"),
+    ("operator_stop", kill(signal.SIGINT), "asked for by SIGINT"),
+]
+
+
+@pytest.mark.parametrize(("name", "what", "said"), FAULTY, ids=[f"{f[0]} {f[2]}" for f in FAULTY])
+def test_a_fault_over_the_link_makes_the_drives_brake_and_has_a_name_in_the_log(
+    file: str, tmp_path: Path, name: str, what: Callable[[LowState], LowState | None], said: str
+) -> None:
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    done = play(file, tmp_path, from_(0.5, what), seconds=2.0)
+    assert done.status == STATUS[name]
+    assert done.account["ended"] == name
+    assert said in done.account["fault"]["message"]
+    assert done.said[-1].startswith(f"fault: {name} at ")
+    assert 0.49 < done.account["fault"]["t"] - BEGIN < 0.65
+    assert done.world.robot.braking
+    assert done.world.obeyed[max(done.world.obeyed)].damping
+    assert (done.cycles["damping"][done.cycles["phase"] == PHASES.index("damping")] == 1).all()
+    assert done.recording.t[-1] < 0.66  # up to the fault, with what led to it
+    assert handlers == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+
+
+def test_a_robot_that_never_speaks_is_waited_for_and_not_commanded(file: str, tmp_path: Path) -> None:
+    done = play(file, tmp_path, lambda state: None, patience=0.3)
+    assert done.status == STATUS["no_state"]
+    assert done.recording is None
+    assert done.account["fault"]["t"] - BEGIN == pytest.approx(0.3, abs=0.03)
+    assert done.account["first_command_after_s"] is None or done.world.obeyed
+
+
+def test_a_link_that_breaks_ends_the_walk_with_a_log(file: str) -> None:
+    sent: list[LowCmd] = []
+    calls = iter(range(100))
+
+    def receive() -> list[LowState]:
+        if next(calls) == 5:
+            raise RobotError("the SDK failed")
+        return [make_state(time.perf_counter(), clock=math.nan, in_force=-1)]
+
+    link = SimpleNamespace(receive=receive, send=sent.append, close=lambda: None)
+    outcome = walk.go(load(file), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0))
+    assert outcome.fault is not None
+    assert (outcome.fault.name, outcome.fault.message) == ("runtime", "RobotError: the SDK failed")
+    assert outcome.status == STATUS["runtime"]
+    assert [command.damping for command in sent] == [False] * 5 + [True]
+    assert outcome.log.states.count == 5
+
+
+def test_every_fault_has_a_status_of_its_own() -> None:
+    assert list(RULES) == list(FAULTS)[: len(RULES)]
+    assert len(set(STATUS.values())) == len(FAULTS)
+    assert min(STATUS.values()) > walk.UNKNOWN_FAULT > 15  # those of other verbs
+    conf = (data_root() / "conf/deploy.yaml").read_text()
+    for name, status in STATUS.items():
+        assert f"{status} {name}" in " ".join(conf.split())
+
+
+# ---------------------------------------------------------------------- estimate
+
+
+def test_the_filters_settings_travel_in_the_bundle(file: str) -> None:
+    about = load(file).metadata
+    assert settings(about.estimator) == go1() == settings({})
+    assert settings(about.estimator, contact_source="height").contact_source == "height"
+    changed = {**about.estimator, "gate": 9.0}
+    assert settings(changed) == from_json(to_json(go1(gate=9.0)), "x")
+    with pytest.raises(ValueError, match=r"estimator: .*|gaet"):
+        settings({**about.estimator, "gaet": 1.0})
+
+
+def test_the_adapter_is_the_filter_at_the_robots_own_time() -> None:
+    failed: list[str] = []
+    made, oracle = KalmanEstimator(go1(), lambda name, *_: failed.append(name)), make_filter(go1())
+    for k in range(200):
+        state = dataclasses.replace(make_state(0.002 * k), t=7.0 + 0.0021 * k)
+        got = made.update(state)
+        row = sample(state.clock, state.imu_quat, state.imu_gyro, state.imu_acc, state.joint_pos, state.joint_vel)
+        row[-4:] = state.foot_force
+        oracle.update(row)
+        np.testing.assert_allclose(got, oracle.velocity_b, rtol=0, atol=1e-12)
+    assert failed == []
+
+
+def test_a_filter_that_cannot_be_believed_is_a_fault() -> None:
+    faults: list[tuple[str, str, float]] = []
+
+    def made() -> KalmanEstimator:
+        faults.clear()
+        return KalmanEstimator(go1(), lambda *fault: faults.append(fault))
+
+    blind = made()
+    assert np.isnan(blind.update(make_state(0.0, joint_pos=np.full(12, np.nan)))).all()
+    for k in range(100):
+        blind.update(make_state(0.002 * k, joint_pos=np.full(12, np.nan)))
+        assert bool(faults) == (0.002 * k > BLIND_S + 1e-9), k
+    assert faults[0][0] == "estimator"
+    assert "refused every sample" in faults[0][1]
+
+    runs_away = made()
+    for k in range(1500):  # thrown up, for all that the accelerometer says
+        flying = {"foot_force": np.zeros(4), "imu_acc": np.array([0.0, 0.0, 30.0])}
+        runs_away.update(make_state(0.002 * k, **flying))
+    assert faults[0][:2] == ("estimator", faults[0][1])
+    assert "diverged" in faults[0][1]
+
+    made()
+    late = KalmanEstimator(go1(), lambda *fault: faults.append(fault))
+    for t in (0.0, 0.002, 0.002, 0.004):
+        late.update(make_state(t))
+    assert late.refused == {"LATE": 1, "INVALID": 0}
+    assert faults == []
+
+
+# ---------------------------------------------------------------------- commands
+
+RANGES = np.array([[-0.5, 1.0], [-0.3, 0.3], [-1.0, 1.0]])
+
+
+def test_a_constant_is_kept_within_the_ranges_and_cuts_are_counted() -> None:
+    source = make(Wish((2.0, -0.1, -3.0)), RANGES, print)
+    assert source(0.0).tolist() == source(1.0).tolist() == [1.0, -0.1, -1.0]
+    assert source.cut.tolist() == [2, 0, 2]
+    assert ranges_of({"lin_vel_x": (-1.0, 2.0)}).tolist() == [[-1, 2], [-np.inf, np.inf], [-np.inf, np.inf]]
+    for wrong in ((1.0, 2.0), (np.nan, 0.0, 0.0)):
+        with pytest.raises(CommandError, match="must be three finite numbers"):
+            make(Wish(wrong), RANGES, print)
+    with pytest.raises(CommandError, match="'fast': must be three numbers"):
+        make(Wish("fast"), RANGES, print)
+
+
+def test_rows_of_a_file_are_held(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text("t,x,y,yaw\n0.5,0.4,0,0\n# faster\n1.0,0.8,0.1,-0.2\n")
+    source = Table(path)
+    assert [source(t)[0] for t in (0.0, 0.49, 0.5, 0.99, 1.0, 50.0)] == [0.0, 0.0, 0.4, 0.4, 0.8, 0.8]
+    assert source(1.5).tolist() == [0.8, 0.1, -0.2]
+    for content, said in (
+        ("", "no rows"),
+        ("t,x\n", r"c\.csv:1: 't,x' must be"),
+        ("0,1,2\n", r"c\.csv:1: must be four"),
+        ("0,1,2,nan\n", r"c\.csv:1: must be four finite"),
+        ("0,1,2,3\n0,1,2,3\n", r"c\.csv:2: t = 0 does not come after 0"),
+        ("0,1,2,3\n1,x,2,3\n", r"c\.csv:2: '1,x,2,3' must be"),
+    ):
+        path.write_text(content)
+        with pytest.raises(CommandError, match=said):
+            Table(path)
+
+
+def test_a_sinusoid_swings_as_often_and_as_far_as_it_says() -> None:
+    source = Sinusoid((1.0, 0.5, -2.0), 4.0)
+    np.testing.assert_allclose(source(1.0), [1.0, 0.5, -2.0])
+    np.testing.assert_allclose(source(2.0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(source(7.0), [-1.0, -0.5, 2.0])
+    with pytest.raises(CommandError, match="period 0"):
+        Sinusoid((1.0, 0.0, 0.0), 0.0)
+
+
+def test_keys_change_the_velocity_and_stop_the_robot() -> None:
+    ours, theirs = pty.openpty()
+    stops: list[str] = []
+    source = make_keyboard(theirs, stops)
+    try:
+        for keys, expected in (
+            (b"ww", [0.2, 0.0, 0.0]),
+            (b"\x1b[A\x1b[D", [0.3, 0.0, 0.2]),
+            (b"a\x1b[C\x1b[C", [0.3, 0.1, -0.2]),
+            (b"w" * 30, [1.0, 0.1, -0.2]),
+            (b"?zs", [0.9, 0.1, -0.2]),
+            (b" d", [0.0, -0.1, 0.0]),
+        ):
+            os.write(ours, keys)
+            source.poll()
+            np.testing.assert_allclose(source(0.0), expected, atol=1e-9)
+        assert stops == []
+        for key in (b"\x1b", b"q"):
+            os.write(ours, key)
+            source.poll()
+        assert stops == ["the Esc key", "the q key"]
+    finally:
+        source.close()
+        os.close(ours)
+        os.close(theirs)
+    assert keys_of("w\x1b[A\x1b") == ["w", "\x1b[A", "\x1b"]
+
+
+def make_keyboard(descriptor: int, stops: list[str]) -> Keyboard:
+    return Keyboard(stops.append, lambda velocity: np.clip(velocity, *RANGES.T), descriptor)
+
+
+def test_a_terminal_is_given_back_as_it_was() -> None:
+    import termios
+
+    ours, theirs = pty.openpty()
+    before = termios.tcgetattr(theirs)
+    source = make_keyboard(theirs, [])
+    assert termios.tcgetattr(theirs) != before
+    source.close()
+    assert termios.tcgetattr(theirs) == before
+    os.close(ours)
+    os.close(theirs)
+    with open(os.devnull) as nothing, pytest.raises(CommandError, match="no terminal"):
+        make_keyboard(nothing.fileno(), [])
+
+
+def test_a_gamepad_needs_its_package_and_sticks_reach_the_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(CommandError, match="needs pygame"):
+        make(Wish("gamepad"), RANGES, print)
+    np.testing.assert_allclose(stretched(np.array([1.0, -1.0, 0.05]), RANGES), [1.0, -0.3, 0.0])
+    np.testing.assert_allclose(stretched(np.array([-1.0, 0.5, -0.5]), RANGES), [-0.5, 0.15, -0.5])
+
+    buttons, stops = [0, 0], list[str]()
+    pad = SimpleNamespace(
+        get_numaxes=lambda: 4, get_axis=lambda k: (0.0, -0.5, 0.0, 1.0)[k], get_button=buttons.__getitem__
+    )
+    joystick = SimpleNamespace(get_count=lambda: 1, Joystick=lambda k: pad)
+    nothing = lambda: None  # noqa: E731
+    event = SimpleNamespace(get=list)
+    game = SimpleNamespace(init=nothing, quit=nothing, joystick=joystick, event=event, JOYDEVICEREMOVED=1)
+    monkeypatch.setitem(sys.modules, "pygame", game)
+    source = make(Wish("gamepad"), RANGES, stops.append)
+    source.poll()
+    np.testing.assert_allclose(source(0.0), [0.5, 0.0, -1.0])
+    buttons[1] = 1
+    source.poll()
+    assert stops == ["a button of the gamepad"]
+    source.close()
+
+
+def test_a_word_of_the_command_line_is_numbers_or_a_name() -> None:
+    assert parsed("1,0,-0.5") == parsed("[1, 0, -0.5]") == (1.0, 0.0, -0.5)
+    assert parsed("walk.csv") == "walk.csv"
+
+
+# ---------------------------------------------------------------------- the log
+
+
+def test_a_ring_keeps_the_newest_rows() -> None:
+    ring = Ring((("a", 1), ("b", 2)), 4)
+    for k in range(6):
+        row = ring.next()
+        row[0], row[1:] = k, (10 * k, 20 * k)
+    assert ring.part("a").tolist() == [2.0, 3.0, 4.0, 5.0]
+    assert ring.part("b")[-1].tolist() == [50.0, 100.0]
+    assert ring.overwritten == 2
+
+
+def cycle(t: float, phase: str, fresh: list[LowState], target: float | None = 0.0) -> Cycle:
+    command = None if target is None else make_command(joint_target=np.full(12, target), damping=phase == "damping")
+    return Cycle(t, phase, fresh[-1] if fresh else None, command, np.zeros(3), np.zeros(3), None, fresh)
+
+
+def test_a_robot_that_does_not_tell_what_it_obeys_is_taken_to_obey_the_newest(file: str) -> None:
+    about = load(file).metadata
+    log = Log(100.0, 1.0)
+    silent = {"clock": math.nan, "in_force": -1}
+    steps = [(0.0, "waiting", None), (0.01, "walking", 1.0), (0.02, "walking", 2.0), (0.03, "damping", 0.0)]
+    for t, phase, target in steps:
+        log.note(cycle(t, phase, [make_state(t - k, **silent) for k in (0.006, 0.002)], target))
+    log.note(cycle(0.04, "damping", [make_state(0.038, **silent)]))
+    found = log.recording(About(about, np.full(12, 20.0), np.full(12, 0.5), False, False, "e"))
+    assert found is not None
+    np.testing.assert_allclose(found.t, [0.014, 0.018, 0.024, 0.028])
+    assert found.joint("q_target")[:, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
+    assert not any(name.startswith("foot_force") for name in found.channels)  # in no unit that anybody knows
+    assert found.meta.source == "measured"
+    assert "does not tell what it obeys" in found.meta.notes
+
+
+def test_a_long_walk_keeps_its_newest_seconds(file: str, tmp_path: Path) -> None:
+    done = play(file, tmp_path, keep=0.5, seconds=0.8)
+    assert done.account["log"]["overwritten"] > 100
+    assert 200 <= len(done.recording.t) <= 251
+    assert done.recording.t[-1] == pytest.approx(1.03, abs=0.03)
+    had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
+    assert done.recording.joint("q_target")[0].tolist() == had[round(done.recording.t[0] / TICK)].tolist()
+
+
+# ---------------------------------------------------------------------- the vendor's SDK
+
+
+class Sdk:
+    """Stands for the vendor's binding, as far as its names go."""
+
+    def __init__(self) -> None:
+        self.tick, self.sent = 0, list[Any]()
+        self.LeggedType = SimpleNamespace(Go1=1)
+        self.LowState = lambda: SimpleNamespace(tick=0)
+        self.LowCmd = lambda: SimpleNamespace(motorCmd=[SimpleNamespace() for _ in range(20)])
+        self.Safety = lambda kind: SimpleNamespace(
+            PositionLimit=lambda command: 0, PowerProtect=lambda command, state, level: 0
+        )
+
+    def UDP(self, level: int, local: int, address: str, port: int) -> Any:
+        return SimpleNamespace(
+            InitCmdData=lambda command: None,
+            Recv=lambda: None,
+            GetRecv=self.fill,
+            SetSend=lambda command: self.sent.append([Motor(**vars(motor)) for motor in command.motorCmd]),
+            Send=lambda: None,
+        )
+
+    def fill(self, state: Any) -> None:
+        state.tick = self.tick
+        state.motorState = [SimpleNamespace(q=0.1 * k, dq=1.0, tauEst=2.0) for k in range(20)]
+        state.imu = SimpleNamespace(quaternion=[1.0, 0, 0, 0], gyroscope=[0.1, 0, 0], accelerometer=[0, 0, 9.8])
+        state.footForce = [100, 101, 102, 103]
+
+
+@dataclasses.dataclass
+class Motor:
+    q: float = -1.0
+    dq: float = -1.0
+    tau: float = -1.0
+    Kp: float = -1.0
+    Kd: float = -1.0
+    mode: int = -1
+
+
+def test_the_sdk_is_spoken_to_as_its_example_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(go1_sdk.SdkLink, "_pump", lambda self: None)  # exchanged by hand
+    sdk = Sdk()
+    link = go1_sdk.SdkLink(sdk)
+    link.exchange(1.0)
+    assert link.receive() == []  # nothing has come
+    assert sdk.sent[-1][0] == Motor()  # and nothing is asked for
+    sdk.tick = 1
+    link.exchange(1.002)
+    link.exchange(1.004)  # the same state again
+    (state,) = link.receive()
+    assert (state.t, math.isnan(state.clock), state.in_force) == (1.002, True, -1)
+    np.testing.assert_allclose(state.joint_pos, 0.1 * np.arange(12))
+    assert state.foot_force.tolist() == [100, 101, 102, 103]
+    braking = Motor(0.0, 0.0, 0.0, 0.0, 2.0, 0x0A)
+    assert sdk.sent[-1][0] == braking
+    link._wanted = (make_command(), 1.01)
+    link.exchange(1.02)
+    np.testing.assert_allclose([m.q for m in sdk.sent[-1][:12]], robot.NOMINAL_STANCE)
+    assert (sdk.sent[-1][3].Kp, sdk.sent[-1][3].Kd, sdk.sent[-1][3].mode) == (20.0, 0.5, 0x0A)
+    link.exchange(1.07)  # the runtime has fallen silent
+    assert sdk.sent[-1][0] == braking
+    link.close()
+
+
+def test_the_sdks_thread_runs_and_its_failure_is_told() -> None:
+    sdk = Sdk()
+    link = go1_sdk.SdkLink(sdk)
+    link.send(make_command())
+    link.close()
+    assert sdk.sent[-1][0].Kp == 0.0 if sdk.tick else sdk.sent
+    broken = Sdk()
+    broken.fill = lambda state: 1 / 0  # type: ignore[assignment, method-assign]
+    link = go1_sdk.SdkLink(broken)
+    link._thread.join(5.0)
+    with pytest.raises(RobotError, match="the SDK failed: ZeroDivisionError"):
+        link.receive()
+
+
+def test_without_the_sdk_the_robot_is_refused(file: str, tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"no module 'robot_interface'.*never been run on hardware"):
+        do(Job(file, "go1", Plan(), str(tmp_path)), print)
+
+
+# ---------------------------------------------------------------------- processes
+
+
+def test_the_verb_walks_against_another_process_in_real_time(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(data_root()))
+    words = ["deploy", file, "robot=sim", "command=[0.3,0,0]", "seconds=1.5", "stand_up=0.5", "brake=0.2"]
+    monkeypatch.setattr(sys, "argv", ["go1exp", *words, f"stale={BUSY}", "effect=payload", "out=logs"])
+    assert cli.main() == 0
+    said = capsys.readouterr().out
+    assert "walking: " in said
+    assert said.splitlines()[-1] == "walked for 1.5 s, to the end"
+    (kept,) = (tmp_path / "logs").glob("*.parquet")
+    found = recording.read(kept)
+    assert found.t[-1] - found.t[0] > 0.5  # on a machine that stands still for the rest of it
+    account = json.loads(kept.with_suffix(".json").read_text())
+    assert account["simulated_robot"]["what"] == "ended"
+    assert account["simulated_robot"]["ticks"] > 250
+    assert account["memory_mb"] > 0
+
+
+def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_path: Path) -> None:
+    code = (
+        "import sys, json\nfrom go1exp.deploy.__main__ import main\nstatus = main(sys.argv[1:])\n"
+        "with open('modules.json', 'w') as file:\n"
+        "    json.dump(sorted({name.split('.')[0] for name in sys.modules}), file)\nsys.exit(status)"
+    )
+    words = [file, "--command", "0.2,0,0", "--stand-up", "0.2", "--brake", "0.2", "--stale", str(BUSY), "--out", "logs"]
+    process = subprocess.Popen(
+        [sys.executable, "-W", "error", "-c", code, *words],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(data_root())},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    seen = []
+    for line in process.stdout:
+        seen.append(line)
+        if line.startswith("walking: "):
+            process.send_signal(signal.SIGINT)
+            break
+    rest, errors = process.communicate(timeout=60)
+    assert process.returncode == STATUS["operator_stop"], (seen, rest, errors)
+    assert errors == ""
+    assert rest.splitlines()[-1].endswith("asked for by SIGINT")
+    heavy = {"torch", "stable_baselines3", "gymnasium", "mujoco", "hydra", "omegaconf", "scipy", "onnx"}
+    modules = set(json.loads((tmp_path / "modules.json").read_text()))
+    assert {"onnxruntime", "pyarrow"} <= modules
+    assert not heavy & modules
+    assert len(list((tmp_path / "logs").glob("*.parquet"))) == 1
+
+
+def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    from go1exp.deploy.__main__ import main
+
+    assert main([str(tmp_path / "none.zip")]) == 1
+    assert "No such file" in capfd.readouterr().err
+    assert main([file, "--command", "fast", "--out", str(tmp_path)]) == 1
+    assert capfd.readouterr().err.startswith("go1exp.deploy: command 'fast': must be three numbers")
+    assert main([file, "--robot", "dog", "--out", str(tmp_path)]) == 1
+    assert "robot=dog: must be sim, go1, or the port" in capfd.readouterr().err
+    with pytest.raises(SystemExit):
+        main([file, "--rate", "-5"])
+    assert "-5: must be greater than 0" in capfd.readouterr().err
+    with pytest.raises(RefusedError, match=r"sim\.loss = 2"):
+        do(Job(file, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_bench_measures_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
+    from go1exp.bench import deploy
+
+    monkeypatch.setattr(deploy, "RATE", 100.0)
+    monkeypatch.setenv("PYTHONPATH", str(data_root()))
+    rounds: list[tuple[int, int]] = []
+    figures = deploy.run(compose("train", SMALL), 1, 1, 0.5, lambda *done: rounds.append(done))
+    assert rounds == [(1, 1)]
+    assert 0 < figures["command_p50_ms"] <= figures["command_p99_ms"]
+    assert figures["policy_us"] > 1
+    assert 20 < figures["memory_mb"] < 400
