@@ -31,7 +31,9 @@ def test_the_closed_form_of_the_feet_is_the_models() -> None:
 def test_no_foot_starts_below_the_ground(terrain: str) -> None:
     core = Go1Core(parse_task(compose("train", [f"terrain={terrain}", "rand=table1"])), 256, seed=3)
     core.reset()
-    clear = core.snapshot().foot_height - robot.FOOT_RADIUS
+    height = core.snapshot().foot_height
+    assert height is not None
+    clear = height - robot.FOOT_RADIUS
     assert float(clear.min()) > -1e-4
     lowest = clear.amin(-1)
     assert (lowest < 1e-4).float().mean() > 0.2, "many are lifted just so far that they touch"

@@ -229,7 +229,8 @@ def test_a_robot_on_its_back_is_terminated_and_starts_again_while_the_others_go_
             assert not a["observation"][fallen, 36:].any()
             assert core.steps[fallen] == 0
             np.testing.assert_allclose(core.snapshot().joint_target[fallen], robot.NOMINAL_STANCE, atol=1e-6)
-            assert core.backend.qpos[fallen, 2] == pytest.approx(robot.NOMINAL_HEIGHT)
+            height = float(core.backend.qpos[fallen, 2])  # higher where a foot would be in the ground otherwise
+            assert robot.NOMINAL_HEIGHT - 1e-9 <= height < robot.NOMINAL_HEIGHT + 0.1
     assert ended
 
 

@@ -29,8 +29,15 @@ def test_a_policy_walks_as_its_table_says(name: str) -> None:
     assert table["policy"]["num_timesteps"] == about["num_timesteps"]
     said = {tuple(c["command"]): c for c in table["commands"]}
     wanted = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.2)]
-    off = dict.fromkeys(("noise", "randomize", "push", "train_ground"), False)
-    brief = EvalConfig(tuple(wanted), 2, duration_s=4.0, settle_s=2.0, policy_dt=None, seed=5, **off)
+    brief = EvalConfig(
+        *(tuple(wanted), 2, 4.0, 2.0),
+        noise=False,
+        randomize=False,
+        push=False,
+        train_ground=False,
+        policy_dt=None,
+        seed=5,
+    )
     found = evaluate(config.task, policy, brief)
     assert found["falls"] == 0
     for row, command in zip(found["commands"], wanted, strict=True):
