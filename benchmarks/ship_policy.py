@@ -30,14 +30,13 @@ GRID = {
 }
 """Commands, one axis at a time, m/s and rad/s."""
 
-HARDER: dict[str, dict[str, Any]] = {
+EVALUATIONS: dict[str, dict[str, Any]] = {
     "flat": {"noise": True},
     "none": {},
     "flat_100_hz": {"noise": True, "policy_dt": 0.01},
     "training_ground": {"noise": True, "randomize": True, "push": True, "train_ground": True},
 }
 """Evaluation -> what is on in it."""
-
 
 EVERY = 10
 """Iterations between rows of the shipped curves."""
@@ -69,7 +68,7 @@ def main(arguments: Sequence[str]) -> None:
     usual = {"duration_s": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}
     off = dict.fromkeys(("noise", "randomize", "push", "train_ground"), False)
     commands = grid(GRID["x"], GRID["y"], GRID["yaw"], cross=False)
-    for name, on in HARDER.items():
+    for name, on in EVALUATIONS.items():
         print(f"== {name}", flush=True)
         wanted = EvalConfig(commands, int(given.get("episodes", 31)), **{**usual, **off, **on})
         report = {"policy": about, **evaluate(config.task, policy, wanted)}

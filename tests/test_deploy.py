@@ -56,18 +56,8 @@ from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
 from go1exp.sim_robot.server import Network, Server
 from go1exp.train import run_folder, trainer
 from tests.lockstep import BEGIN, Spoil, lockstep
+from tests.small_run import SMALL
 
-SMALL = (
-    "ppo.num_envs=4",
-    "ppo.steps=4",
-    "ppo.minibatches=2",
-    "ppo.epochs=1",
-    "ppo.hidden=[16,8]",
-    "ppo.iterations=2",
-    "backend.threads=1",
-    "torch_threads=1",
-    "logger.tensorboard=false",
-)
 BUSY = 5.0
 """Age of a state, s, at which a robot counts as lost where real time passes: the machine may be busy."""
 

@@ -44,20 +44,10 @@ from go1exp.registry import Entry, Term
 from go1exp.train import run_folder, trainer
 from go1exp.train.ppo import GaussianPolicy
 from go1exp.types import Snapshot
+from tests.small_run import SMALL
 
 OBSERVATIONS = sorted(p.stem for p in (data_root() / "conf/observation").glob("*.yaml"))
 ROWS = 1000
-SMALL = (
-    "ppo.num_envs=4",
-    "ppo.steps=4",
-    "ppo.minibatches=2",
-    "ppo.epochs=1",
-    "ppo.hidden=[16,8]",
-    "ppo.iterations=2",
-    "backend.threads=1",
-    "torch_threads=1",
-    "logger.tensorboard=false",
-)
 
 
 @pytest.fixture(scope="module")

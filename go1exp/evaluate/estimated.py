@@ -11,7 +11,7 @@ from go1exp.estimation import WIDTH, go1, make_filter
 from go1exp.estimation import readings as column
 from go1exp.record.tape import sample
 from go1exp.registry import ConfigError
-from go1exp.sim_robot.machine import NOISE, OWN_NOISE, turned
+from go1exp.sim_robot.machine import noisy
 
 TERM = "base_linear_velocity"
 
@@ -52,21 +52,12 @@ class EstimatedVelocity:
     def _listen(self, target: Tensor) -> None:
         """Give every filter a sample, before a step."""
         true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}
+        seen = noisy(true, self._noise, self._rng)
         rows = np.full((len(self._filters), WIDTH), np.nan)
-
-        def even(name: str, size: int) -> np.ndarray:
-            return self._noise * NOISE[name] * self._rng.uniform(-1.0, 1.0, (len(rows), size))
-
-        def normal(name: str, size: int) -> np.ndarray:
-            return self._noise * OWN_NOISE[name] * self._rng.standard_normal((len(rows), size))
-
         rows[:, column.T] = self._steps * self._dt
-        rows[:, column.QUAT] = turned(true["quat"], even("attitude", 3))
-        rows[:, column.GYRO] = true["gyro"] + even("imu_gyro", 3)
-        rows[:, column.ACC] = true["acc"] + normal("imu_acc", 3)
-        rows[:, column.Q] = true["q"] + even("joint_pos", 12)
-        rows[:, column.QD] = true["qd"] + even("joint_vel", 12)
-        rows[:, column.FOOT_FORCE] = np.maximum(true["foot_force"] + normal("foot_force", 4), 0.0)
+        rows[:, column.QUAT], rows[:, column.GYRO], rows[:, column.ACC] = seen["quat"], seen["gyro"], seen["acc"]
+        rows[:, column.Q], rows[:, column.QD] = seen["q"], seen["qd"]
+        rows[:, column.FOOT_FORCE] = seen["foot_force"]
         for one, row in zip(self._filters, rows, strict=True):
             one.update(row)
         self._steps += 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 
@@ -112,25 +114,18 @@ class Robot:
         The truth is in the columns of ``TRUTH``; NaN for a robot that hangs.
         """
         true = {name: values[0].numpy() for name, values in sample(self._plant, self._target).items()}
-        rng, share = self._rng, self._config.noise
-
-        def even(name: str, size: int) -> np.ndarray:
-            return rng.uniform(-1.0, 1.0, size) * share * NOISE[name]
-
-        def normal(name: str, size: int) -> np.ndarray:
-            return rng.standard_normal(size) * share * OWN_NOISE[name]
-
+        seen = noisy(true, self._config.noise, self._rng)
         state = LowState(
             t=self.clock,
             clock=self.clock,
             in_force=self._in_force,
-            joint_pos=true["q"] + even("joint_pos", 12),
-            joint_vel=true["qd"] + even("joint_vel", 12),
+            joint_pos=seen["q"],
+            joint_vel=seen["qd"],
             joint_torque=true["tau_est"],
-            imu_quat=turned(true["quat"], even("attitude", 3)),
-            imu_gyro=true["gyro"] + even("imu_gyro", 3),
-            imu_acc=true["acc"] + normal("imu_acc", 3),
-            foot_force=np.maximum(true["foot_force"] + normal("foot_force", 4), 0.0),
+            imu_quat=seen["quat"],
+            imu_gyro=seen["gyro"],
+            imu_acc=seen["acc"],
+            foot_force=seen["foot_force"],
         )
         if "base_pos" not in true:
             return state, np.full(13, np.nan)
@@ -143,6 +138,25 @@ class Robot:
             self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
         self._plant.step(self._target)
         self.clock = round(self.clock / TICK + 1) * TICK
+
+
+def noisy(true: Mapping[str, np.ndarray], share: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return what sensors read of the truth, values (..., size) by name, with a share of the noises above."""
+
+    def even(name: str, like: np.ndarray) -> np.ndarray:
+        return rng.uniform(-1.0, 1.0, like.shape) * share * NOISE[name]
+
+    def normal(name: str, like: np.ndarray) -> np.ndarray:
+        return rng.standard_normal(like.shape) * share * OWN_NOISE[name]
+
+    return {
+        "q": true["q"] + even("joint_pos", true["q"]),
+        "qd": true["qd"] + even("joint_vel", true["qd"]),
+        "quat": turned(true["quat"], even("attitude", true["gyro"])),
+        "gyro": true["gyro"] + even("imu_gyro", true["gyro"]),
+        "acc": true["acc"] + normal("imu_acc", true["acc"]),
+        "foot_force": np.maximum(true["foot_force"] + normal("foot_force", true["foot_force"]), 0.0),
+    }
 
 
 def turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
