@@ -85,6 +85,53 @@ def test_minibatches_hold_every_sample_once(learner: Callable[..., DevicePPO]) -
     assert torch.equal(got.sort().values, wanted)
 
 
+class ThroughSb3(DevicePPO):
+    """The same buffer, and SB3's own update with its hooks."""
+
+    train = AdaptivePPO.train
+    _before_gradient_step = AdaptivePPO._before_gradient_step
+    _check_gradient = AdaptivePPO._check_gradient
+
+    def collect_rollouts(self, *arguments: Any, **named: Any) -> bool:
+        going = super().collect_rollouts(*arguments, **named)
+        data = self.rollout_buffer.data
+        self.rollout_buffer.values, self.rollout_buffer.returns = data["values"].numpy(), data["returns"].numpy()
+        return going
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("ppo.desired_kl=0.0005",),  # the rate goes up and down
+        ("ppo.schedule=linear", "ppo.iterations=5", "ppo.value_clip=0.1", "ppo.max_grad_norm=0.05"),
+        ("ppo.schedule=fixed", "ppo.normalize_advantage=false", "ppo.entropy=0.05", "ppo.clip_range=0.02"),
+    ],
+)
+def test_an_update_is_sb3s(overrides: tuple[str, ...]) -> None:
+    config = parse_train(compose("train", (*SMALL, "ppo.epochs=3", "ppo.init_std=0.5", *overrides)))
+    found: list[tuple[dict[str, torch.Tensor], list[dict[str, float]]]] = []
+    for kind in (DevicePPO, ThroughSb3):
+        core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
+        ppo: Any = kind(config.ppo, Go1VecEnv(core), 0, "cpu")
+        logs: list[dict[str, float]] = []
+        ppo.after_iteration = lambda p, logs=logs: logs.append(dict(p.logger.name_to_value))
+        torch.manual_seed(1)
+        ppo.learn(48 * 4)
+        found.append((ppo.policy.state_dict(), logs))
+    (mine, my_logs), (theirs, their_logs) = found
+    assert len(my_logs) == len(their_logs) == 4
+    for name, value in theirs.items():
+        torch.testing.assert_close(mine[name], value, rtol=1e-3, atol=1e-5, msg=name)
+    for one, other in zip(my_logs, their_logs, strict=True):
+        assert {k for k in one if k.startswith("train/")} == {k for k in other if k.startswith("train/")}
+        for key in one:
+            if key.startswith("train/"):
+                assert one[key] == pytest.approx(other[key], rel=2e-3, abs=2e-5), key
+    rates = [log["train/learning_rate"] for log in my_logs]
+    if config.ppo.schedule == "adaptive":
+        assert len(set(rates)) > 1
+
+
 def test_training_stopped_and_resumed_is_training_in_one_go(learner: Callable[..., DevicePPO], tmp_path: Path) -> None:
     straight = learner()
     straight.learn(48 * 4)

@@ -167,7 +167,8 @@ def test_the_divergence_of_a_distribution_from_itself_is_zero_to_the_last_bit() 
     ],
 )
 def test_the_rate_rule_is_rsl_rls(rate: float, kl: float, expected: float) -> None:
-    assert adapted_rate(rate, kl, 0.01, (1e-5, 1e-2)) == pytest.approx(expected, rel=1e-12)
+    given = torch.tensor([rate, kl], dtype=torch.float64)
+    assert float(adapted_rate(given[0], given[1], 0.01, (1e-5, 1e-2))) == pytest.approx(expected, rel=1e-12)
 
 
 class Watched:

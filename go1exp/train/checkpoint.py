@@ -121,7 +121,7 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
         "n_updates": ppo._n_updates,
         "episodes": list(ppo.ep_info_buffer),
         "policy": ppo.policy.state_dict(),
-        "optimizer": ppo.policy.optimizer.state_dict(),
+        "optimizer": ppo.optimizer_state(),
         "env": _core(ppo).state_dict(),
         "last_obs": torch.from_numpy(ppo._last_obs.copy()),
         "last_episode_starts": torch.from_numpy(np.asarray(ppo._last_episode_starts).copy()),

@@ -1,13 +1,14 @@
-"""PPO that never leaves the GPU: rollouts, advantages and minibatches stay where the environment is.
+"""PPO that never leaves the GPU: rollouts, advantages and gradient steps stay where the environment is.
 
-SB3's loop takes every step through numpy and looks at every environment's info in Python, and its buffer computes
-advantages on the host (docs/benchmarks.md has what that costs). Policy, loss, update, saving, callbacks and logger are
-SB3's here too.
+SB3's loop takes every step through numpy and looks at every environment's info in Python, its buffer computes
+advantages on the host, and its update waits for the device six times a minibatch (docs/benchmarks.md has what that
+costs). Policy, optimiser, saving, callbacks and logger are SB3's here too; the loss is SB3's law, held to it by
+tests/test_device_training.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,8 @@ from go1exp.env.core import Go1Core
 from go1exp.env.engine import captured
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, MeanRolloutBuffer
+from go1exp.train.device_update import DeviceUpdate
+from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, MeanRolloutBuffer, linear_rate
 
 
 class DeviceRolloutBuffer(MeanRolloutBuffer):
@@ -84,26 +86,25 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
         totals, lengths = (self.data[name].flatten()[rows].tolist() for name in ("totals", "lengths"))
         return [{"r": r, "l": int(n)} for r, n in zip(totals, lengths, strict=True)]
 
-    def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
-        """Yield shuffled minibatches."""
-        flat = {name: value.flatten(0, 1) for name, value in self.data.items()}
+    def minibatches(self, batch_size: int | None = None) -> Iterator[Tensor]:
+        """Yield the rows (B,) of one minibatch after another, in an order drawn anew."""
         total = self.buffer_size * self.n_envs
-        for rows in torch.randperm(total, device=self.device).split(batch_size or total):
-            self.current_means = flat["means"][rows]
-            names = ("observations", "actions", "values", "log_probs", "advantages", "returns")
-            yield RolloutBufferSamples(*(flat[name][rows] for name in names))
+        yield from torch.randperm(total, device=self.device).split(batch_size or total)
 
-    # SB3 wants these two as arrays, for one figure of its log.
+    def batch(self, rows: Tensor) -> RolloutBufferSamples:
+        """Return the samples of ``rows``, and have their means at hand."""
+        names = ("observations", "actions", "values", "log_probs", "advantages", "returns")
+        *samples, self.current_means = (self.data[name].flatten(0, 1)[rows] for name in (*names, "means"))
+        return RolloutBufferSamples(*samples)
 
-    @property
-    def values(self) -> np.ndarray:  # type: ignore[override]
-        """(steps, N) values of the visited states, on the host."""
-        return self.data["values"].cpu().numpy()
+    def get(self, batch_size: int | None = None) -> Iterator[RolloutBufferSamples]:  # type: ignore[override]
+        """Yield shuffled minibatches."""
+        yield from map(self.batch, self.minibatches(batch_size))
 
-    @property
-    def returns(self) -> np.ndarray:  # type: ignore[override]
-        """(steps, N) their returns, on the host."""
-        return self.data["returns"].cpu().numpy()
+    def explained_variance(self) -> float:
+        """Return the share of the returns' variance that the value function explained; NaN without any variance."""
+        left, total = (self.data["returns"] - self.data["values"]).var(), self.data["returns"].var()
+        return float(torch.where(total > 0.0, 1.0 - left / total, torch.nan))
 
 
 class DevicePPO(AdaptivePPO):
@@ -122,6 +123,7 @@ class DevicePPO(AdaptivePPO):
         self._observation = torch.zeros(self.n_envs, *self.rollout_buffer.obs_shape, device=self.device)
         self._starts = torch.zeros(self.n_envs, dtype=torch.bool, device=self.device)
         self._replay: Callable[[], None] | None = None
+        self._update: DeviceUpdate | None = None
 
     def _collect_step(self) -> None:
         """Act on the observation, step, keep both; in place, so that it can be replayed as a graph."""
@@ -198,24 +200,37 @@ class DevicePPO(AdaptivePPO):
         """Do nothing as each gradient arrives: ``train`` looks at all of them in the end."""
 
     def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *arguments: Any) -> None:
-        """Note whether the gradients are finite, and set the learning rate of the step about to be taken."""
-        norms = torch.stack(torch._foreach_norm([p.grad for p in self.policy.parameters()]))  # type: ignore[misc]
-        self._finite.logical_and_(torch.isfinite(norms).all())
-        super()._before_gradient_step(optimizer, *arguments)
+        """Do nothing: the update sets its rate itself."""
 
     def train(self) -> None:
-        """Update on the rollout, then close the iteration.
+        """Update on the rollout as SB3 does, wait for the device once, then close the iteration.
 
         Raises:
             NumericalFault: if a gradient was not finite; the policy is spoilt by then, the last checkpoint is not.
         """
-        self._finite = torch.ones((), dtype=torch.bool, device=self.device)
-        super().train()
-
-    def _close_iteration(self) -> None:
-        if not self._finite:
+        self.policy.set_training_mode(True)
+        if self._update is None:
+            self._update = DeviceUpdate(self, captures=self._core().captures)
+        figures = self._update(self.rollout_buffer, linear_rate(self.config, self.iteration))
+        self._n_updates += self.n_epochs
+        self._kl = figures.pop("kl")
+        if not all(figures.pop("finite")):
             raise NumericalFault("gradient of the policy", f"in iteration {self.iteration + 1}", {})
-        super()._close_iteration()
+        last = slice(-self.config.minibatches, None)  # SB3 tells of the last pass
+        means = {
+            name: float(np.mean(values[last if name == "approx_kl" else slice(None)]))
+            for name, values in figures.items()
+        }
+        means["loss"] = figures["loss"][-1]
+        means["explained_variance"] = self.rollout_buffer.explained_variance()
+        means["std"] = float(self.policy.log_std.detach().exp().mean())
+        for name, value in means.items():
+            self.logger.record(f"train/{name}", value)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/clip_range", self.config.clip_range)
+        if self.config.value_clip is not None:
+            self.logger.record("train/clip_range_vf", self.config.value_clip)
+        self._close_iteration()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_finite", "_replay", "_observation", "_starts"]
+        return [*super()._excluded_save_params(), "_update", "_replay", "_observation", "_starts"]

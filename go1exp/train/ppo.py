@@ -43,13 +43,11 @@ def gaussian_kl(old_mean: Tensor, old_log_std: Tensor, mean: Tensor, log_std: Te
     return (log_std - old_log_std + spread / (2.0 * variance) - 0.5).sum(-1)
 
 
-def adapted_rate(rate: float, kl: float, desired: float, bounds: tuple[float, float]) -> float:
-    """Return the learning rate for the next gradient step (rsl_rl 5.4, ``algorithms/ppo.py``)."""
-    if kl > KL_FACTOR * desired:
-        return max(bounds[0], rate / RATE_FACTOR)
-    if 0.0 < kl < desired / KL_FACTOR:
-        return min(bounds[1], rate * RATE_FACTOR)
-    return rate
+def adapted_rate(rate: Tensor, kl: Tensor, desired: float, bounds: tuple[float, float]) -> Tensor:
+    """Return the learning rate for the next gradient step, () (rsl_rl 5.4, ``algorithms/ppo.py``)."""
+    slower, faster = (rate / RATE_FACTOR).clamp(min=bounds[0]), (rate * RATE_FACTOR).clamp(max=bounds[1])
+    too_near = (kl > 0.0) & (kl < desired / KL_FACTOR)
+    return torch.where(kl > KL_FACTOR * desired, slower, torch.where(too_near, faster, rate))
 
 
 def linear_rate(config: PPOConfig, done: int) -> float:
@@ -188,15 +186,18 @@ class AdaptivePPO(PPO):
 
     def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
         """Set the learning rate of the step about to be taken."""
+        self._kl.append(float(self._divergence()))
+        if self.config.schedule == "adaptive":
+            group, c = optimizer.param_groups[0], self.config
+            rate, kl = torch.tensor([group["lr"], self._kl[-1]], dtype=torch.float64)
+            group["lr"] = float(adapted_rate(rate, kl, c.desired_kl, c.learning_rate_range))
+
+    def _divergence(self) -> Tensor:
+        """Return the KL divergence of the policy from the one that collected this minibatch, ()."""
         with torch.no_grad():
             mean = self.policy.last_distribution.distribution.mean
-            kl = gaussian_kl(self.rollout_buffer.current_means, self._old_log_std, mean, self.policy.log_std).mean()
-        self._kl.append(float(kl))
-        if self.config.schedule == "adaptive":
-            group = optimizer.param_groups[0]
-            group["lr"] = adapted_rate(
-                group["lr"], self._kl[-1], self.config.desired_kl, self.config.learning_rate_range
-            )
+            means = self.rollout_buffer.current_means
+            return gaussian_kl(means, self._old_log_std, mean, self.policy.log_std).mean()
 
     def train(self) -> None:
         """Update on the rollout, then close the iteration."""
@@ -211,13 +212,19 @@ class AdaptivePPO(PPO):
         """Count the iteration that is complete, and tell of it."""
         self.iteration += 1
         self.logger.record("train/kl", float(np.mean(self._kl)))
-        self.logger.record("train/learning_rate", self.policy.optimizer.param_groups[0]["lr"])
+        self.logger.record("train/learning_rate", float(self.policy.optimizer.param_groups[0]["lr"]))
         for key, name in (("r", "return"), ("l", "length")):  # NaN until a first episode has ended
             self.logger.record(f"rollout/{name}", safe_mean([e[key] for e in self.ep_info_buffer or ()]))
         self.after_iteration(self)
 
     def dump_logs(self, iteration: int = 0) -> None:
         """Do nothing: SB3 writes between rollout and update, which would put two iterations into one row."""
+
+    def optimizer_state(self) -> dict[str, Any]:
+        """Return the optimiser's state as any learner on any device can take it: rates are plain numbers."""
+        state = self.policy.optimizer.state_dict()
+        groups = [{**g, "lr": float(g["lr"]), "capturable": False} for g in state["param_groups"]]
+        return {**state, "param_groups": groups}
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "after_iteration", "_kl", "_old_log_std"]

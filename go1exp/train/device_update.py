@@ -1,0 +1,150 @@
+"""PPO's gradient steps on the device: the law of SB3's ``PPO.train``, without a look at any value on the way.
+
+One gradient step (gather the minibatch, loss, backward pass, clipping, rate, Adam) is one CUDA graph where the
+environment's step is one. SB3's own loop reads six numbers a minibatch back, which costs more than the arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import mse_loss
+
+from go1exp.train.ppo import adapted_rate, gaussian_kl
+
+if TYPE_CHECKING:
+    from go1exp.train.device import DevicePPO, DeviceRolloutBuffer
+
+FIGURES = (
+    *("policy_gradient_loss", "value_loss", "entropy_loss", "loss"),
+    *("clip_fraction", "approx_kl", "kl", "finite"),
+)
+"""What is kept of each gradient step; ``finite`` is 1 if its gradients were."""
+
+WARM_UP = 3
+"""Steps before one is recorded, as CUDA graphs ask."""
+
+
+class DeviceUpdate:
+    """All gradient steps of an iteration.
+
+    The memory of policy and optimiser must stay where it is from the first call on: restore checkpoints before it.
+
+    Args:
+        ppo: the learner.
+        captures: record the gradient step as a CUDA graph; else make its calls one by one.
+    """
+
+    def __init__(self, ppo: DevicePPO, captures: bool) -> None:
+        self._config, self._policy, self._buffer = ppo.config, ppo.policy, ppo.rollout_buffer
+        self._adam = ppo.policy.optimizer
+        c, device = ppo.config, ppo.device
+        self._rate = torch.zeros((), device=device)
+        self._old_log_std = torch.zeros_like(ppo.policy.log_std)
+        self._rows = torch.zeros(ppo.batch_size, dtype=torch.int64, device=device)
+        self._figures = torch.zeros(c.epochs * c.minibatches, len(FIGURES), device=device)
+        self._taken = torch.zeros(1, dtype=torch.int64, device=device)
+        self._on_gpu = device.type == "cuda"
+        self._captures = captures and self._on_gpu
+        self._step: Callable[[], None] | None = None
+
+    def __call__(self, buffer: DeviceRolloutBuffer, scheduled_rate: float) -> dict[str, list[float]]:
+        """Make the steps and return their figures, a list each.
+
+        Args:
+            buffer: a full one.
+            scheduled_rate: the learning rate, where a schedule and not the divergence decides.
+        """
+        self._take_over_rate()
+        if self._config.schedule == "linear":
+            self._rate.fill_(scheduled_rate)
+        self._old_log_std.copy_(self._policy.log_std.detach())
+        if self._step is None:
+            self._step = self._captured() if self._captures else self._gradient_step
+        self._taken.zero_()
+        for _ in range(self._config.epochs):
+            for rows in buffer.minibatches(len(self._rows)):
+                self._rows.copy_(rows)
+                self._step()
+        return dict(zip(FIGURES, self._figures.T.tolist(), strict=True))
+
+    def _gradient_step(self) -> None:
+        """SB3's ``PPO.train`` for one minibatch, then rsl_rl's rate; in place, so that it can be replayed."""
+        c, policy = self._config, self._policy
+        batch = self._buffer.batch(self._rows)
+        values, log_prob, entropy = policy.evaluate_actions(batch.observations, batch.actions)
+        values, gain = values.flatten(), batch.advantages
+        assert entropy is not None
+        if c.normalize_advantage:
+            gain = (gain - gain.mean()) / (gain.std() + 1e-8)
+        log_ratio = log_prob - batch.old_log_prob
+        ratio = log_ratio.exp()
+        policy_loss = -torch.min(gain * ratio, gain * ratio.clamp(1 - c.clip_range, 1 + c.clip_range)).mean()
+        if c.value_clip is not None:
+            values = batch.old_values + (values - batch.old_values).clamp(-c.value_clip, c.value_clip)
+        value_loss, entropy_loss = mse_loss(batch.returns, values), -entropy.mean()
+        loss = policy_loss + c.entropy * entropy_loss + c.value_coef * value_loss
+
+        self._adam.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), c.max_grad_norm)
+        with torch.no_grad():
+            mean = policy.last_distribution.distribution.mean
+            kl = gaussian_kl(self._buffer.current_means, self._old_log_std, mean, policy.log_std).mean()
+            if c.schedule == "adaptive":
+                self._rate.copy_(adapted_rate(self._rate, kl, c.desired_kl, c.learning_rate_range))
+            clipped = ((ratio - 1).abs() > c.clip_range).float().mean()
+            approx_kl = ((ratio - 1) - log_ratio).mean()
+            figures = (
+                policy_loss,
+                value_loss,
+                entropy_loss,
+                loss,
+                clipped,
+                approx_kl,
+                kl,
+                torch.isfinite(norm).float(),
+            )
+            self._figures.index_copy_(0, self._taken, torch.stack(figures).unsqueeze(0))
+            self._taken.add_(1)
+        self._adam.step()
+
+    def _take_over_rate(self) -> None:
+        """Put the optimiser's rate, and its counts of steps, where a graph can reach them."""
+        group = self._adam.param_groups[0]
+        if group["lr"] is self._rate:
+            return
+        self._rate.fill_(group["lr"])
+        group["lr"], group["capturable"] = self._rate, self._on_gpu
+        for state in self._adam.state.values():
+            state["step"] = state["step"].to(self._rate.device if self._on_gpu else "cpu")
+
+    def _captured(self) -> Callable[[], None]:
+        """Record a gradient step as a CUDA graph; the ones that must come before it leave no trace."""
+        saved = [(p, p.detach().clone(), _clone(self._adam.state.get(p))) for p in self._policy.parameters()]
+        rate = self._rate.clone()
+        stream = torch.cuda.Stream(self._rate.device)
+        stream.wait_stream(torch.cuda.current_stream(self._rate.device))
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP):
+                self._taken.zero_()
+                self._gradient_step()
+        torch.cuda.synchronize(self._rate.device)
+        self._rate.copy_(rate)
+        with torch.no_grad():
+            for parameter, value, state in saved:
+                parameter.copy_(value)
+                for name, kept in self._adam.state[parameter].items():
+                    kept.copy_(state[name]) if state else kept.zero_()
+        self._adam.zero_grad(set_to_none=True)  # the graph makes gradients in memory of its own
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+            self._gradient_step()
+        return graph.replay
+
+
+def _clone(state: dict[str, Any] | None) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in (state or {}).items()}
