@@ -18,6 +18,7 @@ from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.train import checkpoint
 from go1exp.train.device import DevicePPO
+from go1exp.train.device_update import DeviceUpdate
 from go1exp.train.ppo import AdaptivePPO
 
 SMALL = (
@@ -185,3 +186,32 @@ def test_a_fault_in_the_environment_is_found_after_the_rollout_with_its_moment(l
         ppo.learn(48, reset_num_timesteps=False)
     assert not np.isfinite(fault.value.dump["qpos"]).all()
     assert np.isfinite(fault.value.dump["action"]).all()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+def test_a_recorded_gradient_step_is_the_called_one_and_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
+    overrides = (*SMALL, "backend=warp", "ppo.epochs=3", "ppo.init_std=0.5", "ppo.desired_kl=0.0005")
+    config = parse_train(compose("train", [o for o in overrides if "threads" not in o]))
+    found = []
+    for captures in (True, False):
+        core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
+        core.captures = False  # the rollout is called either way: the same numbers go into the update
+        ppo = DevicePPO(config.ppo, Go1VecEnv(core), 0, "cuda")
+        ppo._update = DeviceUpdate(ppo, captures)
+        torch.manual_seed(1)
+        ppo.learn(48)
+        path = tmp_path / str(captures)
+        checkpoint.save(ppo, path, keep=1)
+        again = DevicePPO(config.ppo, Go1VecEnv(Go1Core(config.task, config.ppo.num_envs, 0)), 0, "cuda")
+        checkpoint.restore(again, checkpoint.load_latest(path)[0])
+        again._update = DeviceUpdate(again, captures)
+        again.rollout_buffer.data = {name: value.clone() for name, value in ppo.rollout_buffer.data.items()}
+        torch.manual_seed(2)
+        figures = again._update(again.rollout_buffer, 0.0)
+        found.append((again.policy.state_dict(), figures))
+    (recorded, its_figures), (called, other_figures) = found
+    for name, value in called.items():
+        torch.testing.assert_close(recorded[name], value, rtol=1e-4, atol=1e-6, msg=name)
+    for name, values in other_figures.items():
+        assert its_figures[name] == pytest.approx(values, rel=1e-3, abs=1e-5), name
