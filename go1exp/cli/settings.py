@@ -64,6 +64,7 @@ class EvalSettings:
     train_ground: bool
     trunk_velocity: Literal["exact", "estimated"]
     policy_dt: Annotated[float, Field(gt=0, le=0.1)] | None
+    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
     seed: Annotated[int, Field(ge=0)]
     out: str | None
 

@@ -40,6 +40,7 @@ class EvalConfig:
         train_ground: the ground of training; else flat.
         policy_dt: another period of the policy, s, or None for that of training.
         seed: of everything random.
+        physics_dt: another step of the physics, s, or None for that of training.
         trunk_velocity: what the policy sees of it: ``exact``, or ``estimated`` by the filter from the robot's sensors.
     """
 
@@ -53,6 +54,7 @@ class EvalConfig:
     train_ground: bool
     policy_dt: float | None
     seed: int
+    physics_dt: float | None = None
     trunk_velocity: Literal["exact", "estimated"] = "exact"
 
     @classmethod
@@ -70,7 +72,8 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     """
     period = config.policy_dt or task.sim.policy_dt
     beyond = (math.ceil(config.duration_s / period) + 1) * period  # no time limit within the evaluation
-    sim = dataclasses.replace(task.sim, policy_dt=period, episode_s=beyond, spread_starts=False)
+    step = config.physics_dt or task.sim.physics_dt
+    sim = dataclasses.replace(task.sim, physics_dt=step, policy_dt=period, episode_s=beyond, spread_starts=False)
     if problems := time_rules(sim):
         raise ConfigError(problems)
     fixed = Term("command", members("command")["fixed_velocity"], {})
