@@ -136,7 +136,7 @@ SMALL: dict[str, dict[str, Any]] = {
     },
     "export": {"seconds": 0.1},
     "export_check": {},
-    "deploy": {"seconds": 0.2, "stand_up": 0.06, "brake": 0.06, "patience": 0.1, "keep": 0.2},
+    "deploy": {"seconds": 0.2, "stand_up": 0.06, "lie_down": 0.04, "brake": 0.06, "patience": 0.1, "keep": 0.2},
     "list": {},
     "bench": {"num_envs": 4, "rounds": 1, "seconds": 0.1, "threads": 1},
 }
