@@ -127,7 +127,7 @@ def _replay(recordings: list[Recording], machine: Machine, settings: GapVerb) ->
     out = Path(settings.out)
     (out / "replay.json").write_text(json.dumps(found.content(), indent=1, allow_nan=False) + "\n")
     kinds = ("free", "held") if len(found.parts) > 1 else ("",)
-    curves: dict[str, np.ndarray] = {}
+    curves: dict[str, Any] = {}
     for part, kind in zip(reversed(found.parts), kinds, strict=True):
         about = {**part.curves, "channels": np.array(part.channels), "episodes": np.array(part.episodes)}
         curves |= {f"{kind}_{name}".lstrip("_"): values for name, values in about.items()}
