@@ -67,7 +67,7 @@ class Listening(Robot):
 
     def sense(self) -> tuple[LowState, np.ndarray]:
         state, true = super().sense()
-        self.world.targets.append((self.clock, self._target[0].numpy().copy(), self.braking))
+        self.world.targets.append((state.clock, self._target[0].numpy().copy(), self.braking))
         spoilt = self.world.spoil(state)
         if spoilt is None:
             raise SilentError(true)
@@ -85,7 +85,6 @@ class Mutable(Server):
         try:
             super().tick()
         except SilentError:
-            self._robot.step()
             self.counts.ticks += 1
 
 

@@ -38,7 +38,7 @@ from go1exp.deploy.commands import (
     ranges_of,
     stretched,
 )
-from go1exp.deploy.controller import PHASES, Cycle
+from go1exp.deploy.controller import LYING, PHASES, Cycle
 from go1exp.deploy.estimate import BLIND_S, KalmanEstimator, settings
 from go1exp.deploy.job import Job, do
 from go1exp.deploy.launch import RefusedError, RobotError
@@ -51,9 +51,10 @@ from go1exp.estimation import from_json, go1, make_filter, sample, to_json
 from go1exp.export.build import build
 from go1exp.gap.prepare import unusable
 from go1exp.gap.standing import StandingGo1
+from go1exp.recording import VECTORS
 from go1exp.sim_robot.__main__ import sim_config, task_of
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
-from go1exp.sim_robot.server import Network, Server
+from go1exp.sim_robot.server import TRUTH, Network, Server
 from go1exp.train import run_folder, trainer
 from tests.lockstep import BEGIN, Spoil, lockstep
 from tests.small_run import SMALL
@@ -305,7 +306,8 @@ def play(
     file: str, out: Path, spoil: Spoil = lambda state: state, *, job: dict[str, Any] | None = None, **plan: Any
 ) -> SimpleNamespace:
     """Walk; return status, what was said, the account, the recording, the cycles and the world."""
-    usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "brake": 0.1, "wish": Wish((0.4, 0.0, 0.0))}
+    usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "lie_down": 0.0, "brake": 0.1}
+    usual["wish"] = Wish((0.4, 0.0, 0.0))
     said: list[str] = []
     with lockstep(spoil) as world:
         status = do(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), said.append)
@@ -332,9 +334,10 @@ def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> N
     phases = [PHASES[int(k)] for k in done.cycles["phase"]]
     counts = [phases.count(name) for name in PHASES]
     assert counts[:3] == [1, 10, 50]
-    assert counts[3] in (6, 7)  # for 0.1 s, both ends included, if rounding lets them
+    assert counts[3] == 0
+    assert counts[4] in (6, 7)  # for 0.1 s, both ends included, if rounding lets them
     assert done.account["timing"]["missed"] == 0
-    assert list(done.account["phases"]) == list(PHASES)
+    assert list(done.account["phases"]) == [name for name in PHASES if name != "lying_down"]
 
     r = done.recording
     assert (r.meta.source, r.meta.tool, r.meta.excitation, r.meta.base) == (
@@ -349,9 +352,14 @@ def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> N
     had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
     targets = np.array([had[round(t / TICK)] for t in r.t])
     assert r.joint("q_target").tobytes() == targets.tobytes()
-    # Drives: torque = kp (target - q) - kd qd, one tick later.
-    torque = 35.0 * (r.joint("q_target") - r.joint("q")) - 0.7 * r.joint("qd")
-    assert np.abs(torque[:-1] - r.joint("tau_est")[1:])[np.diff(targets, axis=0).max(axis=1) == 0].mean() < 0.05
+    # A row is one instant. Drives: torque = kp (target - q) - kd qd; a new target counts for half of its first tick.
+    half = 0.5 * (targets[1:] + targets[:-1])
+    torque = 35.0 * (half - r.joint("q")[1:]) - 0.7 * r.joint("qd")[1:]
+    np.testing.assert_allclose(r.joint("tau_est")[1:], torque, atol=1e-9)
+    np.testing.assert_allclose(r.block(*VECTORS["imu_quat"]), r.block(*VECTORS["base_quat"]), atol=1e-12)
+    np.testing.assert_allclose(r.block(*VECTORS["imu_gyro"]), r.block(*VECTORS["base_ang_vel"]), atol=1e-12)
+    place, speed = r.block(*VECTORS["base_pos"]), r.block(*VECTORS["base_lin_vel"])
+    np.testing.assert_allclose(speed[1:-1], (place[2:] - place[:-2]) / (2 * TICK), atol=1e-9)
     assert r.block("base_pos_z_w").min() > 0.2
     velocity = done.account["velocity"]
     assert np.max(velocity["estimate_rmse"]) < 0.05
@@ -403,6 +411,93 @@ def test_a_robot_gets_up_from_its_belly(file: str, tmp_path: Path) -> None:
     height = done.recording.block("base_pos_z_w")[:, 0]
     assert height[0] < 0.1
     assert height[-1] > 0.22
+
+
+# ---------------------------------------------------------------------- the end of a walk
+
+
+def ended(done: SimpleNamespace) -> tuple[float, float, np.ndarray]:
+    """Return height in the end, the largest speed downwards since the walk's end, and the heights since braking."""
+    rows = done.world.server.truth.rows()
+    place = {name: rows[:, 1 + k] for k, name in enumerate(TRUTH)}
+    begins = done.account["phases"]
+    since = rows[:, 0] >= begins.get("lying_down", begins["damping"]) - BEGIN
+    braking = rows[:, 0] >= begins["damping"] - BEGIN
+    down = -place["base_lin_vel_z_w"][since].min()
+    return float(place["base_pos_z_w"][-1]), float(down), place["base_pos_z_w"][braking]
+
+
+def test_a_walk_ends_with_lying_down(file: str, tmp_path: Path) -> None:
+    sinking = play(file, tmp_path / "a", seconds=0.5, brake=0.5)
+    lying = play(file, tmp_path / "b", seconds=0.5, brake=0.5, lie_down=2.0)
+    assert sinking.status == lying.status == 0
+    assert lying.account["ended"] == sinking.account["ended"] == walk.DONE
+    assert lying.account["walked_s"] == pytest.approx(0.5)
+    assert list(lying.account["phases"]) == list(PHASES)
+    assert lying.account["phases"]["damping"] - lying.account["phases"]["lying_down"] == pytest.approx(2.0, abs=0.03)
+    _, fast, after = ended(sinking)
+    assert after[0] > 0.2  # it falls from where it stood
+    height, slow, heights = ended(lying)
+    assert height < 0.1
+    assert heights[0] < 0.11  # on the ground before the drives brake
+    assert slow < 0.75 * fast
+    # The commands are the policy's, told to stand still; then the way to the nominal stance and to the ground.
+    phase, target = lying.cycles["phase"], lying.cycles["q_target"]
+    down = phase == PHASES.index("lying_down")
+    assert (lying.cycles["command"][down][:39] == 0.0).all()
+    assert (lying.cycles["command"][phase == PHASES.index("walking")] != 0.0).any()
+    np.testing.assert_allclose(target[down][60], robot.NOMINAL_STANCE, atol=1e-6)
+    np.testing.assert_allclose(target[down][-1], np.tile(LYING, 4), atol=0.05)
+    assert np.abs(np.diff(target[down][41:], axis=0)).max() < 0.05
+    assert lying.recording.t[-1] > sinking.recording.t[-1] + 1.9  # and the recording has it
+
+
+@pytest.mark.parametrize(
+    ("what", "name"),
+    [
+        (lambda state: kill(signal.SIGINT)(state), "operator_stop"),
+        (lambda state: None, "stale_state"),
+        (lambda state: leaning(state), "tilt"),
+    ],
+)
+def test_lying_down_is_no_shelter_from_faults(
+    file: str, tmp_path: Path, what: Callable[[LowState], LowState | None], name: str
+) -> None:
+    done = play(file, tmp_path, from_(1.0, what), seconds=0.5, lie_down=2.0)
+    assert done.status == STATUS[name]
+    assert done.account["ended"] == name
+    assert 0.99 < done.account["fault"]["t"] - BEGIN < 1.1
+    begins = done.account["phases"]
+    assert begins["lying_down"] - BEGIN == pytest.approx(0.72, abs=0.03)
+    assert 0.99 < begins["damping"] - BEGIN < 1.1
+    assert done.world.obeyed[max(done.world.obeyed)].damping
+
+
+@pytest.mark.parametrize(("keys", "lie_down", "status"), [(1, 1.0, 0), (2, 1.0, 20), (1, 0.0, 20)])
+def test_a_key_ends_a_walk_in_order_and_twice_at_once(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keys: int, lie_down: float, status: int
+) -> None:
+    ours, theirs = pty.openpty()
+    left = [0.5 + 0.3 * k for k in range(keys)]
+
+    def pressed(state: LowState) -> LowState:
+        if left and state.clock >= left[0] - 1e-9:
+            left.pop(0)
+            os.write(ours, b"q")
+        return state
+
+    with os.fdopen(theirs, "rb", buffering=0) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        done = play(file, tmp_path, pressed, seconds=None, lie_down=lie_down, wish=Wish("keyboard"))
+    os.close(ours)
+    assert done.status == status
+    assert ("lying_down" in done.account["phases"]) == (lie_down > 0)
+    if status:
+        assert done.account["ended"] == "operator_stop"
+    else:
+        assert done.account["ended"] == "asked for by the q key"
+        assert done.said[-1] == "walked for 0.3 s, until the q key"
+        assert ended(done)[0] < 0.1
 
 
 # ---------------------------------------------------------------------- faults on the way
@@ -855,6 +950,45 @@ def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_
     assert {"onnxruntime", "pyarrow"} <= modules
     assert not heavy & modules
     assert len(list((tmp_path / "logs").glob("*.parquet"))) == 1
+
+
+def children(pid: int) -> list[int]:
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="children are found in Linux's /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("way", ["go1exp.deploy", "go1exp.cli"])
+def test_a_signal_while_the_robot_starts_ends_both_at_once(
+    file: str, tmp_path: Path, way: str, number: signal.Signals
+) -> None:
+    words = ["deploy", file, "out=logs"] if way == "go1exp.cli" else [file, "--out", "logs"]
+    process = subprocess.Popen(
+        [sys.executable, "-W", "error", "-m", way, *words],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(data_root())},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    seen = [next(process.stdout)]
+    while "starting the simulated robot" not in seen[-1]:
+        seen.append(next(process.stdout))
+    while not (robots := children(process.pid)):
+        time.sleep(0.001)
+    time.sleep(0.05)  # it has begun to import, which takes seconds
+    process.send_signal(number)
+    begin = time.monotonic()
+    rest, errors = process.communicate(timeout=60)
+    assert time.monotonic() - begin < 2.0
+    assert errors == ""
+    assert rest == "stopped before the walk began: nothing was commanded\n"
+    assert process.returncode == STATUS["operator_stop"]
+    for pid in robots:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+    assert list(tmp_path.rglob("walk_*")) == []
 
 
 def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -136,7 +136,7 @@ SMALL: dict[str, dict[str, Any]] = {
     },
     "export": {"seconds": 0.1},
     "export_check": {},
-    "deploy": {"seconds": 0.2, "stand_up": 0.06, "brake": 0.06, "patience": 0.1, "keep": 0.2},
+    "deploy": {"seconds": 0.04, "stand_up": 0.06, "lie_down": 0.04, "brake": 0.06, "patience": 0.1, "keep": 0.2},
     "list": {},
     "bench": {"num_envs": 4, "rounds": 1, "seconds": 0.1, "threads": 1},
 }
@@ -180,6 +180,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "export_check:file": lambda walk: [str(walk.exported("other", "seed=5"))],
     "deploy:bundle": lambda walk: [str(walk.exported("other", "seed=5"))],
     "deploy:rate": lambda walk: [100.0],
+    "deploy:lie_down": lambda walk: [0.0],
     "list:group": lambda walk: ["reward"],
     "bench:overrides": lambda walk: [["sim.physics_dt=0.004"]],
 }

@@ -47,7 +47,7 @@ def _task(container: dict[str, Any]) -> int:
     if settings.stage == "report":
         return _report(files.load(out), out)
     recordings = read_all(settings.logs)
-    if settings.stage in ("all", "explain", "apply"):
+    if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
 
     from go1exp.gap.machine import machine_of
@@ -57,6 +57,8 @@ def _task(container: dict[str, Any]) -> int:
         return _check(recordings, machine, settings)
     if settings.stage == "localise":
         return _localise(recordings, machine, settings)
+    if settings.stage == "replay":
+        return _replay(recordings, machine, settings)
     if settings.stage == "apply":
         result = files.load(out)
         return _apply(result, recordings, machine, settings) or result.exit_code
@@ -110,6 +112,28 @@ def _localise(recordings: list[Recording], machine: Machine, settings: GapVerb) 
     if found.where is not None:
         print(f"\n{localisation_text(found.where)}")
     return found.exit_code
+
+
+def _replay(recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
+    """Print what training's simulator does under the same commands, and write it with its curves."""
+    import numpy as np
+
+    from go1exp.gap.retrace import retrace
+
+    found = retrace(recordings, machine, settings.search, settings.train_dt, _progress())
+    print(f"\n{found.text()}")
+    if found.flaws:
+        return found.exit_code
+    out = Path(settings.out)
+    (out / "replay.json").write_text(json.dumps(found.content(), indent=1, allow_nan=False) + "\n")
+    kinds = ("free", "held") if len(found.parts) > 1 else ("",)
+    curves: dict[str, Any] = {}
+    for part, kind in zip(reversed(found.parts), kinds, strict=True):
+        about = {**part.curves, "channels": np.array(part.channels), "episodes": np.array(part.episodes)}
+        curves |= {f"{kind}_{name}".lstrip("_"): values for name, values in about.items()}
+    np.savez_compressed(out / "replay.npz", **curves)
+    print(f"\nwritten to {out / 'replay.json'}, {out / 'replay.npz'}")
+    return 0
 
 
 def _apply(result: GapResult, recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:

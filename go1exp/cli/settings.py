@@ -185,6 +185,7 @@ class DeploySettings:
     rate: Annotated[float, Field(ge=10, le=1000)] | None
     seconds: Positive | None
     stand_up: NonNegative
+    lie_down: NonNegative
     brake: NonNegative
     patience: Positive
     keep: Annotated[float, Field(gt=0, le=3600)]
@@ -230,7 +231,7 @@ class GapVerb:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     logs: str | tuple[str, ...]
-    stage: Literal["all", "check", "localise", "explain", "apply", "report"]
+    stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report"]
     out: str
     train_dt: Annotated[float, Field(gt=0, le=0.02)]
     search: GapSettings

@@ -39,6 +39,9 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--stand-up", type=not_negative, default=2.0, help="s from the first pose to the nominal stance"
     )
+    parser.add_argument(
+        "--lie-down", type=not_negative, default=2.0, help="s for lying down at the end of a walk; 0: brake at once"
+    )
     parser.add_argument("--brake", type=not_negative, default=2.0, help="s for which the drives brake at the end")
     parser.add_argument("--keep", type=positive, default=120.0, help="newest seconds that the log has room for")
     parser.add_argument("--stale", type=positive, default=0.03, help="s without a state after which the robot is lost")
@@ -71,6 +74,7 @@ def main(given: Sequence[str]) -> int:
             seconds=found.seconds,
             wish=wish,
             stand_up=found.stand_up,
+            lie_down=found.lie_down,
             brake=found.brake,
             keep=found.keep,
             stale=found.stale,

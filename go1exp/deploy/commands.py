@@ -139,13 +139,19 @@ STEPS = {
 ENDS = {"\x1b": "the Esc key", "q": "the q key", "Q": "the q key"}
 """Keys that stop the robot; Q, which turns in many a game, is one of them, since in a terminal it means the end."""
 
-KEYS = "W S or up down: forward, back; A D: left, right; left right: turn; space: zero; Esc or q: stop"
+KEYS = "W S or up down: forward, back; A D: left, right; left right: turn; space: zero; Esc or q: end (twice: brake)"
 
 
 class Keyboard(Constant):
-    """Keys of the terminal change the velocity in steps; space makes it zero, Esc or q stops the robot."""
+    """Keys of the terminal change the velocity in steps; space makes it zero, Esc or q ends the walk."""
 
-    def __init__(self, stop: Stop, limit: Callable[[np.ndarray], np.ndarray], descriptor: int | None = None) -> None:
+    def __init__(
+        self,
+        stop: Stop,
+        limit: Callable[[np.ndarray], np.ndarray],
+        descriptor: int | None = None,
+        end: Stop | None = None,
+    ) -> None:
         """Take the terminal's keys one by one; ``limit`` keeps what they add up to within the ranges.
 
         Raises:
@@ -161,7 +167,7 @@ class Keyboard(Constant):
             tty.setcbreak(self._keys)
         except (OSError, ValueError, termios.error) as error:
             raise CommandError(f"command=keyboard: standard input is no terminal ({error})") from None
-        self._stop, self._limit = stop, limit
+        self._stop, self._end, self._limit = stop, end or stop, limit
         self._open = True
 
     def poll(self) -> None:
@@ -176,7 +182,7 @@ class Keyboard(Constant):
 
     def _press(self, key: str) -> None:
         if key in ENDS:
-            self._stop(ENDS[key])
+            self._end(ENDS[key])
         elif key == " ":
             self._velocity = np.zeros(3)
         elif key in STEPS:
@@ -296,8 +302,10 @@ class Wish:
     period: float = 10.0
 
 
-def make(wish: Wish, ranges: np.ndarray, stop: Stop) -> Limited:
+def make(wish: Wish, ranges: np.ndarray, stop: Stop, end: Stop | None = None) -> Limited:
     """Return the source that is wished for, within ``ranges`` (3, 2).
+
+    ``stop`` is told of what makes the drives brake at once, ``end`` of who wants an orderly end, if there is one.
 
     Raises:
         CommandError: if it cannot be had.
@@ -309,7 +317,7 @@ def make(wish: Wish, ranges: np.ndarray, stop: Stop) -> Limited:
     elif wish.command == "sinusoid":
         source = Sinusoid(wish.amplitude, wish.period)
     elif wish.command == "keyboard":
-        source = Keyboard(stop, lambda velocity: np.clip(velocity, ranges[:, 0], ranges[:, 1]))
+        source = Keyboard(stop, lambda velocity: np.clip(velocity, ranges[:, 0], ranges[:, 1]), end=end)
     elif wish.command == "gamepad":
         finite = np.where(np.isfinite(ranges), ranges, np.sign(ranges))
         source = Gamepad(stop, finite)

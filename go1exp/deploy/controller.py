@@ -16,8 +16,16 @@ from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.messages import Link, LowCmd, LowState
 from go1exp.deploy.safety import Safety
 
-PHASES = ("waiting", "standing_up", "walking", "damping")
-"""Before the first state; on the way to the nominal stance; under the policy; after a fault, for good."""
+PHASES = ("waiting", "standing_up", "walking", "lying_down", "damping")
+"""Before the first state; on the way to the nominal stance; under the policy; on the way to the ground at a walk's
+orderly end; braking, for good."""
+
+LYING = (0.0, 1.3, -2.65)
+"""Hip, thigh, calf of a Go1 that lies on its belly, rad; of every leg."""
+
+HALTED, STOOD = 0.4, 0.6
+"""Shares of the time for lying down: up to the first a policy that walks is commanded to stand still, at the second the
+robot has reached the nominal stance. Straight out of a gait it tips over its legs (chosen on a shipped policy)."""
 
 
 class Estimator(Protocol):
@@ -62,6 +70,7 @@ class Controller:
     Attributes:
         phase: one of ``PHASES``.
         safety: judges every command before it goes out.
+        finished: the walk came to its orderly end, and what happens to the braking robot after that is not its end.
     """
 
     def __init__(
@@ -73,6 +82,7 @@ class Controller:
         safety: Safety,
         *,
         stand_up: float = 2.0,
+        lie_down: float = 0.0,
         brake: float = 2.0,
         patience: float = 5.0,
         kp: np.ndarray | None = None,
@@ -88,6 +98,7 @@ class Controller:
             estimator: given every new state.
             safety: with the robot's limits.
             stand_up: time from the first pose to the nominal stance, s.
+            lie_down: time that ``finish`` gives the robot to lie down, s; with 0 the drives brake at once.
             brake: time for which the drives are told to brake after a fault before ``cycle`` returns False, s.
             patience: time to wait for the robot's first state, s.
             kp: (J,) N m/rad; those of the bundle if None.
@@ -105,16 +116,17 @@ class Controller:
         self._estimator, self.safety, self._on_cycle = estimator, safety, on_cycle
         self._kp, self._kd = (np.asarray(values, dtype=float) for values in gains)
         self._nominal = np.asarray(about.nominal_stance)
-        self._stand_up, self._brake, self._patience = stand_up, brake, patience
+        self._stand_up, self._lie_down, self._brake, self._patience = stand_up, lie_down, brake, patience
+        self._lying = np.tile(LYING, len(self._nominal) // len(LYING))
         self._begin: float | None = None
         self._readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
         self._target = self._nominal.copy()
         self._state: LowState | None = None
-        self._origin = self._nominal
+        self._origin, self._halting = self._nominal, False
         self._since = 0.0
         self._velocity, self._base = np.zeros(3), np.full(3, np.nan)
         self._observation: np.ndarray | None = None
-        self.phase = "waiting"
+        self.phase, self.finished = "waiting", False
 
     def cycle(self, now: float) -> bool:
         """Do one cycle; return whether there should be another. ``now`` is the clock's time, s.
@@ -134,7 +146,7 @@ class Controller:
             self.safety.fail("runtime", f"{type(error).__name__}: {error}", now)
             wanted = None
         sent = self.safety.review(self._state, wanted, now)
-        if self.safety.fault is not None and self.phase != "damping":
+        if self.safety.fault is not None and self.phase != "damping":  # lying down is no shelter
             self.phase, self._since = "damping", now
         heard = self._state is not None or self.phase == "damping"
         if heard:
@@ -146,9 +158,14 @@ class Controller:
         return self.phase != "damping" or now - self._since < self._brake
 
     def finish(self, now: float) -> None:
-        """End the walk without a fault: from the next cycle on the drives brake, and then there is no next one."""
-        if self.phase != "damping":
-            self.phase, self._since = "damping", now
+        """End the walk without a fault: from the next cycle on the robot lies down, then the drives brake."""
+        if self.phase in ("lying_down", "damping"):
+            return
+        if self._lie_down > 0 and self.phase != "waiting":
+            self._halting, self._origin = self.phase == "walking", self._target
+            self.phase, self._since = "lying_down", now
+        else:
+            self.phase, self._since, self.finished = "damping", now, True
 
     def walked(self, now: float) -> float:
         """Return the time since walking began, s; 0 unless it is going on."""
@@ -168,11 +185,29 @@ class Controller:
             if share < 1.0:
                 return LowCmd(self._origin + share * (self._nominal - self._origin), self._kp, self._kd)
             self.phase, self._since = "walking", now
+        if self.phase == "lying_down":
+            return self._lie(state, now)
         return self._walk(state, now)
+
+    def _lie(self, state: LowState, now: float) -> LowCmd | None:
+        """Halt under the policy if it walked, go to the nominal stance, lie down; None when that is done."""
+        share = (now - self._since) / self._lie_down
+        if share < HALTED and self._halting:
+            self._origin = self._target
+            return self._walk(state, now)
+        if share < 1.0 - 1e-9:
+            ways = (HALTED if self._halting else 0.0, STOOD, 1.0), (self._origin, self._nominal, self._lying)
+            k = int(share >= STOOD)
+            begin, end = ways[0][k : k + 2]
+            part = (share - begin) / (end - begin)
+            return LowCmd(ways[1][k] + part * (ways[1][k + 1] - ways[1][k]), self._kp, self._kd)
+        self.phase, self._since, self.finished = "damping", now, True
+        return None
 
     def _walk(self, state: LowState, now: float) -> LowCmd | None:
         """Ask the policy; None, and a fault, if the estimate or the command is no number."""
-        self._velocity = np.asarray(self._commands(now - self._since), dtype=float)
+        asked = self._commands(now - self._since) if self.phase == "walking" else np.zeros(3)
+        self._velocity = np.asarray(asked, dtype=float)
         given = {
             "joint_pos": state.joint_pos,
             "joint_vel": state.joint_vel,

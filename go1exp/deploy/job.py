@@ -17,7 +17,7 @@ from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
 from go1exp.deploy.udp import UdpLink
-from go1exp.deploy.walk import Plan, account, go, save, velocity_errors
+from go1exp.deploy.walk import STATUS, Outcome, Plan, account, go, interruptible, save, velocity_errors
 
 Say = Callable[[str], None]
 
@@ -87,6 +87,8 @@ def _reached(job: Job, say: Say) -> Iterator[_Robot]:
 def do(job: Job, say: Say) -> int:
     """Walk, write the log, and return the exit status: 0 if it walked to the end, else that of the fault.
 
+    SIGINT and SIGTERM before anything was commanded end it at once, with the status of an operator's stop.
+
     Raises:
         go1exp.errors.Expected: if bundle, robot, commands or estimator cannot be had.
         OSError: if a file cannot be read or written.
@@ -95,17 +97,26 @@ def do(job: Job, say: Say) -> int:
     about, plan = bundle.metadata, job.plan
     if about.kp is None or about.kd is None:
         raise RobotError(f"{job.bundle}: knows no gains of its drives (those of an actuator net that says none)")
-    make(plan.wish, ranges_of(about.command_ranges), lambda who: None).close()  # before anything is started
+    make(
+        plan.wish, ranges_of(about.command_ranges), lambda who: None, lambda who: None
+    ).close()  # before anything is started
     if not about.command_ranges:
         say("note: the bundle knows no range of commands, so none is cut")
     if plan.rate is not None and abs(plan.rate * about.policy_dt - 1.0) > 1e-6:
         say(f"note: the policy was trained at {1 / about.policy_dt:g} Hz and runs at {plan.rate:g} Hz")
     if plan.wish.command == "keyboard":
         say(KEYS)
-    with _reached(job, say) as robot:
-        contact = None if robot.simulated else "torque"
-        outcome = go(bundle, robot.link, plan, contact=contact, on_second=say)
-        traffic = getattr(robot.link, "traffic", None)
+    outcome: Outcome | None = None
+    try:
+        with interruptible(), _reached(job, say) as robot:
+            contact = None if robot.simulated else "torque"
+            outcome = go(bundle, robot.link, plan, contact=contact, on_second=say)
+            traffic = getattr(robot.link, "traffic", None)
+    except KeyboardInterrupt:
+        if outcome is not None:
+            raise
+        say("stopped before the walk began: nothing was commanded")
+        return STATUS["operator_stop"]
     more: dict[str, Any] = {"robot": job.robot, "link": None if traffic is None else vars(traffic)}
     truth: Mapping[str, np.ndarray] = {}
     if robot.process is not None:
@@ -126,7 +137,8 @@ def do(job: Job, say: Say) -> int:
     for line in told(content):
         say(line)
     say(f"written to {', '.join(map(str, files))}")
-    say(f"fault: {outcome.fault}" if outcome.fault else f"walked for {outcome.walked:.1f} s, to the end")
+    end = f"until {outcome.asked}" if outcome.asked else "to the end"
+    say(f"fault: {outcome.fault}" if outcome.fault else f"walked for {outcome.walked:.1f} s, {end}")
     return outcome.status
 
 

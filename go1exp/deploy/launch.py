@@ -81,6 +81,7 @@ class SimulatedRobot:
         except OSError:
             answer = {}
         except BaseException:
+            self._process.kill()  # it does not listen yet, so there is nothing to wait for
             self.close()
             raise
         if answer.get("what") != "listening":

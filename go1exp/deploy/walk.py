@@ -33,6 +33,10 @@ STATUS = {name: FIRST_STATUS + k for k, name in enumerate(FAULTS)}
 """Exit status of a walk that a fault ended, by its name."""
 
 UNKNOWN_FAULT = FIRST_STATUS - 1
+DONE = "walked to the end"
+
+TIME = "the end of its time"
+"""Who ends a walk that nobody else ends."""
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -46,6 +50,7 @@ class Plan:
         seconds: time under the policy, s; None: until somebody stops it.
         wish: where commands come from.
         stand_up: time to the nominal stance, s.
+        lie_down: time that the robot is given to lie down when a walk ends in order, s; 0: the drives brake at once.
         brake: time for which the drives brake at the end, s.
         patience: time to wait for the robot, s.
         keep: newest seconds of a walk that the log has room for.
@@ -57,6 +62,7 @@ class Plan:
     seconds: float | None = None
     wish: Wish = field(default_factory=lambda: Wish((0.0, 0.0, 0.0)))
     stand_up: float = 2.0
+    lie_down: float = 2.0
     brake: float = 2.0
     patience: float = 5.0
     keep: float = 120.0
@@ -77,6 +83,7 @@ class Outcome:
         commands: with what was cut.
         estimator: what it refused, by its word for it.
         memory_mb: resident when the walk ended.
+        asked: who asked for its orderly end: a key; empty if the time was up.
     """
 
     fault: Fault | None
@@ -87,10 +94,11 @@ class Outcome:
     commands: Limited
     estimator: dict[str, int]
     memory_mb: float | None
+    asked: str = ""
 
     @property
     def status(self) -> int:
-        """Exit status: 0 if it walked to the end."""
+        """Exit status: 0 if it came to an orderly end."""
         return 0 if self.fault is None else STATUS.get(self.fault.name, UNKNOWN_FAULT)
 
 
@@ -133,11 +141,12 @@ def go(
     rate = plan.rate or 1.0 / about.policy_dt
     room = plan.keep
     if plan.seconds is not None:
-        room = min(room, plan.seconds + plan.stand_up + plan.brake + plan.patience + 1.0)
+        room = min(room, plan.seconds + plan.stand_up + plan.lie_down + plan.brake + plan.patience + 1.0)
     log = Log(rate, room)
-    commands = make(plan.wish, ranges_of(about.command_ranges), safety.stop)
+    asked: list[str] = []
+    commands = make(plan.wish, ranges_of(about.command_ranges), safety.stop, asked.append)
     try:
-        return _go(bundle, link, plan, rate, safety, estimator, log, commands, on_second)
+        return _go(bundle, link, plan, rate, safety, estimator, log, commands, asked, on_second)
     finally:
         commands.close()
 
@@ -151,9 +160,10 @@ def _go(
     estimator: Estimator,
     log: Log,
     commands: Limited,
+    asked: list[str],
     on_second: Callable[[str], None],
 ) -> Outcome:
-    walked, ended, last = 0.0, False, [0.0, 0.0, 0.0]
+    walked, ended, last = 0.0, "", [0.0, 0.0, 0.0]
 
     def on_cycle(cycle: Cycle) -> None:
         log.note(cycle)
@@ -162,6 +172,7 @@ def _go(
     controller = Controller(
         *(bundle, link, commands, estimator, safety),
         stand_up=plan.stand_up,
+        lie_down=plan.lie_down,
         brake=plan.brake,
         patience=plan.patience,
         on_cycle=on_cycle,
@@ -174,8 +185,15 @@ def _go(
             walked = max(walked, controller.walked(now))
             # Half a period early: the next cycle would be the first one too many.
             if plan.seconds is not None and controller.phase == "walking" and walked > plan.seconds - 0.5 / rate:
-                ended = True
+                ended = TIME
                 controller.finish(now)
+        for who in asked:
+            if ended or not plan.lie_down or controller.phase == "waiting":
+                safety.stop(who)  # once more, or where there is nothing to be ended in order
+            else:
+                ended = who
+                controller.finish(now)
+        asked.clear()
         try:
             return controller.cycle(now)
         except Exception as error:  # of the link or the log: nothing else gets out of a cycle
@@ -191,8 +209,8 @@ def _go(
     with stopping(safety):
         timing = run(work, rate, None, MonotonicClock(plan.spin), report)
     refused = dict(getattr(estimator, "refused", {}), RESTARTED=getattr(estimator, "restarts", 0))
-    fault = None if ended else safety.fault  # what happens to a robot that lies down is not the walk's end
-    return Outcome(fault, walked, timing, log, safety, commands, refused, resident())
+    fault = None if controller.finished else safety.fault
+    return Outcome(fault, walked, timing, log, safety, commands, refused, resident(), ended.removeprefix(TIME))
 
 
 @contextmanager
@@ -211,6 +229,19 @@ def stopping(safety: Safety) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let SIGTERM raise ``KeyboardInterrupt``, as SIGINT does; leave its handler as it was."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def resident() -> float | None:
@@ -239,7 +270,7 @@ def account(bundle: Bundle, plan: Plan, outcome: Outcome, more: Mapping[str, Any
     lived = age()
     return {
         "bundle": {"file": bundle.source, "sha256": bundle.seal},
-        "ended": "walked to the end" if fault is None else fault.name,
+        "ended": (f"asked for by {outcome.asked}" if outcome.asked else DONE) if fault is None else fault.name,
         "fault": None if fault is None else asdict(fault),
         "status": outcome.status,
         "walked_s": outcome.walked,

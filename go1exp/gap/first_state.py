@@ -33,7 +33,7 @@ DRAWS = 4
 """States drawn from what remains uncertain."""
 
 
-def _solved(state: np.ndarray, residual: np.ndarray, off: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def solved(state: np.ndarray, residual: np.ndarray, off: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the likeliest unknowns (W, k), in standard deviations, and the roots (W, k, k) of their covariance.
 
     With ``off`` (W, l), the first l of them are by so much away from what was expected.
@@ -93,7 +93,7 @@ def settled(
         part = rows.part(going)
         residual = score.residual(part, dt)
         before = score.chi2(residual, going)[:, 0] + np.sum(off[going] ** 2, axis=1) / score.size[going]
-        x, _ = _solved(score.state[going, 0], residual[:, 0], off[going])
+        x, _ = solved(score.state[going, 0], residual[:, 0], off[going])
         step = np.zeros((len(everything), own))
         step[going] = x[:, :own].clip(-FARTHEST, FARTHEST)
         windows, length, best = score.windows, np.zeros(len(everything)), before
@@ -124,7 +124,7 @@ def _stepped(score: Scorer, rows: Rows, dt: float) -> tuple[Scorer, dict[str, fl
     everything, windows = np.arange(len(score.windows)), score.windows
     change = score.replayer.run(rows, dt) - score.replayer.run(rows, 0.5 * dt)
     whole = score.unit(change, everything)[:, 0]
-    x, _ = _solved(score.state[:, 0], whole)
+    x, _ = solved(score.state[:, 0], whole)
     left = whole - (score.state[:, 0] @ x[..., None].astype(np.float32))[..., 0]
     error = 2.0 * np.sqrt(np.mean(change**2, axis=1))
     return _rescaled(score, np.sqrt(1.0 + 4.0 * _mean_square(score, left))), windows.by_quantity(error)
@@ -136,7 +136,7 @@ def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
     joints, own = len(windows.joints), 2 * len(windows.joints) + windows.base_sd.shape[1]
     everything = np.arange(len(windows))
     here = replayer.run(plain, dt)
-    _, root = _solved(score.state[:, 0], np.zeros(score.state.shape[::2][:1] + score.state.shape[2:3]))
+    _, root = solved(score.state[:, 0], np.zeros(score.state.shape[::2][:1] + score.state.shape[2:3]))
     sd = np.concatenate([windows.q_sd, windows.qd_sd, windows.base_sd], axis=1)
     rng, square = np.random.default_rng(0), np.zeros_like(score.scale)
     for _ in range(DRAWS):

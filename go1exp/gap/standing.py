@@ -63,6 +63,9 @@ IMU_BIAS_SD = (0.02, 0.2)
 IMU = "imu"
 """Name of the third quantity: gyro x y z, accelerometer x y z, and nothing in the other places of a row."""
 
+TRUNK = "trunk"
+"""Name of the quantity of a ``Witness``: attitude w-x-y-z, and velocity in the world."""
+
 AXES = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z", "imu_acc_x", "imu_acc_y", "imu_acc_z")
 
 
@@ -255,12 +258,28 @@ class Ears:
     def joined(self, joints: np.ndarray, at: np.ndarray, plant: Plant, dt: float) -> np.ndarray:
         """Put the IMU's readings at times ``at`` (R, n), in steps, beside those of the joints (R, n, 2, J)."""
         imu = self.readings(plant, dt).numpy()
-        low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(imu) - 2)
-        share = np.maximum(at - low, 0.0)[..., None]
-        row = np.arange(at.shape[0])[:, None]
-        both = np.zeros((*joints.shape[:2], 1, joints.shape[3]))
-        both[:, :, 0, :6] = (1.0 - share) * imu[low, row] + share * imu[low + 1, row]
-        return np.concatenate([joints, both], axis=2)
+        return beside(joints, imu, at)
+
+
+class Eyes(Ears):
+    """Returns also where the bases look and how fast they move."""
+
+    def joined(self, joints: np.ndarray, at: np.ndarray, plant: Plant, dt: float) -> np.ndarray:
+        """Put attitude w-x-y-z and velocity in the world beside the rest."""
+        speed = self._speed[..., :3]
+        after = torch.cat([speed[1:], 2.0 * speed[-1:] - speed[-2:-1]])
+        trunk = torch.cat([self._quat, 0.5 * (speed + after)], dim=-1).numpy()
+        return beside(super().joined(joints, at, plant, dt), trunk, at)
+
+
+def beside(joints: np.ndarray, more: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Put values (K, R, c) of every step, at times ``at`` (R, n) in steps, beside quantities (R, n, C, J)."""
+    low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(more) - 2)
+    share = np.maximum(at - low, 0.0)[..., None]
+    row = np.arange(at.shape[0])[:, None]
+    both = np.zeros((*joints.shape[:2], 1, joints.shape[3]))
+    both[:, :, 0, : more.shape[2]] = (1.0 - share) * more[low, row] + share * more[low + 1, row]
+    return np.concatenate([joints, both], axis=2)
 
 
 @dataclass
@@ -311,3 +330,10 @@ class StandingReplayer(Replayer):
 
     def _ears(self, steps: int, rows: int) -> Ears:
         return Ears(steps, rows, self._windows.imu_site)
+
+
+class Witness(StandingReplayer):
+    """Replays windows of a robot on its feet, and tells torques and the trunk's motion beside what is scored."""
+
+    def _ears(self, steps: int, rows: int) -> Eyes:
+        return Eyes(steps, rows, self._windows.imu_site)

@@ -9,14 +9,15 @@ import torch
 
 from go1exp import robot
 from go1exp.config import TaskConfig
+from go1exp.deploy.controller import LYING
 from go1exp.deploy.messages import LowCmd, LowState
 from go1exp.deploy.safety import DEFAULT_KD
+from go1exp.effects.base import Measured
 from go1exp.effects.rules import has_gains
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
 from go1exp.randomness import EnvRandom
-from go1exp.record.tape import sample
 from go1exp.registry import ConfigError
 from go1exp.sim_robot.settings import SimConfig
 from go1exp.terrain import TerrainConfig, build_terrain
@@ -32,9 +33,6 @@ NOISE = {"joint_pos": 0.05, "joint_vel": 0.1, "imu_gyro": 0.01, "attitude": 0.05
 
 OWN_NOISE = {"imu_acc": 0.1, "foot_force": 2.0}
 """Standard deviations of what Table II does not have, m/s2 and N, as in ``conf/record.yaml``."""
-
-LYING = (0.0, 1.3, -2.65)
-"""Hip, thigh, calf of a robot that lies on its belly, rad."""
 
 LYING_HEIGHT = 0.12
 """Of its trunk when it is put down, m."""
@@ -70,6 +68,7 @@ class Robot:
         self._own_gains = tuple(getattr(own, name).numpy().ravel().copy() for name in ("kp", "kd"))
         self.clock, self.braking = 0.0, False
         self._commanded, self._in_force = -np.inf, 0
+        self._measured = self.clock, self._in_force
         self._place()
 
     def _place(self) -> None:
@@ -88,7 +87,7 @@ class Robot:
         self._gains = self._own_gains
         self._set_gains(*((np.zeros(robot.NUM_JOINTS), self._braking_kd) if start == "lying" else self._own_gains))
         for _ in range(round(SETTLE_S / TICK)):
-            plant.step(self._target)
+            self._advance()
         plant.effects.reset(everyone)  # what drifts begins now
 
     _braking_kd = np.full(robot.NUM_JOINTS, DEFAULT_KD)
@@ -108,36 +107,61 @@ class Robot:
         self._target = torch.tensor(command.joint_target, dtype=self._plant.q.dtype).unsqueeze(0)
         self._set_gains(command.kp, command.kd)
 
-    def sense(self) -> tuple[LowState, np.ndarray]:
-        """Return what the sensors say now, and the truth (13,): trunk's place, attitude and velocities.
-
-        The truth is in the columns of ``TRUTH``; NaN for a robot that hangs.
-        """
-        true = {name: values[0].numpy() for name, values in sample(self._plant, self._target).items()}
-        seen = noisy(true, self._config.noise, self._rng)
-        state = LowState(
-            t=self.clock,
-            clock=self.clock,
-            in_force=self._in_force,
-            joint_pos=seen["q"],
-            joint_vel=seen["qd"],
-            joint_torque=true["tau_est"],
-            imu_quat=seen["quat"],
-            imu_gyro=seen["gyro"],
-            imu_acc=seen["acc"],
-            foot_force=seen["foot_force"],
-        )
-        if "base_pos" not in true:
-            return state, np.full(13, np.nan)
-        return state, np.concatenate([true[name] for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel")])
-
     def step(self) -> None:
         """Advance by a tick; drives that nobody has commanded for ``SILENCE`` brake."""
         if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE + 1e-9:
             self.braking = True
             self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
-        self._plant.step(self._target)
+        self._measured = self.clock, self._in_force
+        self._advance()
         self.clock = round(self.clock / TICK + 1) * TICK
+
+    def _advance(self) -> None:
+        """Make a step, and note what is true at the instant where it begins.
+
+        The engine tells forces and the IMU's readings while it makes the step that begins there, and speeds half a step
+        before and after: asked before the step, it would tell them one to three milliseconds late.
+        """
+        plant, backend = self._plant, self._plant.backend
+        joints = plant.effects.measure(Measured(plant.q, plant.speed()))
+        pose, q, qd = backend.qpos.clone(), joints.joint_pos.clone(), joints.joint_vel.clone()
+        half = backend.qvel.clone()
+        blocks, readings = backend.sensors, backend.sensordata
+        # Feet tell a tick late: the estimator's wait after a touch-down was chosen with such feet.
+        feet = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))[..., 1:].norm(dim=-1)
+        plant.step(self._target)
+        speed = 0.5 * (half + backend.qvel)
+        floats = pose.shape[1] > robot.NUM_JOINTS
+        rate = speed[:, 3:6] if floats else readings[:, blocks.imu_gyro]
+        about = {"acc": readings[:, blocks.imu_acc], "quat": readings[:, blocks.imu_quat]}
+        imu = plant.effects.measure(Measured(plant.q, plant.speed(), gyro=rate, **about))
+        told = {"q": q, "qd": qd, "tau_est": plant.torque, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
+        told["foot_force"] = feet
+        self._now = {name: values[0].numpy().copy() for name, values in told.items() if values is not None}
+        trunk = torch.cat([pose[:, :7], speed[:, :6]], dim=1)[0].numpy() if floats else np.full(13, np.nan)
+        self._true = np.array(trunk)
+
+    def sense(self) -> tuple[LowState, np.ndarray]:
+        """Return what the sensors say of the instant where the last step began, and the truth (13,) then.
+
+        The truth is the trunk's place, attitude and velocities, in the columns of ``TRUTH``; NaN for a robot that
+        hangs.
+        """
+        seen = noisy(self._now, self._config.noise, self._rng)
+        clock, in_force = self._measured
+        state = LowState(
+            t=clock,
+            clock=clock,
+            in_force=in_force,
+            joint_pos=seen["q"],
+            joint_vel=seen["qd"],
+            joint_torque=self._now["tau_est"],
+            imu_quat=seen["quat"],
+            imu_gyro=seen["gyro"],
+            imu_acc=seen["acc"],
+            foot_force=seen["foot_force"],
+        )
+        return state, self._true
 
 
 def noisy(true: Mapping[str, np.ndarray], share: float, rng: np.random.Generator) -> dict[str, np.ndarray]:

@@ -157,18 +157,18 @@ class Server:
         return timing
 
     def tick(self) -> None:
-        """Listen, obey the newest command, send what the sensors say, and move on by a tick."""
+        """Listen, obey the newest command, move on by a tick, and send what the sensors said at its beginning."""
         robot, now = self._robot, self._robot.clock
         self._listen(now)
         for data in self._here.take(now):
             self._obey(data)
+        robot.step()
         state, true = robot.sense()
         self.truth.add(now, true)
         if self._peer is not None:
             self._back.put(now, wire.pack_state(state, self.counts.ticks))
             for data in self._back.take(now):
                 self._send(data)
-        robot.step()
         self.counts.ticks += 1
 
     def _listen(self, now: float) -> None:

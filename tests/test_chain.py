@@ -1,0 +1,96 @@
+"""The whole chain: train, export, check, deploy against a robot in another process, read the log, replay it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from go1exp import cli, data_root, recording
+from go1exp.compose import compose
+from go1exp.config import parse_parts
+from go1exp.gap.machine import hung
+from go1exp.gap.result import GapSettings
+from go1exp.gap.retrace import Part, retrace
+from go1exp.recording import Recording, joint_channels
+from tests.small_run import SMALL
+
+STEP = 0.002
+"""Training's and the robot's, s."""
+
+LIVELY = ("ppo.learning_rate=0.03", "ppo.learning_rate_range=[0.03,0.03]", "actuator.kp=35", "actuator.kd=0.7")
+"""A policy of two iterations that moves the legs a little."""
+
+TORQUE, SPEED, ANGLE = 0.2, 0.25, 0.006
+"""Bounds on the RMSE of a log of the simulator in the simulator, N m, rad/s, rad. With commands a sample off, torques
+are beyond the first (0.3; 0.1 without)."""
+
+
+@pytest.fixture
+def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Run ``go1exp`` in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(data_root()))
+
+    def run(*words: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["go1exp", *words])
+        return cli.main()
+
+    return run
+
+
+def replayed(log: Recording, shift: int) -> Part:
+    """Replay a log whose commands are ``shift`` samples late."""
+    names = joint_channels("q_target", log.meta.joints)
+    channels = {n: np.roll(v, shift) if n in names else v for n, v in log.channels.items()}
+    moved = dataclasses.replace(log, channels={name: values[1:-1] for name, values in channels.items()})
+    machine = hung(parse_parts(compose("gap", ["logs=x"]), ("robot",))[0]["robot"])
+    (part,) = retrace([moved], machine, GapSettings(threads=1), STEP).parts
+    return part
+
+
+def test_from_training_to_the_replayed_log(
+    verb: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert verb("train", *SMALL, *LIVELY, "hydra.run.dir=run") == 0
+    assert verb("export", "run=run", "out=walk.zip", "seconds=0.2") == 0
+    assert verb("export", "check", "walk.zip") == 0
+    words = ["command=[0.4,0,0]", "seconds=1", "stand_up=0.5", "lie_down=1", "brake=0.2", "stale=5"]
+    robot = ["sim.start=lying", "sim.noise=0.1", "truth=true"]
+    assert verb("deploy", "walk.zip", *words, *robot, "out=logs") == 0
+    (kept,) = (tmp_path / "logs").glob("*.parquet")
+    account = json.loads(kept.with_suffix(".json").read_text())
+    assert account["ended"] == "walked to the end"
+    assert list(account["phases"]) == ["waiting", "standing_up", "walking", "lying_down", "damping"]
+    log = recording.read(kept)
+    height = log.block("base_pos_z_w")[:, 0]
+    assert height[0] < 0.1
+    assert height.max() > 0.22
+    assert height[-1] < 0.12
+
+    capsys.readouterr()
+    assert verb("gap", "replay", f"logs={kept}", "search.threads=1", "out=replay") == 0
+    assert "times the floor (1 is right)" in capsys.readouterr().out
+    (part,) = json.loads((tmp_path / "replay/replay.json").read_text())["parts"]
+    assert len(part["windows"]) > 5
+    assert {"q_FR_hip", "tau_est_RL_calf", "imu_acc_z", "yaw", "base_lin_vel_x_b"} <= set(part["rmse"])
+    with np.load(tmp_path / "replay/replay.npz") as curves:
+        off = np.where(curves["valid"][..., None], curves["simulated"] - curves["measured"], 0.0)
+        rms = np.sqrt(np.mean(np.sum(off**2, axis=1) / curves["valid"].sum(1)[:, None], axis=0))
+        assert dict(zip(curves["channels"].tolist(), rms.tolist(), strict=True)) == pytest.approx(part["rmse"])
+
+    found = {
+        q: np.sqrt(np.mean([v**2 for c, v in part["rmse"].items() if c in joint_channels(q, log.meta.joints)]))
+        for q in ("q", "qd", "tau_est")
+    }
+    assert found["tau_est"] < TORQUE
+    assert found["qd"] < SPEED
+    assert found["q"] < ANGLE
+    assert part["times_floor"] < 1.5
+    for late in (-1, 1):
+        assert replayed(log, late).quantity("tau_est") > TORQUE
