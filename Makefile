@@ -13,7 +13,7 @@ LOCK_VENV := build/lock-venv
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check sanitise bench lock clean
+.PHONY: help setup demo test check sanitise bench runtime image lock clean
 
 help: ## list the verbs
 	@echo "usage: make VERB"
@@ -76,17 +76,34 @@ bench: setup ## measure the speed of the environment, of training, of nets and e
 	@echo "bench 3/3: nets, effects, recording"
 	@$(BIN)/go1exp bench suite=actuator
 
+runtime: ## make build/runtime, the environment of the robot's computer: no torch, no MuJoCo (docs/deploy.md)
+	@echo "runtime 1/3: wheel in build/wheels"
+	@rm -rf build/wheels build/runtime
+	@PYTHON=$(PY) deploy/build.sh build/wheels
+	@echo "runtime 2/3: environment in build/runtime"
+	@PYTHON=$(PY) deploy/install.sh build/runtime build/wheels/go1exp-*.whl
+	@echo "runtime 3/3: check"
+	@deploy/check.sh build/runtime
+
+image: ## the same as a container image, go1exp-deploy; needs Docker
+	@command -v docker >/dev/null || { echo "make image needs Docker, and there is none; make runtime does without" >&2; exit 1; }
+	@docker info >/dev/null 2>&1 || { \
+	  echo "make image: docker reaches no daemon (docker info says why); make runtime does without" >&2; exit 1; }
+	docker build -f deploy/Dockerfile -t go1exp-deploy .
+
 # An override that never applies takes torch, and with it the CUDA packages, out of the resolution.
 lock: ## resolve requirements/base.in into requirements/lock.txt, keeping the pins that still fit
-	@echo "lock 1/2: $(UV) in $(LOCK_VENV)"
+	@echo "lock 1/3: $(UV) in $(LOCK_VENV)"
 	@$(PY) -m venv $(LOCK_VENV)
 	@$(LOCK_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input "$(UV)"
-	@echo "lock 2/2: requirements/lock.txt"
+	@echo "lock 2/3: requirements/lock.txt"
 	@echo "torch ; python_version < '3'" > build/no-torch.txt
 	@$(LOCK_VENV)/bin/uv pip compile -q requirements/base.in --override build/no-torch.txt --python-version 3.11 \
 	  --generate-hashes --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" \
 	  -o requirements/lock.txt
 	@! grep -n '://' requirements/lock.txt || { echo "requirements/lock.txt names an address" >&2; exit 1; }
+	@echo "lock 3/3: requirements/deploy.txt and requirements/build.txt, parts of it"
+	@$(PY) deploy/lock.py
 
 clean: ## remove .venv, build products and caches; keeps runs/ and outputs/
 	@echo "clean: $(VENV), build products and caches"

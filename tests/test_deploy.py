@@ -1005,6 +1005,10 @@ def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytes
     assert "-5: must be greater than 0" in capfd.readouterr().err
     with pytest.raises(RefusedError, match=r"sim\.loss = 2"):
         do(Job(file, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
+    said: list[str] = []
+    with pytest.raises(NotADirectoryError):  # before the robot is started, not when the log is due
+        do(Job(file, "sim", Plan(), f"{file}/logs"), said.append)
+    assert said == []
     assert list(tmp_path.iterdir()) == []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -106,6 +107,7 @@ def do(job: Job, say: Say) -> int:
         say(f"note: the policy was trained at {1 / about.policy_dt:g} Hz and runs at {plan.rate:g} Hz")
     if plan.wish.command == "keyboard":
         say(KEYS)
+    _writable(Path(job.out))
     outcome: Outcome | None = None
     try:
         with interruptible(), _reached(job, say) as robot:
@@ -159,6 +161,13 @@ def told(content: Mapping[str, Any]) -> list[str]:
             f"latest {1e3 * timing['late_worst']:.1f} ms; {robot['lost']} datagrams lost on the way"
         )
     return lines
+
+
+def _writable(folder: Path) -> None:
+    """Make the folder of the logs; raise OSError if nothing can be written there, rather than after the walk."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 def _free(folder: Path, name: str) -> str:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import onnxruntime as ort
 
 from go1exp.deploy.metadata import Port
+
+# The published builds report to their maker (its Privacy.md) unless this is there when they are loaded; 1.31 was seen
+# to put an identifier and a database into the home folder for that. A user's choice stands.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
+import onnxruntime as ort
 
 
 class OnnxPolicy:
