@@ -1,7 +1,7 @@
 """The Kalman filter in numbers: python benchmarks/estimation.py [speed] [scaler] [sim] [--run RUN] [--data FOLDER] ...
 
 1. ``speed``: updates per second on one core, from C++ and one by one from Python.
-2. ``scaler``: the walks of a real robot under motion capture, beside plain leg odometry; FOLDER holds ``run_*.npz``
+2. ``scaler``: the walks of a real robot under motion capture, beside plain leg odometry; FOLDER holds such runs (``.npz``)
    (default: ``scaler_walk_mocap`` in ``../shared/data`` beside the repository, or in GO1EXP_DATA). With
    ``--leave-one-out`` the setting that distance depends on most, ``foot_drift``, is chosen for each run on the others.
 3. ``sim``: a simulated Go1 under the policy of ``--run`` with random commands up to 1.5 m/s (and straight on
@@ -29,11 +29,12 @@ from go1exp import data_root
 from go1exp.compose import compose
 from go1exp.config import parse_task
 from go1exp.estimation import Status, go1, make_filter, readings, scaler
-from go1exp.estimation.mocap import judge
+from go1exp.estimation.mocap import Judgement, judge
 from go1exp.estimation.replay import samples
+from go1exp.importers.source import files
 from go1exp.record.sensors import Channel, SensorConfig
 from go1exp.record.simulate import Rig, Walk, play, play_policy
-from go1exp.recording import VECTORS, Recording
+from go1exp.recording import VECTORS, Recording, RecordingError
 from go1exp.registry import bind
 
 COMMANDS: dict[str, object] = {
@@ -63,7 +64,7 @@ SENSORS = SensorConfig(
     truth=True,
 )
 
-DRIFTS = (0.012, 0.016, 0.02, 0.022, 0.025, 0.03, 0.035)
+DRIFTS = (0.012, 0.016, 0.018, 0.02, 0.022, 0.024, 0.027, 0.03, 0.035)
 
 
 def speed() -> None:
@@ -90,25 +91,35 @@ def speed() -> None:
 
 
 def real(folder: Path, leave_one_out: bool) -> None:
-    """Print the table of SCALER's walks."""
-    files = sorted(folder.glob("*.npz"))
-    found = [judge(file, scaler()) for file in files]
-    print("| run | distance, m | odometry: v RMSE | distance | filter: v RMSE | distance |\n|---|---|---|---|---|---|")
-    for j in found:
+    """Print the table of SCALER's walks; a run that cannot be judged has its reason there."""
+    found: dict[Path, Judgement] = {}
+    print("| run | distance, m | odometry: v RMSE | distance | filter: v RMSE | distance | clock |")
+    print("|---|---|---|---|---|---|---|")
+    for file in files(folder, "*.npz"):
+        try:
+            j = judge(file, scaler())
+        except RecordingError as error:
+            print(f"| {file.stem} | left out: {error} |")
+            continue
+        found[file] = j
         odometry = f"{j.odometry_rmse:.3f} | {100 * j.odometry_distance:+.1f} %"
         filtered = f"{j.filter_rmse:.3f} | {100 * j.filter_distance:+.1f} %"
-        print(f"| {j.run} | {j.truth_distance:.2f} | {odometry} | {filtered} |")
+        clock = f"{j.clock_shift:+.2f} s" if j.clock_shift else ""
+        print(f"| {j.run} | {j.truth_distance:.2f} | {odometry} | {filtered} | {clock} |")
+    if not found:
+        return
+    of = list(found.values())
     columns = [
-        (np.mean([j.odometry_rmse for j in found]), np.mean([abs(j.odometry_distance) for j in found])),
-        (np.mean([j.filter_rmse for j in found]), np.mean([abs(j.filter_distance) for j in found])),
+        (np.mean([j.odometry_rmse for j in of]), np.mean([abs(j.odometry_distance) for j in of])),
+        (np.mean([j.filter_rmse for j in of]), np.mean([abs(j.filter_distance) for j in of])),
     ]
-    print("| mean (distance: of sizes) | | " + " | ".join(f"{v:.3f} | {100 * d:.1f} %" for v, d in columns) + " |")
-    if leave_one_out:
-        error = np.array([[judge(f, scaler(foot_drift=d)).filter_distance for d in DRIFTS] for f in files])
+    print("| mean (distance: of sizes) | | " + " | ".join(f"{v:.3f} | {100 * d:.1f} %" for v, d in columns) + " | |")
+    if leave_one_out and len(found) > 1:
+        error = np.array([[judge(f, scaler(foot_drift=d)).filter_distance for d in DRIFTS] for f in found])
         held = []
-        for k in range(len(files)):
+        for k in range(len(found)):
             others = np.delete(error, k, axis=0)
-            held.append(error[k, np.argmin(np.abs(others).mean(axis=0))])
+            held.append(error[k, np.argmin((others**2).mean(axis=0))])
         print(
             "foot_drift by the other runs: "
             + ", ".join(f"{100 * h:+.1f}" for h in held)
@@ -175,7 +186,7 @@ def main() -> None:
     parser.add_argument(
         "parts", nargs="*", default=["speed", "scaler", "sim"], help="speed, scaler, sim (default: all)"
     )
-    parser.add_argument("--data", type=Path, help="folder of SCALER's runs")
+    parser.add_argument("--data", type=Path, help="a run of SCALER's (.npz), or a folder of them")
     parser.add_argument("--leave-one-out", action="store_true")
     parser.add_argument("--run", type=Path, help="run folder of the policy that walks")
     parser.add_argument("--seconds", type=float, default=600.0, help="simulated time on each ground")

@@ -10,7 +10,7 @@ GRAVITY = 9.81
 
 
 def levelled(
-    t: np.ndarray, gyro: np.ndarray, acc: np.ndarray, *, seconds: float = 10.0, first: float = 0.2
+    t: np.ndarray, gyro: np.ndarray, acc: np.ndarray, *, seconds: float = 10.0, first: float = 0.5
 ) -> np.ndarray:
     """Return the attitude ``(T, 4)``, w-x-y-z, body to world, of a complementary filter (Mahony et al. 2008, eq. 32).
 
@@ -34,3 +34,9 @@ def levelled(
         rotation = rotation * Rotation.from_rotvec(rate * (t[k] - t[k - 1]))
         found.append(rotation)
     return Rotation.concatenate(found).as_quat(scalar_first=True)
+
+
+def vertical(quat: np.ndarray) -> np.ndarray:
+    """Return the world's z axis in the body's, ``(T, 3)``, of attitudes w-x-y-z ``(T, 4)``."""
+    w, x, y, z = quat.T
+    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
