@@ -1,12 +1,13 @@
 """The Kalman filter in numbers: python benchmarks/estimation.py [speed] [scaler] [sim] [--run RUN] [--data FOLDER] ...
 
 1. ``speed``: updates per second on one core, from C++ and one by one from Python.
-2. ``scaler``: the walks of a real robot under motion capture, beside plain leg odometry; FOLDER holds such runs (``.npz``)
+2. ``scaler``: the walks of a real robot under motion capture, beside plain leg odometry; FOLDER holds such
+   runs (``.npz``)
    (default: ``scaler_walk_mocap`` in ``../shared/data`` beside the repository, or in GO1EXP_DATA). With
    ``--leave-one-out`` the setting that distance depends on most, ``foot_drift``, is chosen for each run on the others.
 3. ``sim``: a simulated Go1 under the policy of ``--run`` with random commands up to 1.5 m/s (and straight on
    at 1.5 m/s), sensors at 500 Hz with the standard deviations of the paper's Table II, on flat ground and on the
-   paper's terrain; without a run it squats.
+   paper's terrain; without a run it squats. ``--every 5`` feeds the filter at 100 Hz, ``--lost 0.2`` without a fifth.
 
 The error of a velocity is the root mean square over time of its components (x, y, z of the trunk) and of all three
 together (the length of the error); the first half second is left out.
@@ -115,11 +116,11 @@ def real(folder: Path, leave_one_out: bool) -> None:
     ]
     print("| mean (distance: of sizes) | | " + " | ".join(f"{v:.3f} | {100 * d:.1f} %" for v, d in columns) + " | |")
     if leave_one_out and len(found) > 1:
-        error = np.array([[judge(f, scaler(foot_drift=d)).filter_distance for d in DRIFTS] for f in found])
+        errors = np.array([[judge(f, scaler(foot_drift=d)).filter_distance for d in DRIFTS] for f in found])
         held = []
         for k in range(len(found)):
-            others = np.delete(error, k, axis=0)
-            held.append(error[k, np.argmin((others**2).mean(axis=0))])
+            others = np.delete(errors, k, axis=0)
+            held.append(errors[k, np.argmin((others**2).mean(axis=0))])
         print(
             "foot_drift by the other runs: "
             + ", ".join(f"{100 * h:+.1f}" for h in held)
@@ -127,29 +128,36 @@ def real(folder: Path, leave_one_out: bool) -> None:
         )
 
 
-def score(recordings: Sequence[Recording], ground: str) -> None:
-    """Print how well each simulated robot's velocity was known."""
+def kept(count: int, every: int, lost: float) -> np.ndarray:
+    """Which of so many samples the filter gets: every so many, and of those all but a random share."""
+    rows = np.arange(count)[every - 1 :: every]
+    return rows[np.random.default_rng(0).random(len(rows)) >= lost]
+
+
+def score(recordings: Sequence[Recording], ground: str, every: int, lost: float) -> None:
+    """Print how well each simulated robot's velocity was known by a filter that gets some of the samples."""
     config = go1()
     for r in recordings:
-        rows = samples(r)
-        found = make_filter(config).run(rows)
+        fed = kept(len(r.t), every, lost)
+        t = r.t[fed]
+        found = make_filter(config).run(samples(r)[fed])
         attitude = Rotation.from_quat(r.block(*VECTORS["base_quat"]), scalar_first=True)
-        velocity = attitude.inv().apply(r.block(*VECTORS["base_lin_vel"]))
-        later = r.t > r.t[0] + 0.5
+        velocity = attitude.inv().apply(r.block(*VECTORS["base_lin_vel"]))[fed]
+        later = t > t[0] + 0.5
         error = (found[:, 3:6] - velocity)[later]
         axes = " ".join(f"{x:.3f}" for x in np.sqrt((error**2).mean(axis=0)))
         whole = np.sqrt((error**2).sum(axis=1).mean())
-        tail = np.sqrt((error[r.t[later] > r.t[-1] - 30] ** 2).sum(axis=1).mean())
+        tail = np.sqrt((error[t[later] > t[-1] - 30] ** 2).sum(axis=1).mean())
         horizontal = np.linalg.norm(velocity[later, :2], axis=1)
         odd = int((found[1:, -1] != Status.OK).sum())
         print(
-            f"| {ground} | {r.meta.episode} | {r.t[-1]:.0f} | {horizontal.mean():.2f} ({horizontal.max():.2f}) "
+            f"| {ground} | {r.meta.episode} | {t[-1]:.0f} | {horizontal.mean():.2f} ({horizontal.max():.2f}) "
             f"| {axes} | {whole:.3f} | {tail:.3f} | {np.abs(error).max():.2f} | {odd} |",
             flush=True,
         )
 
 
-def simulated(run: Path | None, seconds: float, robots: int) -> None:
+def simulated(run: Path | None, seconds: float, robots: int, every: int, lost: float) -> None:
     """Print the tables of the simulated Go1."""
     print("| ground | episode | s | speed mean (max), m/s | RMSE x y z | all | last 30 s | worst | left out |")
     print("|---|---|---|---|---|---|---|---|---|")
@@ -163,7 +171,7 @@ def simulated(run: Path | None, seconds: float, robots: int) -> None:
             assert squat is not None
             motion = make_motion(squat, seconds, SENSORS.rate_hz, 0)
             episode = Episode(f"squat_{ground}", "squat", motion, 35.0, 1.2, None, None, 0)
-            score(play(rig, [episode], SENSORS, 0, lambda *_: None), ground)
+            score(play(rig, [episode], SENSORS, 0, lambda *_: None), ground, every, lost)
             continue
         from go1exp.evaluate.policy import load_run
 
@@ -176,7 +184,7 @@ def simulated(run: Path | None, seconds: float, robots: int) -> None:
             command, problems = bind("command", name, parameters, "command")
             assert command is not None, problems
             walk = Walk(replace(trained.task, command=command), policy, names, length, None)
-            score(play_policy(rig, walk, SENSORS, 0, lambda *_: None), ground)
+            score(play_policy(rig, walk, SENSORS, 0, lambda *_: None), ground, every, lost)
 
 
 def main() -> None:
@@ -191,6 +199,8 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="run folder of the policy that walks")
     parser.add_argument("--seconds", type=float, default=600.0, help="simulated time on each ground")
     parser.add_argument("--robots", type=int, default=10, help="among which the time on rough ground is shared")
+    parser.add_argument("--every", type=int, default=1, help="in sim, the filter gets every so many of the samples")
+    parser.add_argument("--lost", type=float, default=0.0, help="in sim, share of the samples that are lost")
     wanted = parser.parse_args()
     if "speed" in wanted.parts:
         speed()
@@ -198,7 +208,7 @@ def main() -> None:
         shared = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
         real(wanted.data or shared / "scaler_walk_mocap", wanted.leave_one_out)
     if "sim" in wanted.parts:
-        simulated(wanted.run, wanted.seconds, wanted.robots)
+        simulated(wanted.run, wanted.seconds, wanted.robots, wanted.every, wanted.lost)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ def levelled(
         gyro: rad/s (T, 3).
         acc: m/s2 (T, 3), +9.81 in z when level and at rest.
         seconds: time in which an error of the vertical decays; longer trusts the gyro more.
-        first: the time at the start whose mean acceleration gives the first vertical, s.
+        first: the time at the start whose mean acceleration gives the first vertical, s; a stride, as logs may begin in
+            the middle of a walk.
     """
     up = acc[t <= t[0] + first].mean(axis=0)
     roll, pitch = np.arctan2(up[1], up[2]), np.arctan2(-up[0], np.hypot(up[1], up[2]))

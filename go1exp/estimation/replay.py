@@ -28,9 +28,9 @@ class Log:
     levelling_s: float = 10.0
 
 
-SCALER_LOG = Log(leg_delay_s=0.085)
-"""SCALER's forward speed swings 94 to 106 ms (eight runs) after the one that its standing legs say, at 4 Hz, and its trunk
-comes to rest later than they do. Vertically it moves with them, 3.3 times as far: for forward velocity only."""
+SCALER_LOG = Log(leg_delay_s=0.085, levelling_s=2.0)
+"""SCALER's forward speed swings 94 to 106 ms (eight runs) after the one that its standing legs say, at 4 Hz.
+Vertically it moves with them, 3.3 times as far: the delay is for forward velocity only."""
 
 
 @dataclass(frozen=True, eq=False)

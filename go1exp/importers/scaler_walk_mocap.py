@@ -26,16 +26,17 @@ NOTES = (
     "The source's joint velocity is 1.5 to 1.7 times the derivative of q and is left out: differentiate q. "
     "Encoders repeat their last value in many samples. imu_gyro has the source's signs turned so that its axes are the "
     "body's. Gyro offset: about 0.005 rad/s in yaw; the robot stands still at the end. The source's contact flags are "
-    "a fixed pattern in some runs and are left out. Joints, IMU and forces share a clock (forces set in within 20 ms of "
-    "a foot's touch-down, their sum follows imu_acc within 20 ms), but legs and soles are soft: the body heaves 3.3 "
-    "times as much as the joints say, and its forward speed swings some 85 to 105 ms after that of the legs."
+    "a fixed pattern in some runs and are left out. Joints, IMU and forces share a clock (forces set in within 20 ms "
+    "of a front foot's touch-down, their sum follows imu_acc within 20 ms), but legs and soles are soft: the body "
+    "heaves 3.3 times as much as the joints say, and its forward speed swings some 85 to 105 ms after that of the legs."
 )
 
 TURNED = (
     "imu_acc is worked out: the source reports gravity right and every other acceleration with its sign turned, so "
-    "imu_acc = 2 x 9.81 z - accel_body, z the world's vertical by gyro and accelerometer (10 s). Evidence, eight runs: "
-    "motion capture's acceleration enters accel_body by -0.9 to -1.4 on every axis (R2 0.64 to 0.95), and the sum of the "
-    "foot forces follows the vertical part once turned back (correlation 0.86 to 0.95)."
+    "imu_acc = 2 x 9.81 z - accel_body, z the world's vertical by gyro and accelerometer; while walking that is off by "
+    "a degree or two, imu_acc by twice as much of g. Evidence, eight runs: motion capture's acceleration enters "
+    "accel_body by -0.9 to -1.4 on every axis (R2 0.64 to 0.95), and the sum of the foot forces follows the vertical "
+    "part once turned back (five runs, correlation 0.86 to 0.95)."
 )
 AS_LOGGED = "imu_acc is no specific force: all of it but gravity has its sign turned (reversed_acceleration: false)."
 
@@ -43,11 +44,11 @@ MOVING_GYRO, MOVING_BODY = 0.3, 0.1
 """rad/s and m/s above which gyro and motion capture see the robot move; at rest they read 0.005 and 0.02."""
 
 STOPS_LATER = 0.05
-"""s by which the body comes to rest by ``MOVING_BODY`` after the gyro does by ``MOVING_GYRO`` (seven runs: 0.04 to 0.06)."""
+"""s by which the body comes to rest by ``MOVING_BODY`` after the gyro by ``MOVING_GYRO`` (seven runs: 0.04 to 0.06)."""
 
 CLOCK_SURE = 0.2
-"""s; a difference of the clocks below is not looked for: the source's match of rotation rates is better than that, where
-it found the right stride (chosen; a stride lasts 0.51 s)."""
+"""s; a difference of the clocks below is not looked for: the source's match of rotation rates is better than that,
+where it found the right stride (chosen; a stride lasts 0.51 s)."""
 
 
 @importer("scaler_walk_mocap")
@@ -57,17 +58,18 @@ def scaler_walk_mocap(
     mocap_tolerance_s: Positive = 0.0065,
     resync: bool = True,
     reversed_acceleration: bool = True,
+    levelling_s: Positive = 2.0,
 ) -> list[Recording]:
     """Walk of the 8.8 kg quadruped SCALER with motion-capture truth, from .npz.
 
     Joints are ``FL_1`` ... ``RL_3`` in the source's order FL FR RR RL; ``foot_force_FL`` ... are magnitudes, as the
-    sensor's axes are not the body's. A leg whose sensor gave nothing, or was broken all along, has no column. Rows whose
-    joints or IMU are not finite, or whose time does not advance, are left out.
+    sensor's axes are not the body's. A leg whose sensor gave nothing, or was broken all along, has no column. Rows
+    whose joints or IMU are not finite, or whose time does not advance, are left out.
 
     Motion capture ran on a clock of its own, which the source shifted onto the robot's by matching rotation rates; in
-    run 14 it took the wrong stride. Each row takes the nearest valid sample, never one worked out between two; ``base_pos``
-    is the marker body's origin and ``base_quat`` the body's attitude through the source's fixed rotation, good to a
-    few degrees. If any row has no valid sample within the tolerance, the recording has neither.
+    run 14 it took the wrong stride. Each row takes the nearest valid sample, never one worked out between two;
+    ``base_pos`` is the marker body's origin and ``base_quat`` the body's attitude through the source's fixed rotation,
+    good to a few degrees. If any row has no valid sample within the tolerance, the recording has neither.
 
     Args:
         path: a ``.npz``, or a folder of them.
@@ -77,20 +79,25 @@ def scaler_walk_mocap(
             different times.
         reversed_acceleration: whether the source's accelerometer has the sign of all but gravity turned, as it has in
             the eight runs; it is then turned back.
+        levelling_s: time in which the vertical for that follows the accelerometer, s (default: four strides; of 1 to
+            10 s it agreed best with motion capture: 1 to 2 degrees while walking, 0.5 at rest).
 
     Raises:
         RecordingError: if an array is missing or of another shape.
     """
-    return [_one(file, mocap_tolerance_s, resync, reversed_acceleration) for file in files(path, "*.npz")]
+    return [
+        _one(file, mocap_tolerance_s, resync, levelling_s if reversed_acceleration else None)
+        for file in files(path, "*.npz")
+    ]
 
 
-def _one(path: Path, tolerance: float, resync: bool, turned: bool) -> Recording:
+def _one(path: Path, tolerance: float, resync: bool, levelling: float | None) -> Recording:
     data, rows, row_notes = open_run(path)
     t, q, gyro = (data.numbers("t")[rows], data.numbers("joint_pos", 4, 3)[rows], data.numbers("gyro_body", 3)[rows])
     acc = data.numbers("accel_body", 3)[rows]
     channels = {"t": t, **joint_columns("q", JOINTS, q.reshape(len(q), -1))}
     channels |= columns(VECTORS["imu_gyro"], gyro)
-    channels |= columns(VECTORS["imu_acc"], specific_force(t, gyro, acc) if turned else acc)
+    channels |= columns(VECTORS["imu_acc"], acc if levelling is None else specific_force(t, gyro, acc, levelling))
     forces, force_notes = _foot_forces(data, rows)
     truth, truth_notes = _truth(data, t, gyro, tolerance, resync)
     return recording(
@@ -103,7 +110,7 @@ def _one(path: Path, tolerance: float, resync: bool, turned: bool) -> Recording:
         base="floating",
         excitation="walk",
         episode=f"scaler_{path.stem}",
-        notes=" ".join([NOTES, TURNED if turned else AS_LOGGED, *row_notes, *force_notes, truth_notes]),
+        notes=" ".join([NOTES, AS_LOGGED if levelling is None else TURNED, *row_notes, *force_notes, truth_notes]),
     )
 
 
@@ -129,11 +136,11 @@ def open_run(path: Path) -> tuple[Arrays, np.ndarray, list[str]]:
     return data, np.flatnonzero(sound), [f"{lost} rows were not finite or not newer and are left out."] if lost else []
 
 
-def specific_force(t: np.ndarray, gyro: np.ndarray, reported: np.ndarray) -> np.ndarray:
+def specific_force(t: np.ndarray, gyro: np.ndarray, reported: np.ndarray, seconds: float) -> np.ndarray:
     """Turn back the sign of all but gravity in what the source reports, ``(T, 3)`` m/s2 (see ``TURNED``)."""
     from go1exp.estimation.attitude import GRAVITY, levelled, vertical
 
-    return 2 * GRAVITY * vertical(levelled(t, gyro, reported)) - reported
+    return 2 * GRAVITY * vertical(levelled(t, gyro, reported, seconds=seconds)) - reported
 
 
 def _foot_forces(data: Arrays, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -204,16 +211,34 @@ def motion_capture(data: Arrays, t: np.ndarray, gyro: np.ndarray, resync: bool =
         raise RecordingError(f"{data.path}: mocap_valid: fewer than two samples of motion capture are valid")
     if (np.diff(clock) <= 0).any():
         raise RecordingError(f"{data.path}: mocap_t: must increase strictly")
-    attitude = Rotation.from_quat(xyzw) * Rotation.from_matrix(to_body).inv()
+    attitude = _unflipped(Rotation.from_quat(xyzw) * Rotation.from_matrix(to_body).inv())
     shift = _clock_error(t, gyro, clock, position, attitude) if resync else 0.0
     return Mocap(clock + shift, position, attitude, shift)
+
+
+def _unflipped(attitude: Rotation) -> Rotation:
+    """Turn back what motion capture saw back to front: half a turn about the body's z from one sample to the next.
+
+    The longest stretch without such a step is right. (Run 14 has a short one at its start, 179.5 degrees off.)
+    """
+    from scipy.spatial.transform import Rotation
+
+    turned = np.flatnonzero((attitude[:-1].inv() * attitude[1:]).magnitude() > np.pi / 2) + 1
+    if not len(turned):
+        return attitude
+    stretches = np.split(np.arange(len(attitude)), turned)
+    longest = int(np.argmax([len(s) for s in stretches]))
+    back = np.concatenate([s for k, s in enumerate(stretches) if (k - longest) % 2] or [np.zeros(0, dtype=int)])
+    half = np.zeros((len(attitude), 3))
+    half[back, 2] = np.pi
+    return attitude * Rotation.from_rotvec(half)
 
 
 def _clock_error(t: np.ndarray, gyro: np.ndarray, clock: np.ndarray, position: np.ndarray, attitude: Rotation) -> float:
     """By how much motion capture is early, s: by the instant of the stop, then by rotation rates around it.
 
-    Steady walking repeats itself every stride, so that rotation rates match almost as well a stride off (0.82 and 0.83 in
-    run 14); the stop does not. 0 where the robot does not come to rest in both, or the two agree.
+    Steady walking repeats itself every stride, so that rotation rates match almost as well a stride off (0.82 and 0.83
+    in run 14); the stop does not. 0 where the robot does not come to rest in both, or the two agree.
     """
     grid = np.arange(clock[0], clock[-1], 0.01)
     if len(grid) < 100:
@@ -253,8 +278,8 @@ def _truth(
     truth = columns(VECTORS["base_pos"], capture.position[near])
     truth |= columns(VECTORS["base_quat"], capture.attitude[near].as_quat()[:, [3, 0, 1, 2]])
     moved = (
-        f" Its clock was moved by {capture.shift:+.2f} s beside the source's: gyro and motion capture saw the robot stop "
-        "at times that far apart."
+        f" Its clock was moved by {capture.shift:+.2f} s beside the source's: gyro and motion capture saw the robot "
+        "stop at times that far apart."
     )
     return truth, (
         f"Ground truth is the nearest motion-capture sample, up to {away.max() * 1000:.1f} ms away, "
