@@ -187,7 +187,7 @@ def test_so101_moves_by_whole_steps_and_the_jaw_is_left_out() -> None:
 
 
 def test_scaler_reads_gravity_upwards_in_its_world() -> None:
-    for r in imported("scaler_walk_mocap"):
+    for r in imported("scaler_walk_mocap", reversed_acceleration=False):
         assert 95 < r.meta.rate_hz < 100
         assert not r.has("qd")  # flawed in the source
         attitude = Rotation.from_quat(r.block("base_quat_x", "base_quat_y", "base_quat_z", "base_quat_w"))
@@ -195,6 +195,15 @@ def test_scaler_reads_gravity_upwards_in_its_world() -> None:
         assert up == pytest.approx([0, 0, 9.81], abs=0.15)
         walked = r.block("base_pos_x_w", "base_pos_y_w")
         assert 2.0 < np.linalg.norm(walked[-1] - walked[0]) < 2.5
+
+
+def test_scaler_at_rest_feels_gravity_whichever_way_it_is_read() -> None:
+    both = zip(imported("scaler_walk_mocap"), imported("scaler_walk_mocap", reversed_acceleration=False), strict=True)
+    for mended, logged in both:
+        rest = mended.t > mended.t[-1] - 0.5  # the vertical has had 5 s of standing to settle
+        felt = [r.block("imu_acc_x", "imu_acc_y", "imu_acc_z")[rest].mean(axis=0) for r in (mended, logged)]
+        assert felt[0] == pytest.approx(felt[1], abs=0.3)
+        assert np.linalg.norm(felt[0]) == pytest.approx(9.81, abs=0.1)
 
 
 def test_scaler_turns_with_its_gyro() -> None:

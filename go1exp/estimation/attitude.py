@@ -10,7 +10,7 @@ GRAVITY = 9.81
 
 
 def levelled(
-    t: np.ndarray, gyro: np.ndarray, acc: np.ndarray, *, seconds: float = 10.0, first: float = 0.2
+    t: np.ndarray, gyro: np.ndarray, acc: np.ndarray, *, seconds: float = 10.0, first: float = 0.5
 ) -> np.ndarray:
     """Return the attitude ``(T, 4)``, w-x-y-z, body to world, of a complementary filter (Mahony et al. 2008, eq. 32).
 
@@ -22,7 +22,8 @@ def levelled(
         gyro: rad/s (T, 3).
         acc: m/s2 (T, 3), +9.81 in z when level and at rest.
         seconds: time in which an error of the vertical decays; longer trusts the gyro more.
-        first: the time at the start whose mean acceleration gives the first vertical, s.
+        first: the time at the start whose mean acceleration gives the first vertical, s; a stride, as logs may begin in
+            the middle of a walk.
     """
     up = acc[t <= t[0] + first].mean(axis=0)
     roll, pitch = np.arctan2(up[1], up[2]), np.arctan2(-up[0], np.hypot(up[1], up[2]))
@@ -34,3 +35,9 @@ def levelled(
         rotation = rotation * Rotation.from_rotvec(rate * (t[k] - t[k - 1]))
         found.append(rotation)
     return Rotation.concatenate(found).as_quat(scalar_first=True)
+
+
+def vertical(quat: np.ndarray) -> np.ndarray:
+    """Return the world's z axis in the body's, ``(T, 3)``, of attitudes w-x-y-z ``(T, 4)``."""
+    w, x, y, z = quat.T
+    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)

@@ -12,6 +12,8 @@ from go1exp.estimation.readings import Status
 
 GRAVITY = np.array([0.0, 0.0, 9.81])
 MOST_LATE = 10
+PERIOD = 0.002
+"""s; see ``cpp/kalman.hpp``."""
 MOST = ((column.GYRO, 1e2), (column.ACC, 1e3), (column.Q, 1e2), (column.QD, 1e3))
 
 
@@ -29,7 +31,7 @@ class NumpyFilter:
         self.running, self.t, self.late, self.unseen = False, -np.inf, 0, 0.0
         self.age, self.contact = np.zeros(4), np.zeros(4)
 
-        self.attitude, self.R = Rotation.identity(), np.eye(3)
+        self.attitude, self.R, self.force = Rotation.identity(), np.eye(3), np.zeros(3)
         self.uneven = np.array([1.0, 1.0, config.sinking**2])
 
     def update(self, s: np.ndarray) -> Status:
@@ -47,7 +49,9 @@ class NumpyFilter:
         dt, self.t, self.late = s[0] - self.t, s[0], 0
         anew = late or dt > c.longest_gap
         self._turn(s[column.QUAT], s[column.GYRO], np.inf if anew else dt)
-        self._look_at_feet(s, speeds)
+        self._look_at_feet(s, speeds, PERIOD if anew else dt)
+        if anew:
+            self.force = self.R @ s[column.ACC]
         if not self.running:
             self.running, self.P[3:6, 3:6] = True, c.initial_speed**2 * np.eye(3)
             self.P[21:, 21:] = np.diag([c.level_noise, c.slope_walk, c.slope_walk]) ** 2
@@ -71,7 +75,7 @@ class NumpyFilter:
             attitude = Rotation.from_quat(keep * turned + (1 - keep) * np.copysign(1, turned @ reported) * reported)
         self.attitude, self.R = attitude, attitude.as_matrix()
 
-    def _look_at_feet(self, s: np.ndarray, speeds: bool) -> None:
+    def _look_at_feet(self, s: np.ndarray, speeds: bool, dt: float) -> None:
         c, R, w = self.c, self.R, s[column.GYRO]
         self.w = w
         feet = [foot(leg, q) for leg, q in zip(c.legs, s[column.Q].reshape(4, 3), strict=True)]
@@ -86,7 +90,7 @@ class NumpyFilter:
         )
         self.place_noise = c.joint_noise**2 * JJ + c.attitude_noise**2 * AA + c.leg_noise**2 * np.eye(3)
         self.speed_noise = c.joint_speed_noise**2 * JJ + c.gyro_noise**2 * AA
-        self.speed_noise += c.foot_speed_noise**2 * np.diag(self.uneven)
+        self.speed_noise += c.foot_speed_noise**2 * PERIOD / dt * np.diag(self.uneven)
         if c.contact_source == "force":
             load = s[column.FOOT_FORCE]
         elif c.contact_source == "height":
@@ -111,7 +115,9 @@ class NumpyFilter:
 
     def _predict(self, acc: np.ndarray, dt: float) -> None:
         c, eye = self.c, np.eye(3)
-        a, v = self.R @ (acc - self.x[6:9]) - GRAVITY, self.x[3:5].copy()
+        unseen, jump = max(dt - PERIOD, 0.0), self.R @ acc - self.force
+        self.force = self.R @ acc
+        a, v = self.force - unseen / (2 * dt) * jump - self.R @ self.x[6:9] - GRAVITY, self.x[3:5].copy()
         self.x[21] += dt * self.x[22:] @ v
         self.x[:3] += dt * self.x[3:6] + dt**2 / 2 * a
         self.x[3:6] += dt * a
@@ -120,7 +126,8 @@ class NumpyFilter:
         F[:3, 3:6], F[:3, 6:9], F[3:6, 6:9] = dt * eye, -(dt**2) / 2 * self.R, -dt * self.R
         n = c.acceleration_noise**2 * (1 + ((np.linalg.norm(acc) - GRAVITY[2]) / c.impact_acceleration) ** 2)
         Q = np.zeros((24, 24))
-        Q[:6, :6] = n * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], eye)
+        along = np.diag(n + jump**2 * unseen**2 / (12 * dt))
+        Q[:6, :6] = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], along)
         Q[6:9, 6:9] = c.bias_walk**2 * dt * eye
         drift = c.foot_drift / np.maximum(self.contact, c.contact_least)
         Q[9:21, 9:21] = np.diag(np.outer(drift**2 * dt, self.uneven).ravel())

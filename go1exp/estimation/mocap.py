@@ -15,7 +15,9 @@ from go1exp.estimation import readings as column
 from go1exp.estimation.legs import foot
 from go1exp.estimation.replay import SCALER_LOG, Log, estimate, samples
 from go1exp.importers import import_recordings
+from go1exp.importers.scaler_walk_mocap import Mocap, motion_capture
 from go1exp.importers.source import load_npz
+from go1exp.recording import VECTORS, RecordingError
 
 GRID = 0.01
 """Step at which motion capture is differentiated and compared, s."""
@@ -35,6 +37,7 @@ class Judgement:
         filter_distance: (distance by the filter) / truth - 1.
         odometry_rmse: the same two of leg odometry.
         odometry_distance: ...
+        clock_shift: by which motion capture was moved beside the source's own match, s (see the importer).
     """
 
     run: str
@@ -43,24 +46,21 @@ class Judgement:
     filter_distance: float
     odometry_rmse: float
     odometry_distance: float
+    clock_shift: float
 
 
-def truth(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def truth(capture: Mocap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times (T,), s, positions (T, 3), m, and forward speed (T,), m/s, by motion capture.
 
     Forward is the trunk's x axis without its slope. Lost samples are bridged by straight lines.
     """
-    data = load_npz(path)
-    valid = data.numbers("mocap_valid") > 0
-    t, position = data.numbers("mocap_t")[valid], data.numbers("mocap_pos", 3)[valid]
-    attitude = Rotation.from_quat(data.numbers("mocap_quat_xyzw", 4)[valid])
-    heading = np.unwrap(
-        _heading((attitude * Rotation.from_matrix(data.numbers("mocap_to_body_rot", 3)).inv()).as_matrix())
-    )
-    grid = np.arange(t[0], t[-1], GRID)
-    place = interp1d(t, position, axis=0)(grid)
+    heading = np.unwrap(_heading(capture.attitude.as_matrix()))
+    grid = np.arange(capture.t[0], capture.t[-1], GRID)
+    if len(grid) <= WINDOW:
+        raise RecordingError(f"motion capture lasts {len(grid) * GRID:.2f} s, too short to differentiate")
+    place = interp1d(capture.t, capture.position, axis=0)(grid)
     velocity = savgol_filter(place, WINDOW, 3, deriv=1, delta=GRID, axis=0)
-    return grid, place, _forward(velocity, np.interp(grid, t, heading))
+    return grid, place, _forward(velocity, np.interp(grid, capture.t, heading))
 
 
 def _heading(rotation: np.ndarray) -> np.ndarray:
@@ -90,15 +90,22 @@ def judge(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Judgement:
     """Compare filter and odometry with motion capture, from 0.05 s after a run's start to its end.
 
     Odometry gets the same joint angles at the same times as the filter.
+
+    Raises:
+        RecordingError: if the run lacks joints, IMU or motion capture.
+        EstimatorError: if the filter is not built.
     """
     (recording,) = import_recordings("scaler_walk_mocap", path, {})
+    capture = motion_capture(load_npz(path), recording.t, recording.block(*VECTORS["imu_gyro"]))
     found, rows = estimate(recording, config, log), samples(recording, log)
     rotation = Rotation.from_quat(found.quat, scalar_first=True)
     heading = _heading(rotation.as_matrix())
     leg_velocity = odometry(rows, config)
     leg_place = np.cumsum(leg_velocity * np.gradient(found.t)[:, None], axis=0)
-    grid, place, speed = truth(path)
+    grid, place, speed = truth(capture)
     within = (grid >= found.t[0] + 0.05) & (grid <= found.t[-1])
+    if within.sum() < WINDOW:
+        raise RecordingError(f"{path}: motion capture and the robot's log have less than {WINDOW * GRID:g} s in common")
     grid, place, speed = grid[within], place[within], speed[within]
     distance = _distance(place)
 
@@ -107,7 +114,7 @@ def judge(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Judgement:
         return float(np.sqrt(np.mean(error**2))), _distance(interp1d(found.t, position_w, axis=0)(grid)) / distance - 1
 
     filtered = errors(rotation.apply(found.velocity_b), found.position_w)
-    return Judgement(path.stem, distance, *filtered, *errors(leg_velocity, leg_place))
+    return Judgement(path.stem, distance, *filtered, *errors(leg_velocity, leg_place), capture.shift)
 
 
 def _distance(place: np.ndarray) -> float:

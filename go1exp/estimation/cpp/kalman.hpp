@@ -27,6 +27,10 @@ using Covariance = Eigen::Matrix<double, kStates, kStates>;
 using Joints = Eigen::Matrix<double, kJoints, 1>;
 using Vec4 = Eigen::Vector4d;
 
+// s, period of the Go1's sensors. foot_speed_noise is that of samples so far apart: feet that give way do so however often
+// one looks. An accelerometer's sample stands for as long.
+constexpr double kPeriod = 0.002;
+
 // So many late samples in a row, and it was the clock that jumped: one wrong stamp far ahead must not stop the filter.
 constexpr int kMostLate = 10;
 
@@ -82,6 +86,7 @@ class Filter {
     attitude_.setIdentity();
     rot_.setIdentity();
     gyro_.setZero();
+    force_.setZero();
   }
 
   // Takes a sample. One that is `late` or `invalid` does not touch the state.
@@ -95,7 +100,8 @@ class Filter {
     gyro_ = s.gyro;
     const bool anew = !running_ || late || dt > c_.longest_gap;
     turn(s, anew ? std::numeric_limits<double>::infinity() : dt);
-    look_at_feet(s);
+    look_at_feet(s, anew ? kPeriod : dt);
+    if (anew) force_ = rot_ * s.acc;
     if (!running_) {
       start();
       return Status::started;
@@ -151,7 +157,7 @@ class Filter {
   }
 
   // Feet against the IMU, in the world's axes: s_, their velocity u_ with the IMU held, that of a rolling foot, noises.
-  void look_at_feet(const Sample& s) {
+  void look_at_feet(const Sample& s, double dt) {
     Vec4 load;
     for (int leg = 0; leg < kLegs; ++leg) {
       const Foot foot = c_.legs[leg].at(s.q.segment<3>(3 * leg));
@@ -164,7 +170,7 @@ class Filter {
       place_noise_[leg] = c_.joint_noise * c_.joint_noise * JJ + c_.attitude_noise * c_.attitude_noise * AA +
                           c_.leg_noise * c_.leg_noise * Mat3::Identity();
       speed_noise_[leg] = c_.joint_speed_noise * c_.joint_speed_noise * JJ + c_.gyro_noise * c_.gyro_noise * AA;
-      speed_noise_[leg].diagonal() += c_.foot_speed_noise * c_.foot_speed_noise * uneven();
+      speed_noise_[leg].diagonal() += c_.foot_speed_noise * c_.foot_speed_noise * kPeriod / dt * uneven();
       if (c_.contact_source == Source::force) load[leg] = s.foot_force[leg];
       if (c_.contact_source == Source::height) load[leg] = foot.position[2];
       if (c_.contact_source == Source::torque) {  // tau + J' f = 0
@@ -218,7 +224,11 @@ class Filter {
   }
 
   void predict(const Vec3& acc, double dt) {
-    const Vec3 a = rot_ * (acc - x_.segment<3>(6)) - kGravity * Vec3::UnitZ();
+    // A sample is the mean over kPeriod; before it the acceleration was anywhere from the last one to this one.
+    const double unseen = std::max(dt - kPeriod, 0.0);
+    const Vec3 force = rot_ * acc, jump = force - force_;
+    const Vec3 a = force - 0.5 * unseen / dt * jump - rot_ * x_.segment<3>(6) - kGravity * Vec3::UnitZ();
+    force_ = force;
     // The ground below rises by m . v dt; v's row is still the old one here.
     const Eigen::Vector2d along = dt * x_.segment<2>(3), rise = dt * x_.segment<2>(kGround + 1);
     x_[kGround] += rise.dot(x_.segment<2>(3));
@@ -233,11 +243,13 @@ class Filter {
     P_.leftCols<3>() += (dt * P_.middleCols<3>(3) + P_.middleCols<3>(6) * S.transpose()).eval();
     P_.middleCols<3>(3) += (P_.middleCols<3>(6) * V.transpose()).eval();
     const double excess = (acc.norm() - kGravity) / c_.impact_acceleration;
-    const double n = c_.acceleration_noise * c_.acceleration_noise * (1.0 + excess * excess);
-    P_.block<3, 3>(0, 0).diagonal().array() += n * dt * dt * dt / 3.0;
-    P_.block<3, 3>(0, 3).diagonal().array() += n * dt * dt / 2.0;
-    P_.block<3, 3>(3, 0).diagonal().array() += n * dt * dt / 2.0;
-    P_.block<3, 3>(3, 3).diagonal().array() += n * dt;
+    const Vec3 n = (c_.acceleration_noise * c_.acceleration_noise * (1.0 + excess * excess) +
+                    jump.array().square() * unseen * unseen / (12.0 * dt))
+                       .matrix();
+    P_.block<3, 3>(0, 0).diagonal() += n * (dt * dt * dt / 3.0);
+    P_.block<3, 3>(0, 3).diagonal() += n * (dt * dt / 2.0);
+    P_.block<3, 3>(3, 0).diagonal() += n * (dt * dt / 2.0);
+    P_.block<3, 3>(3, 3).diagonal() += n * dt;
     P_.block<3, 3>(6, 6).diagonal().array() += c_.bias_walk * c_.bias_walk * dt;
     P_(kGround, kGround) += c_.ground_walk * c_.ground_walk * dt;
     P_.block<2, 2>(kGround + 1, kGround + 1).diagonal().array() += c_.slope_walk * c_.slope_walk * dt;
@@ -319,7 +331,7 @@ class Filter {
   Covariance P_;
   Eigen::Quaterniond attitude_;
   Mat3 rot_;
-  Vec3 gyro_;
+  Vec3 gyro_, force_;
   Vec4 contact_, age_;
   std::array<Vec3, kLegs> arm_, moving_, rolling_;
   std::array<Mat3, kLegs> place_noise_, speed_noise_;
