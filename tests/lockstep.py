@@ -119,7 +119,7 @@ def lockstep(spoil: Spoil = lambda state: state) -> Iterator[World]:
     """Let ``go1exp.deploy.job.do`` play at a time of its own; ``spoil`` changes what sensors say, None is silence."""
     world = World(spoil)
 
-    def clock(spin: float) -> Any:
+    def clock(spin: float, meanwhile: Any) -> Any:
         world.spins.append(spin)
         return SimpleNamespace(now=lambda: world.now, sleep_until=world.pass_until)
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from go1exp import robot
+from go1exp.deploy import loop as loop_module
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.controller import Controller, Cycle
 from go1exp.deploy.loop import Deadlines, MonotonicClock, Timing, run
@@ -336,6 +337,30 @@ def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate(
     assert [seen["base_lin_vel_b"][0, 0] for seen in made.policy.seen] == [5.0 * k for k in range(11, 21)]
 
 
+def test_a_rehearsal_leaves_no_trace() -> None:
+    beyond = lambda t: np.array([9.0, 0.0, 0.0])  # targets 0.9 rad off, which are cut  # noqa: E731
+    plain, rehearsed = controller(commands=beyond), controller(commands=beyond)
+    for k in range(30):
+        asked = len(rehearsed.policy.seen)
+        rehearsed.it.rehearse()
+        assert len(rehearsed.policy.seen) - asked == (rehearsed.it.phase == "walking")  # and nothing before it
+        plain.go(1, k)
+        rehearsed.go(1, k)
+    assert rehearsed.safety.clamped.any()
+    assert (rehearsed.safety.clamped == plain.safety.clamped).all()
+    assert len(rehearsed.link.sent) == len(plain.link.sent) == 30
+    for one, other in zip(rehearsed.link.sent, plain.link.sent, strict=True):
+        assert (one.joint_target == other.joint_target).all()
+
+
+def test_the_reach_of_a_target_follows_the_gains() -> None:
+    safety, far = make_safety(), make_command(joint_target=at(NOMINAL, 0, NOMINAL[0] + 9.0))
+    fresh = [make_safety().review(make_state(), dataclasses.replace(far, kp=f * KP), 0.0) for f in (1, 50)]
+    kept = [safety.review(make_state(), dataclasses.replace(far, kp=f * KP), 0.0) for f in (1, 50, 1)]
+    assert [k.joint_target[0] for k in kept[:2]] == [f.joint_target[0] for f in fresh]
+    assert kept[2].joint_target[0] == kept[0].joint_target[0] != kept[1].joint_target[0]
+
+
 def test_the_command_source_is_asked_for_the_time_since_walking_began() -> None:
     asked: list[float] = []
     made = controller(commands=lambda t: asked.append(t) or np.zeros(3))  # type: ignore[func-returns-value]
@@ -520,6 +545,31 @@ def test_a_report_is_one_line() -> None:
     line = str(played([1.0, 35.0, 1.0, 1.0])[1])
     assert line.startswith("4 cycles; period p50 10.000, p99 ")
     assert line.endswith("missed 3 (50.000 %)")
+
+
+def test_before_a_cycle_there_is_one_rehearsal_unless_it_is_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, slept, rehearsed = [0.0], list[float](), list[float]()
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        now[0] += seconds
+
+    def perf_counter() -> float:
+        now[0] += 1e-5
+        return now[0]
+
+    monkeypatch.setattr(loop_module, "time", SimpleNamespace(sleep=sleep, perf_counter=perf_counter))
+    clock = MonotonicClock(0.001, lambda: rehearsed.append(now[0]))
+    clock.sleep_until(0.01)
+    assert slept == pytest.approx([0.009], abs=1e-4)
+    assert rehearsed == pytest.approx([0.009], abs=1e-4)
+    assert 0.01 <= now[0] < 0.0101
+    clock.sleep_until(0.01)  # that has passed
+    assert len(rehearsed) == 1
+    now[0] = 0.0195
+    clock.sleep_until(0.02)  # too late to sleep, but not to rehearse
+    assert len(slept) == 1
+    assert len(rehearsed) == 2
 
 
 def test_real_time_passes_at_the_rate() -> None:

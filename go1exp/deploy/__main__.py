@@ -46,7 +46,7 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--keep", type=positive, default=120.0, help="newest seconds that the log has room for")
     parser.add_argument("--stale", type=positive, default=0.03, help="s without a state after which the robot is lost")
     parser.add_argument(
-        "--spin", type=not_negative, default=0.0, help="s before each cycle for which the core is kept busy"
+        "--spin", type=not_negative, default=0.0008, help="s before each cycle for which the core is kept busy"
     )
     parser.add_argument("--out", default="deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")

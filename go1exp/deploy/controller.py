@@ -167,6 +167,12 @@ class Controller:
         else:
             self.phase, self._since, self.finished = "damping", now, True
 
+    def rehearse(self) -> None:
+        """Do what a cycle of the walk does most, for nothing: nothing is kept, nothing goes out."""
+        if self._state is not None and self.phase == "walking":
+            self._policy(self._readings)
+            self.safety.rehearse(self._state, LowCmd(self._target, self._kp, self._kd))
+
     def walked(self, now: float) -> float:
         """Return the time since walking began, s; 0 unless it is going on."""
         return now - self._since if self.phase == "walking" else 0.0

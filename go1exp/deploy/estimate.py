@@ -85,7 +85,7 @@ class KalmanEstimator:
         self._since = None
         self.restarts += status is Status.RESTARTED
         velocity = np.array(self._filter.velocity_b)
-        speed = float(np.linalg.norm(velocity))
+        speed = math.hypot(*velocity)
         if not speed <= FASTEST:  # NaN too
             self._fail("estimator", f"the filter has diverged: it says {speed:g} m/s", state.t)
         self._velocity = velocity

@@ -35,10 +35,12 @@ class MonotonicClock:
 
     Args:
         spin: for this long before the time the core is kept busy instead of asleep, s; 0 leaves it to the system.
+        meanwhile: called once at the beginning of that, such as a rehearsal of the work: what comes first after a sleep
+            finds cold caches and takes two to three times as long.
     """
 
-    def __init__(self, spin: float = 0.0) -> None:
-        self._spin = spin
+    def __init__(self, spin: float = 0.0, meanwhile: Callable[[], None] = lambda: None) -> None:
+        self._spin, self._meanwhile = spin, meanwhile
 
     def now(self) -> float:
         """Return the time, s."""
@@ -49,6 +51,8 @@ class MonotonicClock:
         left = when - time.perf_counter() - self._spin
         if left > 0:
             time.sleep(left)
+        if self._spin and time.perf_counter() < when:
+            self._meanwhile()
         while self._spin and time.perf_counter() < when:
             pass
 

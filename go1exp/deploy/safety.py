@@ -109,6 +109,7 @@ class Safety:
         self._torque, self._power = _Counter(self.config.count), _Counter(self.config.count)
         self._stop: str | None = None
         self._zeros = np.zeros(len(self._joints))
+        self._gains: tuple[np.ndarray, np.ndarray] | None = None
         self._braking = np.full(len(self._joints), self.config.damping_kd)
         self.clamped = np.zeros(len(self._joints), dtype=np.int64)
         self.fault: Fault | None = None
@@ -152,14 +153,29 @@ class Safety:
 
         Where a joint moves so fast that both cannot be had, the range wins.
         """
-        held = command.kp > 0.0
-        reach = np.divide(self._torque_limit, command.kp, out=np.full_like(self._torque_limit, np.inf), where=held)
-        drag = np.divide(command.kd, command.kp, out=np.zeros_like(self._torque_limit), where=held)
-        still = state.joint_pos + drag * state.joint_vel  # the target that asks for no torque
-        target = np.minimum(np.maximum(command.joint_target, still - reach), still + reach)
-        target = np.minimum(np.maximum(target, self._low), self._high)
+        target = self._cut(state, command)
         self.clamped += target != command.joint_target
         return LowCmd(target, command.kp, command.kd, command.damping)
+
+    def rehearse(self, state: LowState, command: LowCmd) -> None:
+        """Do the work of a review without a judgement, for ``Controller.rehearse``."""
+        for rule in (Safety.not_finite, Safety.attitude, Safety.tilt, Safety.joint_range):
+            rule(self, state, command, state.t)
+        self._cut(state, command)
+
+    def _cut(self, state: LowState, command: LowCmd) -> np.ndarray:
+        reach, drag = self._reach(command.kp, command.kd)
+        still = state.joint_pos + drag * state.joint_vel  # the target that asks for no torque
+        target = np.minimum(np.maximum(command.joint_target, still - reach), still + reach)
+        return np.minimum(np.maximum(target, self._low), self._high)
+
+    def _reach(self, kp: np.ndarray, kd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far from where they ask for nothing targets may be, rad, and kd / kp, s; kept for these gains."""
+        if self._gains is None or self._gains[0] is not kp or self._gains[1] is not kd:
+            limit, held = self._torque_limit, kp > 0.0
+            reach = np.divide(limit, kp, out=np.full_like(limit, np.inf), where=held)
+            self._gains, self._reached = (kp, kd), (reach, np.divide(kd, kp, out=np.zeros_like(limit), where=held))
+        return self._reached
 
     # ------------------------------------------------------------------ the rules
 

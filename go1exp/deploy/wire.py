@@ -109,7 +109,7 @@ def _packed(message: LowState | LowCmd, parts: tuple[tuple[str, int], ...]) -> b
     for (name, size), value in zip(parts, values, strict=True):
         if value.shape != (size,):
             raise ValueError(f"{name}: has shape {value.shape}; a Go1's is ({size},)")
-    return b"".join(value.tobytes() for value in values)
+    return np.concatenate(values).tobytes()
 
 
 def _unpacked(data: bytes, start: int, parts: tuple[tuple[str, int], ...]) -> dict[str, np.ndarray]:
