@@ -483,6 +483,15 @@ def test_list_prints_every_registered_term_with_its_first_line_and_every_choice(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_reader_may_leave(tmp_path: Path) -> None:
+    """``go1exp list | head -1``: no complaint, and the status of a closed pipe."""
+    script = f"set -o pipefail; {sys.executable} -m go1exp.cli list | head -n 1"
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "actuator\n"
+    assert done.stderr == ""
+    assert done.returncode in (0, 141)  # 0 where everything fitted into the pipe before the reader left
+
+
 @pytest.mark.parametrize("word", ["effect", "effects", "group=effect"])
 def test_list_takes_a_group_by_position_in_singular_and_plural(word: str, tmp_path: Path) -> None:
     done = cli(tmp_path, "list", word)

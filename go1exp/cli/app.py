@@ -25,8 +25,9 @@ from go1exp.cli.files import choices_from_files
 from go1exp.compose import as_container, config_folder, flat_keys, register_groups
 from go1exp.registry import ConfigError, Expected, nearest, unknown_name
 
-BAD_CONFIG, FAILED, STOPPED = 2, 1, 130
-"""Exit statuses: configuration refused before anything was built; the work failed; a signal ended it."""
+BAD_CONFIG, FAILED, STOPPED, READER_LEFT = 2, 1, 130, 141
+"""Exit statuses: configuration refused before anything was built; the work failed; a signal ended it (the last: that of
+a closed pipe, 128 + 13 as shells count)."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,10 @@ class App:
             hydra.main(**version, config_path=config_folder(), config_name=self.name)(task)()
             if failure:
                 raise failure[0]
+            sys.stdout.flush()
+        except BrokenPipeError:  # who read our output has left, as `| head` does
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return READER_LEFT
         except Exception as error:
             if own_traceback:
                 raise
