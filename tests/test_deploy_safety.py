@@ -301,9 +301,9 @@ def controller(
     **settings: Any,
 ) -> SimpleNamespace:
     link, policy, log = FakeLink(script), FakePolicy(), list[Cycle]()
-    about = SimpleNamespace(kp=tuple(KP), kd=tuple(KD), nominal_stance=tuple(NOMINAL))
+    about = SimpleNamespace(kp=tuple(KP), kd=tuple(KD), nominal_stance=tuple(NOMINAL), policy_dt=0.04)
     bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=policy))
-    usual: dict[str, Any] = {"stand_up": 0.1, "brake": 0.045, "on_cycle": log.append}
+    usual: dict[str, Any] = {"rate": 25.0, "stand_up": 0.1, "brake": 0.045, "on_cycle": log.append}
     made = Controller(bundle, link, commands, estimator or Velocity(), make_safety(), **{**usual, **settings})
 
     def go(cycles: int, start: int = 0) -> list[bool]:
@@ -335,6 +335,14 @@ def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate(
     made.go(20)
     assert made.it._estimator.count == 100
     assert [seen["base_lin_vel_b"][0, 0] for seen in made.policy.seen] == [5.0 * k for k in range(11, 21)]
+
+
+def test_at_another_rate_the_previous_action_is_that_of_a_training_period_ago() -> None:
+    made = controller(commands=lambda t: np.array([1.0 + t, 0.0, 0.0]), rate=100.0)  # 4 cycles in a training period
+    made.go(30)
+    actions = [float(seen["command"][0, 0]) for seen in made.policy.seen]  # what ``FakePolicy`` answers with
+    seen = [float(seen["previous_action"][0, 0]) for seen in made.policy.seen]
+    assert seen == [0.0] * 4 + actions[:-4]
 
 
 def test_a_rehearsal_leaves_no_trace() -> None:
@@ -419,7 +427,7 @@ def test_a_stop_before_the_robot_has_said_anything_ends_the_loop() -> None:
 
 
 def test_gains_that_nobody_knows_have_to_be_given() -> None:
-    about = SimpleNamespace(kp=None, kd=None, nominal_stance=tuple(NOMINAL))
+    about = SimpleNamespace(kp=None, kd=None, nominal_stance=tuple(NOMINAL), policy_dt=0.02)
     bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=FakePolicy()))
     arguments = (FakeLink(always), lambda t: np.zeros(3), Velocity(), make_safety())
     with pytest.raises(ValueError, match="kp, kd: the bundle does not know any"):

@@ -198,17 +198,17 @@ def test_a_recorded_gradient_step_is_the_called_one_and_goes_on_from_a_checkpoin
         core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
         core.captures = False  # the rollout is called either way: the same numbers go into the update
         ppo = DevicePPO(config.ppo, Go1VecEnv(core), 0, "cuda")
-        ppo._update = DeviceUpdate(ppo, captures)
+        ppo._update = DeviceUpdate(ppo, ppo.rollout_buffer, captures)
         torch.manual_seed(1)
         ppo.learn(48)
         path = tmp_path / str(captures)
         checkpoint.save(ppo, path, keep=1)
         again = DevicePPO(config.ppo, Go1VecEnv(Go1Core(config.task, config.ppo.num_envs, 0)), 0, "cuda")
         checkpoint.restore(again, checkpoint.load_latest(path)[0])
-        again._update = DeviceUpdate(again, captures)
+        again._update = DeviceUpdate(again, again.rollout_buffer, captures)
         again.rollout_buffer.data = {name: value.clone() for name, value in ppo.rollout_buffer.data.items()}
         torch.manual_seed(2)
-        figures = again._update(again.rollout_buffer, 0.0)
+        figures = again._update(0.0)
         found.append((again.policy.state_dict(), figures))
     (recorded, its_figures), (called, other_figures) = found
     for name, value in called.items():

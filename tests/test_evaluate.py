@@ -18,6 +18,7 @@ from go1exp.compose import compose
 from go1exp.config import TaskConfig, TrainConfig, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.evaluate import table
+from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy, load_policy
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
 from go1exp.registry import ConfigError
@@ -220,6 +221,19 @@ def test_progress_is_told_in_steps(task: TaskConfig) -> None:
     faster = settings(duration_s=0.2, settle_s=0.0, policy_dt=0.01)
     evaluate(task, stand, faster, lambda done, total: told.append((done, total)))
     assert told[-1] == (20, 20)
+
+
+def test_at_another_rate_the_previous_action_is_that_of_a_training_period_ago(task: TaskConfig) -> None:
+    where = columns(task, "previous_action")
+    for policy_dt, cycles in ((None, 1), (0.01, 2), (0.004, 5)):
+        seen: list[float] = []
+
+        def policy(observation: torch.Tensor) -> torch.Tensor:
+            seen.append(float(observation[0, where].mean()))  # noqa: B023
+            return torch.full((len(observation), 12), 0.01 * len(seen))  # noqa: B023
+
+        evaluate(task, policy, settings(duration_s=0.2, settle_s=0.0, policy_dt=policy_dt))
+        assert seen == pytest.approx([0.0] * cycles + [0.01 * (k + 1) for k in range(len(seen) - cycles)], abs=1e-6)
 
 
 def test_the_same_seed_gives_the_same_report(task: TaskConfig) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.messages import Link, LowCmd, LowState
+from go1exp.deploy.past import PastActions
 from go1exp.deploy.safety import Safety
 
 PHASES = ("waiting", "standing_up", "walking", "lying_down", "damping")
@@ -81,6 +82,7 @@ class Controller:
         estimator: Estimator,
         safety: Safety,
         *,
+        rate: float | None = None,
         stand_up: float = 2.0,
         lie_down: float = 0.0,
         brake: float = 2.0,
@@ -97,6 +99,7 @@ class Controller:
             commands: asked in every cycle.
             estimator: given every new state.
             safety: with the robot's limits.
+            rate: of the cycles, Hz; that of training if None.
             stand_up: time from the first pose to the nominal stance, s.
             lie_down: time that ``finish`` gives the robot to lie down, s; with 0 the drives brake at once.
             brake: time for which the drives are told to brake after a fault before ``cycle`` returns False, s.
@@ -120,6 +123,7 @@ class Controller:
         self._lying = np.tile(LYING, len(self._nominal) // len(LYING))
         self._begin: float | None = None
         self._readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
+        self._past = PastActions[np.ndarray](about.policy_dt, about.policy_dt if rate is None else 1.0 / rate)
         self._target = self._nominal.copy()
         self._state: LowState | None = None
         self._origin, self._halting = self._nominal, False
@@ -233,6 +237,6 @@ class Controller:
                 return None
         outputs = self._policy(self._readings)
         if "previous_action" in self._readings:
-            self._readings["previous_action"][:] = outputs["action"]
+            self._readings["previous_action"][:] = self._past.after(outputs["action"])
         self._observation = outputs["observation"][0]
         return LowCmd(outputs["joint_target"][0].astype(float), self._kp, self._kd)

@@ -171,6 +171,7 @@ def _go(
 
     controller = Controller(
         *(bundle, link, commands, estimator, safety),
+        rate=rate,
         stand_up=plan.stand_up,
         lie_down=plan.lie_down,
         brake=plan.brake,

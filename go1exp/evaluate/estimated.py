@@ -9,6 +9,7 @@ from torch import Tensor
 from go1exp.env.core import Go1Core
 from go1exp.estimation import WIDTH, go1, make_filter
 from go1exp.estimation import readings as column
+from go1exp.evaluate.observed import columns
 from go1exp.record.tape import sample
 from go1exp.registry import ConfigError
 from go1exp.sim_robot.machine import noisy
@@ -31,12 +32,10 @@ class EstimatedVelocity:
             ConfigError: if the policy does not see the velocity.
             go1exp.estimation.EstimatorError: if the filter is not built.
         """
-        names = [term.entry.name for term in core.task.observation]
-        sizes = [term.entry.traits["size"] for term in core.task.observation]
-        if TERM not in names:
+        found = columns(core.task, TERM)
+        if found is None:
             raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
-        start = sum(sizes[: names.index(TERM)])
-        self._columns = slice(start, start + 3)
+        self._columns = found
         self._filters = [make_filter(go1()) for _ in range(core.num_envs)]
         self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
         self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])

@@ -12,8 +12,10 @@ import torch
 
 from go1exp.backends import CpuBackend
 from go1exp.config import TaskConfig, time_rules
+from go1exp.deploy.past import PastActions
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.estimated import EstimatedVelocity
+from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.registry import ConfigError, Term, members
@@ -102,6 +104,8 @@ def evaluate(
     estimated = config.trunk_velocity == "estimated"
     core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=estimated)
     seen = EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
+    past = PastActions[torch.Tensor](task.sim.policy_dt, core.task.sim.policy_dt)
+    held = columns(core.task, "previous_action") if past.cycles > 1 else None
     assert isinstance(core.command, FixedVelocity)
     commands = torch.tensor(config.commands, dtype=torch.float32)
     core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
@@ -119,6 +123,9 @@ def evaluate(
         result = core.step(policy(seen(observation)))
         core.check(result)
         observation = result.observation
+        if held is not None:
+            observation = observation.clone()
+            observation[:, held] = past.after(core.action.clone())
         fell |= alive & result.terminated
         alive &= ~(result.terminated | result.truncated)
         survived += alive * dt

@@ -7,16 +7,14 @@ environment's step is one. SB3's own loop reads six numbers a minibatch back, wh
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from go1exp.train.ppo import adapted_rate, gaussian_kl
-
-if TYPE_CHECKING:
-    from go1exp.train.device import DevicePPO, DeviceRolloutBuffer
+from go1exp.train.device_buffer import DeviceRolloutBuffer
+from go1exp.train.ppo import AdaptivePPO, adapted_rate, gaussian_kl
 
 FIGURES = (
     *("policy_gradient_loss", "value_loss", "entropy_loss", "loss"),
@@ -35,11 +33,12 @@ class DeviceUpdate:
 
     Args:
         ppo: the learner.
+        buffer: its rollouts.
         captures: record the gradient step as a CUDA graph; else make its calls one by one.
     """
 
-    def __init__(self, ppo: DevicePPO, captures: bool) -> None:
-        self._config, self._policy, self._buffer = ppo.config, ppo.policy, ppo.rollout_buffer
+    def __init__(self, ppo: AdaptivePPO, buffer: DeviceRolloutBuffer, captures: bool) -> None:
+        self._config, self._policy, self._buffer = ppo.config, ppo.policy, buffer
         self._adam = ppo.policy.optimizer
         c, device = ppo.config, ppo.device
         self._rate = torch.zeros((), device=device)
@@ -51,12 +50,10 @@ class DeviceUpdate:
         self._captures = captures and self._on_gpu
         self._step: Callable[[], None] | None = None
 
-    def __call__(self, buffer: DeviceRolloutBuffer, scheduled_rate: float) -> dict[str, list[float]]:
-        """Make the steps and return their figures, a list each.
+    def __call__(self, scheduled_rate: float) -> dict[str, list[float]]:
+        """Make the steps on the full buffer and return their figures, a list each.
 
-        Args:
-            buffer: a full one.
-            scheduled_rate: the learning rate, where a schedule and not the divergence decides.
+        ``scheduled_rate`` is the learning rate of the linear schedule.
         """
         self._take_over_rate()
         if self._config.schedule == "linear":
@@ -66,7 +63,7 @@ class DeviceUpdate:
             self._step = self._captured() if self._captures else self._gradient_step
         self._taken.zero_()
         for _ in range(self._config.epochs):
-            for rows in buffer.minibatches(len(self._rows)):
+            for rows in self._buffer.minibatches(len(self._rows)):
                 self._rows.copy_(rows)
                 self._step()
         return dict(zip(FIGURES, self._figures.T.tolist(), strict=True))
