@@ -3,7 +3,7 @@
 Writes ``assets/policies/NAME``: the run's configuration and origin, its curves (every tenth iteration), a checkpoint
 that holds the policy alone (what only training needs stays behind), and evaluations on the CPU engine: on flat ground
 with noise, with nothing random (``rand=none``), with noise at 100 Hz, and on the ground of training with all that
-training does to a robot.
+training does to a robot. Without ``run`` the policy that is there is evaluated again.
 """
 
 from __future__ import annotations
@@ -59,16 +59,23 @@ def shipped(run: Path, to: Path) -> None:
 def main(arguments: Sequence[str]) -> None:
     """Copy and evaluate."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
-    if not {"run", "name"} <= set(given) <= {"run", "name", "episodes"}:
-        raise SystemExit("usage: python -m benchmarks.ship_policy run=RUN name=NAME [episodes=31]")
+    if (
+        not {"name"} <= set(given) <= {"run", "name", "episodes", "only"}
+        or given.get("only", "flat") not in EVALUATIONS
+    ):
+        known = "|".join(EVALUATIONS)
+        raise SystemExit(f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [episodes=31] [only={known}]")
     to = data_root() / "assets" / "policies" / given["name"]
-    shipped(Path(given["run"]), to)
+    if "run" in given:
+        shipped(Path(given["run"]), to)
     config, policy, about = load_run(to)
     about["file"] = str(Path(about["file"]).relative_to(data_root()))
     usual = {"duration_s": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}
     off = dict.fromkeys(("noise", "randomize", "push", "train_ground"), False)
     commands = grid(GRID["x"], GRID["y"], GRID["yaw"], cross=False)
     for name, on in EVALUATIONS.items():
+        if name != given.get("only", name):
+            continue
         print(f"== {name}", flush=True)
         wanted = EvalConfig(commands, int(given.get("episodes", 31)), **{**usual, **off, **on})
         report = {"policy": about, **evaluate(config.task, policy, wanted)}
