@@ -205,7 +205,8 @@ def test_the_lines_of_the_dockerfile_make_a_runtime_that_walks(tmp_path: Path, m
     assert done.stdout.startswith("usage: python -m go1exp.deploy")
 
     monkeypatch.setenv("PYTHONPATH", str(ROOT))  # of the robots' processes alone
-    words = [*entry, str(bundle), "--command", "0.5,0,0", "--stand-up", "0.5", "--brake", "0.2", "--stale", "5"]
+    words = [*entry, str(bundle), "--command", "0.5,0,0", "--stand-up", "0.5", "--lie-down", "0"]
+    words += ["--brake", "0.2", "--stale", "5"]
     with SimulatedRobot(str(bundle), {"noise": 0.1}, {}) as robot:
         done = subprocess.run(
             [*words, "--robot", str(robot.port), "--seconds", "2"], cwd=logs, env=bare, capture_output=True, text=True

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.gap import alone
+from go1exp.gap import alone, box, profile
 from go1exp.gap.base_state import AGREE, Base, Log, base_state
 from go1exp.gap.explain import explain
 from go1exp.gap.first_state import settled
@@ -202,6 +202,28 @@ def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it
     assert [(c.effect, c.status) for c in search.candidates] == [("payload", "accepted")]
     assert plain > 1.0
     assert search.candidates[0].excess_after < 0.1 * plain
+
+
+def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> None:
+    config, recordings = recorded("excitation=[gait]", "seeds=[0,1]", "+effect.payload.mass=2.0")
+    replayer, dt = ready(config, recordings)
+    score, _ = settled(replayer, dt, 0.00015)
+    everything, begun = np.arange(len(score.windows)), profile.begun(score, dt)
+    assert begun.windows is replayer.windows
+    found = profile.fitted(begun, box.sizes("payload"), everything, dt)
+    assert found["payload", "mass"].item() == pytest.approx(2.0, abs=0.2)
+    truth = {("payload", "mass"): np.array([2.0])}
+    right, none = (np.log(profile.chi2(begun, theta, everything, dt)).mean() for theta in (truth, {}))
+    assert right < 0.5
+    assert none > right + 1.0
+    # By first states that suit the nominal model the truth is hidden.
+    hidden = np.log(score.chi2(residuals(score, [truth], everything, dt)[0], everything)).mean()
+    assert hidden > right + 0.5
+
+
+def test_rungs_of_a_ladder_are_on_both_sides_of_null_and_no_farther_than_a_parameter_goes() -> None:
+    found = profile.ladder(box.param(("payload", "mass")))
+    assert found == pytest.approx([-0.8, -0.4, 0.0, 0.4, 0.8, 1.6, 3.2])
 
 
 def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:

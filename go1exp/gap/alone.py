@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from go1exp.gap import box, judge
+from go1exp.gap import box, judge, profile
 from go1exp.gap.fit import Model, fit, scores
 from go1exp.gap.likelihood import Scorer, table
-from go1exp.gap.replay import Key, Probe
+from go1exp.gap.replay import Key
 from go1exp.gap.trial import excess, removed
 
 if TYPE_CHECKING:
@@ -37,29 +37,10 @@ STRETCHES = (1.0, 0.85, 1.15, 1.4)
 """Factors on what a fit found that are tried after it: where joints stick, small changes tell less than large ones."""
 
 TURNS = 2
-"""Times that effects are fitted and the first states are moved to suit the best of them."""
+"""Times that first states are moved to suit the best effect, and it is fitted again."""
 
 NEARLY_ALL = 0.8
 """Share of the held-out excess that an effect must remove alone."""
-
-
-def fits(scorer: Scorer, windows: np.ndarray, may: box.Freedom, dt: float, begun: Model | None = None) -> list[Model]:
-    """Return the effects of the whole robot, each fitted alone from the nominal model.
-
-    Args:
-        scorer: of a robot on its feet.
-        windows: to fit.
-        may: what may leave its tolerance so far.
-        dt: physics step, s.
-        begun: the one of them that first states suit, which goes on from where it is.
-    """
-    empty = table(scorer, {}, windows, [], dt)
-    models = [Model(name, {}, may.also(name), box.sizes(name)) for name in box.ON_FEET]
-    found = fit(scorer, models, empty, ITERATIONS, dt)
-    if begun is not None:
-        (again,) = fit(scorer, [Model(begun.name, begun.theta, begun.may, begun.keys)], empty, ITERATIONS, dt)
-        found = [again if m.name == begun.name else m for m in found]
-    return [stretched(scorer, m, windows, dt) for m in found]
 
 
 def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Model:
@@ -82,22 +63,33 @@ def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> M
     return model
 
 
-def rivals(scorer: Scorer, windows: np.ndarray, may: box.Freedom, dt: float) -> list[Model]:
-    """Return models in which all joints are off alike, fitted from the nominal model."""
-    joints = len(scorer.windows.joints)
-    found: list[Model] = []
-    for key in COMMON:
-        probe = Probe(key, None, np.full(joints, box.step(key, factor=box.SMALL)))
-        own = table(scorer, {}, windows, [probe], dt)
-        found += fit(scorer, [Model(key[0], {}, may.also(key[0]), ())], own, ITERATIONS, dt)
-    return [stretched(scorer, m, windows, dt) for m in found]
+def refitted(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Model:
+    """Return a model fitted from where it is, by first states that suit it."""
+    empty = table(scorer, {}, windows, [], dt)
+    (found,) = fit(scorer, [model], empty, ITERATIONS, dt)
+    return stretched(scorer, found, windows, dt)
 
 
-def beaten(scorer: Scorer, best: Model, others: list[Model], windows: np.ndarray, dt: float) -> bool:
-    """Return whether ``best`` explains held-out ``windows`` better than each of the others."""
-    chi2 = scores(scorer, [best.theta, *(m.theta for m in others)], windows, dt)
-    gain = judge.gains(chi2[0], chi2[1:]).mean(axis=1)
-    return bool((gain < -judge.SAME).all())
+def clearest(begun: Scorer, search: Seeker) -> Model | None:
+    """Return the effect of the whole robot that does best, every model by first states of its own.
+
+    Args:
+        begun: scores from the first states that sensors tell (``gap/profile.py``).
+        search: whose windows count.
+
+    Returns:
+        None unless, on windows that no fit has seen, it does clearly better than all others, joints that are all off
+        alike, and nothing at all.
+    """
+    train, select, dt = search.splits.train, search.splits.select, search.dt
+    own = {name: profile.fitted(begun, box.sizes(name), train, dt) for name in box.ON_FEET}
+    thetas = [{}, *own.values(), *(profile.fitted(begun, [key], train, dt) for key in COMMON)]
+    cost = [float(np.log(profile.chi2(begun, theta, train, dt)).mean()) for theta in thetas]
+    name = min(own, key=lambda n: cost[1 + list(own).index(n)])
+    chi2 = profile.chi2(begun, own[name], select, dt)
+    others = np.stack([profile.chi2(begun, t, select, dt) for t in thetas if t is not own[name]])
+    clear = bool((judge.gains(chi2, others).mean(axis=1) < -judge.SAME).all())
+    return Model(name, own[name], search.may.also(name), box.sizes(name)) if clear else None
 
 
 class Seeker(Protocol):
@@ -129,32 +121,26 @@ class Seeker(Protocol):
 def cause(search: Seeker) -> Model | None:
     """Return the effect of the whole robot that explains nearly everything by itself, if there is one.
 
-    First states suit the nominal model so far, and hide a part of what is missing: they are moved to suit the best
-    effect, which is then fitted again. The evidence is noted in the search.
+    First states that suit the nominal model hide a part of what is missing: effects are compared by first states of
+    their own, and the best is fitted again at states that suit it. The evidence is noted in the search.
     """
-    train, select, dt, may = search.splits.train, search.splits.select, search.dt, search.may
+    train, select, dt = search.splits.train, search.splits.select, search.dt
     settings, kept = search.settings, search.scorer
     plain, now = (scores(kept, [{}], part, dt)[0] for part in (train, select))
     if excess(now) < settings.material:
         return None
     search.progress("looking for one cause alone", 0.08)
-    models = fits(kept, train, may, dt)
-    best = min(models, key=lambda m: np.inf if m.chi2 is None else float(np.log(m.chi2).mean()))
-    considered = not settings.effects or best.name in settings.effects
-    if not considered or removed(excess(now), excess(search.held_out(best.theta))) < 0.5 * NEARLY_ALL:
+    best = clearest(profile.begun(kept, dt), search)
+    if best is None or (settings.effects and best.name not in settings.effects):
         return None
     for _ in range(TURNS):
-        assert search.scorer.renewed is not None
-        search.scorer = search.scorer.renewed(best.theta)
-        models = fits(search.scorer, train, may, dt, best)
-        best = next(m for m in models if m.name == best.name)
-    others = [m for m in models if m is not best]
-    others += rivals(search.scorer, train, may, dt)
-    clear = beaten(search.scorer, best, others, select, dt)
+        assert kept.renewed is not None
+        search.scorer = kept.renewed(best.theta)
+        best = refitted(search.scorer, best, train, dt)
     share = removed(excess(now), excess(search.held_out(best.theta)))
     accepted, _ = search.judged(1, [best], plain, now)
     search.scorer = kept
-    if accepted is None or not clear or share < NEARLY_ALL:
+    if accepted is None or share < NEARLY_ALL:
         return None
     search.single = best.name
     return best

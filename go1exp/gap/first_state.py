@@ -116,6 +116,7 @@ def settled(
     score = _rescaled(score, score.windows.scale / np.where(np.isfinite(first), first, 1.0))
     score, numerical = _stepped(score, rows, dt)
     score = _bent(score, rows, dt)
+    score = dataclasses.replace(score, expected=replayer.windows)
     return dataclasses.replace(score, renewed=lambda values: settled(replayer, dt, clock_s, values)[0]), numerical
 
 

@@ -52,12 +52,16 @@ class Scorer:
         state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the first state and
             of the clock.
         renewed: returns a scorer whose floors and first states suit other values of the model.
+        clock_s: what the clock was taken to be off by, s.
+        expected: the windows with their first states as sensors tell them, where those were moved; None if not.
     """
 
     replayer: Replayer
     scale: np.ndarray
     state: np.ndarray
     renewed: Callable[[Theta], Scorer] | None = None
+    clock_s: float = 0.0
+    expected: Windows | None = None
 
     @property
     def windows(self) -> Windows:
@@ -122,7 +126,7 @@ def scorer(
     probes = state_probes(machine)
     everything = np.arange(len(w)) if some is None else some
     rows = variants(machine, theta, everything, probes)
-    empty = Scorer(replayer, scale, np.empty(0))
+    empty = Scorer(replayer, scale, np.empty(0), clock_s=clock_s)
     y = replayer.run(rows, dt).reshape(len(everything), 1 + len(probes), *w.y.shape[1:])
     columns = []
     for k, probe in enumerate(probes):
