@@ -58,7 +58,7 @@ READINGS = (
     Port("joint_torque", J, "N m", "joint", "torques that the drives report"),
     Port("joint_target", J, "rad", "joint", "position targets now in force; the nominal stance at the start"),
     Port("command", 3, "m/s, m/s, rad/s", "trunk", "commanded velocity: x, y and yaw rate"),
-    Port("previous_action", J, "1", "joint", "the output `action` of the step before; zero at the start"),
+    Port("previous_action", J, "1", "joint", "the output `action` of one training period before; zero until then"),
 )
 """What the robot's computer can tell a policy. A graph has those as inputs that its terms read, in this order."""
 
@@ -79,7 +79,7 @@ SOURCES = {
 OUTPUTS = (
     Port("joint_target", J, "rad", "joint", "position targets for the drives"),
     Port("observation", 0, "as each term", "-", "what the network sees: the terms, one after the other"),
-    Port("action", J, "1", "joint", "the network's output, clipped: the next step's `previous_action`"),
+    Port("action", J, "1", "joint", "the network's output, clipped: `previous_action` one training period later"),
 )
 """Outputs of the graph; the observation's size is the policy's."""
 
