@@ -980,7 +980,11 @@ def test_a_signal_while_the_robot_starts_ends_both_at_once(
     time.sleep(0.05)  # it has begun to import, which takes seconds
     process.send_signal(number)
     begin = time.monotonic()
-    rest, errors = process.communicate(timeout=60)
+    try:
+        rest, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
     assert time.monotonic() - begin < 2.0
     assert errors == ""
     assert rest == "stopped before the walk began: nothing was commanded\n"

@@ -238,15 +238,16 @@ def stopping(safety: Safety) -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let SIGTERM raise ``KeyboardInterrupt``, as SIGINT does; leave its handler as it was."""
+    """Let signals raise ``KeyboardInterrupt``, SIGINT also where a shell's background had it ignored; put them back."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def resident() -> float | None:
