@@ -213,7 +213,7 @@ def test_the_lines_of_the_dockerfile_make_a_runtime_that_walks(tmp_path: Path, m
         )
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     assert done.stdout.splitlines()[-1] == "walked for 2.0 s, to the end"
-    (file,) = (logs / "deploy").glob("*.parquet")
+    (file,) = (logs / "runs/deploy").glob("*.parquet")
     account = json.loads(file.with_suffix(".json").read_text())
     assert (account["ended"], account["status"]) == ("walked to the end", 0)
     # By the real clock: the first cycle within half a period of 2 s ends it, or a later one if that is missed.
@@ -239,5 +239,5 @@ def test_the_lines_of_the_dockerfile_make_a_runtime_that_walks(tmp_path: Path, m
         rest, _ = process.communicate(timeout=30)
     assert process.returncode == STATUS["operator_stop"]
     assert rest.splitlines()[-1].endswith("asked for by SIGTERM")
-    assert len(list((logs / "deploy").glob("*.parquet"))) == 2
+    assert len(list((logs / "runs/deploy").glob("*.parquet"))) == 2
     assert list(home.iterdir()) == []  # onnxruntime would keep an identifier for its reports there

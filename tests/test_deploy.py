@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import IO, Any, cast
 
 import numpy as np
 import pytest
@@ -919,6 +919,20 @@ def test_the_verb_walks_against_another_process_in_real_time(
     assert account["memory_mb"] > 0
 
 
+def begun(folder: Path, *words: str) -> tuple[subprocess.Popen[str], IO[str]]:
+    """Start Python in a folder, with warnings as errors; return the process and what it prints."""
+    process = subprocess.Popen(
+        [sys.executable, "-W", "error", *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(data_root())},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    return process, process.stdout
+
+
 def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_path: Path) -> None:
     code = (
         "import sys, json\nfrom go1exp.deploy.__main__ import main\nstatus = main(sys.argv[1:])\n"
@@ -926,17 +940,9 @@ def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_
         "    json.dump(sorted({name.split('.')[0] for name in sys.modules}), file)\nsys.exit(status)"
     )
     words = [file, "--command", "0.2,0,0", "--stand-up", "0.2", "--brake", "0.2", "--stale", str(BUSY), "--out", "logs"]
-    process = subprocess.Popen(
-        [sys.executable, "-W", "error", "-c", code, *words],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(data_root())},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
+    process, told = begun(tmp_path, "-c", code, *words)
     seen = []
-    for line in process.stdout:
+    for line in told:
         seen.append(line)
         if line.startswith("walking: "):
             process.send_signal(signal.SIGINT)
@@ -963,18 +969,10 @@ def test_a_signal_while_the_robot_starts_ends_both_at_once(
     file: str, tmp_path: Path, way: str, number: signal.Signals
 ) -> None:
     words = ["deploy", file, "out=logs"] if way == "go1exp.cli" else [file, "--out", "logs"]
-    process = subprocess.Popen(
-        [sys.executable, "-W", "error", "-m", way, *words],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(data_root())},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    seen = [next(process.stdout)]
+    process, told = begun(tmp_path, "-m", way, *words)
+    seen = [next(told)]
     while "starting the simulated robot" not in seen[-1]:
-        seen.append(next(process.stdout))
+        seen.append(next(told))
     while not (robots := children(process.pid)):
         time.sleep(0.001)
     time.sleep(0.05)  # it has begun to import, which takes seconds

@@ -48,7 +48,7 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--spin", type=not_negative, default=0.0008, help="s before each cycle for which the core is kept busy"
     )
-    parser.add_argument("--out", default="deploy", help="folder of the logs")
+    parser.add_argument("--out", default="runs/deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
     sim.add_argument("--start", choices=("standing", "lying", "hung"), default="standing")
     sim.add_argument("--noise", type=float, default=1.0, help="times that of the paper's Table II")
