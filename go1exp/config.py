@@ -189,6 +189,7 @@ class ProcessConfig:
         device: torch device of policy and update, ``auto`` for that of the environment, which is its backend's.
         torch_threads: threads of torch, 0 for its own choice.
         resume: run folder to continue, or null.
+        start_from: run folder, or name of a shipped policy, whose weights a new run begins with, or null.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -197,6 +198,7 @@ class ProcessConfig:
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     torch_threads: CountOrZero
     resume: str | None
+    start_from: str | None = None  # runs of older versions have no such key
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from go1exp.cli import settings
 from go1exp.cli.app import App
 from go1exp.cli.record import RIG
 from go1exp.compose import config_folder, register_groups
-from go1exp.config import MANY_TERMS, ONE_TERM, parse_parts, parse_train
+from go1exp.config import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
 from go1exp.deploy.bundle import loads
 from go1exp.deploy.walk import STATUS
 from go1exp.env.core import Go1Core
@@ -148,6 +148,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "train:device": lambda walk: ["cuda"],
     "train:logger.wandb": lambda walk: [{"project": "p", "mode": "offline", "group": None, "entity": None}],
     "train:resume": lambda walk: [str(walk.trained("resumed"))],
+    "train:start_from": lambda walk: ["paper"],
     "train:actuator.file": lambda walk: [str(walk.net(1))],
     "train:actuator.period": lambda walk: ["resample"],
     "train:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],
@@ -539,11 +540,11 @@ class Walk:
         return put(container, "excitation", ["policy"]) if "excitation=[policy]" in needs else container
 
     def trace(self, program: str, container: dict[str, Any], key: str) -> Trace:
-        how = resume_trace if key == "resume" else TRACES[program]
+        how = verb_trace if key in THE_VERBS else TRACES[program]
         return how(resolved(container), self)
 
     def base(self, program: str, container: dict[str, Any], key: str) -> list[tuple[str, Any]]:
-        identity = f"{program} {key == 'resume'} {json.dumps(container, sort_keys=True)}"
+        identity = f"{program} {key in THE_VERBS} {json.dumps(container, sort_keys=True)}"
         if identity not in self._bases:
             self._bases[identity] = list(self.trace(program, container, key))
         return self._bases[identity]
@@ -692,17 +693,26 @@ def wandb_stub(told: list[Any]) -> types.ModuleType:
     return module
 
 
-def resume_trace(container: dict[str, Any], walk: Walk) -> Trace:
-    """Run the verb itself, with a stub for the training: in which folder it would train."""
+THE_VERBS = ("resume", "start_from")
+"""Settings that act before the training, in the verb."""
+
+
+def verb_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """Run the verb itself, with stubs for the training: in which folder it would train, with whose weights."""
     from go1exp.cli.train import APP
 
-    folders: list[str] = []
-    chosen = json.dumps(container["resume"])
+    folders: list[list[str | None]] = []
+    chosen = [f"{key}={json.dumps(container[key])}" for key in THE_VERBS if container[key]]
+
+    def noted(config: TrainConfig, container: dict[str, Any], run: Path, source: Path | None) -> None:
+        folders.append([run.name, source.name if source else None])
+
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()):
         patch.setattr(sys, "argv", sys.argv)
         patch.setenv("HYDRA_FULL_ERROR", "0")  # the verb changes both
-        patch.setattr(trainer, "train", lambda config, container, run: folders.append(run.name))
-        assert APP.run([f"hydra.run.dir={walk.folder() / 'new'}", f"resume={chosen}"]) == 0
+        patch.setattr(trainer, "try_out", lambda *_: None)
+        patch.setattr(trainer, "train", noted)
+        assert APP.run([f"hydra.run.dir={walk.folder() / 'new'}", *chosen]) == 0
     yield "folder", folders
 
 

@@ -299,6 +299,8 @@ CASES = [
     Case("thigh_contact", "calves do not count", {"calf_contact": [True] * 4, "trunk_contact": True}, 0.0),
     Case("calf_contact", "three calves", {"calf_contact": [True, True, True, False]}, 3.0),
     Case("calf_contact", "feet do not count", {"foot_contact": [True] * 4, "thigh_contact": [True] * 4}, 0.0),
+    Case("trunk_contact", "the trunk", {"trunk_contact": True}, 1.0),
+    Case("trunk_contact", "legs do not count", {"thigh_contact": [True] * 4, "calf_contact": [True] * 4}, 0.0),
     # Table III to the letter
     Case("feet_air_time_literal", "feet on the ground", {}, -0.7),
     Case("feet_air_time_literal", "never landing pays", {"foot_air_time": [10.0] * 4}, 39.3),

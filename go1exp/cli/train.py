@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from go1exp.cli.app import STOPPED, App, discard, run_dir
 from go1exp.cli.settings import run_folder as existing
+from go1exp.cli.settings import shipped_policies
 from go1exp.compose import config_folder, key_values
 from go1exp.registry import ConfigError, Expected
 
@@ -57,6 +58,13 @@ def _refuse_other(run: Path, container: dict[str, Any]) -> None:
         raise ConfigError([f"{run}: holds a run with other settings of {', '.join(differ)}; use another folder"])
 
 
+def _source(start_from: str | None) -> Path | None:
+    """Return the folder of the run or shipped policy whose weights are meant."""
+    if start_from is None:
+        return None
+    return shipped_policies().get(start_from) or existing(start_from, "start_from")
+
+
 def _task(container: dict[str, Any]) -> int | None:
     from go1exp.config import parse_train
 
@@ -71,22 +79,22 @@ def _task(container: dict[str, Any]) -> int | None:
         run = existing(config.process.resume, "resume")
         container = _resumed(run, list(HydraConfig.get().overrides.task))
         config = parse_train(container)
-
     else:
         _refuse_other(run, container)
 
-    from go1exp.train import run_folder, trainer
+    from go1exp.train import checkpoint, run_folder, trainer
 
     try:
-        trainer.try_out(config)
-    except (Expected, ConfigError):
+        source = None if checkpoint.checkpoints(run) else _source(config.process.start_from)
+        trainer.try_out(config, source)
+    except (Expected, ConfigError, FileNotFoundError):
         if not config.process.resume:
             discard(run)
         raise
     run_folder.write(run, container)
     print(f"run folder {run}")
     try:
-        trainer.train(config, container, run)
+        trainer.train(config, container, run, source)
     except trainer.Stopped:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             raise  # so that the jobs after this one do not start

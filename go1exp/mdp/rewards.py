@@ -212,3 +212,13 @@ def calf_contact(s: Snapshot) -> Tensor:
     """Calves that touch the ground, 0 to 4; the foot does not count. Table III."""
     assert s.calf_contact is not None
     return s.calf_contact.sum(-1).to(s.joint_pos.dtype)
+
+
+@reward("trunk_contact")
+def trunk_contact(s: Snapshot) -> Tensor:
+    """Trunk, head or a hip touched the ground, 0 or 1. Not in Table III.
+
+    Where this ends the episode (``termination=fall``) it is what a fall costs, once: weight x policy period.
+    """
+    assert s.trunk_contact is not None
+    return s.trunk_contact.to(s.joint_pos.dtype)

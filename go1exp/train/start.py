@@ -1,0 +1,64 @@
+"""A new run that begins with the weights of another: fine-tuning, or a second stage with other rewards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from go1exp.config import TrainConfig, parse_train
+from go1exp.registry import ConfigError
+from go1exp.train import checkpoint, run_folder
+from go1exp.train.ppo import AdaptivePPO
+
+FILE = "start.json"
+"""In the new run's folder: where its first weights are from."""
+
+
+def weights(config: TrainConfig, source: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the weights of ``source``'s newest checkpoint, and what ``start.json`` tells of them.
+
+    Args:
+        config: the new run's.
+        source: run folder, or that of a shipped policy.
+
+    Raises:
+        ConfigError: if a policy of the new run is another function than one of ``source``.
+        FileNotFoundError: if ``source`` holds no checkpoint.
+    """
+    theirs = parse_train(run_folder.read_config(source))
+    differ = [
+        f"{name} is {new} here and {old} there"
+        for name, new, old in (
+            ("observation", *([t.key for t in c.task.observation] for c in (config, theirs))),
+            ("ppo.hidden", list(config.ppo.hidden), list(theirs.ppo.hidden)),
+            ("ppo.activation", config.ppo.activation, theirs.ppo.activation),
+        )
+        if new != old
+    ]
+    if differ:
+        raise ConfigError([f"start_from = {str(source)!r}: its weights fit no policy of this run: {'; '.join(differ)}"])
+    state, path = checkpoint.load_latest(source)
+    about = {
+        "run": str(source),
+        "checkpoint": path.name,
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "iteration": state["iteration"],
+        "num_timesteps": state["num_timesteps"],
+    }
+    return state["policy"], about
+
+
+def begin(ppo: AdaptivePPO, config: TrainConfig, source: Path, run: Path) -> None:
+    """Give ``ppo`` the weights of ``source`` (actor, critic, standard deviations), and note in ``run`` where from.
+
+    Iterations, optimiser, learning rate, robots and curriculum begin anew.
+
+    Raises:
+        ConfigError, FileNotFoundError: as ``weights``.
+    """
+    policy, about = weights(config, source)
+    ppo.policy.load_state_dict(policy)
+    (run / FILE).write_text(json.dumps(about, indent=2) + "\n")
+    print(f"starting from {source}, iteration {about['iteration']}")

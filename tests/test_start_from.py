@@ -1,0 +1,108 @@
+"""A new run that begins with the weights of another."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from go1exp.cli.train import APP
+from go1exp.compose import compose
+from go1exp.config import parse_train
+from go1exp.registry import ConfigError
+from go1exp.train import checkpoint, run_folder, start, trainer
+
+SMALL = (
+    *("ppo.num_envs=4", "ppo.steps=4", "ppo.minibatches=2", "ppo.epochs=1", "ppo.iterations=1", "ppo.hidden=[16]"),
+    *("backend.threads=1", "torch_threads=1", "logger.tensorboard=false"),
+)
+
+Train = Callable[..., Any]
+
+
+def train_here(run: Path, *overrides: str, source: Path | None = None) -> Any:
+    container = compose("train", [*SMALL, *overrides])
+    config = parse_train(container)
+    run_folder.write(run, container)
+    return trainer.train(config, container, run, source)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("start") / "first"
+    train_here(run)
+    return run
+
+
+def test_the_weights_are_the_others_and_all_else_is_new(
+    first: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: dict[str, Any] = {}
+    begin = start.begin
+
+    def spied(ppo: Any, *arguments: Any) -> None:
+        fresh = [p.clone() for p in ppo.policy.state_dict().values()]
+        begin(ppo, *arguments)
+        begun.update(policy={k: v.clone() for k, v in ppo.policy.state_dict().items()}, fresh=fresh)
+        begun.update(iteration=ppo.iteration, moments=dict(ppo.policy.optimizer.state))
+
+    monkeypatch.setattr(start, "begin", spied)
+    run = tmp_path / "second"
+    ppo = train_here(run, "reward.gait.weight=20", "ppo.learning_rate=0.0001", source=first)
+    old = checkpoint.read(first / "checkpoints/000001.pt")["policy"]
+    assert begun["policy"].keys() == old.keys()
+    assert all(torch.equal(begun["policy"][k], old[k]) for k in old)
+    assert any(not torch.equal(a, b) for a, b in zip(begun["fresh"], old.values(), strict=True))
+    assert begun["iteration"] == 0
+    assert begun["moments"] == {}
+    assert ppo.iteration == 1
+    assert ppo.num_timesteps == 16
+
+    told = json.loads((run / "start.json").read_text())
+    file = first / "checkpoints" / told.pop("checkpoint")
+    assert told.pop("sha256") == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert told == {"run": str(first), "iteration": 1, "num_timesteps": 16}
+
+
+def test_a_run_that_has_a_checkpoint_goes_on_from_that(first: Path, tmp_path: Path) -> None:
+    run = tmp_path / "second"
+    train_here(run, source=first)
+    (run / "start.json").unlink()
+    train_here(run, "ppo.iterations=2", source=first)
+    assert [int(p.stem) for p in checkpoint.checkpoints(run)] == [1, 2]
+    assert not (run / "start.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("~observation.projected_gravity", "observation is .* here and .*'projected_gravity'.* there"),
+        ("ppo.hidden=[16,16]", r"ppo.hidden is \[16, 16\] here and \[16\] there"),
+        ("ppo.activation=relu", "ppo.activation is relu here and elu there"),
+    ],
+)
+def test_weights_of_another_function_are_refused(first: Path, override: str, said: str) -> None:
+    config = parse_train(compose("train", [*SMALL, override]))
+    with pytest.raises(ConfigError, match=said):
+        trainer.try_out(config, first)
+
+
+def test_from_the_command_line(
+    first: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    big = [o for o in SMALL if "hidden" not in o]
+    assert APP.run([*big, "start_from=paper", "hydra.run.dir=tuned"]) == 0
+    assert json.loads((tmp_path / "tuned/start.json").read_text())["num_timesteps"] > 1e8
+    assert "starting from" in capsys.readouterr().out
+    assert parse_train(run_folder.read_config(tmp_path / "tuned")).process.start_from == "paper"
+
+    for wrong, said in (("nowhere", "start_from = 'nowhere'"), (str(first), "ppo.hidden is [512, 256, 128] here")):
+        assert APP.run([*big, f"start_from={wrong}", "hydra.run.dir=refused"]) == 2
+        assert said in capsys.readouterr().err
+        assert not (tmp_path / "refused/config.yaml").exists()
