@@ -198,7 +198,7 @@ class Replayer:
 
 def padded(rows: int) -> int:
     """Return how many simulations to make for ``rows``: at most a quarter, or 7, more, so that few sizes are built."""
-    step = max(8, 1 << max(rows.bit_length() - 3, 0))  # whole vectors of eight: the same bits wherever a row lies
+    step = min(max(8, 1 << max(rows.bit_length() - 3, 0)), 64)  # whole vectors of eight: same bits wherever a row is
     return -(-rows // step) * step
 
 
