@@ -51,7 +51,7 @@ demo: setup ## train for some minutes, judge the policy, film it, find what a lo
 
 test: setup ## run the tests
 	@echo "test: pytest"
-	@$(BIN)/python -m pytest -n 2 -q --durations=15
+	@$(BIN)/python -m pytest -n 2 --dist worksteal -q --durations=15
 
 check: setup ## formatting, lint and types; changes nothing
 	@echo "check 1/3: ruff format"

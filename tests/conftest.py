@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
+from go1exp.cli import ONE_BLAS_THREAD
+
+os.environ.setdefault(*ONE_BLAS_THREAD)  # before NumPy is imported; tests run side by side
+
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +25,7 @@ from go1exp.env.core import Go1Core
 from go1exp.fit.net import ActuatorNet, NetInfo, Provenance, group_names
 from go1exp.randomness import EnvRandom
 
-torch.set_num_threads(1)  # tests run side by side
+torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from go1exp import data_root, registry
-from go1exp.cli import SUBVERBS, VERBS, _by_name
+from go1exp.cli import ONE_BLAS_THREAD, SUBVERBS, VERBS, _by_name, main
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
 from go1exp.config import parse_train
@@ -404,6 +404,18 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
     version = re.search(r'^version = "(.+)"$', pyproject, re.MULTILINE)
     assert version
     assert cli(tmp_path, "--version").stdout == f"go1exp {version.group(1)}\n"
+
+
+@pytest.mark.parametrize("given", [None, "3"])
+def test_blas_has_one_thread_unless_the_user_says_otherwise(given: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Set before NumPy is imported, which the general help shows not to be."""
+    variable, one = ONE_BLAS_THREAD
+    monkeypatch.setenv(variable, given or "")
+    if given is None:
+        monkeypatch.delenv(variable)
+    monkeypatch.setattr(sys, "argv", ["go1exp", "--version"])
+    assert main() == 0
+    assert os.environ[variable] == (given or one)
 
 
 # ---------------------------------------------------------------------- tab completion

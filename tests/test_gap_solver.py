@@ -21,7 +21,7 @@ from go1exp.gap.judge import max_t, splits
 from go1exp.gap.likelihood import Layout, gram, predicted
 from go1exp.gap.machine import HungGo1, hung
 from go1exp.gap.prepare import prepare
-from go1exp.gap.replay import Probe
+from go1exp.gap.replay import Probe, padded
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
 from go1exp.gap.windows import even_clock, held, noise
 from go1exp.record import simulate
@@ -160,6 +160,14 @@ def test_episodes_without_a_like_are_cut_into_stretches() -> None:
 
 
 # ---------------------------------------------------------------------- windows
+
+
+def test_batches_are_little_larger_than_what_is_asked_and_of_few_sizes() -> None:
+    asked = range(1, 1025)
+    made = [padded(rows) for rows in asked]
+    assert all(rows <= size <= max(1.25 * rows, rows + 7) for rows, size in zip(asked, made, strict=True))
+    assert all(size % 8 == 0 for size in made)
+    assert len(set(made)) < 30
 
 
 def test_a_held_signal_changes_at_the_nearest_step() -> None:

@@ -210,7 +210,7 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
     score, _ = settled(replayer, dt, 0.00015)
     everything, begun = np.arange(len(score.windows)), profile.begun(score, dt)
     assert begun.windows is replayer.windows
-    found = profile.fitted(begun, box.sizes("payload"), everything, dt)
+    found, _ = profile.fitted(begun, box.sizes("payload"), everything, dt)
     assert found["payload", "mass"].item() == pytest.approx(2.0, abs=0.2)
     truth = {("payload", "mass"): np.array([2.0])}
     right, none = (np.log(profile.chi2(begun, theta, everything, dt)).mean() for theta in (truth, {}))

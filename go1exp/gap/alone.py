@@ -82,14 +82,22 @@ def clearest(begun: Scorer, search: Seeker) -> Model | None:
         alike, and nothing at all.
     """
     train, select, dt = search.splits.train, search.splits.select, search.dt
-    own = {name: profile.fitted(begun, box.sizes(name), train, dt) for name in box.ON_FEET}
-    thetas = [{}, *own.values(), *(profile.fitted(begun, [key], train, dt) for key in COMMON)]
-    cost = [float(np.log(profile.chi2(begun, theta, train, dt)).mean()) for theta in thetas]
-    name = min(own, key=lambda n: cost[1 + list(own).index(n)])
-    chi2 = profile.chi2(begun, own[name], select, dt)
-    others = np.stack([profile.chi2(begun, t, select, dt) for t in thetas if t is not own[name]])
-    clear = bool((judge.gains(chi2, others).mean(axis=1) < -judge.SAME).all())
-    return Model(name, own[name], search.may.also(name), box.sizes(name)) if clear else None
+    none = profile.cost(begun, {}, train, dt)
+    own = {name: profile.fitted(begun, box.sizes(name), train, dt, none) for name in box.ON_FEET}
+    name = min(own, key=lambda n: own[n][1])
+    best = own.pop(name)[0]
+    if not best:
+        return None
+    chi2 = profile.chi2(begun, best, select, dt)
+
+    def loses(rival: Theta) -> bool:
+        return bool(judge.gains(chi2, profile.chi2(begun, rival, select, dt)[None]).mean() < -judge.SAME)
+
+    # In the order of what they cost: the first that does as well ends it.
+    if not loses({}) or not all(loses(rival) for rival, _ in own.values() if rival):
+        return None
+    clear = all(loses(profile.fitted(begun, [key], train, dt, none)[0]) for key in COMMON)
+    return Model(name, best, search.may.also(name), box.sizes(name)) if clear else None
 
 
 class Seeker(Protocol):

@@ -82,7 +82,14 @@ def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndar
     return best
 
 
-def fitted(score: Scorer, keys: Sequence[Key], windows: np.ndarray, dt: float) -> Theta:
+def cost(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> float:
+    """Return what fits make small, the mean log :func:`chi2` (arguments as there)."""
+    return float(np.log(chi2(score, theta, windows, dt)).mean())
+
+
+def fitted(
+    score: Scorer, keys: Sequence[Key], windows: np.ndarray, dt: float, nominal: float | None = None
+) -> tuple[Theta, float]:
     """Return the values of an effect that fit best, one number for each parameter, one parameter after the other.
 
     Args:
@@ -90,25 +97,30 @@ def fitted(score: Scorer, keys: Sequence[Key], windows: np.ndarray, dt: float) -
         keys: the parameters; one that is best at its null value is not among those returned.
         windows: (V,) to fit.
         dt: physics step, s.
+        nominal: cost of the nominal model, if it is known.
+
+    Returns:
+        The values and their cost.
     """
     theta: Theta = {}
+    least = cost(score, {}, windows, dt) if nominal is None else nominal
     for key in keys:
         p = box.param(key)
         wide = len(score.windows.joints) if p.per == "joint" else 1
 
-        def cost(value: float, key: Key = key, wide: int = wide, others: Theta = theta) -> float:
-            there = {**others, key: np.full(wide, value)}
-            return float(np.log(chi2(score, there, windows, dt)).mean())
+        def at(value: float, key: Key = key, wide: int = wide, others: Theta = theta) -> float:
+            return cost(score, {**others, key: np.full(wide, value)}, windows, dt)
 
         rungs = ladder(p)
-        costs = [cost(value) for value in rungs]
+        costs = [least if value == p.null else at(value) for value in rungs]
         k = int(np.argmin(costs))
         if rungs[k] == p.null:
             continue
         between = rungs[max(k - 1, 0)], rungs[min(k + 1, len(rungs) - 1)]
-        found = minimize_scalar(cost, bounds=between, options={"maxiter": CLOSER})
-        theta = {**theta, key: np.full(wide, found.x if found.fun < costs[k] else rungs[k])}
-    return theta
+        found = minimize_scalar(at, bounds=between, options={"maxiter": CLOSER})
+        value, least = (found.x, float(found.fun)) if found.fun < costs[k] else (rungs[k], costs[k])
+        theta = {**theta, key: np.full(wide, value)}
+    return theta, least
 
 
 def ladder(p: Param) -> list[float]:

@@ -84,7 +84,7 @@ class Replayer:
             mine = np.flatnonzero(which.ravel() == k)
             pieces = int(np.ceil(len(mine) / self.max_rows))
             for piece in np.array_split(mine, pieces):
-                size = -(-len(piece) // 64) * 64 if len(piece) < self.max_rows else self.max_rows
+                size = min(padded(len(piece)), self.max_rows)
                 full = np.concatenate([piece, np.repeat(piece[-1:], size - len(piece))])
                 found[piece] = self._batch(rows.part(full), dt, tuple(float(v) for v in quat))[: len(piece)]
                 self.on_rows(len(piece))
@@ -194,6 +194,12 @@ class Replayer:
         at = w.t[rows.window] / dt - first
         found = _sampled(q, qd, torque, at, dt)
         return found if ears is None else ears.joined(found, at, plant, dt)
+
+
+def padded(rows: int) -> int:
+    """Return how many simulations to make for ``rows``: at most a quarter, or 7, more, so that few sizes are built."""
+    step = min(max(8, 1 << max(rows.bit_length() - 3, 0)), 64)  # whole vectors of eight: same bits wherever a row is
+    return -(-rows // step) * step
 
 
 def _sampled(q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float) -> np.ndarray:
