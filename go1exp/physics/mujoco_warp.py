@@ -43,6 +43,10 @@ STATE_FIELDS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl")
 WARM_UP = 2
 """Runs of what is to be captured, before it is: they compile kernels and make what is made once."""
 
+MODULES = ("forward", "sensor", "smooth", "passive", "solver", "constraint", "support")
+"""Modules of mujoco-warp whose kernels every step calls. Compiled side by side before the first one; what is made for a
+model follows one by one, when it is called."""
+
 LOST = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "HFIELD", "CONTACT_MATCH")
 """Overflows by which contacts or constraints are lost (the others are limits of iterations)."""
 
@@ -94,6 +98,8 @@ class MujocoWarp:
         supported = copy.copy(model)
         supported.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it has none to disable
         with self._scope():
+            kernels = [wp.get_module(f"{mjw.__name__}._src.{name}") for name in MODULES]
+            wp.force_load(self._wp_device, kernels, max_workers=len(kernels))
             self._model = mjw.put_model(supported)
             self._model.opt.warn_overflow = 0  # kernels that print are slow; ``overflowed`` tells
             without_contact_sensors(self._model)
