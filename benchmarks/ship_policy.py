@@ -1,9 +1,12 @@
-"""Put the policy of a run beside the package: ``python -m benchmarks.ship_policy run=RUN name=NAME [episodes=31]``.
+"""Put the policy of a run beside the package.
+
+``python -m benchmarks.ship_policy run=RUN name=NAME [first=RUN] [episodes=31]``
 
 Writes ``assets/policies/NAME``: the run's configuration and origin, its curves (every tenth iteration), a checkpoint
 that holds the policy alone (what only training needs stays behind), and evaluations on the CPU engine: on flat ground
 with noise, with nothing random (``rand=none``), with noise at 100 Hz, and on the ground of training with all that
-training does to a robot. Without ``run`` the policy that is there is evaluated again.
+training does to a robot. ``first`` is the run that ``run`` started from (``start_from``): its configuration, origin and
+curves go to ``first_stage``. Without ``run`` the policy that is there is evaluated again.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from go1exp import data_root
 from go1exp.evaluate import table
 from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
-from go1exp.train import checkpoint
+from go1exp.train import checkpoint, start
 
 GRID = {
     "x": (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0),
@@ -50,8 +53,15 @@ def shipped(run: Path, to: Path) -> None:
         old.unlink()
     kept = {name: state[name] for name in ("format", "policy", "iteration", "num_timesteps")}
     torch.save(kept, to / "checkpoints" / path.name)
-    for name in ("config.yaml", "meta.json"):
-        shutil.copyfile(run / name, to / name)
+    told(run, to)
+
+
+def told(run: Path, to: Path) -> None:
+    """Copy what tells of a run: configuration, origin, curves."""
+    to.mkdir(exist_ok=True)
+    for name in ("config.yaml", "meta.json", start.FILE):
+        if (run / name).exists():
+            shutil.copyfile(run / name, to / name)
     head, *rows = (run / "metrics.csv").read_text().splitlines(keepends=True)
     (to / "metrics.csv").write_text("".join([head, *rows[9::EVERY]]))
 
@@ -60,14 +70,18 @@ def main(arguments: Sequence[str]) -> None:
     """Copy and evaluate."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
     if (
-        not {"name"} <= set(given) <= {"run", "name", "episodes", "only"}
+        not {"name"} <= set(given) <= {"run", "name", "first", "episodes", "only"}
         or given.get("only", "flat") not in EVALUATIONS
     ):
         known = "|".join(EVALUATIONS)
-        raise SystemExit(f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [episodes=31] [only={known}]")
+        raise SystemExit(
+            f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [first=RUN] [episodes=31] [only={known}]"
+        )
     to = data_root() / "assets" / "policies" / given["name"]
     if "run" in given:
         shipped(Path(given["run"]), to)
+        if "first" in given:
+            told(Path(given["first"]), to / "first_stage")
     config, policy, about = load_run(to)
     about["file"] = str(Path(about["file"]).relative_to(data_root()))
     usual = {"duration_s": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}
