@@ -14,6 +14,7 @@ import torch
 from go1exp.cli.train import APP
 from go1exp.compose import compose
 from go1exp.config import parse_train
+from go1exp.evaluate.policy import load_run
 from go1exp.registry import ConfigError
 from go1exp.train import checkpoint, run_folder, start, trainer
 
@@ -67,6 +68,14 @@ def test_the_weights_are_the_others_and_all_else_is_new(
     file = first / "checkpoints" / told.pop("checkpoint")
     assert told.pop("sha256") == hashlib.sha256(file.read_bytes()).hexdigest()
     assert told == {"run": str(first), "iteration": 1, "num_timesteps": 16}
+
+
+def test_steps_are_counted_from_the_first_of_the_runs(first: Path, tmp_path: Path) -> None:
+    second, third = tmp_path / "second", tmp_path / "third"
+    train_here(second, source=first)
+    train_here(third, source=second)
+    assert json.loads((third / "start.json").read_text())["num_timesteps"] == 2 * 16
+    assert [load_run(run)[2]["num_timesteps"] for run in (first, second, third)] == [16, 2 * 16, 3 * 16]
 
 
 def test_a_run_that_has_a_checkpoint_goes_on_from_that(first: Path, tmp_path: Path) -> None:

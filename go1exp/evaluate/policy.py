@@ -13,7 +13,7 @@ from torch import Tensor
 
 from go1exp import robot
 from go1exp.config import PPOConfig, TrainConfig, parse_train
-from go1exp.train import checkpoint, run_folder
+from go1exp.train import checkpoint, run_folder, start
 from go1exp.train.ppo import GaussianPolicy, policy_settings
 
 Policy = Callable[[Tensor], Tensor]
@@ -52,7 +52,7 @@ def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tup
         which: a checkpoint file; the newest if None.
 
     Returns:
-        The network, and the checkpoint's ``iteration`` and ``num_timesteps`` with its ``file``.
+        The network, and of the checkpoint ``iteration``, ``file`` and ``num_timesteps``, earlier stages included.
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
@@ -67,5 +67,6 @@ def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tup
     )
     network.load_state_dict(state["policy"])
     network.set_training_mode(False)
-    about = {"iteration": state["iteration"], "num_timesteps": state["num_timesteps"], "file": str(path)}
+    steps = state["num_timesteps"] + start.timesteps_before(run)
+    about = {"iteration": state["iteration"], "num_timesteps": steps, "file": str(path)}
     return network, about

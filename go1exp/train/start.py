@@ -45,9 +45,15 @@ def weights(config: TrainConfig, source: Path) -> tuple[dict[str, Any], dict[str
         "checkpoint": path.name,
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "iteration": state["iteration"],
-        "num_timesteps": state["num_timesteps"],
+        "num_timesteps": state["num_timesteps"] + timesteps_before(source),
     }
     return state["policy"], about
+
+
+def timesteps_before(run: Path) -> int:
+    """Return the policy steps that a run's first weights had learnt from, over all stages before it."""
+    file = run / FILE
+    return int(json.loads(file.read_text())["num_timesteps"]) if file.is_file() else 0
 
 
 def begin(ppo: AdaptivePPO, config: TrainConfig, source: Path, run: Path) -> None:
