@@ -74,7 +74,10 @@ EXEMPT = {
 }
 """Leaf, or mapping of leaves, that need not be shown to act, and the reason."""
 
-NEEDS = {"curriculum/terrain_level": ["terrain=rough"]}
+NEEDS = {
+    "curriculum/terrain_level": ["terrain=rough"],
+    "experiment/reference_second": ["experiment=reference", "backend=cpu"],  # it changes what that one adds
+}
 """Choices that other choices must go with."""
 
 SMALL: dict[str, dict[str, Any]] = {
