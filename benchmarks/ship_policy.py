@@ -41,6 +41,9 @@ EVALUATIONS: dict[str, dict[str, Any]] = {
 }
 """Evaluation -> what is on in it."""
 
+FIRST = "first_stage"
+"""What tells of the run that a policy's run started from."""
+
 EVERY = 10
 """Iterations between rows of the shipped curves."""
 
@@ -49,8 +52,8 @@ def shipped(run: Path, to: Path) -> None:
     """Copy what a shipped policy needs: configuration, origin, curves, the policy's weights."""
     state, path = checkpoint.load_latest(run)
     (to / "checkpoints").mkdir(parents=True, exist_ok=True)
-    for old in (to / "checkpoints").glob("*"):
-        old.unlink()
+    for old in [*(to / "checkpoints").glob("*"), *(to / FIRST).glob("*"), to / start.FILE]:
+        old.unlink(missing_ok=True)
     kept = {name: state[name] for name in ("format", "policy", "iteration", "num_timesteps")}
     torch.save(kept, to / "checkpoints" / path.name)
     told(run, to)
@@ -81,7 +84,7 @@ def main(arguments: Sequence[str]) -> None:
     if "run" in given:
         shipped(Path(given["run"]), to)
         if "first" in given:
-            told(Path(given["first"]), to / "first_stage")
+            told(Path(given["first"]), to / FIRST)
     config, policy, about = load_run(to)
     about["file"] = str(Path(about["file"]).relative_to(data_root()))
     usual = {"duration_s": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}

@@ -47,7 +47,7 @@ from go1exp.env.core import Go1Core
 from go1exp.export.build import build
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.registry import ConfigError, Expected, Range
-from go1exp.train import run_folder, trainer
+from go1exp.train import run_folder, start, trainer
 from go1exp.types import Snapshot
 from tests.lockstep import lockstep
 
@@ -707,13 +707,12 @@ def verb_trace(container: dict[str, Any], walk: Walk) -> Trace:
     folders: list[list[str | None]] = []
     chosen = [f"{key}={json.dumps(container[key])}" for key in THE_VERBS if container[key]]
 
-    def noted(config: TrainConfig, container: dict[str, Any], run: Path, source: Path | None) -> None:
-        folders.append([run.name, source.name if source else None])
+    def noted(config: TrainConfig, container: dict[str, Any], run: Path, first: start.Weights | None) -> None:
+        folders.append([run.name, first.about["run"] if first else None])
 
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()):
         patch.setattr(sys, "argv", sys.argv)
         patch.setenv("HYDRA_FULL_ERROR", "0")  # the verb changes both
-        patch.setattr(trainer, "try_out", lambda *_: None)
         patch.setattr(trainer, "train", noted)
         assert APP.run([f"hydra.run.dir={walk.folder() / 'new'}", *chosen]) == 0
     yield "folder", folders

@@ -30,7 +30,7 @@ def train_here(run: Path, *overrides: str, source: Path | None = None) -> Any:
     container = compose("train", [*SMALL, *overrides])
     config = parse_train(container)
     run_folder.write(run, container)
-    return trainer.train(config, container, run, source)
+    return trainer.train(config, container, run, start.read(config, source) if source else None)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_a_run_that_has_a_checkpoint_goes_on_from_that(first: Path, tmp_path: Pa
 def test_weights_of_another_function_are_refused(first: Path, override: str, said: str) -> None:
     config = parse_train(compose("train", [*SMALL, override]))
     with pytest.raises(ConfigError, match=said):
-        trainer.try_out(config, first)
+        start.read(config, first)
 
 
 def test_from_the_command_line(
@@ -111,7 +111,18 @@ def test_from_the_command_line(
     assert "starting from" in capsys.readouterr().out
     assert parse_train(run_folder.read_config(tmp_path / "tuned")).process.start_from == "paper"
 
-    for wrong, said in (("nowhere", "start_from = 'nowhere'"), (str(first), "ppo.hidden is [512, 256, 128] here")):
+    run = tmp_path / "paper"  # a run folder goes before a shipped policy of its name
+    train_here(run, "ppo.hidden=[512,256,128]")
+    assert APP.run([*big, "start_from=paper", "hydra.run.dir=of_the_folder"]) == 0
+    assert json.loads((tmp_path / "of_the_folder/start.json").read_text())["num_timesteps"] == 16
+
+    for wrong, said in (
+        (
+            "nowhere",
+            "start_from = 'nowhere': no run folder (it has no config.yaml) and no shipped policy (there are: paper)",
+        ),
+        (str(first), "ppo.hidden is [512, 256, 128] here"),
+    ):
         assert APP.run([*big, f"start_from={wrong}", "hydra.run.dir=refused"]) == 2
         assert said in capsys.readouterr().err
         assert not (tmp_path / "refused/config.yaml").exists()

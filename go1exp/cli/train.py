@@ -58,11 +58,16 @@ def _refuse_other(run: Path, container: dict[str, Any]) -> None:
         raise ConfigError([f"{run}: holds a run with other settings of {', '.join(differ)}; use another folder"])
 
 
-def _source(start_from: str | None) -> Path | None:
-    """Return the folder of the run or shipped policy whose weights are meant."""
-    if start_from is None:
-        return None
-    return shipped_policies().get(start_from) or existing(start_from, "start_from")
+def _source(start_from: str) -> Path:
+    """Return the folder of the run or shipped policy whose weights are meant; a run folder goes first."""
+    if (Path(start_from) / "config.yaml").is_file():
+        return Path(start_from)
+    there = shipped_policies()
+    if start_from not in there:
+        known = ", ".join(there) or "none"
+        said = f"no run folder (it has no config.yaml) and no shipped policy (there are: {known})"
+        raise ConfigError([f"start_from = {start_from!r}: {said}"])
+    return there[start_from]
 
 
 def _task(container: dict[str, Any]) -> int | None:
@@ -82,11 +87,13 @@ def _task(container: dict[str, Any]) -> int | None:
     else:
         _refuse_other(run, container)
 
-    from go1exp.train import checkpoint, run_folder, trainer
+    from go1exp.train import checkpoint, run_folder, start, trainer
 
+    first = None
     try:
-        source = None if checkpoint.checkpoints(run) else _source(config.process.start_from)
-        trainer.try_out(config, source)
+        if config.process.start_from and not checkpoint.checkpoints(run):
+            first = start.read(config, _source(config.process.start_from))
+        trainer.try_out(config)
     except (Expected, ConfigError, FileNotFoundError):
         if not config.process.resume:
             discard(run)
@@ -94,7 +101,7 @@ def _task(container: dict[str, Any]) -> int | None:
     run_folder.write(run, container)
     print(f"run folder {run}")
     try:
-        trainer.train(config, container, run, source)
+        trainer.train(config, container, run, first)
     except trainer.Stopped:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             raise  # so that the jobs after this one do not start

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,16 @@ FILE = "start.json"
 """In the new run's folder: where its first weights are from."""
 
 
-def weights(config: TrainConfig, source: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the weights of ``source``'s newest checkpoint, and what ``start.json`` tells of them.
+@dataclass(frozen=True)
+class Weights:
+    """The state of a policy, and what ``start.json`` tells of it."""
+
+    policy: dict[str, Any]
+    about: dict[str, Any]
+
+
+def read(config: TrainConfig, source: Path) -> Weights:
+    """Return the weights of ``source``'s newest checkpoint.
 
     Args:
         config: the new run's.
@@ -31,7 +40,7 @@ def weights(config: TrainConfig, source: Path) -> tuple[dict[str, Any], dict[str
     differ = [
         f"{name} is {new} here and {old} there"
         for name, new, old in (
-            ("observation", *([t.key for t in c.task.observation] for c in (config, theirs))),
+            ("observation", *([t.entry.name for t in c.task.observation] for c in (config, theirs))),
             ("ppo.hidden", list(config.ppo.hidden), list(theirs.ppo.hidden)),
             ("ppo.activation", config.ppo.activation, theirs.ppo.activation),
         )
@@ -47,7 +56,7 @@ def weights(config: TrainConfig, source: Path) -> tuple[dict[str, Any], dict[str
         "iteration": state["iteration"],
         "num_timesteps": state["num_timesteps"] + timesteps_before(source),
     }
-    return state["policy"], about
+    return Weights(state["policy"], about)
 
 
 def timesteps_before(run: Path) -> int:
@@ -56,15 +65,11 @@ def timesteps_before(run: Path) -> int:
     return int(json.loads(file.read_text())["num_timesteps"]) if file.is_file() else 0
 
 
-def begin(ppo: AdaptivePPO, config: TrainConfig, source: Path, run: Path) -> None:
-    """Give ``ppo`` the weights of ``source`` (actor, critic, standard deviations), and note in ``run`` where from.
+def begin(ppo: AdaptivePPO, weights: Weights, run: Path) -> None:
+    """Give ``ppo`` the weights (actor, critic, standard deviations), and note in ``run`` where they are from.
 
     Iterations, optimiser, learning rate, robots and curriculum begin anew.
-
-    Raises:
-        ConfigError, FileNotFoundError: as ``weights``.
     """
-    policy, about = weights(config, source)
-    ppo.policy.load_state_dict(policy)
-    (run / FILE).write_text(json.dumps(about, indent=2) + "\n")
-    print(f"starting from {source}, iteration {about['iteration']}")
+    ppo.policy.load_state_dict(weights.policy)
+    (run / FILE).write_text(json.dumps(weights.about, indent=2) + "\n")
+    print(f"starting from {weights.about['run']}, iteration {weights.about['iteration']}")

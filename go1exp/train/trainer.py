@@ -46,21 +46,18 @@ def build(config: TrainConfig) -> AdaptivePPO:
     return learner(config.ppo, Go1VecEnv(core), config.process.seed, device)
 
 
-def try_out(config: TrainConfig, source: Path | None = None) -> None:
-    """Read what files the run needs, before a run folder says that this run began: build one robot, load the weights.
+def try_out(config: TrainConfig) -> None:
+    """Build one robot, where that can fail for what a file holds: before a run folder says that this run began.
 
     Raises:
-        ConfigError: if an actuator net does not fit the robot or the physics step, or ``source`` not the policy.
-        go1exp.registry.Expected: if the net's file is damaged.
-        FileNotFoundError: if ``source`` holds no checkpoint.
+        ConfigError: if an actuator net does not fit the robot or the physics step.
+        go1exp.registry.Expected: if its file is damaged.
     """
-    if source is not None:
-        start.weights(config, source)
     if any("file" in term.parameters for term, _ in drives(config.task.actuator)):
         Go1Core(config.task, 1)
 
 
-def train(config: TrainConfig, container: dict[str, Any], run: Path, source: Path | None = None) -> AdaptivePPO:
+def train(config: TrainConfig, container: dict[str, Any], run: Path, first: start.Weights | None = None) -> AdaptivePPO:
     """Train in ``run``, from its newest checkpoint if it has one; return the learner.
 
     SIGINT and SIGTERM end training after the iteration under way, with a checkpoint; a second one ends it at once.
@@ -69,7 +66,7 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, source: Pat
         config: what to train.
         container: the same as plain data, for the loggers.
         run: the run folder, already written.
-        source: run folder whose weights to begin with, unless ``run`` has a checkpoint.
+        first: weights to begin with, unless ``run`` has a checkpoint.
 
     Raises:
         Stopped: after such a signal.
@@ -81,8 +78,8 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, source: Pat
         state, path = checkpoint.load_latest(run)
         checkpoint.restore(ppo, state)
         print(f"continuing from {path}")
-    elif source is not None:
-        start.begin(ppo, config, source, run)
+    elif first is not None:
+        start.begin(ppo, first, run)
     env = ppo.get_env()
     assert isinstance(env, Go1VecEnv)
     logger = metrics.make_logger(config.logger, run, ppo.iteration, container)
