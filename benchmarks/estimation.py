@@ -36,7 +36,7 @@ from go1exp.importers.source import files
 from go1exp.record.sensors import Channel, SensorConfig
 from go1exp.record.simulate import Rig, Walk, play, play_policy
 from go1exp.recording import VECTORS, Recording, RecordingError
-from go1exp.registry import bind
+from go1exp.schema.registry import bind
 
 COMMANDS: dict[str, object] = {
     "lin_vel_x": [-0.5, 1.5],

@@ -19,7 +19,7 @@ from go1exp.compose import compose
 from go1exp.config import parse_parts
 from go1exp.record import plan, simulate
 from go1exp.record.sensors import Channel, SensorConfig
-from go1exp.registry import Term, members
+from go1exp.schema.registry import Term, members
 
 HIDDEN = [
     "effect=[lag,coulomb,torque_speed_limit]",

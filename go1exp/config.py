@@ -18,9 +18,10 @@ import go1exp.actuator
 import go1exp.effects
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
-from go1exp.backends import BACKENDS, BackendConfig, CpuBackend
 from go1exp.effects.rules import drive_problems
-from go1exp.registry import (
+from go1exp.robot import RobotConfig
+from go1exp.schema.backends import BACKENDS, BackendConfig, CpuBackend
+from go1exp.schema.registry import (
     STRICT,
     ConfigError,
     Fraction,
@@ -32,7 +33,6 @@ from go1exp.registry import (
     explain,
     unknown_name,
 )
-from go1exp.robot import RobotConfig
 from go1exp.terrain import TerrainConfig
 
 Count = Annotated[int, Field(ge=1)]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 
-from go1exp.joint_values import JointValues, spread
-from go1exp.randomness import EnvRandom
+from go1exp.schema.joint_values import JointValues, spread
+from go1exp.tensors.randomness import EnvRandom
 
 if TYPE_CHECKING:
     from torch import Tensor

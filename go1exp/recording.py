@@ -34,8 +34,8 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from go1exp.registry import STRICT, Expected, NonNegative, Positive, explain, nearest
 from go1exp.robot import JOINTS, LEGS
+from go1exp.schema.registry import STRICT, Expected, NonNegative, Positive, explain, nearest
 
 if TYPE_CHECKING:
     import pyarrow.parquet as pq

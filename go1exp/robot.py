@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import ConfigDict
 
-from go1exp.registry import STRICT, NonNegative, Positive
+from go1exp.schema.registry import STRICT, NonNegative, Positive
 
 LEGS = ("FR", "FL", "RR", "RL")
 """Leg order of the vendor SDK, used for every ``(N, 4)`` array."""

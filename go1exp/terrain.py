@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict
 
-from go1exp.registry import STRICT
+from go1exp.schema.registry import STRICT
 
 KINDS = ("flat", "tiles")
 """Allowed values of `TerrainConfig.kind`."""

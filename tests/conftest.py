@@ -23,7 +23,7 @@ from go1exp.config import TaskConfig, parse_task
 from go1exp.drive import DriveSetup
 from go1exp.env.core import Go1Core
 from go1exp.fit.net import ActuatorNet, NetInfo, Provenance, group_names
-from go1exp.randomness import EnvRandom
+from go1exp.tensors.randomness import EnvRandom
 
 torch.set_num_threads(1)
 

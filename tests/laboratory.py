@@ -12,7 +12,7 @@ from go1exp.compose import compose
 from go1exp.config import parse_parts
 from go1exp.record import plan, simulate
 from go1exp.recording import Recording
-from go1exp.registry import bind
+from go1exp.schema.registry import bind
 
 
 def recorded(

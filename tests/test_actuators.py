@@ -21,8 +21,8 @@ from go1exp.drive import DriveSetup
 from go1exp.effects.stack import EffectStack
 from go1exp.env.core import Go1Core
 from go1exp.fit.net import ActuatorNet, NetFileError, load
-from go1exp.randomness import EnvRandom
-from go1exp.registry import ConfigError, Term, members
+from go1exp.schema.registry import ConfigError, Term, members
+from go1exp.tensors.randomness import EnvRandom
 
 Drives = Callable[..., DriveSetup]
 EFFORT = np.array([23.7, 23.7, 35.55] * 4)

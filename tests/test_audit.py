@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp import data_root, excitations, registry
+from go1exp import data_root, excitations
 from go1exp.audit import AuditReport, audit, audit_file, signals
 from go1exp.recording import Meta, Recording, RecordingError, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
+from go1exp.schema import registry
 
 RATE = 500.0
 SECONDS = 6

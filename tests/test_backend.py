@@ -19,7 +19,7 @@ from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
-from go1exp.registry import members
+from go1exp.schema.registry import members
 from go1exp.terrain import build_terrain
 
 FEET = [f"{leg}_foot" for leg in robot.LEGS]

@@ -16,12 +16,13 @@ import pytest
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from go1exp import data_root, registry
+from go1exp import data_root
 from go1exp.cli import ONE_BLAS_THREAD, SUBVERBS, VERBS, _by_name, main
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.evaluate.camera import RenderingUnavailable, choose_gl
+from go1exp.schema import registry
 from go1exp.train import run_folder, trainer
 
 COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"

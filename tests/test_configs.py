@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 
 import go1exp.importers
 import go1exp.record.policy  # noqa: F401  (registers every importer and excitation)
-from go1exp import cli, data_root, registry
+from go1exp import cli, data_root
 from go1exp.cli import listing, settings
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.record import RIG
@@ -31,7 +31,8 @@ from go1exp.env.core import Go1Core
 from go1exp.fit import FitSettings
 from go1exp.gap.models import parse_model
 from go1exp.mdp import rewards
-from go1exp.registry import ConfigError, Term
+from go1exp.schema import registry
+from go1exp.schema.registry import ConfigError, Term
 
 CONF = data_root() / "conf"
 DOCS = Path(__file__).parents[1] / "docs"

@@ -19,9 +19,9 @@ from go1exp.config import TaskConfig
 from go1exp.drive import DriveSetup
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
+from go1exp.mdp.types import StepResult
 from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.registry import Entry, Term
-from go1exp.types import StepResult
+from go1exp.schema.registry import Entry, Term
 
 Make = Callable[..., Go1Core]
 

@@ -24,8 +24,8 @@ from go1exp.effects.two_mass import TwoMass, resonance
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
-from go1exp.registry import bind
+from go1exp.schema.registry import bind
+from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import build_terrain
 
 G = 9.81

@@ -27,8 +27,8 @@ from go1exp.effects.base import Effect
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
-from go1exp.registry import Term, bind
+from go1exp.schema.registry import Term, bind
+from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import build_terrain
 
 DT = 0.002

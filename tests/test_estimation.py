@@ -43,7 +43,7 @@ from go1exp.record.plan import Episode, make_motion
 from go1exp.record.sensors import Channel, SensorConfig
 from go1exp.record.simulate import Rig, play
 from go1exp.recording import VECTORS
-from go1exp.registry import ConfigError, bind
+from go1exp.schema.registry import ConfigError, bind
 
 GRAVITY = np.array([0.0, 0.0, 9.81])
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

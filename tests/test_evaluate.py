@@ -21,7 +21,7 @@ from go1exp.evaluate import table
 from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy, load_policy
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 from go1exp.train import checkpoint, run_folder, trainer
 
 MakeTask = Callable[..., TaskConfig]

@@ -35,7 +35,7 @@ from hydra.core.global_hydra import GlobalHydra
 from mujoco.batch import Batch
 from omegaconf import OmegaConf
 
-from go1exp import data_root, registry
+from go1exp import data_root
 from go1exp.cli import settings
 from go1exp.cli.app import App
 from go1exp.cli.record import RIG
@@ -45,10 +45,11 @@ from go1exp.deploy.bundle import loads
 from go1exp.deploy.walk import STATUS
 from go1exp.env.core import Go1Core
 from go1exp.export.build import build
+from go1exp.mdp.types import Snapshot
 from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.registry import ConfigError, Expected, Range
+from go1exp.schema import registry
+from go1exp.schema.registry import ConfigError, Expected, Range
 from go1exp.train import run_folder, start, trainer
-from go1exp.types import Snapshot
 from tests.lockstep import lockstep
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")

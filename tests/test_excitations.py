@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from go1exp import excitations, registry, robot
+from go1exp import excitations, robot
 from go1exp.excitations import ExcitationError, Motion
+from go1exp.schema import registry
 
 RATE = 500.0
 MEMBERS = registry.members("excitation")

@@ -40,10 +40,10 @@ from go1exp.export import graph
 from go1exp.export.build import build, command_ranges, gains
 from go1exp.export.graph import DeployedPolicy, ExportError, inputs_of, to_onnx
 from go1exp.export.trace import readings
-from go1exp.registry import Entry, Term
+from go1exp.mdp.types import Snapshot
+from go1exp.schema.registry import Entry, Term
 from go1exp.train import run_folder, trainer
 from go1exp.train.ppo import GaussianPolicy
-from go1exp.types import Snapshot
 from tests.small_run import SMALL
 
 OBSERVATIONS = sorted(p.stem for p in (data_root() / "conf/observation").glob("*.yaml"))

@@ -17,16 +17,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from go1exp import data_root, registry
+from go1exp import data_root
 from go1exp.compose import compose
 from go1exp.config import TrainConfig, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
-from go1exp.registry import Expected
+from go1exp.mdp.types import Snapshot, StepResult
+from go1exp.schema import registry
+from go1exp.schema.registry import Expected
 from go1exp.train import checkpoint, run_folder, trainer
 from go1exp.train.metrics import CsvWriter
 from go1exp.train.ppo import AdaptivePPO
-from go1exp.types import Snapshot, StepResult
 
 SMALL = (
     "ppo=paper",

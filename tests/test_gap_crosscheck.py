@@ -22,7 +22,7 @@ from go1exp.config import parse_parts
 from go1exp.excitations import Motion
 from go1exp.record import plan
 from go1exp.record.simulate import Rig, play
-from go1exp.registry import bind
+from go1exp.schema.registry import bind
 
 QUIET = [f"sensors.{name}={{noise: 0.0, step: 0.0}}" for name in ("q", "qd", "tau_est", "gyro", "acc", "attitude")]
 SIGNED = ("base_tilt", "encoder_offset", "link_com", "cogging", "parallel_stiffness")

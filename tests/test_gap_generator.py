@@ -56,7 +56,7 @@ def test_the_tolerances_are_those_of_the_library() -> None:
     import math
 
     import go1exp.config  # noqa: F401  (registers every effect)
-    from go1exp.registry import members
+    from go1exp.schema.registry import members
 
     library: dict[str, dict[str, float]] = {}
     nulls: dict[tuple[str, str], float] = {}

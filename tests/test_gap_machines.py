@@ -27,7 +27,7 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.windows import averaged
 from go1exp.importers import import_recordings
 from go1exp.recording import Meta, Recording, joint_channel
-from go1exp.registry import ConfigError, bind
+from go1exp.schema.registry import ConfigError, bind
 
 MODELS = sorted(f.stem for f in (data_root() / "conf/model").glob("*.yaml") if f.stem != "go1")
 DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))

@@ -28,7 +28,7 @@ from go1exp.gap.report.figures import shown_joints, split_channel
 from go1exp.gap.report.html import page
 from go1exp.gap.report.tables import Cell, heat_maps, short
 from go1exp.gap.result import Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay, Verdict
-from go1exp.registry import bind, members
+from go1exp.schema.registry import bind, members
 
 CALVES = tuple(j for j in robot.JOINTS if j.endswith("calf"))
 REGIMES = ("stick", "reversal", "slow", "fast", "high torque", "after an edge", "drives off", "small angle")

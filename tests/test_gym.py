@@ -22,7 +22,7 @@ from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.env.gym_env import Go1Env
 from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 
 Make = Callable[..., Go1Core]
 

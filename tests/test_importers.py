@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from go1exp import data_root, recording
 from go1exp.importers import import_recordings
 from go1exp.recording import Recording, RecordingError
-from go1exp.registry import ConfigError, members
 from go1exp.robot import JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE
+from go1exp.schema.registry import ConfigError, members
 
 DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
 

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from go1exp import data_root, registry
+from go1exp import data_root
 from go1exp.cli import MODULES, SUBVERBS, VERBS
+from go1exp.schema import registry
 
 PACKAGE = data_root() / "go1exp"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -38,20 +39,14 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "__init__.py": (*FOREIGN, "torch", "numpy", "go1exp"),
     "errors.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
-    "types.py": (*FOREIGN, "go1exp.mdp", *UP),
-    "backends.py": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    "registry.py": (*FOREIGN, "torch", "go1exp"),
-    "randomness.py": (*FOREIGN, "go1exp"),
-    "memory.py": (*FOREIGN, "go1exp"),
-    "threads.py": (*FOREIGN, "go1exp"),
+    "schema/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    "schema/registry.py": (*FOREIGN, "torch", "go1exp"),
+    "schema/joint_values.py": (*FOREIGN, "torch", "go1exp"),
+    "tensors/": (*FOREIGN, "go1exp.schema", "go1exp.robot", "go1exp.mdp", *UP),
     "terrain.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "config.py": (*FOREIGN, "omegaconf", "go1exp.compose", *UP),
     "gym.py": ("stable_baselines3", "hydra", "omegaconf", "mujoco", *up("env")),
-    "joint_values.py": (*FOREIGN, "torch", "go1exp"),
-    "rotation.py": (*FOREIGN, "go1exp"),
-    "delay_line.py": (*FOREIGN, "go1exp.registry", "go1exp.robot", "go1exp.mdp", *UP),
-    "constants.py": (*FOREIGN, "go1exp"),
-    "drive.py": (*FOREIGN, "go1exp.registry", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
+    "drive.py": (*FOREIGN, "go1exp.schema.registry", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
     # recordings, which need no robot and no engine
     "recording.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "importers/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
@@ -62,6 +57,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "compose.py": ("mujoco", "gymnasium", "stable_baselines3", "torch", "go1exp.config", *UP),
     # the MDP knows no engine, the engine no MDP
     "mdp/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.actuator", *UP),
+    "mdp/types.py": (*FOREIGN, "go1exp"),
     # an actuator may load a net: the file's format, not the way it is fitted
     "actuator/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *up("fit")),
     "effects/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *UP),
@@ -91,8 +87,18 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "export/": ("mujoco", "gymnasium", "hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     # the robot's computer: nothing of the above, nor what describes it
     "deploy/": (
-        *(*FOREIGN, "torch", "onnx", "omegaconf", "pydantic", "scipy", "rich", "go1exp.registry", "go1exp.config"),
-        *("go1exp.robot", "go1exp.types", "go1exp.compose", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
+        *(
+            *FOREIGN,
+            "torch",
+            "onnx",
+            "omegaconf",
+            "pydantic",
+            "scipy",
+            "rich",
+            "go1exp.schema.registry",
+            "go1exp.config",
+        ),
+        *("go1exp.robot", "go1exp.compose", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
     ),
     # the simulated robot: the runtime's messages on one side, the plant on the other
     "sim_robot/": (

@@ -18,7 +18,7 @@ from stable_baselines3.common import logger as sb3_logger
 
 from go1exp.compose import compose
 from go1exp.config import LoggerConfig, WandbConfig, parse_train
-from go1exp.registry import Expected
+from go1exp.schema.registry import Expected
 from go1exp.train import metrics, run_folder, trainer
 from go1exp.train.metrics import CsvWriter, make_logger
 

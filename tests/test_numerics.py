@@ -22,8 +22,8 @@ from go1exp.config import MANY_TERMS, TaskConfig, parse_task
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
-from go1exp.randomness import EnvRandom
-from go1exp.registry import bind, members
+from go1exp.schema.registry import bind, members
+from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import build_terrain
 
 GAINS = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))

@@ -21,10 +21,10 @@ from go1exp.compose import compose
 from go1exp.config import PPOConfig, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.registry import ConfigError
+from go1exp.mdp.types import StepResult
+from go1exp.schema.registry import ConfigError
 from go1exp.train import trainer
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, linear_rate, policy_settings
-from go1exp.types import StepResult
 
 TINY = (
     "ppo=paper",

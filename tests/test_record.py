@@ -25,7 +25,7 @@ from go1exp.config import parse_parts
 from go1exp.record import plan, simulate
 from go1exp.record.sensors import Channel, SensorConfig
 from go1exp.recording import Recording, read_folder
-from go1exp.registry import ConfigError, bind
+from go1exp.schema.registry import ConfigError, bind
 
 Make = Callable[..., list[Recording]]
 NOISELESS = [f"sensors.{name}={{noise: 0.0, step: 0.0}}" for name in ("q", "qd", "tau_est", "gyro", "acc", "attitude")]

@@ -13,8 +13,8 @@ import torch
 
 from go1exp import robot
 from go1exp.config import TaskConfig
-from go1exp.registry import members
-from go1exp.types import Snapshot
+from go1exp.mdp.types import Snapshot
+from go1exp.schema.registry import members
 
 WALK = [0.5, 0.0, 0.0]
 """A command, so that the robot counts as moving."""

@@ -11,7 +11,7 @@ import torch
 from go1exp.cli.settings import shipped_policies, trained
 from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 from go1exp.train import checkpoint
 
 NAMES = sorted(shipped_policies())

@@ -15,7 +15,7 @@ from go1exp.cli.train import APP
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.evaluate.policy import load_run
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 from go1exp.train import checkpoint, run_folder, start, trainer
 
 SMALL = (

@@ -10,8 +10,8 @@ from go1exp.actuator.envelope import envelope
 from go1exp.actuator.pd import Gain
 from go1exp.actuator.setup import Gains
 from go1exp.drive import DriveSetup
-from go1exp.joint_values import JointValues, each_within
-from go1exp.registry import actuator
+from go1exp.schema.joint_values import JointValues, each_within
+from go1exp.schema.registry import actuator
 
 if TYPE_CHECKING:
     from torch import Tensor

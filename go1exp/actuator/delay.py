@@ -9,9 +9,9 @@ from pydantic import AfterValidator, Field
 
 from go1exp.actuator.setup import Actuator
 from go1exp.actuator.wrapped import Drive, build
-from go1exp.delay_line import DelayLine
 from go1exp.drive import DriveSetup
-from go1exp.registry import actuator, ordered
+from go1exp.schema.registry import actuator, ordered
+from go1exp.tensors.delay_line import DelayLine
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -13,8 +13,8 @@ from pydantic_core import PydanticKnownError
 from go1exp import data_root, robot
 from go1exp.actuator.grouped_mlp import FEWEST, GroupedMLP
 from go1exp.drive import DriveSetup
-from go1exp.memory import Memory
-from go1exp.registry import ConfigError, actuator
+from go1exp.schema.registry import ConfigError, actuator
+from go1exp.tensors.memory import Memory
 
 if TYPE_CHECKING:
     from torch import Tensor

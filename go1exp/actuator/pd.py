@@ -8,8 +8,8 @@ import torch
 
 from go1exp.actuator.setup import Gains
 from go1exp.drive import DriveSetup
-from go1exp.joint_values import JointValues, each_within
-from go1exp.registry import actuator
+from go1exp.schema.joint_values import JointValues, each_within
+from go1exp.schema.registry import actuator
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from go1exp.memory import Memory
+from go1exp.tensors.memory import Memory
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -8,7 +8,7 @@ from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
 from go1exp.drive import DriveSetup
-from go1exp.registry import bind, members
+from go1exp.schema.registry import bind, members
 
 
 def _checked(settings: dict[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from go1exp.config import TaskConfig
 from go1exp.fit import FitSettings, fit
 from go1exp.record import plan, simulate
 from go1exp.record.sensors import SensorConfig
-from go1exp.registry import Term, members
+from go1exp.schema.registry import Term, members
 
 EFFECTS = {
     "coulomb": {"bound": 0.2},

@@ -16,13 +16,13 @@ from mujoco.batch import Batch
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from go1exp import robot
-from go1exp.backends import CpuBackend
 from go1exp.bench.measure import Subject, rates, ratio
 from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.gym_env import Go1Env
-from go1exp.joint_values import spread
 from go1exp.physics.scene import build_model
+from go1exp.schema.backends import CpuBackend
+from go1exp.schema.joint_values import spread
 from go1exp.terrain import build_terrain
 
 ACTION_SCALE = 0.5

@@ -15,16 +15,16 @@ import numpy as np
 import torch
 
 from go1exp import robot
-from go1exp.backends import WarpBackend
 from go1exp.bench.env import ACTION_SCALE
 from go1exp.bench.measure import Subject, rates, ratio
 from go1exp.config import TaskConfig, TrainConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.engine import make_backend
 from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.joint_values import spread
 from go1exp.physics.scene import build_model
-from go1exp.registry import ConfigError, Term, members
+from go1exp.schema.backends import WarpBackend
+from go1exp.schema.joint_values import spread
+from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.terrain import build_terrain
 from go1exp.train import trainer
 from go1exp.train.ppo import AdaptivePPO

@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import as_container, config_folder, flat_keys, register_groups
-from go1exp.registry import ConfigError, Expected, nearest, unknown_name
+from go1exp.schema.registry import ConfigError, Expected, nearest, unknown_name
 
 BAD_CONFIG, FAILED, STOPPED, READER_LEFT = 2, 1, 130, 141
 """Exit statuses: configuration refused before anything was built; the work failed; a signal ended it (the last: that of

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.config import TaskConfig, TrainConfig

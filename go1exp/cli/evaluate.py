@@ -7,7 +7,7 @@ from typing import Any
 
 from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 
 
 def _task(container: dict[str, Any]) -> None:

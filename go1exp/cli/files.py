@@ -10,7 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 
 PATHS = {"model": "mjcf"}
 """Group -> key of its files that names another file, from where the file itself lies."""

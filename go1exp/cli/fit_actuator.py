@@ -8,7 +8,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
-from go1exp.registry import ConfigError, explain
+from go1exp.schema.registry import ConfigError, explain
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from go1exp.cli.app import App, spinner
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb

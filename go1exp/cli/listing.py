@@ -13,8 +13,8 @@ def _task(container: dict[str, Any]) -> None:
     import go1exp.excitations
     import go1exp.importers
     import go1exp.record.policy  # noqa: F401  (registers every member)
-    from go1exp import registry
     from go1exp.cli.settings import ListSettings, parse
+    from go1exp.schema import registry
 
     settings = parse(ListSettings, container)
     choices = _choices()
@@ -30,7 +30,7 @@ def _task(container: dict[str, Any]) -> None:
 
 
 def _print_group(group: str, choices: list[tuple[str, str]], what: str) -> None:
-    from go1exp import registry
+    from go1exp.schema import registry
 
     terms = registry.members(group)
     print(group)

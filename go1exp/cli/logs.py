@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.recording import Recording

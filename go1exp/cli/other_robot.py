@@ -19,7 +19,7 @@ def split(container: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         ConfigError: with every problem of the choices.
     """
     from go1exp.config import parse_parts
-    from go1exp.registry import ConfigError
+    from go1exp.schema.registry import ConfigError
 
     chosen = {name: container[name] for name in CHOICES if container.get(name) is not None}
     parts, problems = parse_parts(chosen, tuple(chosen))
@@ -36,7 +36,7 @@ def replaced(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
     """
     from go1exp import robot
     from go1exp.effects.rules import drive_problems
-    from go1exp.registry import ConfigError
+    from go1exp.schema.registry import ConfigError
 
     changed = dataclasses.replace(task, **parts)
     if problems := drive_problems(changed.actuator, changed.effect, robot.JOINTS):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
-from go1exp.registry import ConfigError, Term, bind
+from go1exp.schema.registry import ConfigError, Term, bind
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import RecordSettings

@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from go1exp import data_root
 from go1exp.gap.result import GapSettings
 from go1exp.record.plan import Wishes
-from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
+from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
 from go1exp.sim_robot.settings import SimConfig
 
 T = TypeVar("T")

@@ -13,7 +13,7 @@ from go1exp.cli.app import STOPPED, App, discard, run_dir
 from go1exp.cli.settings import run_folder as existing
 from go1exp.cli.settings import shipped_policies
 from go1exp.compose import config_folder, key_values
-from go1exp.registry import ConfigError, Expected
+from go1exp.schema.registry import ConfigError, Expected
 
 RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "backend")
 """Settings that a resumed run may change: none of them changes what was computed so far (the last three may change

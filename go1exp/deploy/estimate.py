@@ -29,7 +29,7 @@ def settings(given: Mapping[str, Any], **changes: Any) -> FilterConfig:
     """Return the filter's settings from a bundle's metadata; a Go1's if it has none; ``changes`` replace some.
 
     Raises:
-        go1exp.registry.ConfigError: if something is missing, unknown or of a wrong value.
+        go1exp.schema.registry.ConfigError: if something is missing, unknown or of a wrong value.
     """
     if not given:
         return go1(**changes)

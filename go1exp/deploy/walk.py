@@ -108,7 +108,7 @@ def estimator_of(bundle: Bundle, safety: Safety, contact: str | None) -> Estimat
     ``contact`` is ``torque`` for a robot whose feet's sensors are not calibrated; None leaves the bundle's choice.
 
     Raises:
-        go1exp.registry.ConfigError: if the bundle's settings are not such.
+        go1exp.schema.registry.ConfigError: if the bundle's settings are not such.
         go1exp.estimation.EstimatorError: if the compiled filter is missing.
     """
     from go1exp.deploy.estimate import TORQUE

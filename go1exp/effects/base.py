@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from go1exp.drive import DriveSetup, ModelFields
-from go1exp.joint_values import JointValues, each_within
-from go1exp.memory import Memory
+from go1exp.schema.joint_values import JointValues, each_within
+from go1exp.tensors.memory import Memory
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -9,8 +9,8 @@ import torch
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Measured, Param
-from go1exp.registry import effect
-from go1exp.rotation import quat_multiply
+from go1exp.schema.registry import effect
+from go1exp.tensors.rotation import quat_multiply
 
 if TYPE_CHECKING:
     from torch import Tensor

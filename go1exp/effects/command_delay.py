@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Param
 from go1exp.effects.delayed import Delayed
-from go1exp.registry import effect
+from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor

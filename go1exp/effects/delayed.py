@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from go1exp.delay_line import DelayLine
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Effect
+from go1exp.tensors.delay_line import DelayLine
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from go1exp.joint_values import JointValues
+    from go1exp.schema.joint_values import JointValues
 
 
 class Delayed(Effect):

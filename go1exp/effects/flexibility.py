@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Gears, Param
-from go1exp.registry import effect
+from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
-from go1exp.registry import effect
+from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor

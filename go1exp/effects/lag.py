@@ -8,12 +8,12 @@ import torch
 
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Effect, Param
-from go1exp.registry import effect
+from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from go1exp.joint_values import JointValues
+    from go1exp.schema.joint_values import JointValues
 
 
 @effect("lag")

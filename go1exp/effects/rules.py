@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from go1exp.joint_values import spread
-from go1exp.registry import Term, members, unknown_name
+from go1exp.schema.joint_values import spread
+from go1exp.schema.registry import Term, members, unknown_name
 
 
 def drives(actuator: Term) -> Iterator[tuple[Term, str]]:

@@ -12,8 +12,8 @@ from go1exp.actuator.setup import Actuator, HasGains
 from go1exp.drive import DriveSetup, ModelFields
 from go1exp.effects.base import Effect, Gears, Measured
 from go1exp.effects.two_mass import TwoMass
-from go1exp.joint_values import spread
-from go1exp.registry import Term
+from go1exp.schema.joint_values import spread
+from go1exp.schema.registry import Term
 
 HOOKS = (
     *("on_target", "on_encoder", "on_gains", "on_drive", "on_transmission", "on_gears"),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.effects.base import Effect, Param
-from go1exp.registry import effect
+from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -9,7 +9,7 @@ import torch
 
 from go1exp.actuator.envelope import envelope
 from go1exp.effects.base import Effect, Param
-from go1exp.registry import effect
+from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.backends import WarpBackend
 from go1exp.config import TaskConfig
 from go1exp.env.engine import CapturedStep, make_backend
 from go1exp.env.evidence import Evidence, accuse
@@ -24,11 +23,12 @@ from go1exp.mdp.clearance import lift
 from go1exp.mdp.foot_timers import FootTimers
 from go1exp.mdp.ground import GroundHeight
 from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
-from go1exp.rotation import projected_gravity, rotate_inverse
+from go1exp.schema.backends import WarpBackend
+from go1exp.tensors.randomness import EnvRandom
+from go1exp.tensors.rotation import projected_gravity, rotate_inverse
 from go1exp.terrain import build_terrain
-from go1exp.types import Snapshot, StepResult
 
 THIGHS, CALVES, TRUNK = slice(0, 4), slice(4, 8), slice(8, 13)
 """Columns of the link contact block (``physics/scene.py``); the trunk's are trunk with head, and the four hips."""

@@ -8,11 +8,11 @@ from typing import Any, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from go1exp.backends import BackendConfig, CpuBackend
+from go1exp.mdp.types import StepResult
 from go1exp.physics.backend import PhysicsBackend
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors
-from go1exp.types import StepResult
+from go1exp.schema.backends import BackendConfig, CpuBackend
 
 T = TypeVar("T")
 
@@ -21,8 +21,8 @@ def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: 
     """Build the physics engine that the configuration names.
 
     Raises:
-        go1exp.registry.Expected: if its packages are not installed.
-        go1exp.registry.ConfigError: if its device is not there.
+        go1exp.schema.registry.Expected: if its packages are not installed.
+        go1exp.schema.registry.ConfigError: if its device is not there.
     """
     if isinstance(config, CpuBackend):
         return MujocoCpu(model, sensors, num_envs, config.threads)

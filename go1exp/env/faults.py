@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from go1exp.registry import Expected
+from go1exp.schema.registry import Expected
 
 
 class NumericalFault(Expected):

@@ -27,7 +27,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         render_mode: ``rgb_array`` or None.
 
     Raises:
-        go1exp.registry.ConfigError: if an override does not fit.
+        go1exp.schema.registry.ConfigError: if an override does not fit.
         go1exp.env.faults.NumericalFault: from ``step`` when a value is not finite.
     """
 

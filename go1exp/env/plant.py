@@ -24,11 +24,11 @@ from go1exp.actuator.setup import Actuator
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Measured
 from go1exp.effects.stack import EffectStack
+from go1exp.mdp.types import Snapshot
 from go1exp.physics.backend import PhysicsBackend
-from go1exp.randomness import EnvRandom
-from go1exp.registry import Term
 from go1exp.robot import RobotConfig
-from go1exp.types import Snapshot
+from go1exp.schema.registry import Term
+from go1exp.tensors.randomness import EnvRandom
 
 FRICTION, ARMATURE = "dof_frictionloss", "dof_armature"
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from go1exp import robot
 from go1exp.env.core import Go1Core
-from go1exp.types import StepResult
+from go1exp.mdp.types import StepResult
 
 
 def spaces(core: Go1Core) -> tuple[gym.spaces.Box, gym.spaces.Box]:

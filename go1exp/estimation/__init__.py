@@ -14,7 +14,7 @@ import numpy as np
 
 from go1exp.estimation.config import ChainLeg, FilterConfig, from_json, go1, load, scaler, to_json
 from go1exp.estimation.readings import WIDTH, Status, sample
-from go1exp.registry import Expected
+from go1exp.schema.registry import Expected
 
 if TYPE_CHECKING:
     from types import ModuleType

@@ -10,8 +10,8 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
 from go1exp import data_root
-from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, explain
 from go1exp.robot import FOOT_RADIUS, HIP_OFFSET, LEGS, LINK_LENGTHS
+from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, explain
 
 Vector = tuple[float, float, float]
 PositiveVector = tuple[Positive, Positive, Positive]

@@ -26,7 +26,7 @@ from torch import Tensor
 from go1exp.env.core import Go1Core
 from go1exp.physics.scene import build_model
 from go1exp.physics.terrain_geom import FLOOR
-from go1exp.registry import Expected
+from go1exp.schema.registry import Expected
 from go1exp.terrain import Terrain
 
 Picture = NDArray[np.uint8]

@@ -11,7 +11,7 @@ from go1exp.estimation import WIDTH, go1, make_filter
 from go1exp.estimation import readings as column
 from go1exp.evaluate.observed import columns
 from go1exp.record.tape import sample
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 from go1exp.sim_robot.machine import noisy
 
 TERM = "base_linear_velocity"

@@ -25,7 +25,7 @@ def load_run(run: Path, which: Path | None = None) -> tuple[TrainConfig, Policy,
 
     Raises:
         FileNotFoundError: if ``run`` is no run folder or holds no checkpoint.
-        go1exp.registry.ConfigError: if its configuration is not one that this version knows.
+        go1exp.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
     config = parse_train(run_folder.read_config(run))
     policy, about = load_policy(run, config.ppo, which)

@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import torch
 
-from go1exp.backends import CpuBackend
 from go1exp.config import TaskConfig, time_rules
 from go1exp.deploy.past import PastActions
 from go1exp.env.core import Go1Core
@@ -18,7 +17,8 @@ from go1exp.evaluate.estimated import EstimatedVelocity
 from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy
 from go1exp.mdp.commands import FixedVelocity
-from go1exp.registry import ConfigError, Term, members
+from go1exp.schema.backends import CpuBackend
+from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.terrain import TerrainConfig
 
 Command = tuple[float, float, float]

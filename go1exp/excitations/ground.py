@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from go1exp.excitations.motion import ExcitationError, Motion, always_on, check, glide
-from go1exp.registry import Annotated, Field, PositiveRange, excitation
+from go1exp.schema.registry import Annotated, Field, PositiveRange, excitation
 
 Depth = Annotated[float, Field(gt=0, le=0.6)]
 """Share of the standing height; a leg folds no farther than some 0.6."""

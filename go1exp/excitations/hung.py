@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from go1exp.excitations.motion import Motion, PerKind, always_on, check, ease, spread, swing
-from go1exp.registry import Annotated, Field, Fraction, NonNegative, Positive, PositiveRange, excitation
+from go1exp.schema.registry import Annotated, Field, Fraction, NonNegative, Positive, PositiveRange, excitation
 
 Lines = Annotated[int, Field(ge=1, le=64)]
 """Number of sines in a sum."""

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from go1exp.registry import Expected, Positive
+from go1exp.schema.registry import Expected, Positive
 
 PerKind = Annotated[tuple[Positive, ...], Field(min_length=1)]
 """One value for each joint of a limb (Go1: hip, thigh, calf), repeated over the limbs; a single one fits all joints."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from go1exp.excitations.motion import Motion, PerKind, always_on, check, glide, room
-from go1exp.registry import Annotated, Field, Fraction, Positive, PositiveRange, excitation
+from go1exp.schema.registry import Annotated, Field, Fraction, Positive, PositiveRange, excitation
 
 Joints = Annotated[int, Field(ge=1)]
 """A number of joints."""

@@ -24,10 +24,10 @@ from go1exp.estimation import go1, to_json
 from go1exp.evaluate.policy import load_network
 from go1exp.export.graph import DeployedPolicy, ExportError, blocks, to_onnx
 from go1exp.export.trace import record
-from go1exp.joint_values import spread
-from go1exp.registry import Term
 from go1exp.robot import RobotConfig
-from go1exp.threads import one_thread
+from go1exp.schema.joint_values import spread
+from go1exp.schema.registry import Term
+from go1exp.tensors.threads import one_thread
 from go1exp.train import run_folder
 
 PACKAGES = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy", "mujoco-core")
@@ -70,7 +70,7 @@ def build(
             missing, or the robot falls before the trace has a row.
         go1exp.deploy.archive.BundleError: if ONNX, torch and the environment do not agree.
         FileNotFoundError: if ``run`` is no run folder or holds no checkpoint.
-        go1exp.registry.ConfigError: if its configuration is not one that this version knows.
+        go1exp.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
     config = parse_train(run_folder.read_config(run))
     network, about = load_network(run, config.ppo, checkpoint)

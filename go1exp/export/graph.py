@@ -22,9 +22,9 @@ from go1exp import robot
 from go1exp.config import ActionConfig
 from go1exp.deploy.metadata import Block, Port
 from go1exp.mdp.actions import clipped, joint_target
-from go1exp.registry import Expected, Term
-from go1exp.rotation import projected_gravity
-from go1exp.types import Snapshot
+from go1exp.mdp.types import Snapshot
+from go1exp.schema.registry import Expected, Term
+from go1exp.tensors.rotation import projected_gravity
 
 if TYPE_CHECKING:
     from go1exp.train.ppo import GaussianPolicy

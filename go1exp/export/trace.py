@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from torch import Tensor
 
-from go1exp.backends import CpuBackend
 from go1exp.config import TaskConfig
 from go1exp.deploy.metadata import Port
 from go1exp.effects.base import Measured
 from go1exp.env.core import Go1Core
+from go1exp.schema.backends import CpuBackend
 
 
 def readings(core: Go1Core) -> dict[str, Tensor]:

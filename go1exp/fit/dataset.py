@@ -18,7 +18,7 @@ from go1exp.fit.net import InputName, Target
 from go1exp.fit.settings import FitError
 from go1exp.fit.smoothing import smooth_motion
 from go1exp.recording import Meta, Recording
-from go1exp.registry import unknown_name
+from go1exp.schema.registry import unknown_name
 
 JointTorque = Callable[[Recording], np.ndarray]
 """Recording -> torque at its joints ``(T, J)``, N m, in the order of ``meta.joints``; NaN where it is not known."""

@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from go1exp.registry import STRICT, Expected, NonNegative, Positive, explain
+from go1exp.schema.registry import STRICT, Expected, NonNegative, Positive, explain
 
 if TYPE_CHECKING:
     pass

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from go1exp.fit.net import Count, InputName, Name, Share, Target
-from go1exp.registry import STRICT, Expected, Positive
+from go1exp.schema.registry import STRICT, Expected, Positive
 
 Part = Annotated[float, Field(gt=0, lt=1)]
 

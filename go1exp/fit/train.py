@@ -13,7 +13,7 @@ from torch.nn.functional import mse_loss
 
 from go1exp.fit.dataset import Rows
 from go1exp.fit.settings import FitError, FitSettings
-from go1exp.threads import one_thread
+from go1exp.tensors.threads import one_thread
 
 OnEpoch = Callable[[int, int, float, float], None]
 """``on_epoch(done, total, train, validation)``: epochs, and root mean square errors in N m."""

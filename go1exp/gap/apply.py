@@ -22,10 +22,10 @@ from go1exp.gap.prepare import prepare
 from go1exp.gap.replay import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.trial import excess, removed
-from go1exp.joint_values import spread
 from go1exp.recording import Recording
-from go1exp.registry import Term, members
 from go1exp.robot import RobotConfig
+from go1exp.schema.joint_values import spread
+from go1exp.schema.registry import Term, members
 
 EFFECT, CALIBRATION, COMPENSATING = "effect.yaml", "calibration.yaml", "compensating.yaml"
 """What is missing; the nominal parameters within their tolerances; what only makes up for something unknown."""

@@ -18,7 +18,7 @@ from go1exp.effects.base import Effect, Param
 from go1exp.gap import machine as machines
 from go1exp.gap.likelihood import Layout
 from go1exp.gap.replay import Key, Machine, Probe, Theta
-from go1exp.registry import members
+from go1exp.schema.registry import members
 
 BOX = (
     *("kp_scale", "kd_scale", "strength", "armature", "coulomb", "viscous"),

@@ -28,7 +28,7 @@ from go1exp.gap.trial import excess, removed
 from go1exp.gap.windows import Windows
 from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
-from go1exp.threads import one_thread
+from go1exp.tensors.threads import one_thread
 
 MOST = 0.75
 """Share of the excess that terms must remove before the first of them is certified although a gap remains."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.gap.result import EXIT_CODES, Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
-from go1exp.registry import Expected
+from go1exp.schema.registry import Expected
 
 RESULT = "verdict.json"
 """Name of the file in the output folder."""

@@ -21,9 +21,9 @@ from go1exp.env.plant import drive_setup
 from go1exp.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
-from go1exp.registry import ConfigError, Entry, Term, bind
 from go1exp.robot import RobotConfig
+from go1exp.schema.registry import ConfigError, Entry, Term, bind
+from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import TerrainConfig, build_terrain
 
 if TYPE_CHECKING:

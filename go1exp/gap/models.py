@@ -15,8 +15,8 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 import go1exp.effects  # noqa: F401  (registers every effect)
 from go1exp import data_root
-from go1exp.joint_values import JointValues, each_within, spread
-from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain, members, unknown_name
+from go1exp.schema.joint_values import JointValues, each_within, spread
+from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain, members, unknown_name
 
 Name = Annotated[str, Field(min_length=1)]
 Limit = Annotated[JointValues, each_within(1e-9)]

@@ -16,7 +16,7 @@ from go1exp.effects.base import Measured
 from go1exp.env.plant import FRICTION, Plant
 from go1exp.gap.machine import Machine, drive_of
 from go1exp.gap.windows import PAST_S, Windows, averaged, held
-from go1exp.registry import bind, members
+from go1exp.schema.registry import bind, members
 
 Key = tuple[str, str]
 """Effect and parameter."""

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from go1exp.registry import STRICT, Fraction, NonNegative, Positive
+from go1exp.schema.registry import STRICT, Fraction, NonNegative, Positive
 
 Verdict = Literal["no gap", "explained", "partly explained", "unexplained", "not excited", "bad log"]
 

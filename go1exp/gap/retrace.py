@@ -27,7 +27,7 @@ from go1exp.gap.standing import AXES, IMU, TRUNK, StandingWindows, Witness, rows
 from go1exp.gap.trial import excess
 from go1exp.gap.windows import even_clock, noise_of
 from go1exp.recording import VECTORS, Recording, RecordingError, joint_channels
-from go1exp.threads import one_thread
+from go1exp.tensors.threads import one_thread
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
 TURN, SPEED = ("roll", "pitch", "yaw"), ("base_lin_vel_x_b", "base_lin_vel_y_b", "base_lin_vel_z_b")

@@ -11,7 +11,7 @@ import numpy as np
 from go1exp.gap import box, strain
 from go1exp.gap.likelihood import Layout, Scorer, Table, differences, predicted
 from go1exp.gap.replay import Key, Machine, Probe, Theta, variants
-from go1exp.registry import members
+from go1exp.schema.registry import members
 
 GROUND = ("foot_friction", "ground_compliance", "external_wrench", "payload", "com_offset")
 """Effects that a held robot does not feel."""

@@ -28,10 +28,10 @@ from go1exp.gap.windows import Windows, cut, noise_of
 from go1exp.physics.legs import Legs
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
 from go1exp.recording import VECTORS, Recording
 from go1exp.robot import RobotConfig
-from go1exp.rotation import quat_from_rotvec, quat_multiply, rotate_inverse
+from go1exp.tensors.randomness import EnvRandom
+from go1exp.tensors.rotation import quat_from_rotvec, quat_multiply, rotate_inverse
 from go1exp.terrain import TerrainConfig, build_terrain
 
 NO_SENSORS = 1 << 13

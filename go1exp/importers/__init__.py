@@ -21,7 +21,7 @@ from go1exp.importers import (
     so101_arm,
 )
 from go1exp.recording import Recording
-from go1exp.registry import ConfigError, members, unknown_name
+from go1exp.schema.registry import ConfigError, members, unknown_name
 
 __all__ = [
     "ak80_double_pendulum",

@@ -9,7 +9,7 @@ import numpy as np
 
 from go1exp.importers.source import LEVEL, Arrays, files, joint_columns, load_npz, rate, recording
 from go1exp.recording import Recording, RecordingError
-from go1exp.registry import importer
+from go1exp.schema.registry import importer
 
 SHOULDER_ELBOW = ("shoulder", "elbow")
 

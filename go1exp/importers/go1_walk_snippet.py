@@ -8,8 +8,8 @@ import numpy as np
 
 from go1exp.importers.source import Arrays, columns, files, joint_columns, load_npz, rate, recording, reorder
 from go1exp.recording import VECTORS, Recording, RecordingError
-from go1exp.registry import importer
 from go1exp.robot import JOINT_KINDS, JOINTS
+from go1exp.schema.registry import importer
 
 THEIR_JOINTS = tuple(f"{leg}_{kind}" for leg in ("FL", "FR", "RL", "RR") for kind in JOINT_KINDS)
 

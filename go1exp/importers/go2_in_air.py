@@ -9,8 +9,8 @@ import numpy as np
 
 from go1exp.importers.source import LEVEL, columns, files, joint_columns, recording, reorder
 from go1exp.recording import Quaternion, Recording, RecordingError
-from go1exp.registry import Positive, importer
 from go1exp.robot import JOINT_KINDS, JOINTS
+from go1exp.schema.registry import Positive, importer
 
 THEIR_JOINTS = tuple(f"{leg}_{kind}" for leg in ("FL", "FR", "RL", "RR") for kind in JOINT_KINDS)
 

@@ -13,8 +13,8 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from go1exp.importers.source import files, joint_columns, rate, recording
 from go1exp.recording import Quaternion, Recording, RecordingError
-from go1exp.registry import NonNegative, Positive, explain, importer
 from go1exp.robot import JOINTS
+from go1exp.schema.registry import NonNegative, Positive, explain, importer
 
 TYPES = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from go1exp.importers.source import Arrays, columns, files, joint_columns, load_npz, rate, recording
 from go1exp.recording import FOOT_FORCE, VECTORS, Recording, RecordingError
-from go1exp.registry import Positive, importer
+from go1exp.schema.registry import Positive, importer
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

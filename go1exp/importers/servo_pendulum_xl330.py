@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from go1exp.importers.source import LEVEL, files, rate, recording
 from go1exp.recording import Recording, RecordingError
-from go1exp.registry import explain, importer
+from go1exp.schema.registry import explain, importer
 
 MOST_LINES = 3
 """How many of a file's problems are told: a missing key is missing in every row."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from go1exp.importers.source import LEVEL, files, joint_columns, load_npz, rate, recording
 from go1exp.recording import Quaternion, Recording, RecordingError
-from go1exp.registry import importer
+from go1exp.schema.registry import importer
 
 JAW = "Jaw"
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from go1exp import __version__
 from go1exp.recording import Meta, Recording, RecordingError, joint_channels, problems
-from go1exp.registry import explain
+from go1exp.schema.registry import explain
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 """Attitude of an upright base, w-x-y-z."""

@@ -10,7 +10,7 @@ import torch
 
 from go1exp import robot
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.rotation import rotate
+from go1exp.tensors.rotation import rotate
 
 if TYPE_CHECKING:
     from torch import Tensor

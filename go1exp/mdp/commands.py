@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from go1exp.memory import Memory
-from go1exp.randomness import Stream
-from go1exp.registry import Fraction, Positive, PositiveRange, Range, command
+from go1exp.schema.registry import Fraction, Positive, PositiveRange, Range, command
+from go1exp.tensors.memory import Memory
+from go1exp.tensors.randomness import Stream
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp import robot
-from go1exp.constants import constant_like
-from go1exp.types import Snapshot
+from go1exp.mdp.types import Snapshot
+from go1exp.tensors.constants import constant_like
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.memory import Memory
-from go1exp.randomness import Stream
-from go1exp.registry import PositiveRange, Range, event
+from go1exp.schema.registry import PositiveRange, Range, event
+from go1exp.tensors.memory import Memory
+from go1exp.tensors.randomness import Stream
 
 if TYPE_CHECKING:
     from torch import Tensor

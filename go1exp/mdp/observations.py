@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.mdp.derived import joint_deviation
-from go1exp.registry import observation
-from go1exp.types import Snapshot
+from go1exp.mdp.types import Snapshot
+from go1exp.schema.registry import observation
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -15,12 +15,12 @@ import torch
 from pydantic import AfterValidator, Field
 
 from go1exp import robot
-from go1exp.constants import constant_like
 from go1exp.drive import ModelFields
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.randomness import Stream
-from go1exp.registry import PositiveRange, Range, ordered, randomization
-from go1exp.rotation import quat_from_rotvec, quat_multiply
+from go1exp.schema.registry import PositiveRange, Range, ordered, randomization
+from go1exp.tensors.constants import constant_like
+from go1exp.tensors.randomness import Stream
+from go1exp.tensors.rotation import quat_from_rotvec, quat_multiply
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.constants import constant_like
 from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS, foot_speed_xy, is_moving, joint_deviation
-from go1exp.registry import Fraction, NonNegative, Positive, reward
-from go1exp.types import Snapshot
+from go1exp.mdp.types import Snapshot
+from go1exp.schema.registry import Fraction, NonNegative, Positive, reward
+from go1exp.tensors.constants import constant_like
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 
 from go1exp.physics.scene import RIGID, Sensors
-from go1exp.registry import Expected
+from go1exp.schema.registry import Expected
 
 BASE = "trunk"
 """Name that the base body gets, whatever the file calls it: effects on the attitude of a held robot look for it."""

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from go1exp.physics.scene import Sensors
-from go1exp.registry import ConfigError, Expected
+from go1exp.schema.registry import ConfigError, Expected
 
 try:
     import warp as wp
@@ -235,7 +235,7 @@ class MujocoWarp:
         return (self._overflow & lost) != 0
 
     def units(self, key: Tensor, counter: Tensor, count: int) -> Tensor:
-        """Do what ``go1exp.randomness.unit_numbers`` does, in one kernel."""
+        """Do what ``go1exp.tensors.randomness.unit_numbers`` does, in one kernel."""
         out = torch.empty(len(key), count, device=self.device)
         with self._scope():
             wp.launch(

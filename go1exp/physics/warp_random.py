@@ -1,4 +1,4 @@
-"""The numbers of ``go1exp.randomness`` in one kernel, bit for bit, where each of its operations would be one."""
+"""Numbers of ``go1exp.tensors.randomness`` in one kernel, bit for bit, where each of its operations would be one."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from go1exp import robot
 from go1exp.excitations import Motion
 from go1exp.record.sensors import SensorConfig
-from go1exp.registry import STRICT, ConfigError, NonNegative, Positive, Term
+from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, Term
 
 SOFT_LIMIT = 0.95
 """Share of the joint ranges that motions may use."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from go1exp.registry import excitation
+from go1exp.schema.registry import excitation
 
 
 @excitation("policy", closed_loop=True)

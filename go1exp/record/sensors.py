@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field
 
 from go1exp import robot
 from go1exp.recording import VECTORS, joint_channels
-from go1exp.registry import STRICT, Fraction, NonNegative, Positive
+from go1exp.schema.registry import STRICT, Fraction, NonNegative, Positive
 
 
 @dataclass(frozen=True)

@@ -14,21 +14,21 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from go1exp import __version__, robot
-from go1exp.backends import BackendConfig
 from go1exp.config import TaskConfig, time_rules
 from go1exp.effects.rules import drives, has_gains
 from go1exp.env.core import Go1Core
 from go1exp.env.engine import make_backend
 from go1exp.env.plant import Plant, drive_setup
-from go1exp.joint_values import spread
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
 from go1exp.record.plan import Episode
 from go1exp.record.sensors import SensorConfig, log
 from go1exp.record.tape import Tape
 from go1exp.recording import Meta, Recording
-from go1exp.registry import ConfigError, Term
 from go1exp.robot import RobotConfig
+from go1exp.schema.backends import BackendConfig
+from go1exp.schema.joint_values import spread
+from go1exp.schema.registry import ConfigError, Term
+from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import TerrainConfig, build_terrain
 
 SETTLE_S = 1.0

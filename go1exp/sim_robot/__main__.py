@@ -24,8 +24,8 @@ from go1exp.deploy.archive import unpack
 from go1exp.deploy.bundle import CONFIG, MEMBERS
 from go1exp.effects.rules import drive_problems
 from go1exp.errors import Expected
-from go1exp.registry import ConfigError, as_json, explain
 from go1exp.robot import JOINTS
+from go1exp.schema.registry import ConfigError, as_json, explain
 from go1exp.sim_robot.machine import Robot
 from go1exp.sim_robot.server import TRUTH, Server
 from go1exp.sim_robot.settings import SimConfig

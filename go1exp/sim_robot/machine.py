@@ -17,9 +17,9 @@ from go1exp.effects.rules import has_gains
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 from go1exp.sim_robot.settings import SimConfig
+from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import TerrainConfig, build_terrain
 
 TICK = 0.002

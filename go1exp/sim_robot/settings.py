@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from go1exp.registry import STRICT, Fraction, NonNegative
+from go1exp.schema.registry import STRICT, Fraction, NonNegative
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
 from go1exp.config import LoggerConfig, WandbConfig
-from go1exp.registry import Expected
+from go1exp.schema.registry import Expected
 
 CLOCK = "time/"
 """Prefix of metrics that depend on the machine's clock; they have a file of their own."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.config import TrainConfig, parse_train
-from go1exp.registry import ConfigError
+from go1exp.schema.registry import ConfigError
 from go1exp.train import checkpoint, run_folder
 from go1exp.train.ppo import AdaptivePPO
 

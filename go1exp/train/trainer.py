@@ -19,7 +19,7 @@ from go1exp.effects.rules import drives
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.registry import ConfigError, Expected
+from go1exp.schema.registry import ConfigError, Expected
 from go1exp.train import checkpoint, metrics, start
 from go1exp.train.device import DevicePPO
 from go1exp.train.ppo import AdaptivePPO
@@ -51,7 +51,7 @@ def try_out(config: TrainConfig) -> None:
 
     Raises:
         ConfigError: if an actuator net does not fit the robot or the physics step.
-        go1exp.registry.Expected: if its file is damaged.
+        go1exp.schema.registry.Expected: if its file is damaged.
     """
     if any("file" in term.parameters for term, _ in drives(config.task.actuator)):
         Go1Core(config.task, 1)

@@ -15,8 +15,8 @@ import go1exp.config  # noqa: F401  (registers every member)
 from go1exp import robot
 from go1exp.actuator.setup import Actuator
 from go1exp.drive import DriveSetup
-from go1exp.randomness import EnvRandom
-from go1exp.registry import members
+from go1exp.schema.registry import members
+from go1exp.tensors.randomness import EnvRandom
 
 NEEDS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "delay": lambda net: {"drive": {"term": "pd"}},

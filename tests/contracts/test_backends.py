@@ -24,7 +24,7 @@ from go1exp.env.core import Go1Core
 from go1exp.env.engine import make_backend
 from go1exp.physics.backend import PhysicsBackend
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom
+from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import build_terrain
 
 HAS_WARP = importlib.util.find_spec("mujoco_warp") is not None

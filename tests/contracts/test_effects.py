@@ -26,12 +26,12 @@ from go1exp.effects.base import Effect, Measured, Param
 from go1exp.effects.stack import HOOKS
 from go1exp.env.core import Go1Core
 from go1exp.env.plant import Plant, drive_setup
-from go1exp.joint_values import JointValues, numbers, spread
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
-from go1exp.randomness import EnvRandom
-from go1exp.registry import Entry, Term, bind, members
-from go1exp.rotation import rotate_inverse
+from go1exp.schema.joint_values import JointValues, numbers, spread
+from go1exp.schema.registry import Entry, Term, bind, members
+from go1exp.tensors.randomness import EnvRandom
+from go1exp.tensors.rotation import rotate_inverse
 from go1exp.terrain import build_terrain
 
 DT = 0.002

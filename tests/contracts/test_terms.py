@@ -17,12 +17,12 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.config import TaskConfig
 from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.types import Snapshot
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
-from go1exp.randomness import EnvRandom, Stream
-from go1exp.registry import Entry, groups, members
+from go1exp.schema.registry import Entry, groups, members
+from go1exp.tensors.randomness import EnvRandom, Stream
 from go1exp.terrain import build_terrain
-from go1exp.types import Snapshot
 
 ODD = 37
 """Size of a batch that no vector register divides."""

@@ -15,7 +15,7 @@ import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
 from go1exp.effects.base import Param
 from go1exp.gap.result import GapResult, GapSettings, Localisation, NamedEffect
 from go1exp.gap.verdict import where
-from go1exp.registry import members
+from go1exp.schema.registry import members
 
 NOTHING = "–"
 """Stands for a number that there is not."""

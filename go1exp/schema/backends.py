@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from go1exp.registry import STRICT
+from go1exp.schema.registry import STRICT
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Tools on torch tensors that know neither robot nor task: memory, constants, randomness, delay lines, rotations."""
