@@ -13,12 +13,12 @@ from go1exp.drive import DriveSetup
 from go1exp.schema.registry import Term, bind
 
 
-class Machine(Protocol):
-    """A robot that can be replayed.
+NEEDLESS = 1 << 4 | 1 << 13
+"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
 
-    One that is not driven by the ideal PD law has ``drive() -> Term`` beside; one whose nominal parameters are known
-    worse or better than the effects declare has ``tolerances``, by (effect, parameter).
-    """
+
+class Machine(Protocol):
+    """A robot that can be replayed."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -30,7 +30,14 @@ class Machine(Protocol):
 
     @property
     def base_probe(self) -> tuple[float, ...]:
-        """Changes of a free base's first state by which its influence is measured; empty for one that is held."""
+        """Changes of a free base's initial state by which its influence is measured; empty for one that is held."""
+
+    @property
+    def tolerances(self) -> Mapping[tuple[str, str], float]:
+        """Tolerances by (effect, parameter), where they are not those that the effects declare."""
+
+    def drive(self) -> Term:
+        """Return what turns commands into torques."""
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
@@ -43,19 +50,13 @@ def pd() -> Term:
     return term
 
 
-def drive_of(machine: Machine) -> Term:
-    """Return what turns a machine's commands into torques: the ideal PD law unless it says otherwise."""
-    own = getattr(machine, "drive", None)
-    return pd() if own is None else own()
-
-
 _TOLERANCES: ContextVar[Mapping[tuple[str, str], float]] = ContextVar("tolerances")
 
 
 @contextmanager
 def tolerances_of(machine: Machine) -> Iterator[None]:
     """Let a machine's own tolerances count wherever one is asked for within the block."""
-    token = _TOLERANCES.set(getattr(machine, "tolerances", {}))
+    token = _TOLERANCES.set(machine.tolerances)
     try:
         yield
     finally:
