@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -32,12 +33,32 @@ def as_container(config: DictConfig) -> dict[str, Any]:
     return {str(k): v for k, v in container.items()}
 
 
+VALUE_PER_JOINT = re.compile(
+    r"(?P<add>\+{0,2})(?P<key>(effect\.[^.=]+|actuator(\.drive)*)\.(?!(drive|spread)=)[^.=@]+)=\s*[\[{]"
+)
+"""An override that writes a value per joint as a list or as a mapping."""
+
+
+def form_replaced(overrides: Sequence[str]) -> list[str]:
+    """Return overrides by which a value per joint may change its form: number, list or mapping.
+
+    Hydra merges a mapping into what the file has, and refuses if that is a list, such as ``bound: [0.2, 0.2, 0.3]``.
+    So such a value is removed first; a joint that the new mapping leaves out is without the effect, as documented.
+    """
+    replaced = []
+    for override in overrides:
+        if match := VALUE_PER_JOINT.match(override):
+            replaced.append(f"{'++' if match['add'] else ''}{match['key']}=null")
+        replaced.append(override)
+    return replaced
+
+
 def compose(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Compose ``conf/<name>.yaml`` with command-line overrides outside a Hydra application."""
     register_groups()
     GlobalHydra.instance().clear()
     with initialize_config_dir(config_folder(), version_base="1.3"):
-        return as_container(hydra_compose(name, list(overrides)))
+        return as_container(hydra_compose(name, form_replaced(overrides)))
 
 
 def key_values(container: Any, path: str = "") -> dict[str, Any]:
