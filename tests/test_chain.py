@@ -14,9 +14,9 @@ import pytest
 from go1exp import cli, data_root, recording
 from go1exp.compose import compose
 from go1exp.config import parse_parts
-from go1exp.gap.machine import hung
 from go1exp.gap.result import GapSettings
-from go1exp.gap.retrace import Part, retrace
+from go1exp.gap.robots.hung import hung
+from go1exp.gap.stages.replay import Part, retrace
 from go1exp.recording import Recording, joint_channels
 from tests.small_run import SMALL
 

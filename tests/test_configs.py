@@ -29,7 +29,7 @@ from go1exp.compose import compose, config_folder
 from go1exp.config import TrainConfig, parse_parts, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.fit import FitSettings
-from go1exp.gap.models import parse_model
+from go1exp.gap.robots.description import parse_model
 from go1exp.mdp import rewards
 from go1exp.schema import registry
 from go1exp.schema.registry import ConfigError, Term

@@ -49,8 +49,8 @@ from go1exp.deploy.udp import UdpLink
 from go1exp.deploy.walk import FAULTS, STATUS, Plan
 from go1exp.estimation import from_json, go1, make_filter, sample, to_json
 from go1exp.export.build import build
-from go1exp.gap.prepare import unusable
-from go1exp.gap.standing import StandingGo1
+from go1exp.gap.data.prepare import unusable
+from go1exp.gap.robots.standing import StandingGo1
 from go1exp.recording import VECTORS
 from go1exp.sim_robot.__main__ import sim_config, task_of
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned

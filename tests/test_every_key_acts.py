@@ -846,8 +846,9 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
     the whole one, but a replay has ten variants and not sixty.
     """
     from go1exp.cli.gap import APP, DOES_NOT_HOLD
-    from go1exp.gap import box, machine
     from go1exp.gap.result import EXIT_CODES
+    from go1exp.gap.robots import hung
+    from go1exp.gap.search import tolerances
 
     built: set[tuple[int, int]] = set()
 
@@ -857,8 +858,8 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
     few = put(container, "search.effects", ["coulomb", "viscous"])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(box, "BOX", ("viscous",))
-        patch.setattr(machine, "MujocoCpu", backend)
+        patch.setattr(tolerances, "BOX", ("viscous",))
+        patch.setattr(hung, "MujocoCpu", backend)
         _, files = outcome(APP, few, walk, (*EXIT_CODES.values(), DOES_NOT_HOLD))
     yield "files", sorted(files)
     yield "batches", sorted(built)

@@ -21,11 +21,11 @@ from go1exp.compose import compose
 from go1exp.config import parse_task
 from go1exp.env.core import Go1Core
 from go1exp.gap import files
-from go1exp.gap.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
-from go1exp.gap.explain import explain
-from go1exp.gap.machine import hung
-from go1exp.gap.prepare import prepare, unusable
+from go1exp.gap.data.prepare import prepare, unusable
 from go1exp.gap.result import Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
+from go1exp.gap.robots.hung import hung
+from go1exp.gap.stages.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
+from go1exp.gap.stages.explain import explain
 from go1exp.record import simulate
 from go1exp.recording import Recording
 from go1exp.robot import JOINTS

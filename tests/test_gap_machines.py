@@ -18,13 +18,16 @@ from go1exp import data_root
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
 from go1exp.env.plant import Plant
-from go1exp.gap import box
-from go1exp.gap.explain import explain
-from go1exp.gap.machine import FixedBase, HungGo1, machine_of, tolerances_of
-from go1exp.gap.models import ModelConfig, parse_model
-from go1exp.gap.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, prepare, slope
+from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, prepare, slope
+from go1exp.gap.data.windows import averaged
+from go1exp.gap.replay.machine import tolerances_of
 from go1exp.gap.result import GapSettings
-from go1exp.gap.windows import averaged
+from go1exp.gap.robots.choice import machine_of
+from go1exp.gap.robots.description import ModelConfig, parse_model
+from go1exp.gap.robots.fixed_base import FixedBase
+from go1exp.gap.robots.hung import HungGo1
+from go1exp.gap.search import tolerances
+from go1exp.gap.stages.explain import explain
 from go1exp.importers import import_recordings
 from go1exp.recording import Meta, Recording, joint_channel
 from go1exp.schema.registry import ConfigError, bind
@@ -180,12 +183,12 @@ def test_a_users_own_file_names_its_model_from_where_it_lies(tmp_path: Path) -> 
 
 def test_a_machines_own_tolerances_count_while_it_is_at_hand() -> None:
     key = ("base_tilt", "roll")
-    declared = box.param(key).tolerance
+    declared = tolerances.param(key).tolerance
     with tolerances_of(machine("go2")):
-        assert box.param(key).tolerance == 0.05
+        assert tolerances.param(key).tolerance == 0.05
         with tolerances_of(HungGo1(None)):  # type: ignore[arg-type]
-            assert box.param(key).tolerance == declared
-    assert box.param(key).tolerance == declared
+            assert tolerances.param(key).tolerance == declared
+    assert tolerances.param(key).tolerance == declared
 
 
 # ---------------------------------------------------------------------- recordings
@@ -330,7 +333,7 @@ QUICK = GapSettings(
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only some of the nominal parameters may vary, so that a replay has ten variants and not forty."""
-    monkeypatch.setattr(box, "BOX", ("strength", "coulomb", "viscous", "link_mass", "base_tilt"))
+    monkeypatch.setattr(tolerances, "BOX", ("strength", "coulomb", "viscous", "link_mass", "base_tilt"))
 
 
 @pytest.mark.usefixtures("few")

@@ -13,17 +13,21 @@ import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import RIG
 from go1exp.compose import compose
 from go1exp.config import parse_parts
-from go1exp.gap import strain
-from go1exp.gap.box import Bounds, solve
-from go1exp.gap.explain import explain, measured
-from go1exp.gap.fit import scores
-from go1exp.gap.judge import max_t, splits
-from go1exp.gap.likelihood import Layout, gram, predicted
-from go1exp.gap.machine import HungGo1, hung
-from go1exp.gap.prepare import prepare
-from go1exp.gap.replay import Probe, padded
+from go1exp.gap.data.prepare import prepare
+from go1exp.gap.data.splits import splits
+from go1exp.gap.data.windows import even_clock, held, noise
+from go1exp.gap.replay.replayer import padded
+from go1exp.gap.replay.rows import Probe
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
-from go1exp.gap.windows import even_clock, held, noise
+from go1exp.gap.robots.hung import HungGo1, hung
+from go1exp.gap.score.floors import measured
+from go1exp.gap.score.likelihood import gram
+from go1exp.gap.score.linear import Layout, predicted
+from go1exp.gap.search import strain
+from go1exp.gap.search.fit import scores
+from go1exp.gap.search.significance import max_t
+from go1exp.gap.search.tolerances import Bounds, solve
+from go1exp.gap.stages.explain import explain
 from go1exp.record import simulate
 from go1exp.recording import Meta, Recording
 from tests.laboratory import recorded

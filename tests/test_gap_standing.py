@@ -11,21 +11,24 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.gap import alone, box, profile
-from go1exp.gap.base_state import AGREE, Base, Log, base_state
-from go1exp.gap.explain import explain
-from go1exp.gap.first_state import settled
-from go1exp.gap.fit import residuals
-from go1exp.gap.judge import splits
-from go1exp.gap.likelihood import Scorer
-from go1exp.gap.localise import ON_FEET, REGIMES, localise
-from go1exp.gap.machine import HungGo1
-from go1exp.gap.prepare import prepare
-from go1exp.gap.replay import Probe, Replayer, variants
+from go1exp.gap.data.prepare import prepare
+from go1exp.gap.data.splits import splits
+from go1exp.gap.data.standing import StandingWindows
+from go1exp.gap.data.trunk import AGREE, Base, Log, base_state
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.rows import Probe, variants
+from go1exp.gap.replay.standing import StandingReplayer
 from go1exp.gap.result import GapSettings
-from go1exp.gap.search import Search
-from go1exp.gap.standing import StandingGo1, StandingReplayer, StandingWindows, on_feet
-from go1exp.gap.trial import excess
+from go1exp.gap.robots.hung import HungGo1
+from go1exp.gap.robots.standing import StandingGo1, on_feet
+from go1exp.gap.score.initial_state import settled
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.localise import ON_FEET, REGIMES, localise
+from go1exp.gap.search import profile_likelihood, single_cause, tolerances
+from go1exp.gap.search.fit import residuals
+from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.trial import excess
+from go1exp.gap.stages.explain import explain
 from go1exp.physics.legs import Legs
 from go1exp.physics.scene import build_model
 from go1exp.recording import VECTORS, Recording
@@ -195,7 +198,7 @@ def search_in(*overrides: str) -> Search:
 def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it() -> None:
     search = search_in("+effect.payload.mass=1.0")
     plain = excess(search.held_out({}))
-    found = alone.cause(search)
+    found = single_cause.cause(search)
     assert found is not None
     assert found.name == "payload"
     assert found.theta["payload", "mass"].item() == pytest.approx(1.0, abs=0.1)
@@ -208,12 +211,12 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
     config, recordings = recorded("excitation=[gait]", "seeds=[0,1]", "+effect.payload.mass=2.0")
     replayer, dt = ready(config, recordings)
     score, _ = settled(replayer, dt, 0.00015)
-    everything, begun = np.arange(len(score.windows)), profile.begun(score, dt)
+    everything, begun = np.arange(len(score.windows)), profile_likelihood.begun(score, dt)
     assert begun.windows is replayer.windows
-    found, _ = profile.fitted(begun, box.sizes("payload"), everything, dt)
+    found, _ = profile_likelihood.fitted(begun, tolerances.sizes("payload"), everything, dt)
     assert found["payload", "mass"].item() == pytest.approx(2.0, abs=0.2)
     truth = {("payload", "mass"): np.array([2.0])}
-    right, none = (np.log(profile.chi2(begun, theta, everything, dt)).mean() for theta in (truth, {}))
+    right, none = (np.log(profile_likelihood.chi2(begun, theta, everything, dt)).mean() for theta in (truth, {}))
     assert right < 0.5
     assert none > right + 1.0
     # By first states that suit the nominal model the truth is hidden.
@@ -222,16 +225,16 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
 
 
 def test_rungs_of_a_ladder_are_on_both_sides_of_null_and_no_farther_than_a_parameter_goes() -> None:
-    found = profile.ladder(box.param(("payload", "mass")))
+    found = profile_likelihood.ladder(tolerances.param(("payload", "mass")))
     assert found == pytest.approx([-0.8, -0.4, 0.0, 0.4, 0.8, 1.6, 3.2])
 
 
 def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
     search = search_in()
-    assert alone.cause(search) is None
+    assert single_cause.cause(search) is None
     assert search.candidates == []
     assert excess(search.held_out({})) < search.settings.material
 
 
 def test_drives_that_are_all_a_little_weak_are_no_payload() -> None:
-    assert alone.cause(search_in("+effect.strength.scale=0.93")) is None
+    assert single_cause.cause(search_in("+effect.strength.scale=0.93")) is None

@@ -15,7 +15,7 @@ from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb
-    from go1exp.gap.machine import Machine
+    from go1exp.gap.replay.machine import Machine
     from go1exp.gap.result import GapResult
     from go1exp.recording import Recording
 
@@ -26,7 +26,7 @@ DOES_NOT_HOLD = 15
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.settings import GapVerb, parse
     from go1exp.config import parse_parts
-    from go1exp.gap.models import parse_model
+    from go1exp.gap.robots.description import parse_model
 
     parts, problems = parse_parts(container, ("robot",))
     try:
@@ -50,7 +50,7 @@ def _task(container: dict[str, Any]) -> int:
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
 
-    from go1exp.gap.machine import machine_of
+    from go1exp.gap.robots.choice import machine_of
 
     machine = machine_of(model, parts["robot"])
     if settings.stage == "check":
@@ -63,7 +63,7 @@ def _task(container: dict[str, Any]) -> int:
         result = files.load(out)
         return _apply(result, recordings, machine, settings) or result.exit_code
 
-    from go1exp.gap.explain import explain
+    from go1exp.gap.stages.explain import explain
 
     result = explain(recordings, machine, settings.search, _progress())
     print(f"\n{result.sentence}\n\nwritten to {files.save(result, out)}")
@@ -91,7 +91,7 @@ def _progress() -> Callable[[str, float], None]:
 def _check(recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
     """Say whether the logs are fit to be compared, their floors, and which effects they could not show."""
     from go1exp.audit import audit
-    from go1exp.gap.survey import survey
+    from go1exp.gap.stages.check import survey
 
     for recording in recordings:
         report = audit(recording)
@@ -106,7 +106,7 @@ def _check(recordings: list[Recording], machine: Machine, settings: GapVerb) -> 
 def _localise(recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
     """Print where the plain model is wrong."""
     from go1exp.gap.report import localisation_text
-    from go1exp.gap.survey import survey
+    from go1exp.gap.stages.check import survey
 
     found = survey(recordings, machine, settings.search, _progress(), screen=False)
     if found.where is not None:
@@ -118,7 +118,7 @@ def _replay(recordings: list[Recording], machine: Machine, settings: GapVerb) ->
     """Print what training's simulator does under the same commands, and write it with its curves."""
     import numpy as np
 
-    from go1exp.gap.retrace import retrace
+    from go1exp.gap.stages.replay import retrace
 
     found = retrace(recordings, machine, settings.search, settings.train_dt, _progress())
     print(f"\n{found.text()}")
@@ -138,7 +138,7 @@ def _replay(recordings: list[Recording], machine: Machine, settings: GapVerb) ->
 
 def _apply(result: GapResult, recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
     """Write the effect files, read them back as training does, and score them at training's step."""
-    from go1exp.gap import apply
+    from go1exp.gap.stages import apply
     from go1exp.robot import JOINTS
 
     out = Path(settings.out)

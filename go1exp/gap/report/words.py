@@ -13,8 +13,8 @@ import numpy as np
 import go1exp.effects
 import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
 from go1exp.effects.base import Param
+from go1exp.gap.answer import where
 from go1exp.gap.result import GapResult, GapSettings, Localisation, NamedEffect
-from go1exp.gap.verdict import where
 from go1exp.schema.registry import members
 
 NOTHING = "–"

@@ -1,0 +1,132 @@
+"""Effects of the whole robot against first states of their own.
+
+First states that were moved to suit the nominal model hide a part of what is missing, and where feet slip or land they
+hold it fast: a payload of 2 kg on a walk, fitted at those, stops at 1 kg, and the truth looks worse than nothing.
+So every value is tried from the first states that sensors tell, which are then moved to suit that value alone; and as
+derivatives tell little where feet stick, values are laddered and the best is closed in on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from go1exp.effects.base import Param
+from go1exp.gap.replay.rows import Key, Theta, variants
+from go1exp.gap.score.initial_state import FARTHEST, solved
+from go1exp.gap.score.likelihood import Scorer, gram, scorer
+from go1exp.gap.search import tolerances
+
+ROUNDS = 2
+"""Steps of the first states, all by the changes that were measured at the nominal model."""
+
+SHARES = (1.0, 0.4)
+"""Shares of a step that are tried, window by window."""
+
+FIRST = 2.0
+"""Lowest rung of the ladder, in tolerances; each further one is twice as far."""
+
+CLOSER = 8
+"""Tries between the neighbours of the best rung."""
+
+
+def begun(score: Scorer, dt: float) -> Scorer:
+    """Return a scorer with the same floors whose first states are those that sensors tell.
+
+    Args:
+        score: of a robot on its feet (``first_state.settled``), of the nominal model.
+        dt: physics step, s.
+    """
+    assert score.expected is not None
+    replayer = dataclasses.replace(score.replayer, windows=score.expected)
+    return scorer(replayer, {}, score.scale, dt, score.clock_s)
+
+
+def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndarray:
+    """Return chi2 per value (V, 1) of a model, each window's first state moved to suit it.
+
+    What the states are away from what sensors tell counts as much as readings do.
+
+    Args:
+        score: what :func:`begun` returns.
+        theta: values of the model.
+        windows: (V,) which.
+        dt: physics step, s.
+    """
+    w = score.windows
+    joints, own = len(w.joints), 2 * len(w.joints) + w.base_sd.shape[1]
+    sd = np.concatenate([w.q_sd, w.qd_sd, w.base_sd], axis=1)[windows]
+    state = score.state[windows]
+    rows = variants(score.replayer.machine, theta, windows, [])
+
+    def at(off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        moved = off * sd
+        q, qd, base = moved[:, :joints], moved[:, joints : 2 * joints], moved[:, 2 * joints :]
+        residual = score.residual(dataclasses.replace(rows, q=q, qd=qd, base=base), dt)
+        # As if the state had stayed, and the change by it were a line: then the priors are those of the metric.
+        back = residual + (state[..., :own] @ off[:, None, :, None].astype(np.float32))[..., 0]
+        return residual, np.asarray(gram(back[..., None], state)[..., 0, 0] / score.size[windows][:, None])
+
+    off = np.zeros((len(windows), own))
+    residual, best = at(off)
+    for _ in range(ROUNDS):
+        step = solved(state[:, 0], residual[:, 0], off)[0][:, :own].clip(-FARTHEST, FARTHEST)
+        begin = off.copy()
+        for share in SHARES:
+            there, found = at(begin + share * step)
+            better = found[:, 0] < best[:, 0]
+            off[better], residual[better], best[better] = (begin + share * step)[better], there[better], found[better]
+    return best
+
+
+def cost(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> float:
+    """Return what fits make small, the mean log :func:`chi2` (arguments as there)."""
+    return float(np.log(chi2(score, theta, windows, dt)).mean())
+
+
+def fitted(
+    score: Scorer, keys: Sequence[Key], windows: np.ndarray, dt: float, nominal: float | None = None
+) -> tuple[Theta, float]:
+    """Return the values of an effect that fit best, one number for each parameter, one parameter after the other.
+
+    Args:
+        score: what :func:`begun` returns.
+        keys: the parameters; one that is best at its null value is not among those returned.
+        windows: (V,) to fit.
+        dt: physics step, s.
+        nominal: cost of the nominal model, if it is known.
+
+    Returns:
+        The values and their cost.
+    """
+    theta: Theta = {}
+    least = cost(score, {}, windows, dt) if nominal is None else nominal
+    for key in keys:
+        p = tolerances.param(key)
+        wide = len(score.windows.joints) if p.per == "joint" else 1
+
+        def at(value: float, key: Key = key, wide: int = wide, others: Theta = theta) -> float:
+            return cost(score, {**others, key: np.full(wide, value)}, windows, dt)
+
+        rungs = ladder(p)
+        costs = [least if value == p.null else at(value) for value in rungs]
+        k = int(np.argmin(costs))
+        if rungs[k] == p.null:
+            continue
+        between = rungs[max(k - 1, 0)], rungs[min(k + 1, len(rungs) - 1)]
+        found = minimize_scalar(at, bounds=between, options={"maxiter": CLOSER})
+        value, least = (found.x, float(found.fun)) if found.fun < costs[k] else (rungs[k], costs[k])
+        theta = {**theta, key: np.full(wide, value)}
+    return theta, least
+
+
+def ladder(p: Param) -> list[float]:
+    """Return the values of a parameter that are tried first, in order, the null value among them."""
+    found, far = {p.null}, FIRST * p.tolerance
+    while p.null - far >= p.low or p.null + far <= p.high:
+        found |= {v for v in (p.null - far, p.null + far) if p.low <= v <= p.high}
+        far *= 2.0
+    return sorted(found)

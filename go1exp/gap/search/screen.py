@@ -1,0 +1,273 @@
+"""Which missing effects could explain what the model cannot, to first order: one pass of replays for all of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from go1exp.gap.replay.machine import Machine
+from go1exp.gap.replay.rows import Key, Probe, Theta, variants
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.linear import Layout, Table, differences, predicted
+from go1exp.gap.search import strain, tolerances
+from go1exp.schema.registry import members
+
+GROUND = ("foot_friction", "ground_compliance", "external_wrench", "payload", "com_offset")
+"""Effects that a held robot does not feel."""
+
+LEVELS: dict[str, tuple[dict[str, float], ...]] = {
+    "torque_speed_limit": (
+        *({"peak": -v} for v in (0.1, 0.3, 0.55, 0.7)),
+        *({"droop": v} for v in (0.2, 0.6, 1.0, 1.6)),
+    ),
+    "backlash": ({"gap": 0.002}, {"gap": 0.015}),
+    "flexibility": ({"compliance": 0.001}, {"compliance": 0.004}),
+    "joint_stop": ({"time_constant": 0.006}, {"time_constant": 0.03}),
+    "command_delay": ({"delay": 0.01},),
+    "foot_friction": ({"scale": -0.3}, {"scale": 0.3}),
+    "ground_compliance": ({"time_constant": 0.01}, {"time_constant": -0.008}),
+}
+"""Changes by which effects with a threshold, or far from linear, are probed; any one may become the start of a fit."""
+
+SHAPES: dict[str, tuple[dict[str, float], ...]] = {
+    "stribeck": ({"speed": 0.1}, {"speed": 0.5}),
+    "parallel_stiffness": ({"rest": math.nan},),  # where the joint is on average
+}
+"""Shapes with which effects are tried; the null one where nothing is said."""
+
+FREE_SHAPES: dict[str, tuple[str, ...]] = {
+    "stribeck": ("speed",),
+    "parallel_stiffness": ("rest",),
+    "cogging": ("phase", "count"),
+    "torque_speed_limit": ("stall",),
+    "payload": ("x", "y", "z"),
+}
+"""Shapes that a full fit may change."""
+
+COUNTS = tuple(float(count) for count in range(18, 64, 3))
+"""Periods per turn at which cogging is looked for; over a radian of motion, neighbours differ by half a period."""
+
+PROBE = 2.0
+"""Change of a parameter by which it is probed, in tolerances."""
+
+
+OUTSIDE = 0.03
+"""Fall of chi2 per value, in the windows of the screening, of which half are the worst, for an effect that the
+tolerances have no place for: at most 0.0074 in development nulls, 0.053 and 0.138 for effects of two tolerances that
+others hid."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way for an effect to be there.
+
+    Attributes:
+        effect: registered name.
+        probes: what was changed to see it; empty for one whose columns the box has.
+        shapes: values of its shapes.
+        quadrature: the two halves of the probes are amplitudes at phases 0 and pi / 2.
+    """
+
+    effect: str
+    probes: tuple[Probe, ...] = ()
+    shapes: Theta = field(default_factory=dict)
+    quadrature: bool = False
+
+    def start(self, theta: Theta, layout: Layout, x: np.ndarray, machine: Machine) -> Theta:
+        """Return where a fit begins: ``theta`` with this effect as large as the linear model has it."""
+        if self.quadrature:
+            key = self.probes[0].key
+            assert isinstance(key, tuple)
+            sine, cosine = np.zeros(len(machine.joints)), np.zeros(len(machine.joints))
+            for i in range(layout.size):
+                (sine if layout.probe[i] < len(self.probes) // 2 else cosine)[layout.joint[i]] = x[i]
+            found = {
+                **{key: np.broadcast_to(value, sine.shape).copy() for key, value in self.shapes.items()},
+                (self.effect, "amplitude"): np.hypot(sine, cosine),
+                (self.effect, "phase"): np.arctan2(cosine, sine),
+            }
+            return {**theta, **found}
+        return tolerances.moved({**theta, **self.shapes}, layout, self.probes, x, machine)
+
+    @property
+    def free(self) -> tuple[Key, ...]:
+        """Parameters that a full fit changes."""
+        return (*tolerances.sizes(self.effect), *((self.effect, name) for name in FREE_SHAPES.get(self.effect, ())))
+
+
+def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -> list[Variant]:
+    """Return every way in which an effect could be missing; ``mean`` (J,) are the joints' average angles, rad."""
+    found: list[Variant] = []
+    for effect in members("effect"):
+        if (effect in GROUND and not machine.base_probe) or effect in exclude:
+            continue
+        if effect in tolerances.of(machine) and effect not in LEVELS:
+            found.append(Variant(effect))
+            continue
+        keys = tolerances.sizes(effect)
+        if effect == "cogging":
+            key = (effect, "amplitude")
+            plain = tolerances.probes(machine, [key], {}, PROBE)
+            for count in COUNTS:
+                at: Theta = {(effect, "count"): np.array([count])}
+                sides = [{**at, (effect, "phase"): np.array([v])} for v in (0.0, math.pi / 2)]
+                both = [Probe(key, p.place, p.delta, also) for also in sides for p in plain]
+                found.append(Variant(effect, tuple(both), at, quadrature=True))
+            continue
+        for given in SHAPES.get(effect, ({},)):
+            shapes: Theta = {
+                (effect, name): (mean.copy() if math.isnan(value) else np.array([value]))
+                for name, value in given.items()
+            }
+            for level in LEVELS.get(effect, ({},)):
+                wanted = [key for key in keys if not level or key[1] in level]
+                probes = tolerances.probes(machine, wanted, {}, PROBE)
+                probes = [
+                    Probe(p.key, p.place, np.full_like(p.delta, level[p.key[1]]) if level else p.delta, shapes)
+                    for p in probes
+                ]
+                found.append(Variant(effect, tuple(probes), shapes))
+    return found
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What the linear model says of one variant.
+
+    Attributes:
+        variant: which.
+        theta: where a fit would begin.
+        gain: mean fall of log chi2 over the windows.
+        relief: fall of chi2 and priors per value, if the effect may leave its tolerance.
+        signal: largest chi2 that twice its tolerance adds to one value of a window, on average over the window.
+    """
+
+    variant: Variant
+    theta: Theta
+    gain: float
+    relief: float
+    signal: float
+
+
+def screen(
+    scorer: Scorer,
+    theta: Theta,
+    own: Table,
+    may: tolerances.Freedom,
+    library: Sequence[Variant],
+    dt: float,
+) -> list[Screened]:
+    """Rank variants.
+
+    Args:
+        scorer: of the windows.
+        theta: present values.
+        own: the linear model of what may move already.
+        may: what may leave its tolerance.
+        library: the variants.
+        dt: physics step, s.
+    """
+    machine = scorer.replayer.machine
+    known = len(own.probes)
+    every = [p for v in library for p in v.probes]
+    columns = _columns(scorer, theta, own.windows, every, dt)
+    size = scorer.size[own.windows][:, None]
+    found = []
+    full = Table(
+        own.windows, (*own.probes, *every), own.residual, np.concatenate([own.columns, columns], axis=-1), theta
+    )
+    grams = full.grams(scorer)
+    before = grams[..., -1, -1] / size
+    weight = 1.0 / np.maximum(before, 1.0)
+    plain, count = strain.cost(scorer, own)(may), strain.values(scorer, own)
+    at = known
+    for variant in library:
+        added = list(range(at, at + len(variant.probes)))
+        at += len(variant.probes)
+        pick = [*range(known), *added]
+        probes = [*own.probes, *variant.probes]
+        part = grams[:, :, [*pick, -1]][..., [*pick, -1]]
+        layout = Layout.of(machine, probes)
+        matrix, right = layout.total(part * weight[..., None, None])
+        freed = may.also(variant.effect)
+        limits, strict = (tolerances.bounds(layout, probes, theta, freed, back) for back in (False, True))
+        for some in (limits, strict) if variant.quadrature else ():
+            some.low[layout.part(np.arange(known, len(probes)))] = -np.inf
+        relief = (plain - strain.price(matrix, right, strict)) / count
+        x = tolerances.solve(matrix, right, limits)
+        after = predicted(part, layout, x) / size
+        gain = float(np.mean(np.log(before.sum(1) / np.maximum(after, 0.3).sum(1))))
+        start = _start(theta, variant, own.probes, layout, x, machine)
+        mine = [*added, *(k for k, p in enumerate(own.probes) if p.key[0] == variant.effect)]
+        found.append(Screened(variant, start, gain, relief, _signal(grams, full.probes, mine, size)))
+    return sorted(found, key=lambda s: -s.gain)
+
+
+def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Screened]:
+    """Return the effects to try if one that has no tolerance to move in would relieve the others most; none otherwise.
+
+    Those that would relieve nearly as much are its rivals; held-out data decide between them.
+
+    Args:
+        screened: what the linear model says of every effect.
+        within: effects that move within their tolerances already.
+    """
+    order = sorted(screened, key=lambda s: -s.relief)
+    if not order or order[0].variant.effect in within or order[0].relief < OUTSIDE:
+        return []
+    return [s for s in order if s.relief > order[0].relief / strain.LEAD]
+
+
+def _start(
+    theta: Theta, variant: Variant, known: Sequence[Probe], layout: Layout, x: np.ndarray, machine: Machine
+) -> Theta:
+    """Return where a fit begins: the present values with the variant's effect alone moved.
+
+    What else the linear model would move, it would move too far: with the effect so large, it is no longer right.
+    """
+    if variant.probes:
+        extra = Layout.of(machine, variant.probes)
+        return variant.start(theta, extra, x[layout.size - extra.size :], machine)
+    own = np.array([known[k].key[0] == variant.effect for k in layout.probe])
+    return tolerances.moved(theta, layout, known, np.where(own, x, 0.0), machine)
+
+
+def _signal(grams: np.ndarray, probes: Sequence[Probe], mine: Sequence[int], size: np.ndarray) -> float:
+    """Return the largest mean square, in units of the noise, that a change by twice a tolerance makes in a window."""
+    most = 0.0
+    for k in mine:
+        key = probes[k].key
+        assert isinstance(key, tuple)
+        reach = 2.0 * tolerances.param(key).tolerance
+        if np.abs(probes[k].delta).max() <= 1.5 * reach:  # beyond, a threshold may lie between
+            most = max(most, float((grams[..., k, k] / size).max()) * reach**2)
+    return most
+
+
+def _columns(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], dt: float) -> np.ndarray:
+    """Return the columns of probes, replayed a few effects at a time: a step pays for every effect on the plant."""
+    machine, replayer = scorer.replayer.machine, scorer.replayer
+    by_effect: dict[str, list[int]] = {}
+    for k, p in enumerate(probes):
+        by_effect.setdefault(p.key[0], []).append(k)
+    lots: list[list[int]] = []
+    for mine in by_effect.values():
+        if lots and len(lots[-1]) + len(mine) <= 14:
+            lots[-1] += mine
+        else:
+            lots.append(list(mine))
+    found = np.zeros((len(windows), len(machine.groups), *_sizes(scorer), len(probes)), dtype=np.float32)
+    for lot in lots:
+        chosen = [probes[k] for k in lot]
+        rows = variants(machine, theta, windows, chosen)
+        y = replayer.run(rows, 2.0 * dt).reshape(len(windows), 1 + len(chosen), *scorer.windows.y.shape[1:])
+        found[..., lot] = differences(scorer, y, windows, chosen)
+    return found
+
+
+def _sizes(scorer: Scorer) -> tuple[int]:
+    w = scorer.windows
+    return (w.t.shape[1] * len(w.quantities) * len(scorer.replayer.machine.groups[0]),)
