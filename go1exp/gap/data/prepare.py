@@ -16,6 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import savgol_filter
 
 from go1exp.audit import AuditReport, audit
+from go1exp.audit.related import SPEED_CHECKS
 from go1exp.gap.data.standing import cut_standing, for_feet, missing
 from go1exp.gap.data.windows import Windows, cut
 from go1exp.gap.replay.machine import Machine
@@ -23,9 +24,6 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.standing import StandingGo1, on_feet
 from go1exp.recording import Recording, joint_channel, joint_channels
-
-SPEED_CHECKS = ("scale", "lag", "repeats")
-"""Checks of the audit after which a speed is no longer compared, even if they only call it suspect."""
 
 SMOOTH = 5
 """Samples of the parabola whose slope is the speed where none was recorded, or none that can be trusted."""

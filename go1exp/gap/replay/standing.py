@@ -100,7 +100,7 @@ class StandingReplayer(Replayer):
             return super().run(rows, dt)
         assert isinstance(self.machine, StandingGo1)
         if self.hung is None:
-            machine = HungGo1(self.machine.config, groups=self.machine.groups)
+            machine = HungGo1(self.machine.config, groups=self.machine.groups, tolerances=self.machine.tolerances)
             self.hung = Replayer(machine, self.windows, self.quats, self.max_rows, self.threads)
         self.hung.windows = self._windows.plain()
         found = np.zeros((len(held), self.windows.t.shape[1], len(self.windows.quantities), len(self.windows.joints)))

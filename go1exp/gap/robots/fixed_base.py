@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import go1exp.actuator
 import go1exp.effects  # noqa: F401  (registers every effect)
 from go1exp.actuator.setup import Gains
 from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.schema.registry import ConfigError, Entry, Term
@@ -56,7 +57,7 @@ class FixedBase:
         groups: numbers of the joints that move together.
         effort: peak torque (J,), N m.
         top_speed: (J,) rad/s.
-        tolerances: of nominal parameters, where they are not those that the effects declare.
+        tolerances: of nominal parameters.
     """
 
     config: ModelConfig
@@ -64,7 +65,7 @@ class FixedBase:
     groups: tuple[tuple[int, ...], ...]
     effort: tuple[float, ...]
     top_speed: tuple[float, ...]
-    tolerances: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    tolerances: Tolerances = DECLARED
     base_probe: tuple[float, ...] = ()
 
     @staticmethod
@@ -77,7 +78,7 @@ class FixedBase:
         index = {name: k for k, name in enumerate(config.joints)}
         groups = tuple(tuple(index[name] for name in group) for group in config.joint_groups)
         effort, top = (tuple(float(v) for v in config.per_joint(name)) for name in ("torque_limit", "speed_limit"))
-        machine = FixedBase(config, config.joints, groups, effort, top, config.tolerance)
+        machine = FixedBase(config, config.joints, groups, effort, top, Tolerances.of(config.tolerances))
         try:
             model = machine.model(0.001, (1.0, 0.0, 0.0, 0.0))
         except FixedBaseError as error:

@@ -10,6 +10,7 @@ import go1exp.actuator
 import go1exp.effects  # noqa: F401  (registers every effect)
 from go1exp import robot
 from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.env.plant import drive_setup
 from go1exp.gap.replay.machine import Machine
 from go1exp.physics.mujoco_cpu import MujocoCpu
@@ -30,6 +31,7 @@ class HungGo1:
     joints: tuple[str, ...] = robot.JOINTS
     groups: tuple[tuple[int, ...], ...] = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
     base_probe: tuple[float, ...] = ()
+    tolerances: Tolerances = DECLARED
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
@@ -41,6 +43,6 @@ class HungGo1:
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
 
-def hung(config: RobotConfig) -> Machine:
+def hung(config: RobotConfig, tolerances: Tolerances = DECLARED) -> Machine:
     """Return a Go1 whose trunk is held."""
-    return HungGo1(config)
+    return HungGo1(config, tolerances=tolerances)

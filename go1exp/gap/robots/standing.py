@@ -8,6 +8,7 @@ from typing import Any
 
 from go1exp import robot
 from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.env.plant import drive_setup
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.robots.hung import HungGo1
@@ -33,6 +34,7 @@ class StandingGo1:
     joints: tuple[str, ...] = robot.JOINTS
     groups: tuple[tuple[int, ...], ...] = (tuple(range(robot.NUM_JOINTS)),)
     base_probe: tuple[float, ...] = BASE_PROBE
+    tolerances: Tolerances = DECLARED
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` free robots, and their drives; ``base_quat`` says nothing here."""
@@ -45,4 +47,6 @@ class StandingGo1:
 def on_feet(machine: Machine, recordings: Sequence[Recording]) -> Machine:
     """Return the Go1 on its feet in the place of the hung one if it is in one of the recordings."""
     standing = any(r.meta.base == "floating" for r in recordings)
-    return StandingGo1(machine.config) if standing and isinstance(machine, HungGo1) else machine
+    if not standing or not isinstance(machine, HungGo1):
+        return machine
+    return StandingGo1(machine.config, tolerances=machine.tolerances)

@@ -13,6 +13,7 @@ import numpy as np
 
 from go1exp.config import parse_parts
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.tolerances import Tolerances
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.data.prepare import prepare
 from go1exp.gap.data.splits import splits
@@ -76,7 +77,11 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
     found = []
     for name, about, lines in (
         (EFFECT, "What the model lacks.", _named_lines(certified)),
-        (CALIBRATION, "The model's own parameters, within their tolerances.", _box_lines(result.box)),
+        (
+            CALIBRATION,
+            "The model's own parameters, within their tolerances.",
+            _box_lines(result.box, Tolerances.of(result.tolerances)),
+        ),
         (COMPENSATING, "Makes up for something that no effect describes. Not for training.", _named_lines(rest)),
     ):
         path = folder / name
@@ -110,10 +115,10 @@ def _named_lines(named: Sequence[NamedEffect]) -> list[str]:
     return lines
 
 
-def _box_lines(box: Values) -> list[str]:
+def _box_lines(box: Values, tolerances: Tolerances) -> list[str]:
     lines = []
     for effect, params in box.items():
-        kind = _params(effect, params)
+        kind = {name: tolerances.param((effect, name)) for name in _params(effect, params)}
         body = [
             f"  {name}: {_value(places, kind[name])}  # {kind[name].unit}"
             for name, places in params.items()
@@ -202,11 +207,20 @@ def _reported(result: GapResult) -> float:
     return steps.get(certified[-1], float("nan")) if certified else result.excess.get("box", float("nan"))
 
 
-def _same_search(recordings: Sequence[Recording], settings: GapSettings, result: GapResult) -> None:
+def _same_search(
+    recordings: Sequence[Recording], settings: GapSettings, result: GapResult, tolerances: Tolerances
+) -> None:
     before, now = result.provenance.get("settings", {}), asdict(settings)
     changed = [f"search.{k}" for k in SPLITTING if k in before and before[k] != now[k]]
     if changed:
         raise GapFileError(f"{', '.join(changed)}: not as in the search that found this; run go1exp gap explain again")
+    searched = Tolerances.of(result.tolerances)
+    for key, value in tolerances.replaced.items():
+        if value != searched.param(key).tolerance:
+            raise GapFileError(
+                f"model.tolerances.{'.'.join(key)} = {value:g}: not as in the search that found this "
+                f"({searched.param(key).tolerance:g}); run go1exp gap explain again"
+            )
     logs = result.provenance.get("logs")
     if logs and logs != {r.meta.episode: fingerprint(r) for r in recordings}:
         raise GapFileError("logs: not those of the search that found this; run go1exp gap explain again")
@@ -237,8 +251,8 @@ def prove(
     Raises:
         GapFileError: if logs or settings are not those of the search: what it held out would not be known.
     """
-    _same_search(recordings, settings, result)
     machine = hung(config) if isinstance(config, RobotConfig) else config
+    _same_search(recordings, settings, result, machine.tolerances)
     ready = prepare(recordings, machine, settings)
     recordings, settings, windows = ready.recordings, ready.settings, ready.windows()
     dt = float(windows.period / np.ceil(windows.period / physics_dt - 1e-3))

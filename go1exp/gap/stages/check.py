@@ -10,7 +10,7 @@ import numpy as np
 from go1exp.gap import answer as words
 from go1exp.gap.data.prepare import prepare
 from go1exp.gap.data.splits import splits
-from go1exp.gap.replay.machine import Machine, tolerances_of
+from go1exp.gap.replay.machine import Machine
 from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.score.floors import measured, repeatability
@@ -78,8 +78,7 @@ def survey(
 ) -> Survey:
     """Take a first look at recordings of a held robot; ``screen`` also asks what they could not tell."""
     machine = hung(config) if isinstance(config, RobotConfig) else config
-    with tolerances_of(machine):
-        return _survey(recordings, machine, settings, on_progress, screen)
+    return _survey(recordings, machine, settings, on_progress, screen)
 
 
 def _survey(

@@ -10,12 +10,13 @@ from importlib.metadata import version
 import numpy as np
 
 from go1exp import __version__
+from go1exp.effects.tolerances import declared
 from go1exp.gap import answer as words
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.data.prepare import prepare
 from go1exp.gap.data.splits import splits
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import Machine, tolerances_of
+from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.result import Floors, GapResult, GapSettings, NamedEffect, Overlay
 from go1exp.gap.robots.hung import hung
@@ -24,7 +25,6 @@ from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import localise
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Progress, Search
-from go1exp.gap.search.tolerances import param
 from go1exp.gap.search.trial import excess, removed
 from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
@@ -52,7 +52,7 @@ def explain(
         on_progress: told what goes on and which share of the work is done.
     """
     machine = hung(config) if isinstance(config, RobotConfig) else config
-    with one_thread(), tolerances_of(machine):
+    with one_thread():
         return _explain(recordings, machine, settings or GapSettings(), on_progress)
 
 
@@ -150,6 +150,7 @@ def _explain(
         bags=dict(search.shares),
         waterfall=(("model as it is", excesses["null"]), *search.steps),
         overlays=overlays(score, recordings, search.theta, parts.select, settings.overlays, float(dt)),
+        tolerances=ready.machine.tolerances.by_effect(),
         box=_nested(theta, windows.joints, {n.effect: n for n in named}),
         provenance={
             "logs": {r.meta.episode: fingerprint(r) for r in logs},
@@ -213,7 +214,7 @@ def _nested(
     found: dict[str, dict[str, dict[str, float]]] = {}
     for (effect, name), value in theta.items():
         own = named.get(effect)
-        if param((effect, name)).per == "robot":
+        if declared((effect, name)).per == "robot":
             left = {} if own else {"robot": float(value[0])}
         else:
             full = zip(joints, np.broadcast_to(value, (len(joints),)), strict=True)

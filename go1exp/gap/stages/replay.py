@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from go1exp.gap.data.prepare import prepare
 from go1exp.gap.data.standing import AXES, IMU, StandingWindows, rows_at
 from go1exp.gap.data.windows import even_clock, noise_of
-from go1exp.gap.replay.machine import Machine, tolerances_of
+from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Rows, variants
 from go1exp.gap.replay.standing import TRUNK, Witness
@@ -169,7 +169,7 @@ def retrace(
     parts: list[Part] = []
     warnings: list[str] = []
     dt = physics_dt
-    with one_thread(), tolerances_of(machine):
+    with one_thread():
         for some in filter(None, kinds):
             on_progress("replaying the logs", len(parts) / 2)
             ready = prepare(some, machine, dataclasses.replace(settings, torque=False, physics_dt=physics_dt))
