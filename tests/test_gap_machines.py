@@ -17,10 +17,10 @@ from omegaconf import OmegaConf
 from go1exp import data_root
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
+from go1exp.effects.tolerances import declared
 from go1exp.env.plant import Plant
 from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, prepare, slope
 from go1exp.gap.data.windows import averaged
-from go1exp.gap.replay.machine import tolerances_of
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.choice import machine_of
 from go1exp.gap.robots.description import ModelConfig, parse_model
@@ -181,14 +181,11 @@ def test_a_users_own_file_names_its_model_from_where_it_lies(tmp_path: Path) -> 
     FixedBase.of(model)
 
 
-def test_a_machines_own_tolerances_count_while_it_is_at_hand() -> None:
+def test_a_robot_carries_its_tolerances_and_another_robot_beside_it_has_others() -> None:
     key = ("base_tilt", "roll")
-    declared = tolerances.param(key).tolerance
-    with tolerances_of(machine("go2")):
-        assert tolerances.param(key).tolerance == 0.05
-        with tolerances_of(HungGo1(None)):  # type: ignore[arg-type]
-            assert tolerances.param(key).tolerance == declared
-    assert tolerances.param(key).tolerance == declared
+    go2, go1 = machine("go2"), HungGo1(None)  # type: ignore[arg-type]
+    assert go2.tolerances.param(key).tolerance == 0.05
+    assert go1.tolerances.param(key) == declared(key)
 
 
 # ---------------------------------------------------------------------- recordings
@@ -333,7 +330,8 @@ QUICK = GapSettings(
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only some of the nominal parameters may vary, so that a replay has ten variants and not forty."""
-    monkeypatch.setattr(tolerances, "BOX", ("strength", "coulomb", "viscous", "link_mass", "base_tilt"))
+    few = ("strength", "coulomb", "viscous", "link_mass", "base_tilt")
+    monkeypatch.setattr(tolerances, "nominal", lambda machine: few)
 
 
 @pytest.mark.usefixtures("few")

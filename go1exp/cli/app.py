@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from go1exp.cli.files import choices_from_files
-from go1exp.compose import as_container, config_folder, flat_keys, register_groups
+from go1exp.compose import as_container, as_hydra_takes_them, config_folder, flat_keys, register_groups
 from go1exp.schema.registry import ConfigError, Expected, nearest, unknown_name
 
 BAD_CONFIG, FAILED, STOPPED, READER_LEFT = 2, 1, 130, 141
@@ -67,7 +67,7 @@ class App:
         # Tab completion is installed for the program, whichever verb serves it.
         title = f"go1exp {self.title or self.name}"
         try:
-            sys.argv = ["go1exp" if "-sc" in arguments else title, *choices_from_files(arguments)]
+            sys.argv = ["go1exp" if "-sc" in arguments else title, *as_hydra_takes_them(choices_from_files(arguments))]
             hydra.main(**version, config_path=config_folder(), config_name=self.name)(task)()
             if failure:
                 raise failure[0]

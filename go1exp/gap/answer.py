@@ -5,51 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
+from go1exp.effects.tolerances import Tolerances, declared, effect_class, sizes
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import significance, tolerances
 from go1exp.gap.search.evidence import inaudible
 from go1exp.gap.search.fit import fit
-from go1exp.gap.search.screen import GROUND
 from go1exp.gap.search.stepwise import SILENT, Search
 from go1exp.gap.search.trial import excess, removed
-
-RECORD: dict[str, str] = {
-    "coulomb": "slow_ramps",
-    "stribeck": "slow_ramps",
-    "asymmetric_friction": "slow_ramps",
-    "load_friction": "slow_ramps",
-    "cogging": "slow_ramps",
-    "backlash": "slow_ramps",
-    "encoder_offset": "slow_ramps",
-    "base_tilt": "slow_ramps",
-    "parallel_stiffness": "slow_ramps",
-    "viscous": "torque_off",
-    "kd_scale": "torque_off",
-    "command_delay": "steps",
-    "torque_delay": "steps",
-    "torque_speed_limit": "steps",
-    "joint_stop": "steps",
-    "ground_compliance": "drop",
-    **dict.fromkeys(("foot_friction", "payload", "com_offset", "external_wrench"), "squat"),
-}
-"""Effect -> excitation that shows it best; ``chirp`` for all others."""
-
-TELL: tuple[tuple[frozenset[str], str], ...] = (
-    (frozenset({"kd_scale", "viscous"}), "record torque_off swings, or two values of kd (gains=[[20,0.5],[20,1.0]])"),
-    (
-        frozenset({"base_tilt", "encoder_offset", "link_com"}),
-        "record two attitudes of the trunk (hang=[[0,0],[0,0.5]])",
-    ),
-    (frozenset({"torque_delay", "lag"}), "record steps, whose edges tell a delay from a lag"),
-    (frozenset({"strength", "kp_scale", "armature", "link_mass"}), "record slow_ramps and a chirp at two gain sets"),
-)
-"""Effects that are hard to tell apart, and what tells them apart."""
-
+from go1exp.schema.registry import members
 
 MOST = 0.75
 """Share of the excess that terms must remove before the first of them is certified although a gap remains."""
@@ -65,12 +34,24 @@ LAW = 0.04
 effects (265 values), widened to it, hold 89 % of the truths; with 2 %, 76 %."""
 
 
+def told_apart(names: Sequence[str]) -> tuple[str, ...]:
+    """Return what to record to tell apart effects that are confounded, each thing once; empty if none of them says."""
+    how = {name: tolerances.identification(name) for name in names}
+    return tuple(
+        dict.fromkeys(
+            how[first].told_apart_by if second in how[first].confounded else how[second].told_apart_by
+            for first, second in combinations(names, 2)
+            if second in how[first].confounded or first in how[second].confounded
+        )
+    )
+
+
 def advice(aliases: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Return what to record to tell apart the members of alias sets."""
     sentences = []
     for names in aliases.values():
         if len(names) > 1:
-            what = next((text for family, text in TELL if len(family & set(names)) > 1), "record chirp and steps")
+            what = ", and ".join(told_apart(names)) or "record chirp and steps"
             sentences.append(f"These logs cannot tell {' from '.join(names)}; {what} to separate them.")
     return tuple(sentences)
 
@@ -78,7 +59,8 @@ def advice(aliases: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str]:
     """Return effects that these data cannot show, and the excitation that would; ``held``: the trunk is."""
     silent = [effect for effect, loud in signal.items() if loud < SILENT]
-    return {effect: RECORD.get(effect, "chirp") for effect in (*silent, *(GROUND if held else ()))}
+    unfelt = [effect for effect in members("effect") if held and tolerances.identification(effect).needs_ground]
+    return {effect: tolerances.identification(effect).excitation for effect in (*silent, *unfelt)}
 
 
 @dataclass(frozen=True)
@@ -159,7 +141,7 @@ def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
         x = tolerances.solve(matrix, right, replace(limits, centre=centre))
         for key, value in tolerances.moved(search.theta, layout, linear.probes, x, machine).items():
             if key[0] in search.terms:
-                null = tolerances.param(key).null
+                null = search.robot_tolerances.param(key).null
                 law = 1.0 + LAW * search.rng.standard_normal(value.shape)
                 drawn.setdefault(key, []).append(null + (value - null) * law)
     return best.theta, {key: np.stack([np.ravel(v) for v in values]) for key, values in drawn.items()}
@@ -177,11 +159,11 @@ def name_terms(
         adequate: whether the model with them counts as right.
         mostly: whether they remove most of the excess, so that the first may be certified although a gap remains.
     """
-    joints = search.scorer.windows.joints
+    joints, known = search.scorer.windows.joints, search.robot_tolerances
     named = []
     for number, effect in enumerate(search.terms):
-        per_joint = [key for key in tolerances.sizes(effect) if tolerances.param(key).per == "joint"]
-        at = _joints_beyond(per_joint, theta, drawn, joints)
+        per_joint = [key for key in sizes(effect) if known.param(key).per == "joint"]
+        at = _joints_beyond(per_joint, theta, drawn, joints, known)
         params: dict[str, dict[str, float]] = {}
         interval: dict[str, dict[str, tuple[float, float]]] = {}
         for key in (key for key in theta if key[0] == effect):
@@ -198,12 +180,12 @@ def name_terms(
 
 
 def _joints_beyond(
-    keys: Sequence[Key], theta: Theta, drawn: Mapping[Key, np.ndarray], joints: Sequence[str]
+    keys: Sequence[Key], theta: Theta, drawn: Mapping[Key, np.ndarray], joints: Sequence[str], known: Tolerances
 ) -> tuple[str, ...]:
     """Return the joints at which one of the parameters leaves its tolerance, and is not null, beyond doubt."""
     beyond, at_best = np.zeros(len(joints), dtype=bool), np.zeros(len(joints), dtype=bool)
     for key in keys:
-        p = tolerances.param(key)
+        p = known.param(key)
         low, high = np.quantile(drawn[key], QUANTILES, axis=0)
         value = np.broadcast_to(theta[key], len(joints))
         at_best |= np.abs(value - p.null) > p.tolerance
@@ -217,7 +199,7 @@ def _by_joint(
     key: Key, value: np.ndarray, samples: np.ndarray, joints: Sequence[str], at: Sequence[str]
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """Return the values and the 95 % intervals of a parameter by joint (those of ``at``), or by ``robot``."""
-    names = joints if tolerances.param(key).per == "joint" else ("robot",)
+    names = joints if declared(key).per == "joint" else ("robot",)
     values = np.broadcast_to(np.ravel(value), len(names))
     low, high = (np.broadcast_to(v, len(names)) for v in np.quantile(samples, QUANTILES, axis=0))
     kept = [k for k, n in enumerate(names) if n == "robot" or n in at]
@@ -269,7 +251,9 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], more: Se
     rejected = [c.effect for c in search.candidates if c.status == "rejected" and c.stage == 1][:2]
     if answer.named and rejected:
         parts.append(f"{' and '.join(rejected)} {'was' if len(rejected) == 1 else 'were'} considered and rejected.")
-    quiet = [effect for effect in silent if effect not in GROUND or effect in search.signal]
+    quiet = [
+        effect for effect in silent if effect in search.signal or not tolerances.identification(effect).needs_ground
+    ]
     if quiet:
         parts.append(f"These logs cannot show {', '.join(quiet)}.")
     return " ".join([*filter(None, parts), *more])
@@ -288,17 +272,17 @@ def _opening(verdict: Verdict, first: float) -> str:
 def _lacking(effect: NamedEffect, everyone: Sequence[str]) -> str:
     """Return the sentence about one effect that the model lacks."""
     texts = []
-    for name in (key[1] for key in tolerances.sizes(effect.effect)):
+    for _, name in sizes(effect.effect):
         values = np.array(list(effect.params.get(name, {}).values()))
         if len(values):
-            p = tolerances.param((effect.effect, name))
+            p = declared((effect.effect, name))
             half = np.mean([0.5 * (b - a) for a, b in effect.interval[name].values()])
             spread = f", {values.min():.3g} to {values.max():.3g}" if len(values) > 1 else ""
             unit = "" if p.unit == "-" else f" {p.unit}"
             texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}")
     at = f" at {where(effect.joints, everyone)}" if effect.joints else ""
     doubt = "" if effect.status == "certified" else " (compensating, not certified)"
-    title = f"{tolerances.effect_class(effect.effect).title} ({effect.effect})"
+    title = f"{effect_class(effect.effect).title} ({effect.effect})"
     return f"The model lacks {title}{at}: {'; '.join(texts)}{doubt}."
 
 

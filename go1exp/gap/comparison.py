@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,6 @@ from go1exp.audit import audit
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.splits import Splits, splits
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import tolerances_of
 from go1exp.gap.result import Floors, GapSettings
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.robots.protocol import Robot
@@ -20,7 +18,6 @@ from go1exp.gap.score.floors import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
-from go1exp.tensors.threads import one_thread
 
 Progress = Callable[[str, float], None]
 """Called with what is being done, and which share of all is finished."""
@@ -100,13 +97,6 @@ def robot_from(robot: RobotConfig | Robot) -> Robot:
     return hung(robot) if isinstance(robot, RobotConfig) else robot
 
 
-@contextmanager
-def session(robot: Robot) -> Iterator[None]:
-    """Let torch use one thread and the robot's tolerances count within the block; every stage runs in one."""
-    with one_thread(), tolerances_of(robot):
-        yield
-
-
 def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings) -> tuple[Robot, Ready]:
     """Return the robot as it is in the recordings, and those of them that can be compared with it.
 
@@ -134,7 +124,7 @@ def compare(
     physics_dt: float | None = None,
     fewest: int = FEWEST_WINDOWS,
 ) -> Comparison:
-    """Prepare recordings, cut them into windows, and measure the floors; to be called within a :func:`session`.
+    """Prepare recordings, cut them into windows, and measure the floors.
 
     Args:
         recordings: of one robot.

@@ -59,6 +59,7 @@ def from_dict(plain: Mapping[str, Any]) -> GapResult:
     values["waterfall"] = tuple((str(label), _number(value)) for label, value in plain["waterfall"])
     for name in ("excess", "bags", "box"):
         values[name] = _numbers(plain[name])
+    values["tolerances"] = _numbers(plain.get("tolerances", {}))  # of an older version: the declared ones
     for name in ("closed", "seconds"):
         values[name] = _number(plain[name])
     for name in ("advice", "warnings"):

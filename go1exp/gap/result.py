@@ -222,6 +222,7 @@ class GapResult:
         waterfall: (label, excess) from the plain model down to what remains.
         overlays: windows to look at.
         box: parameters within their tolerances: effect -> parameter -> joint or ``robot`` -> value.
+        tolerances: that counted: effect -> parameter -> tolerance; where there is none, the effect's declared one.
         provenance: hashes, versions, seeds, steps.
         warnings: what a reader must know, a sentence each.
         seconds: time it took.
@@ -242,6 +243,7 @@ class GapResult:
     waterfall: tuple[tuple[str, float], ...] = ()
     overlays: tuple[Overlay, ...] = ()
     box: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
+    tolerances: dict[str, dict[str, float]] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     seconds: float = math.nan

@@ -1,4 +1,4 @@
-"""Recordings as they come made comparable: what is kept, what was chosen, and speeds and clocks where they are missing."""
+"""What makes recordings comparable: what is kept and chosen, and speeds and clocks where they are missing."""
 
 from __future__ import annotations
 

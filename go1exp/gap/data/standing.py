@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.gap.data.trunk import AGREE, SLIDE, TORN, Base, Log, base_state, loaded
 from go1exp.gap.data.cutting import cut, noise_of
+from go1exp.gap.data.trunk import AGREE, SLIDE, TORN, Base, Log, base_state, loaded
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.result import GapSettings
 from go1exp.physics.legs import Legs
@@ -175,9 +175,7 @@ def _with_trunk(
     kept |= {"quantities": (*plain.quantities, IMU), "y": np.concatenate([plain.y, imu], axis=2)}
     kept["scale"] = np.concatenate([plain.scale, scale], axis=1)
     held = np.array([number not in logs for number in plain.episode])
-    return StandingWindows(
-        **kept, base=state, sd_of_base=base_sd, contact=contact, held=held, imu_site=legs.imu_site
-    )
+    return StandingWindows(**kept, base=state, sd_of_base=base_sd, contact=contact, held=held, imu_site=legs.imu_site)
 
 
 def rows_at(t: np.ndarray, when: np.ndarray) -> np.ndarray:

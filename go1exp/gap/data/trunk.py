@@ -13,7 +13,8 @@ from go1exp.physics.legs import Legs
 from go1exp.recording import VECTORS, Recording
 
 LOADED = 10.0
-"""Force from which a foot carries weight, N: a third of what each bears at rest, twice the estimate for a foot in the air."""
+"""Force from which a foot carries weight, N: a third of what each bears at rest, twice what is
+estimated for a foot in the air."""
 
 AGREE = 0.004
 """Feet that carry weight and disagree by more about the height of the base, m, are not all on the ground."""

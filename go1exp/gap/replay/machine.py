@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import go1exp.actuator
 import go1exp.effects  # noqa: F401  (registers every effect)
 from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import Tolerances
 from go1exp.schema.registry import Term, bind
-
 
 NEEDLESS = 1 << 4 | 1 << 13
 """MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
@@ -33,8 +31,8 @@ class Machine(Protocol):
         """Changes of a free base's initial state by which its influence is measured; empty for one that is held."""
 
     @property
-    def tolerances(self) -> Mapping[tuple[str, str], float]:
-        """Tolerances by (effect, parameter), where they are not those that the effects declare."""
+    def tolerances(self) -> Tolerances:
+        """How far the nominal parameters may be off."""
 
     def drive(self) -> Term:
         """Return what turns commands into torques."""
@@ -48,21 +46,3 @@ def pd() -> Term:
     term = bind("actuator", "pd", {}, "pd")[0]
     assert term is not None
     return term
-
-
-_TOLERANCES: ContextVar[Mapping[tuple[str, str], float]] = ContextVar("tolerances")
-
-
-@contextmanager
-def tolerances_of(machine: Machine) -> Iterator[None]:
-    """Let a machine's own tolerances count wherever one is asked for within the block."""
-    token = _TOLERANCES.set(machine.tolerances)
-    try:
-        yield
-    finally:
-        _TOLERANCES.reset(token)
-
-
-def tolerance(effect: str, parameter: str, declared: float) -> float:
-    """Return the tolerance of a parameter of the machine at hand, ``declared`` unless the machine has its own."""
-    return _TOLERANCES.get({}).get((effect, parameter), declared)

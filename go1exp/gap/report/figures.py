@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 import go1exp.gap.report.words as words
+from go1exp.effects.tolerances import Tolerances
 from go1exp.gap.report.svg import PAGE_INCHES, draw
 from go1exp.gap.result import GapResult, NamedEffect, Overlay
 
@@ -175,9 +176,9 @@ def _step(label: str) -> str:
     return label if label.startswith(("within", "without", "with ")) else f"with {label}"
 
 
-def forest(named: NamedEffect, name: str, index: int) -> Markup:
+def forest(named: NamedEffect, name: str, index: int, tolerances: Tolerances) -> Markup:
     """Draw the values of one parameter with their 95 % intervals, over the tolerance about null."""
-    declared, values = words.param(named.effect, name), named.params[name]
+    declared, values = words.param(named.effect, name, tolerances), named.params[name]
     intervals = named.interval.get(name, {})
 
     def paint() -> Figure:
@@ -211,7 +212,7 @@ def box(result: GapResult) -> Markup:
     rows = []
     for effect, by_name in result.box.items():
         for name, values in by_name.items():
-            declared = words.param(effect, name)
+            declared = words.param(effect, name, words.tolerances(result))
             if declared and math.isfinite(declared.tolerance):
                 unit = words.unit(effect, name)
                 label = f"{effect} {name} (± {words.number(declared.tolerance)}{' ' if unit else ''}{unit})"

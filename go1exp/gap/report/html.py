@@ -81,7 +81,9 @@ def _context(result: GapResult) -> dict[str, Any]:
             if len(window.t) and window.measured
         ],
         "waterfall": figures.waterfall(result) if any(v == v for _, v in result.waterfall) else None,
-        "forests": [figures.forest(n, name, k) for k, (n, name) in enumerate(forests[:MOST_FORESTS])],
+        "forests": [
+            figures.forest(n, name, k, words.tolerances(result)) for k, (n, name) in enumerate(forests[:MOST_FORESTS])
+        ],
         "box": figures.box(result),
         "bags": figures.bags(result),
     }

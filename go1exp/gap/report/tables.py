@@ -217,7 +217,7 @@ def values(result: GapResult) -> list[Value]:
     found = []
     for named in result.named:
         for name, by_joint in named.params.items():
-            p = words.param(named.effect, name)
+            p = words.param(named.effect, name, words.tolerances(result))
             for joint, value in by_joint.items():
                 pair = named.interval.get(name, {}).get(joint)
                 interval = f"{words.number(pair[0])} to {words.number(pair[1])}" if pair else words.NOTHING

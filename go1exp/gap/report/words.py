@@ -13,6 +13,7 @@ import numpy as np
 import go1exp.effects
 import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
 from go1exp.effects.base import Param
+from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.gap.answer import where
 from go1exp.gap.result import GapResult, GapSettings, Localisation, NamedEffect
 from go1exp.schema.registry import members
@@ -66,11 +67,16 @@ def errors(result: GapResult) -> list[tuple[str, str]]:
     return [(ERRORS[k], error(result.excess[k])) for k in keys]
 
 
-def param(effect: str, name: str) -> Param | None:
+def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | None:
     """Return the declaration of a parameter, None for one that is not registered (any more)."""
     entry = members("effect").get(effect)
-    declared: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
-    return next((p for p in declared if p.name == name), None)
+    known: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
+    return tolerances.param((effect, name)) if any(p.name == name for p in known) else None
+
+
+def tolerances(result: GapResult) -> Tolerances:
+    """Return the tolerances that counted."""
+    return Tolerances.of(result.tolerances)
 
 
 def unit(effect: str, name: str) -> str:

@@ -13,12 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from go1exp.audit import AuditReport
+from go1exp.audit.related import SPEED_CHECKS
 from go1exp.gap.data.prepare import TELLING, clock_of_speeds, slope
 from go1exp.gap.robots.description import ModelConfig
 from go1exp.recording import Recording, joint_channel, joint_channels
-
-SPEED_CHECKS = ("scale", "lag", "repeats")
-"""Checks of the audit after which a speed is no longer compared, even if they only call it suspect."""
 
 
 def flaws_of(recording: Recording, report: AuditReport, config: ModelConfig) -> list[str]:

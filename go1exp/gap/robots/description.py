@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 import go1exp.effects  # noqa: F401  (registers every effect)
 from go1exp import data_root
+from go1exp.effects.tolerances import problems as tolerance_problems
 from go1exp.schema.joint_values import JointValues, each_within, spread
-from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain, members, unknown_name
+from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
 
 Name = Annotated[str, Field(min_length=1)]
 Limit = Annotated[JointValues, each_within(1e-9)]
@@ -103,7 +102,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Check what concerns several keys."""
-        wrong = [*_joint_problems(self), *_tolerance_problems(self.tolerances)]
+        wrong = [*_joint_problems(self), *tolerance_problems(self.tolerances, "tolerances")]
         if self.drive == "torque" and (self.kp is not None or self.kd is not None or self.firmware is not None):
             wrong.append("drive = 'torque': takes no kp, kd or firmware")
         if wrong:
@@ -114,15 +113,30 @@ class ModelConfig:
         """The groups, by name."""
         return self.groups or (self.joints,)
 
-    @cached_property
-    def tolerance(self) -> dict[tuple[str, str], float]:
-        """The tolerances by (effect, parameter)."""
-        return {(e, name): value for e, own in self.tolerances.items() for name, value in own.items()}
-
     def per_joint(self, name: str) -> np.ndarray:
         """Return a per-joint value (J,); NaN where it is not given."""
         values = getattr(self, name)
         return np.full(len(self.joints), np.nan) if values is None else spread(values, self.joints)
+
+
+@dataclass(frozen=True)
+class Go1Model:
+    """The Go1 of the group ``robot``: ``mjcf`` is null, and only how well it is known can be said here.
+
+    Attributes:
+        mjcf: null.
+        tolerances: effect -> parameter -> tolerance that replaces the declared one (unit as there).
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    mjcf: None = None
+    tolerances: dict[str, dict[str, Positive]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the names."""
+        if wrong := tolerance_problems(self.tolerances, "tolerances"):
+            raise ValueError("\n".join(wrong))
 
 
 def _joint_problems(config: ModelConfig) -> list[str]:
@@ -148,23 +162,8 @@ def _joint_problems(config: ModelConfig) -> list[str]:
     return wrong
 
 
-def _tolerance_problems(tolerances: Mapping[str, Mapping[str, float]]) -> list[str]:
-    wrong = []
-    for effect, own in tolerances.items():
-        if effect not in members("effect"):
-            wrong.append(unknown_name(f"tolerances.{effect}", effect, members("effect"), "effect"))
-            continue
-        params = {p.name: p for p in members("effect")[effect].target.params}  # type: ignore[attr-defined]
-        for name in own:
-            if name not in params:
-                wrong.append(unknown_name(f"tolerances.{effect}.{name}", name, params, "parameter"))
-            elif not math.isfinite(params[name].tolerance):
-                wrong.append(f"tolerances.{effect}.{name}: is a shape, which has no tolerance")
-    return wrong
-
-
-def parse_model(settings: Any, path: str = "model") -> ModelConfig | None:
-    """Validate a choice of ``conf/model``; None for the Go1, whose ``mjcf`` is null.
+def parse_model(settings: Any, path: str = "model") -> ModelConfig | Go1Model:
+    """Validate a choice of ``conf/model``; the Go1's ``mjcf`` is null.
 
     A relative path of a MuJoCo file counts from the project's root. The file itself is not opened here.
 
@@ -174,12 +173,19 @@ def parse_model(settings: Any, path: str = "model") -> ModelConfig | None:
     if not isinstance(settings, Mapping):
         raise ConfigError([f"{path} = {settings!r}: must be a choice of conf/model or a FILE.yaml"])
     if settings.get("mjcf", "") is None:
-        more = [key for key in settings if key != "mjcf"]
-        if more:
-            raise ConfigError([f"{path}.mjcf: is null, which is the Go1; {', '.join(more)} would do nothing"])
-        return None
-    try:
-        config = TypeAdapter(ModelConfig).validate_json(as_json(dict(settings)))
-    except ValidationError as error:
-        raise ConfigError(explain(error, path, [f.name for f in fields(ModelConfig)])) from None
+        others = [f.name for f in fields(ModelConfig) if f.name in settings and f.name not in ("mjcf", "tolerances")]
+        if others:
+            raise ConfigError([f"{path}.mjcf: is null, which is the Go1; {', '.join(others)} would do nothing"])
+        return _checked(Go1Model, settings, path)
+    config = _checked(ModelConfig, settings, path)
     return dataclasses.replace(config, mjcf=str(data_root() / config.mjcf))
+
+
+Kind = TypeVar("Kind", ModelConfig, Go1Model)
+
+
+def _checked(kind: type[Kind], settings: Mapping[str, Any], path: str) -> Kind:
+    try:
+        return TypeAdapter(kind).validate_json(as_json(dict(settings)))
+    except ValidationError as error:
+        raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import go1exp.actuator  # noqa: F401  (registers every actuator)
 from go1exp.actuator.setup import Gains
 from go1exp.audit import AuditReport
 from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
 from go1exp.gap.data.windows import Windows
@@ -56,7 +57,7 @@ class FixedBase:
         groups: numbers of the joints that move together.
         effort: peak torque (J,), N m.
         top_speed: (J,) rad/s.
-        tolerances: of nominal parameters, where they are not those that the effects declare.
+        tolerances: of nominal parameters.
     """
 
     config: ModelConfig
@@ -64,7 +65,7 @@ class FixedBase:
     groups: tuple[tuple[int, ...], ...]
     effort: tuple[float, ...]
     top_speed: tuple[float, ...]
-    tolerances: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    tolerances: Tolerances = DECLARED
     base_probe: tuple[float, ...] = ()
 
     @staticmethod
@@ -77,7 +78,7 @@ class FixedBase:
         index = {name: k for k, name in enumerate(config.joints)}
         groups = tuple(tuple(index[name] for name in group) for group in config.joint_groups)
         effort, top = (tuple(float(v) for v in config.per_joint(name)) for name in ("torque_limit", "speed_limit"))
-        machine = FixedBase(config, config.joints, groups, effort, top, config.tolerance)
+        machine = FixedBase(config, config.joints, groups, effort, top, Tolerances.of(config.tolerances))
         try:
             model = machine.model(0.001, (1.0, 0.0, 0.0, 0.0))
         except FixedBaseError as error:
@@ -131,9 +132,7 @@ class FixedBase:
         """Return why a recording cannot be compared, a line each."""
         return flaws_of(recording, report, self.config)
 
-    def prepared(
-        self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings
-    ) -> Ready:
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return recordings with what they lack taken from the description, and windows whose number is affordable."""
         warnings = []
         wrong = wrong_speeds(recordings, reports, self.config)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from go1exp import robot
 from go1exp.audit import AuditReport
 from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.env.plant import drive_setup
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.data.prepare import Ready
@@ -41,14 +42,14 @@ class HungGo1:
         joints: names.
         groups: the legs.
         base_probe: none, as the trunk is held.
-        tolerances: as for :class:`~go1exp.gap.replay.machine.Machine`.
+        tolerances: of nominal parameters.
     """
 
     config: RobotConfig
     joints: tuple[str, ...] = robot.JOINTS
     groups: tuple[tuple[int, ...], ...] = LEGS
     base_probe: tuple[float, ...] = ()
-    tolerances: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    tolerances: Tolerances = DECLARED
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
@@ -73,9 +74,7 @@ class HungGo1:
         """Return why a recording cannot be compared, a line each."""
         return go1_flaws(recording, report, self.joints, free=False)
 
-    def prepared(
-        self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings
-    ) -> Ready:
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are."""
         return Ready(tuple(recordings), settings)
 
@@ -88,6 +87,6 @@ class HungGo1:
         return Replayer(self, windows, quats, max_rows, threads)
 
 
-def hung(config: RobotConfig) -> Robot:
+def hung(config: RobotConfig, tolerances: Tolerances = DECLARED) -> Robot:
     """Return a Go1 whose trunk is held."""
-    return HungGo1(config)
+    return HungGo1(config, tolerances=tolerances)

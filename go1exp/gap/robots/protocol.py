@@ -25,9 +25,7 @@ class Robot(Machine, Protocol):
     def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
         """Return why a recording cannot be compared with this robot, a line each."""
 
-    def prepared(
-        self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings
-    ) -> Ready:
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return recordings without flaws as they are compared, and what had to be chosen.
 
         Args:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from go1exp import robot
 from go1exp.audit import AuditReport
 from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.env.plant import drive_setup
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet
@@ -48,7 +49,7 @@ class StandingGo1:
         joints: names.
         groups: all joints in one.
         base_probe: as for :class:`~go1exp.gap.replay.machine.Machine`.
-        tolerances: as there.
+        tolerances: of nominal parameters.
     """
 
     config: RobotConfig
@@ -56,7 +57,7 @@ class StandingGo1:
     joints: tuple[str, ...] = robot.JOINTS
     groups: tuple[tuple[int, ...], ...] = ONE_GROUP
     base_probe: tuple[float, ...] = BASE_PROBE
-    tolerances: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    tolerances: Tolerances = DECLARED
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
@@ -77,9 +78,7 @@ class StandingGo1:
         """Return why a recording cannot be compared, a line each."""
         return go1_flaws(recording, report, self.joints, free=True)
 
-    def prepared(
-        self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings
-    ) -> Ready:
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are, with windows that suit contact."""
         return Ready(tuple(recordings), for_feet(settings, recordings))
 

@@ -18,7 +18,6 @@ from go1exp.effects.base import Param
 from go1exp.gap.replay.rows import Key, Theta, variants
 from go1exp.gap.score.initial_state import FARTHEST, solved
 from go1exp.gap.score.likelihood import Scorer, gram, scorer
-from go1exp.gap.search import tolerances
 
 ROUNDS = 2
 """Steps of the first states, all by the changes that were measured at the nominal model."""
@@ -105,7 +104,7 @@ def fitted(
     theta: Theta = {}
     least = cost(score, {}, windows, dt) if nominal is None else nominal
     for key in keys:
-        p = tolerances.param(key)
+        p = score.replayer.machine.tolerances.param(key)
         wide = len(score.windows.joints) if p.per == "joint" else 1
 
         def at(value: float, key: Key = key, wide: int = wide, others: Theta = theta) -> float:

@@ -3,52 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from go1exp.effects.identification import Identification, Periodic
+from go1exp.effects.tolerances import Tolerances, sizes
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta, variants
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table, differences, predicted
 from go1exp.gap.search import strain, tolerances
-from go1exp.schema.registry import members
-
-GROUND = ("foot_friction", "ground_compliance", "external_wrench", "payload", "com_offset")
-"""Effects that a held robot does not feel."""
-
-LEVELS: dict[str, tuple[dict[str, float], ...]] = {
-    "torque_speed_limit": (
-        *({"peak": -v} for v in (0.1, 0.3, 0.55, 0.7)),
-        *({"droop": v} for v in (0.2, 0.6, 1.0, 1.6)),
-    ),
-    "backlash": ({"gap": 0.002}, {"gap": 0.015}),
-    "flexibility": ({"compliance": 0.001}, {"compliance": 0.004}),
-    "joint_stop": ({"time_constant": 0.006}, {"time_constant": 0.03}),
-    "command_delay": ({"delay": 0.01},),
-    "foot_friction": ({"scale": -0.3}, {"scale": 0.3}),
-    "ground_compliance": ({"time_constant": 0.01}, {"time_constant": -0.008}),
-}
-"""Changes by which effects with a threshold, or far from linear, are probed; any one may become the start of a fit."""
-
-SHAPES: dict[str, tuple[dict[str, float], ...]] = {
-    "stribeck": ({"speed": 0.1}, {"speed": 0.5}),
-    "parallel_stiffness": ({"rest": math.nan},),  # where the joint is on average
-}
-"""Shapes with which effects are tried; the null one where nothing is said."""
-
-FREE_SHAPES: dict[str, tuple[str, ...]] = {
-    "stribeck": ("speed",),
-    "parallel_stiffness": ("rest",),
-    "cogging": ("phase", "count"),
-    "torque_speed_limit": ("stall",),
-    "payload": ("x", "y", "z"),
-}
-"""Shapes that a full fit may change."""
-
-COUNTS = tuple(float(count) for count in range(18, 64, 3))
-"""Periods per turn at which cogging is looked for; over a radian of motion, neighbours differ by half a period."""
 
 PROBE = 2.0
 """Change of a parameter by which it is probed, in tolerances."""
@@ -68,69 +34,83 @@ class Variant:
         effect: registered name.
         probes: what was changed to see it; empty for one whose columns the box has.
         shapes: values of its shapes.
-        quadrature: the two halves of the probes are amplitudes at phases 0 and pi / 2.
     """
 
     effect: str
     probes: tuple[Probe, ...] = ()
     shapes: Theta = field(default_factory=dict)
-    quadrature: bool = False
+
+    @property
+    def quadrature(self) -> bool:
+        """Whether the two halves of the probes are amplitudes at phases 0 and pi / 2."""
+        return tolerances.identification(self.effect).periodic is not None
 
     def start(self, theta: Theta, layout: Layout, x: np.ndarray, machine: Machine) -> Theta:
         """Return where a fit begins: ``theta`` with this effect as large as the linear model has it."""
-        if self.quadrature:
-            key = self.probes[0].key
-            assert isinstance(key, tuple)
+        periodic = tolerances.identification(self.effect).periodic
+        if periodic:
             sine, cosine = np.zeros(len(machine.joints)), np.zeros(len(machine.joints))
             for i in range(layout.size):
                 (sine if layout.probe[i] < len(self.probes) // 2 else cosine)[layout.joint[i]] = x[i]
-            found = {
+            return {
+                **theta,
                 **{key: np.broadcast_to(value, sine.shape).copy() for key, value in self.shapes.items()},
-                (self.effect, "amplitude"): np.hypot(sine, cosine),
-                (self.effect, "phase"): np.arctan2(cosine, sine),
+                (self.effect, periodic.amplitude): np.hypot(sine, cosine),
+                (self.effect, periodic.phase): np.arctan2(cosine, sine),
             }
-            return {**theta, **found}
         return tolerances.moved({**theta, **self.shapes}, layout, self.probes, x, machine)
 
     @property
     def free(self) -> tuple[Key, ...]:
         """Parameters that a full fit changes."""
-        return (*tolerances.sizes(self.effect), *((self.effect, name) for name in FREE_SHAPES.get(self.effect, ())))
+        return (*sizes(self.effect), *free_shapes(self.effect))
+
+
+def free_shapes(effect: str) -> tuple[Key, ...]:
+    """Return the shape parameters of an effect that a full fit may change."""
+    return tuple((effect, name) for name in tolerances.identification(effect).free_shapes)
 
 
 def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -> list[Variant]:
     """Return every way in which an effect could be missing; ``mean`` (J,) are the joints' average angles, rad."""
-    found: list[Variant] = []
-    for effect in members("effect"):
-        if (effect in GROUND and not machine.base_probe) or effect in exclude:
+    variants: list[Variant] = []
+    within = tolerances.nominal(machine)
+    for effect in tolerances.felt(machine):
+        how = tolerances.identification(effect)
+        if effect in exclude:
             continue
-        if effect in tolerances.of(machine) and effect not in LEVELS:
-            found.append(Variant(effect))
-            continue
-        keys = tolerances.sizes(effect)
-        if effect == "cogging":
-            key = (effect, "amplitude")
-            plain = tolerances.probes(machine, [key], {}, PROBE)
-            for count in COUNTS:
-                at: Theta = {(effect, "count"): np.array([count])}
-                sides = [{**at, (effect, "phase"): np.array([v])} for v in (0.0, math.pi / 2)]
-                both = [Probe(key, p.place, p.delta, also) for also in sides for p in plain]
-                found.append(Variant(effect, tuple(both), at, quadrature=True))
-            continue
-        for given in SHAPES.get(effect, ({},)):
-            shapes: Theta = {
-                (effect, name): (mean.copy() if math.isnan(value) else np.array([value]))
-                for name, value in given.items()
-            }
-            for level in LEVELS.get(effect, ({},)):
-                wanted = [key for key in keys if not level or key[1] in level]
-                probes = tolerances.probes(machine, wanted, {}, PROBE)
-                probes = [
-                    Probe(p.key, p.place, np.full_like(p.delta, level[p.key[1]]) if level else p.delta, shapes)
-                    for p in probes
-                ]
-                found.append(Variant(effect, tuple(probes), shapes))
-    return found
+        if effect in within and not how.levels:
+            variants.append(Variant(effect))  # its columns are there
+        elif how.periodic:
+            variants += _periods(machine, effect, how.periodic)
+        else:
+            variants += _levels(machine, effect, how, mean)
+    return variants
+
+
+def _periods(machine: Machine, effect: str, periodic: Periodic) -> Iterator[Variant]:
+    """Yield a variant for each number of periods per turn, with amplitudes at phases 0 and pi / 2."""
+    key = (effect, periodic.amplitude)
+    plain = tolerances.probes(machine, [key], {}, PROBE)
+    for count in periodic.counts:
+        at: Theta = {(effect, periodic.count): np.array([count])}
+        phases = [{**at, (effect, periodic.phase): np.array([phase])} for phase in (0.0, math.pi / 2)]
+        yield Variant(effect, tuple(Probe(key, p.place, p.delta, also) for also in phases for p in plain), at)
+
+
+def _levels(machine: Machine, effect: str, how: Identification, mean: np.ndarray) -> Iterator[Variant]:
+    """Yield a variant for each choice of shapes and each level at which the effect is probed."""
+    for chosen in how.shapes or ({},):
+        shapes: Theta = {
+            (effect, name): mean.copy() if math.isnan(value) else np.array([value]) for name, value in chosen.items()
+        }
+        for level in how.levels or ({},):
+            keys = [key for key in sizes(effect) if not level or key[1] in level]
+            probes = [
+                Probe(p.key, p.place, np.full_like(p.delta, level[p.key[1]]) if level else p.delta, shapes)
+                for p in tolerances.probes(machine, keys, {}, PROBE)
+            ]
+            yield Variant(effect, tuple(probes), shapes)
 
 
 @dataclass(frozen=True)
@@ -202,7 +182,7 @@ def screen(
         gain = float(np.mean(np.log(before.sum(1) / np.maximum(after, 0.3).sum(1))))
         start = _start(theta, variant, own.probes, layout, x, machine)
         mine = [*added, *(k for k, p in enumerate(own.probes) if p.key[0] == variant.effect)]
-        found.append(Screened(variant, start, gain, relief, _signal(grams, full.probes, mine, size)))
+        found.append(Screened(variant, start, gain, relief, _signal(grams, full.probes, mine, size, may.tolerances)))
     return sorted(found, key=lambda s: -s.gain)
 
 
@@ -235,13 +215,15 @@ def _start(
     return tolerances.moved(theta, layout, known, np.where(own, x, 0.0), machine)
 
 
-def _signal(grams: np.ndarray, probes: Sequence[Probe], mine: Sequence[int], size: np.ndarray) -> float:
+def _signal(
+    grams: np.ndarray, probes: Sequence[Probe], mine: Sequence[int], size: np.ndarray, declared: Tolerances
+) -> float:
     """Return the largest mean square, in units of the noise, that a change by twice a tolerance makes in a window."""
     most = 0.0
     for k in mine:
         key = probes[k].key
         assert isinstance(key, tuple)
-        reach = 2.0 * tolerances.param(key).tolerance
+        reach = 2.0 * declared.param(key).tolerance
         if np.abs(probes[k].delta).max() <= 1.5 * reach:  # beyond, a threshold may lie between
             most = max(most, float((grams[..., k, k] / size).max()) * reach**2)
     return most

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from go1exp.gap.replay.rows import Key
+from go1exp.effects.tolerances import sizes
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import table
 from go1exp.gap.search import profile_likelihood, significance, tolerances
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.trial import excess, removed
+from go1exp.schema.registry import members
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from go1exp.gap.data.splits import Splits
     from go1exp.gap.replay.rows import Theta
     from go1exp.gap.result import GapSettings
-
-COMMON: tuple[Key, ...] = (("strength", "scale"), ("kp_scale", "scale"), ("link_mass", "scale"))
-"""What may be off for all joints at once, by one number; it moves the legs as weight and its place do."""
 
 ITERATIONS = 4
 """Gauss-Newton steps of a fit: joints that stick make a payload's first ones short."""
@@ -53,7 +51,7 @@ def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> M
         for factor in STRETCHES:
             theta = {}
             for key, value in model.theta.items():
-                p = tolerances.param(key)
+                p = model.may.tolerances.param(key)
                 theta[key] = (p.null + factor * (value - p.null)).clip(p.low, p.high)
             tries.append(theta)
         chi2 = scores(scorer, tries, windows, dt)
@@ -84,11 +82,14 @@ def clearest(begun: Scorer, search: Seeker) -> Model | None:
     """
     train, select, dt = search.splits.train, search.splits.select, search.dt
     none = profile_likelihood.cost(begun, {}, train, dt)
-    own = {
-        name: profile_likelihood.fitted(begun, tolerances.sizes(name), train, dt, none) for name in tolerances.ON_FEET
+    machine = begun.replayer.machine
+    fits = {
+        name: profile_likelihood.fitted(begun, sizes(name), train, dt, none)
+        for name in tolerances.nominal(machine)
+        if tolerances.identification(name).needs_ground
     }
-    name = min(own, key=lambda n: own[n][1])
-    best = own.pop(name)[0]
+    name = min(fits, key=lambda n: fits[n][1])
+    best = fits.pop(name)[0]
     if not best:
         return None
     chi2 = profile_likelihood.chi2(begun, best, select, dt)
@@ -100,10 +101,11 @@ def clearest(begun: Scorer, search: Seeker) -> Model | None:
         )
 
     # In the order of what they cost: the first that does as well ends it.
-    if not loses({}) or not all(loses(rival) for rival, _ in own.values() if rival):
+    if not loses({}) or not all(loses(rival) for rival, _ in fits.values() if rival):
         return None
-    clear = all(loses(profile_likelihood.fitted(begun, [key], train, dt, none)[0]) for key in COMMON)
-    return Model(name, best, search.may.also(name), tolerances.sizes(name)) if clear else None
+    weights = [effect for effect in members("effect") if tolerances.identification(effect).weighs_on_legs]
+    clear = all(loses(profile_likelihood.fitted(begun, sizes(effect), train, dt, none)[0]) for effect in weights)
+    return Model(name, best, search.may.also(name), sizes(name)) if clear else None
 
 
 class Seeker(Protocol):

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from go1exp.effects.tolerances import Tolerances, sizes
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Table, table
 from go1exp.gap.search import evidence, significance, single_cause, strain, tolerances
 from go1exp.gap.search.fit import Model, fit, misfit, scores
-from go1exp.gap.search.screen import FREE_SHAPES, Screened, library, outside, screen
+from go1exp.gap.search.screen import Screened, free_shapes, library, outside, screen
 from go1exp.gap.search.trial import excess, removed, tried
 
 Progress = Callable[[str, float], None]
@@ -30,9 +31,6 @@ LOOSENED = 3
 
 NEEDED = 12.0
 """Fall of chi2 that a joint must bring before it may leave the tolerance of a term's effect."""
-
-SIMPLER = {"asymmetric_friction": "coulomb", "stribeck": "coulomb", "load_friction": "coulomb"}
-"""Effect -> one that says the same with fewer numbers, where it does."""
 
 SETTLED = 0.01
 """Fall of log chi2 in a round of fitting, and log chi2 itself, below which more rounds are not worth their time."""
@@ -87,9 +85,14 @@ class Search:
     @property
     def keys(self) -> tuple[Key, ...]:
         """All parameters that may move: those of the box, and of the terms."""
-        effects = dict.fromkeys([*tolerances.of(self.scorer.replayer.machine), *self.loosened, *self.terms])
-        shapes = [(e, name) for e in self.terms for name in FREE_SHAPES.get(e, ())]
-        return (*(k for e in effects for k in tolerances.sizes(e)), *shapes)
+        effects = dict.fromkeys([*tolerances.nominal(self.scorer.replayer.machine), *self.loosened, *self.terms])
+        shapes = [key for effect in self.terms for key in free_shapes(effect)]
+        return (*(key for effect in effects for key in sizes(effect)), *shapes)
+
+    @property
+    def robot_tolerances(self) -> Tolerances:
+        """Tolerances of the robot that is compared."""
+        return self.scorer.replayer.machine.tolerances
 
     def linear(self, theta: Theta, windows: np.ndarray) -> Table:
         """Return the linear model of what may move."""
@@ -100,7 +103,7 @@ class Search:
     @property
     def may(self) -> tolerances.Freedom:
         """What may leave its tolerance."""
-        return tolerances.Freedom(frozenset(self.terms), self.kept, not self.settings.calibrate)
+        return tolerances.Freedom(self.robot_tolerances, frozenset(self.terms), self.kept, not self.settings.calibrate)
 
     def model(self, theta: Theta) -> Model:
         """Return a model with all terms, to fit."""
@@ -151,10 +154,12 @@ class Search:
             assert self.own is not None
             relief = strain.relief(self.scorer, self.own, self.may) if small else {}
             straining = strain.straining(relief, strain.values(self.scorer, self.own), [*self.terms, *self._unasked()])
-            beyond = outside(found, tolerances.of(self.scorer.replayer.machine)) if small and not straining else []
+            beyond = outside(found, tolerances.nominal(self.scorer.replayer.machine)) if small and not straining else []
             if small and straining is None and not beyond:
                 if not self.terms:  # beside a term they are no rivals of it
-                    self.candidates += evidence.absorbed(self.keys, relief, self.theta, settings.shortlist)
+                    self.candidates += evidence.absorbed(
+                        self.keys, relief, self.theta, self.robot_tolerances, settings.shortlist
+                    )
                 break
             self.progress(f"fitting candidates for term {stage}", share + 0.06)
             chosen = beyond if small else found
@@ -181,7 +186,11 @@ class Search:
             self._eliminate(now)
             self._simplify()
             self._prune()
-        if strained and self.terms and max(evidence.size(t, self.theta) for t in self.terms) <= strain.CLEAR:
+        if (
+            strained
+            and self.terms
+            and max(evidence.size(t, self.theta, self.robot_tolerances) for t in self.terms) <= strain.CLEAR
+        ):
             self.withdraw("it leaves its tolerance by too little to be called missing")
 
     def confirmed(self) -> bool:
@@ -264,12 +273,13 @@ class Search:
 
     def _unasked(self) -> list[str]:
         """Return the effects that the user does not want to be considered."""
-        return [e for e in tolerances.BOX if self.settings.effects and e not in self.settings.effects]
+        wanted = self.settings.effects
+        return [e for e in tolerances.nominal(self.scorer.replayer.machine) if wanted and e not in wanted]
 
     def _freed(self, effect: str) -> list[Model]:
         """Return the model in which an effect of the box may leave its tolerance, fitted."""
         assert self.own is not None
-        model = Model(effect, self.theta, self.may.also(effect), tolerances.sizes(effect))
+        model = Model(effect, self.theta, self.may.also(effect), sizes(effect))
         return fit(self.scorer, [model], self.own, self.settings.iterations, self.dt)
 
     def _listen(self, found: Sequence[Screened]) -> None:
@@ -349,7 +359,8 @@ class Search:
     def _eliminate(self, now: np.ndarray) -> None:
         """Drop terms without which the rest does as well."""
         for name in [t for t in self.terms if t != self.single and len(self.terms) > 1]:
-            rest = replace(self, terms=[t for t in self.terms if t != name], theta=tolerances.without(self.theta, name))
+            theta = tolerances.without(self.theta, name, self.robot_tolerances)
+            rest = replace(self, terms=[t for t in self.terms if t != name], theta=theta)
             rest.settle(1)
             without = self.held_out(rest.theta)
             gain = significance.gains(without, now[None])
@@ -360,14 +371,14 @@ class Search:
 
     def _simplify(self) -> None:
         """Replace terms by effects that say the same with fewer numbers, where they do."""
-        for name in [t for t in self.terms if SIMPLER.get(t, t) not in self.terms]:
-            other = SIMPLER[name]
+        for name in [t for t in self.terms if (tolerances.identification(t).simpler or t) not in self.terms]:
+            other = tolerances.identification(name).simpler
             terms = [other if t == name else t for t in self.terms]
-            rest = replace(self, terms=terms, theta=tolerances.without(self.theta, name))
+            rest = replace(self, terms=terms, theta=tolerances.without(self.theta, name, self.robot_tolerances))
             rest.settle(2)
             before, now = self.held_out(self.nominal), self.held_out(self.theta)
             gain, less = significance.gains(before, np.stack([now, self.held_out(rest.theta)])).mean(axis=1)
-            if less > gain - significance.same(gain) and evidence.size(other, rest.theta) > 1.0:
+            if less > gain - significance.same(gain) and evidence.size(other, rest.theta, self.robot_tolerances) > 1.0:
                 self.terms, self.theta, self.own = rest.terms, rest.theta, rest.own
                 self.aliases[other], self.shares[other] = (other,), self.shares[name]
                 self.steps.append((f"{other} in place of {name}", excess(self.held_out(self.theta))))
@@ -379,7 +390,7 @@ class Search:
         cost = strain.cost(self.scorer, self.own)
         kept = self.kept
         for name in self.terms:
-            out = np.flatnonzero(evidence.beyond(name, self.theta, machine.joints))
+            out = np.flatnonzero(evidence.beyond(name, self.theta, machine.joints, self.robot_tolerances))
             alone = {int(j): cost(replace(self.may, kept=kept | {(name, int(j))})) for j in out}
             for j in sorted(alone, key=lambda j: alone[j])[: len(out) - 1]:  # where it brings most, it stays
                 more = kept | {(name, j)}
@@ -393,7 +404,7 @@ class Search:
 
     def _within(self, key: Key, value: np.ndarray) -> np.ndarray:
         """Return values of which those of ``kept`` joints are within tolerance."""
-        p = tolerances.param(key)
+        p = self.robot_tolerances.param(key)
         mine = [j for name, j in self.kept if name == key[0]]
         if not mine or not math.isfinite(p.tolerance):
             return value

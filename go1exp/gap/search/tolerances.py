@@ -14,27 +14,13 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import lsq_linear
 
-from go1exp.effects.base import Effect, Param
-from go1exp.gap.replay import machine as machines
+from go1exp.effects.base import Param
+from go1exp.effects.identification import Identification
+from go1exp.effects.tolerances import Tolerances, effect_class
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.linear import Layout
 from go1exp.schema.registry import members
-
-BOX = (
-    *("kp_scale", "kd_scale", "strength", "armature", "coulomb", "viscous"),
-    *("link_mass", "link_com", "encoder_offset", "base_tilt", "command_delay", "torque_delay"),
-)
-"""Effects that every model has a value for, if only the null one."""
-
-ON_FEET = ("payload", "com_offset", "foot_friction", "ground_compliance")
-"""Effects that the model of a robot on its feet has a value for as well."""
-
-
-def of(machine: Machine) -> tuple[str, ...]:
-    """Return the effects whose parameters may move within their tolerances."""
-    return (*BOX, *ON_FEET) if machine.base_probe else BOX
-
 
 PRIOR = 0.5
 """Standard deviation of a parameter within its tolerance, in tolerances: it settles what the data leave open."""
@@ -46,26 +32,24 @@ ROUNDS = 40
 """Rounds after which an active set counts as cycling."""
 
 
-def effect_class(name: str) -> type[Effect]:
-    """Return the class of a registered effect."""
-    return members("effect")[name].target  # type: ignore[return-value]
+def identification(effect: str) -> Identification:
+    """Return how a registered effect is looked for."""
+    return effect_class(effect).identification
 
 
-def param(key: Key) -> Param:
-    """Return the declaration of a parameter, with the tolerance of the machine at hand."""
-    found = next(p for p in effect_class(key[0]).params if p.name == key[1])
-    own = machines.tolerance(*key, found.tolerance)
-    return found if own == found.tolerance else replace(found, tolerance=own)
+def felt(machine: Machine) -> tuple[str, ...]:
+    """Return the registered effects that a robot can feel; one whose trunk is held has no use for ground."""
+    return tuple(name for name in members("effect") if machine.base_probe or not identification(name).needs_ground)
 
 
-def sizes(effect: str) -> tuple[Key, ...]:
-    """Return the parameters of an effect that have a tolerance; the others are shapes."""
-    return tuple((effect, p.name) for p in effect_class(effect).params if math.isfinite(p.tolerance))
+def nominal(machine: Machine) -> tuple[str, ...]:
+    """Return the effects that every model of the robot has a value for, which move within their tolerances."""
+    names = [name for name in felt(machine) if identification(name).nominal]
+    return tuple(sorted(names, key=lambda name: identification(name).rank))
 
 
-def step(key: Key, value: float | None = None, factor: float = 1.0) -> float:
+def step(p: Param, value: float | None = None, factor: float = 1.0) -> float:
     """Return a change of a parameter to learn its influence from, in the direction in which there is room."""
-    p = param(key)
     at = p.null if value is None else value
     size = p.tolerance if math.isfinite(p.tolerance) else 0.05 * min(p.high - p.low, 4.0 * max(abs(p.null), 0.1))
     return factor * size if at + factor * size <= p.high else -factor * size
@@ -76,25 +60,22 @@ SMALL = 0.1
 trace; that only shows if columns are exact, and differences over a whole tolerance are not (coulomb and kd were off by
 5 and 9 %)."""
 
-COMMON = ("torque_speed_limit",)
-"""Effects with one value for all joints: few joints ever reach a limit, and one supply feeds them all."""
-
 
 def probes(
     machine: Machine, keys: Sequence[Key], theta: Mapping[Key, np.ndarray], factor: float = SMALL
 ) -> list[Probe]:
     """Return the probes of parameters at their present values."""
-    found = []
+    columns: list[Probe] = []
     joints = len(machine.joints)
     for key in keys:
-        p = param(key)
+        p = machine.tolerances.param(key)
         wide = joints if p.per == "joint" else 1
         values = np.broadcast_to(theta.get(key, np.array([p.null])), (wide,))
-        delta = np.array([step(key, float(v), factor) for v in values])
-        own = p.per == "joint" and key[0] not in COMMON
-        places: list[int | None] = list(range(len(machine.groups[0]))) if own else [None]
-        found += [Probe(key, place, delta) for place in places]
-    return found
+        delta = np.array([step(p, float(v), factor) for v in values])
+        by_joint = p.per == "joint" and not identification(key[0]).common
+        places: list[int | None] = list(range(len(machine.groups[0]))) if by_joint else [None]
+        columns += [Probe(key, place, delta) for place in places]
+    return columns
 
 
 @dataclass(frozen=True)
@@ -112,11 +93,13 @@ class Freedom:
     """What may leave its tolerance.
 
     Attributes:
+        tolerances: of all parameters.
         effects: that may.
         kept: effects and joints that may not although their effect may elsewhere.
         rigid: whether all others stay at their nominal values, and not only within their tolerances (an ablation).
     """
 
+    tolerances: Tolerances
     effects: frozenset[str] = frozenset()
     kept: frozenset[tuple[str, int]] = frozenset()
     rigid: bool = False
@@ -127,7 +110,7 @@ class Freedom:
 
     def reach(self, key: Key, joint: int) -> float:
         """Return how far from null a parameter may go, as far as tolerances are concerned."""
-        tolerance = param(key).tolerance
+        tolerance = self.tolerances.param(key).tolerance
         if key[0] in self.effects:
             return tolerance if (key[0], joint) in self.kept else math.inf
         return 0.0 if self.rigid else tolerance
@@ -149,7 +132,7 @@ def bounds(
     for i in range(layout.size):
         probe = columns[layout.probe[i]]
         assert isinstance(probe.key, tuple)
-        p = param(probe.key)
+        p = may.tolerances.param(probe.key)
         j = max(int(layout.joint[i]), 0)
         value = float(
             np.ravel(theta.get(probe.key, np.array([p.null])))[
@@ -216,26 +199,26 @@ def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:
 
 def moved(theta: Theta, layout: Layout, columns: Sequence[Probe], x: np.ndarray, machine: Machine) -> Theta:
     """Return ``theta`` with increments ``x`` (size,) added."""
-    found = {key: value.copy() for key, value in theta.items()}
+    values = {key: value.copy() for key, value in theta.items()}
     for i in range(layout.size):
         probe = columns[layout.probe[i]]
         assert isinstance(probe.key, tuple)
-        p = param(probe.key)
+        p = machine.tolerances.param(probe.key)
         wide = len(machine.joints) if p.per == "joint" else 1
-        full = np.broadcast_to(found.get(probe.key, np.array([p.null])), (wide,)).copy()
+        full = np.broadcast_to(values.get(probe.key, np.array([p.null])), (wide,)).copy()
         full[layout.joint[i] if layout.joint[i] >= 0 else slice(None)] += x[i]
-        found[probe.key] = full.clip(p.low, p.high)
-    return found
+        values[probe.key] = full.clip(p.low, p.high)
+    return values
 
 
-def without(theta: Theta, name: str) -> Theta:
-    """Return the values without a term; a part of the box goes back inside."""
-    found = {}
+def without(theta: Theta, name: str, tolerances: Tolerances) -> Theta:
+    """Return the values without a term; a nominal effect goes back within its tolerance."""
+    values = {}
     for key, value in theta.items():
         if key[0] == name:
-            p = param(key)
-            if name not in (*BOX, *ON_FEET) or not math.isfinite(p.tolerance):
+            p = tolerances.param(key)
+            if not identification(name).nominal or not math.isfinite(p.tolerance):
                 continue
             value = value.clip(p.null - p.tolerance, p.null + p.tolerance)
-        found[key] = value
-    return found
+        values[key] = value
+    return values

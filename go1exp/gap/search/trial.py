@@ -129,7 +129,7 @@ def tried(
     share = np.array([removed(before, a) for a in after])
     needed = settings.min_share if before > settings.adequate else max(MOSTLY, settings.min_share)
     needed = -math.inf if small else needed
-    sizes = np.array([evidence.size(m.name, m.theta) for m in fitted])
+    sizes = np.array([evidence.size(m.name, m.theta, m.may.tolerances) for m in fitted])
     helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
     fit_for_it = np.flatnonzero(helps & (sizes > (CLEAR if small else 1.0)))
     chosen, alias, aside = None, *np.zeros((2, len(fitted)), dtype=bool)

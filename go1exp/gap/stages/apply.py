@@ -1,4 +1,4 @@
-"""The stage ``apply``: from an answer to a choice of ``effect`` that training takes, and the proof that it holds there."""
+"""The stage ``apply``: an answer written as a choice of ``effect`` for training, and the proof that it holds there."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import numpy as np
 
 from go1exp.config import parse_parts
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.tolerances import Tolerances
+from go1exp.gap.comparison import Comparison, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.files import GapFileError
-from go1exp.gap.comparison import Comparison, compare, robot_from, session
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.protocol import Robot
@@ -25,6 +26,7 @@ from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term, members
+from go1exp.tensors.threads import one_thread
 
 EFFECT, CALIBRATION, COMPENSATING = "effect.yaml", "calibration.yaml", "compensating.yaml"
 """What is missing; the nominal parameters within their tolerances; what only makes up for something unknown."""
@@ -73,7 +75,11 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
     written = []
     for name, about, lines in (
         (EFFECT, "What the model lacks.", _named_lines(certified)),
-        (CALIBRATION, "The model's own parameters, within their tolerances.", _box_lines(result.box)),
+        (
+            CALIBRATION,
+            "The model's own parameters, within their tolerances.",
+            _box_lines(result.box, Tolerances.of(result.tolerances)),
+        ),
         (COMPENSATING, "Makes up for something that no effect describes. Not for training.", _named_lines(rest)),
     ):
         path = folder / name
@@ -107,10 +113,10 @@ def _named_lines(named: Sequence[NamedEffect]) -> list[str]:
     return lines
 
 
-def _box_lines(box: Values) -> list[str]:
+def _box_lines(box: Values, tolerances: Tolerances) -> list[str]:
     lines = []
     for effect, params in box.items():
-        kind = _params(effect, params)
+        kind = {name: tolerances.param((effect, name)) for name in _params(effect, params)}
         body = [
             f"  {name}: {_value(places, kind[name])}  # {kind[name].unit}"
             for name, places in params.items()
@@ -199,11 +205,21 @@ def _reported(result: GapResult) -> float:
     return steps.get(certified[-1], float("nan")) if certified else result.excess.get("box", float("nan"))
 
 
-def _same_search(recordings: Sequence[Recording], settings: GapSettings, result: GapResult) -> None:
+def _same_search(
+    recordings: Sequence[Recording], settings: GapSettings, result: GapResult, tolerances: Tolerances
+) -> None:
+    """Raise a ``GapFileError`` unless a result is of a search in these recordings with these settings."""
     before, now = result.provenance.get("settings", {}), asdict(settings)
     changed = [f"search.{k}" for k in SPLITTING if k in before and before[k] != now[k]]
     if changed:
         raise GapFileError(f"{', '.join(changed)}: not as in the search that found this; run go1exp gap explain again")
+    searched = Tolerances.of(result.tolerances)
+    for key, value in tolerances.replaced.items():
+        if value != searched.param(key).tolerance:
+            raise GapFileError(
+                f"model.tolerances.{'.'.join(key)} = {value:g}: not as in the search that found this "
+                f"({searched.param(key).tolerance:g}); run go1exp gap explain again"
+            )
     logs = result.provenance.get("logs")
     if logs and logs != {r.meta.episode: fingerprint(r) for r in recordings}:
         raise GapFileError("logs: not those of the search that found this; run go1exp gap explain again")
@@ -235,9 +251,9 @@ def prove(
         GapFileError: if logs or settings are not those of the search: what it held out would not be known.
         NotComparable: if the recordings do not suit the robot.
     """
-    _same_search(recordings, settings, result)
     robot = robot_from(robot)
-    with session(robot):
+    _same_search(recordings, settings, result, robot.tolerances)
+    with one_thread():
         comparison = compare(recordings, robot, settings, physics_dt=physics_dt, fewest=1)
         plain, effect_only, both = (excess(_held_out(comparison, theta)) for theta in _proposals(contents, robot))
     reported = _reported(result)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from go1exp.gap.answer import not_excited
-from go1exp.gap.comparison import NotComparable, Progress, compare, robot_from, session
+from go1exp.gap.comparison import NotComparable, Progress, compare, robot_from
 from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.localise import localise
@@ -17,6 +17,7 @@ from go1exp.gap.search.stepwise import Search
 from go1exp.gap.search.trial import excess
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
+from go1exp.tensors.threads import one_thread
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m", "imu_gyro": "rad/s", "imu_acc": "m/s2"}
 
@@ -82,7 +83,7 @@ def check(
         screen: whether to ask also which effects the recordings could not show.
     """
     robot = robot_from(robot)
-    with session(robot):
+    with one_thread():
         try:
             comparison = compare(recordings, robot, settings, on_progress)
         except NotComparable as error:
@@ -101,6 +102,4 @@ def check(
             silent = not_excited(search.signal, held=not comparison.robot.base_probe)
     on_progress("done", 1.0)
     error_of_all = excess(score.chi2(plain, everything))
-    return CheckResult(
-        (), comparison.floors(), len(everything), error_of_all, where, silent, comparison.ready.warnings
-    )
+    return CheckResult((), comparison.floors(), len(everything), error_of_all, where, silent, comparison.ready.warnings)

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from go1exp import __version__
+from go1exp.effects.tolerances import declared
 from go1exp.gap.answer import Answer, advice, concluded, evidence, not_excited, sentence
-from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from, session
+from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect, Overlay
@@ -21,10 +22,10 @@ from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import localise
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
-from go1exp.gap.search.tolerances import param
 from go1exp.gap.search.trial import excess
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
+from go1exp.tensors.threads import one_thread
 
 
 def explain(
@@ -44,7 +45,7 @@ def explain(
     start = time.perf_counter()
     settings, robot = settings or GapSettings(), robot_from(robot)
     rng, warnings = np.random.default_rng(settings.seed), list[str]()
-    with session(robot):
+    with one_thread():
         try:
             comparison = compare(recordings, robot, settings, on_progress)
         except NotComparable as error:
@@ -117,6 +118,7 @@ def written(
         bags=dict(search.shares),
         waterfall=(("model as it is", answer.excess["null"]), *search.steps),
         overlays=overlays(score, comparison.recordings, search.theta, parts.select, settings.overlays, dt),
+        tolerances=comparison.robot.tolerances.by_effect(),
         box=_nested(answer.theta, score.windows.joints, named),
         provenance={**about, "simulation_steps": score.replayer.made},
         warnings=tuple(warnings),
@@ -183,7 +185,7 @@ def _nested(
     nested: dict[str, dict[str, dict[str, float]]] = {}
     for (effect, name), value in theta.items():
         claim = named.get(effect)
-        if param((effect, name)).per == "robot":
+        if declared((effect, name)).per == "robot":
             left = {} if claim else {"robot": float(value[0])}
         else:
             full = zip(joints, np.broadcast_to(value, (len(joints),)), strict=True)

@@ -1,7 +1,7 @@
 """The stage ``replay``: the simulator beside a recording, window by window, under the same commands.
 
-No verdict and no search. Initial states are those of the search: estimated, and moved to where each window fits best, so
-that what is left is not the unknown initial state. What a robot's sensors do not measure (how fast its trunk moves) is
+No verdict and no search. Initial states are those of the search: estimated, and moved to where each window fits best.
+So what is left is not the unknown initial state. What a robot's sensors do not measure (how fast its trunk moves) is
 compared where a recording has the truth, as those of a simulated robot may.
 """
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from, session
+from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.cutting import even_clock, noise_of
 from go1exp.gap.data.standing import AXES, rows_at
 from go1exp.gap.replay.rows import Rows, variants
@@ -26,6 +26,7 @@ from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.trial import excess
 from go1exp.recording import VECTORS, Recording, joint_channels
 from go1exp.robot import RobotConfig
+from go1exp.tensors.threads import one_thread
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
 TURN, SPEED = ("roll", "pitch", "yaw"), ("base_lin_vel_x_b", "base_lin_vel_y_b", "base_lin_vel_z_b")
@@ -166,7 +167,7 @@ def replay(
     kinds = [[r for r in recordings if (r.meta.base == "floating") == free] for free in (False, True)]
     comparisons = []
     parts: list[Part] = []
-    with session(robot):
+    with one_thread():
         for some in filter(None, kinds):
             on_progress("replaying the logs", len(parts) / 2)
             try:
@@ -257,9 +258,7 @@ def _measured(comparison: Comparison) -> Readings:
     return readings | of_trunk | {name: np.zeros_like(w.t) for name in TURN}, reference, noise | more
 
 
-def _measured_trunk(
-    recordings: Sequence[Recording], taken: Callable[[Sequence[np.ndarray]], np.ndarray]
-) -> Readings:
+def _measured_trunk(recordings: Sequence[Recording], taken: Callable[[Sequence[np.ndarray]], np.ndarray]) -> Readings:
     """Return the readings of the IMU, and the true velocity of the trunk where the recordings have it.
 
     Args:
