@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
+from go1exp.gap.data.cutting import cut, noise_of
 from go1exp.gap.data.trunk import AGREE, SLIDE, TORN, Base, Log, base_state, loaded
-from go1exp.gap.data.windows import Windows, cut, noise_of
+from go1exp.gap.data.windows import Windows
 from go1exp.gap.result import GapSettings
 from go1exp.physics.legs import Legs
 from go1exp.recording import VECTORS, Recording
@@ -20,14 +21,14 @@ from go1exp.robot import RobotConfig
 from go1exp.tensors.rotation import quat_from_rotvec, quat_multiply
 
 WINDOW_S, BURN_S, STRIDE_S = 0.2, 0.03, 0.3
-"""Longest windows, what is replayed before them, and from one to the next, s (chosen: what is not known of the first
-state grows so fast over impacts that longer ones tell less)."""
+"""Longest windows, what is replayed before them, and from one to the next, s (chosen: what is not known of the
+initial state grows so fast over impacts that longer ones tell less)."""
 
 MOST_WINDOWS = 96
 """Windows beyond which more would only cost time."""
 
 BASE_SD = (0.0015, 0.003, 0.003, 0.02, 0.02, 0.02, 0.02, 0.02, 0.02)
-"""Standard deviations of the base's first state: height m, roll and pitch rad, velocity m/s, rate rad/s (chosen: some
+"""Standard deviations of the base's initial state: height m, roll and pitch rad, velocity m/s, rate rad/s (chosen: some
 times what the estimate misses by on simulated squats); that of velocity grows with the disagreement of the feet."""
 
 IMU_DELAY_SD = 0.001
@@ -39,6 +40,9 @@ IMU_BIAS_SD = (0.02, 0.2)
 IMU = "imu"
 """Name of the third quantity: gyro x y z, accelerometer x y z, and nothing in the other places of a row."""
 
+TRUNK = "trunk"
+"""Name of a fourth quantity, which is never compared: attitude w-x-y-z, and velocity in the world."""
+
 AXES = ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z", "imu_acc_x", "imu_acc_y", "imu_acc_z")
 
 
@@ -47,7 +51,7 @@ class StandingWindows(Windows):
     """Windows of a robot on its feet.
 
     Attributes:
-        base: (W, 13) first state: position m, attitude w-x-y-z, velocity in the world m/s, rate in the trunk rad/s.
+        base: (W, 13) initial state: position m, attitude w-x-y-z, velocity in the world m/s, rate in the trunk rad/s.
         sd_of_base: (W, 9) its standard deviations: height, roll and pitch, velocity, rate.
         contact: (W, n, 4) bool, which feet carry weight.
         held: (W,) bool, windows of a robot whose trunk is held; their bases mean nothing.
@@ -71,16 +75,21 @@ class StandingWindows(Windows):
 
     @property
     def base_sd(self) -> np.ndarray:
-        """(W, 9) standard deviations of the base's first state."""
+        """(W, 9) standard deviations of the base's initial state."""
         return self.sd_of_base
 
     def moved(self, x: np.ndarray) -> StandingWindows:
-        """Return windows whose first states are moved by ``x`` (W, 2 J + 9) standard deviations."""
+        """Return windows whose initial states are moved by ``x`` (W, 2 J + 9) standard deviations."""
         joints = len(self.joints)
         q, qd, off = x[:, :joints], x[:, joints : 2 * joints], x[:, 2 * joints :] * self.base_sd
         base = torch.as_tensor(self.base)
-        found = base_moved(base, torch.as_tensor(off)).numpy()
-        return dataclasses.replace(self, q=self.q + q * self.q_sd, qd=self.qd + qd * self.qd_sd, base=found)
+        other = base_moved(base, torch.as_tensor(off)).numpy()
+        return dataclasses.replace(self, q=self.q + q * self.q_sd, qd=self.qd + qd * self.qd_sd, base=other)
+
+    @property
+    def observable(self) -> tuple[str, ...]:
+        """Quantities that a simulation can tell, whether they are compared or not."""
+        return (*super().observable, IMU, TRUNK)
 
     @property
     def channels(self) -> tuple[tuple[str, int, int], ...]:
@@ -102,12 +111,12 @@ class StandingWindows(Windows):
         """Return changes of the readings ``y`` (W, n, C, J) per standard deviation of what the IMU may be off by."""
         late = np.zeros_like(y)
         late[:, :, 2] = IMU_DELAY_SD * np.gradient(y[:, :, 2], self.period, axis=1)
-        found = [late]
+        changes = [late]
         for axis in range(6):
             bias = np.zeros_like(y)
             bias[:, :, 2, axis] = IMU_BIAS_SD[axis // 3]
-            found.append(bias)
-        return found
+            changes.append(bias)
+        return changes
 
 
 def base_moved(base: Tensor, off: Tensor) -> Tensor:
@@ -126,18 +135,32 @@ def cut_standing(recordings: Sequence[Recording], settings: GapSettings, config:
     """
     legs = Legs(config)
     logs = {k: Log.of(r) for k, r in enumerate(recordings) if r.meta.base == "floating"}
-    known: dict[tuple[int, float], Base] = {}
+    bases: dict[tuple[int, float], Base] = {}
 
     def doubt(number: int, at: float) -> float:
         if number not in logs:
             return 0.0
-        found = known[number, at] = base_state(legs, logs[number], at)
-        return found.slide / SLIDE if found.spread < AGREE and found.slide < TORN else np.inf
+        base = bases[number, at] = base_state(legs, logs[number], at)
+        return base.slide / SLIDE if base.spread < AGREE and base.slide < TORN else np.inf
 
     plain = cut(recordings, dataclasses.replace(settings, torque=False), doubt)
+    return _with_trunk(plain, legs, logs, bases)
+
+
+def _with_trunk(
+    plain: Windows, legs: Legs, logs: Mapping[int, Log], bases: Mapping[tuple[int, float], Base]
+) -> StandingWindows:
+    """Add to windows what concerns the trunk: its initial state, its IMU, and which feet carry weight.
+
+    Args:
+        plain: the windows.
+        legs: of the nominal robot.
+        logs: by number of the recording; none of a robot whose trunk is held.
+        bases: estimates by number of the recording and time, s.
+    """
     count, width = len(plain), len(plain.joints)
     imu, scale = np.zeros((*plain.t.shape, 1, width)), np.full((count, 1, width), np.inf)
-    base, base_sd = np.tile(np.eye(13)[3], (count, 1)), np.tile(BASE_SD, (count, 1))
+    state, base_sd = np.tile(np.eye(13)[3], (count, 1)), np.tile(BASE_SD, (count, 1))
     contact = np.zeros((*plain.t.shape, robot.NUM_LEGS), dtype=bool)
     sd = np.concatenate([noise_of([log.imu[:, k : k + 3] for log in logs.values()]) for k in (0, 3)])
     bearing = {number: loaded(legs, log) for number, log in logs.items()}
@@ -146,13 +169,13 @@ def cut_standing(recordings: Sequence[Recording], settings: GapSettings, config:
             rows = rows_at(logs[number].t, begin + plain.t[k])
             imu[k, :, 0, :6], scale[k, 0, :6] = logs[number].imu[rows], sd
             contact[k] = bearing[number][rows]
-            found = known[number, begin]
-            base[k], base_sd[k, 3:6] = found.state, np.hypot(base_sd[k, 3:6], 0.5 * found.slide)
+            base = bases[number, begin]
+            state[k], base_sd[k, 3:6] = base.state, np.hypot(base_sd[k, 3:6], 0.5 * base.slide)
     kept = {f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}
     kept |= {"quantities": (*plain.quantities, IMU), "y": np.concatenate([plain.y, imu], axis=2)}
     kept["scale"] = np.concatenate([plain.scale, scale], axis=1)
     held = np.array([number not in logs for number in plain.episode])
-    return StandingWindows(**kept, base=base, sd_of_base=base_sd, contact=contact, held=held, imu_site=legs.imu_site)
+    return StandingWindows(**kept, base=state, sd_of_base=base_sd, contact=contact, held=held, imu_site=legs.imu_site)
 
 
 def rows_at(t: np.ndarray, when: np.ndarray) -> np.ndarray:

@@ -8,12 +8,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
-from go1exp.gap.data.windows import FIT_S, even_clock
+from go1exp.gap.data.cutting import FIT_S, even_clock
 from go1exp.physics.legs import Legs
 from go1exp.recording import VECTORS, Recording
 
 LOADED = 10.0
-"""Force from which a foot carries weight, N: a third of what each bears at rest, twice what a swing feigns."""
+"""Force from which a foot carries weight, N: a third of what each bears at rest, twice what is
+estimated for a foot in the air."""
 
 AGREE = 0.004
 """Feet that carry weight and disagree by more about the height of the base, m, are not all on the ground."""
@@ -71,12 +72,12 @@ class Base:
 
 def loaded(legs: Legs, log: Log) -> np.ndarray:
     """Return which feet carry weight (T, 4) bool, at every row of a recording."""
-    found = np.empty((len(log.t), robot.NUM_LEGS), dtype=bool)
+    bearing = np.empty((len(log.t), robot.NUM_LEGS), dtype=bool)
     up = log.attitude.as_matrix()[:, 2]
     for k in range(len(log.t)):
         _, moves = legs.feet(log.q[k], up[k])
-        found[k] = legs.forces(moves, log.torque[k]) @ up[k] > LOADED
-    return found
+        bearing[k] = legs.forces(moves, log.torque[k]) @ up[k] > LOADED
+    return bearing
 
 
 def base_state(legs: Legs, log: Log, at: float) -> Base:

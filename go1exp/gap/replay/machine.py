@@ -11,12 +11,12 @@ from go1exp.drive import DriveSetup
 from go1exp.effects.tolerances import Tolerances
 from go1exp.schema.registry import Term, bind
 
+NEEDLESS = 1 << 4 | 1 << 13
+"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
+
 
 class Machine(Protocol):
-    """A robot that can be replayed.
-
-    One that is not driven by the ideal PD law has ``drive() -> Term`` beside.
-    """
+    """A robot that can be replayed."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -27,12 +27,15 @@ class Machine(Protocol):
         """Joints that move together, equally many in each group; groups do not feel each other."""
 
     @property
+    def base_probe(self) -> tuple[float, ...]:
+        """Changes of a free base's initial state by which its influence is measured; empty for one that is held."""
+
+    @property
     def tolerances(self) -> Tolerances:
         """How far the nominal parameters may be off."""
 
-    @property
-    def base_probe(self) -> tuple[float, ...]:
-        """Changes of a free base's first state by which its influence is measured; empty for one that is held."""
+    def drive(self) -> Term:
+        """Return what turns commands into torques."""
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
@@ -43,9 +46,3 @@ def pd() -> Term:
     term = bind("actuator", "pd", {}, "pd")[0]
     assert term is not None
     return term
-
-
-def drive_of(machine: Machine) -> Term:
-    """Return what turns a machine's commands into torques: the ideal PD law unless it says otherwise."""
-    own = getattr(machine, "drive", None)
-    return pd() if own is None else own()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +14,7 @@ from go1exp.drive import DriveSetup
 from go1exp.effects.base import Measured
 from go1exp.env.plant import FRICTION, Plant
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
-from go1exp.gap.replay.machine import Machine, drive_of
+from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Rows
 from go1exp.schema.registry import bind
 
@@ -38,14 +37,13 @@ class Replayer:
     max_rows: int
     threads: int
     made: int = 0
-    on_rows: Callable[[int], None] = lambda rows: None
     _backends: dict[Any, tuple[Any, DriveSetup, set[str]]] = field(default_factory=dict)
     _inputs: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     def run(self, rows: Rows, dt: float) -> np.ndarray:
-        """Return what sensors would say (R, n, C, J) at the windows' sample times."""
+        """Return what sensors would measure (R, n, C, J) at the windows' sample times."""
         w = self.windows
-        found = np.empty((len(rows.window), w.t.shape[1], len(w.quantities), len(w.joints)))
+        y = np.empty((len(rows.window), w.t.shape[1], len(w.quantities), len(w.joints)))
         attitudes, which = np.unique(self.quats[rows.window].round(6), axis=0, return_inverse=True)
         for k, quat in enumerate(attitudes):
             mine = np.flatnonzero(which.ravel() == k)
@@ -53,9 +51,8 @@ class Replayer:
             for piece in np.array_split(mine, pieces):
                 size = min(padded(len(piece)), self.max_rows)
                 full = np.concatenate([piece, np.repeat(piece[-1:], size - len(piece))])
-                found[piece] = self._batch(rows.part(full), dt, tuple(float(v) for v in quat))[: len(piece)]
-                self.on_rows(len(piece))
-        return found
+                y[piece] = self._batch(rows.part(full), dt, tuple(float(v) for v in quat))[: len(piece)]
+        return y
 
     def _plant(self, rows: Rows, dt: float, quat: tuple[float, ...]) -> Plant:
         """Return a plant whose effects are exactly those of ``rows``, on a backend that may be an old one."""
@@ -69,7 +66,7 @@ class Replayer:
             backend.derive_constants(torch.ones(len(rows.window), dtype=torch.bool))
         names = list(dict.fromkeys(effect for effect, _ in rows.values))
         terms = [bind("effect", name, {}, name)[0] for name in names]
-        plant = Plant(backend, setup, drive_of(self.machine), [term for term in terms if term is not None])
+        plant = Plant(backend, setup, self.machine.drive(), [term for term in terms if term is not None])
         touched |= set(plant.effects.fields) | {FRICTION, "dof_armature"}
         for (effect, parameter), value in rows.values.items():
             live = getattr(plant.effects.effects[effect], parameter)
@@ -80,7 +77,7 @@ class Replayer:
         return plant
 
     def _begin(self, plant: Plant, rows: Rows, past: Tensor, dt: float) -> None:
-        """Put the robots into their windows' first states, as the encoders see them."""
+        """Put the robots into their windows' initial states, as the encoders see them."""
         w = self.windows
         q, qd = torch.as_tensor(w.q[rows.window]), torch.as_tensor(w.qd[rows.window])
         if rows.q is not None and rows.qd is not None:
@@ -113,8 +110,12 @@ class Replayer:
         """Return the coordinates and speeds of robots whose joints are at ``q`` (R, J) and ``qd``."""
         return q, qd
 
-    def _ears(self, steps: int, rows: int) -> Any:
-        """Return what listens to more than the joints, or None."""
+    def observing(self, windows: Windows) -> Replayer:
+        """Return a replayer of the same windows with other quantities (``Windows.observable``): with torques."""
+        return Replayer(self.machine, windows, self.quats, self.max_rows, self.threads)
+
+    def _recorder(self, steps: int, rows: int) -> Any:
+        """Return what records more than the joints, or None."""
         return None
 
     def _signals(self, dt: float) -> tuple[Tensor, Tensor]:
@@ -143,15 +144,15 @@ class Replayer:
         shape = (kept, len(index), len(w.joints))
         q, qd, torque = np.empty(shape), np.empty(shape), np.empty(shape) if "tau_est" in w.quantities else None
         senses = plant.effects.senses
-        ears = self._ears(kept, len(index))
+        recorder = self._recorder(kept, len(index))
         for k in range(steps):
             if k >= first:
                 seen = Measured(plant.q, plant.speed())
                 if senses:
                     seen = plant.effects.measure(seen)
                 q[k - first], qd[k - first] = seen.joint_pos.numpy(), seen.joint_vel.numpy()
-                if ears is not None:
-                    ears.take(k - first, plant)
+                if recorder is not None:
+                    recorder.record(k - first, plant)
             if not always:
                 plant.enabled = enabled[past + k]
             plant.step(targets[past + k])
@@ -159,8 +160,8 @@ class Replayer:
                 torque[k - first] = plant.torque.numpy()
         self.made += len(index) * steps
         at = w.t[rows.window] / dt - first
-        found = _sampled(q, qd, torque, at, dt)
-        return found if ears is None else ears.joined(found, at, plant, dt)
+        y = _sampled(q, qd, torque, at, dt)
+        return y if recorder is None else recorder.joined(y, at, plant, dt)
 
 
 def padded(rows: int) -> int:

@@ -1,13 +1,12 @@
-"""A Go1 on its feet: its base in the windows' first states, and its IMU beside the encoders.
+"""Replay of a robot on its feet: its trunk in the windows' initial states, and its IMU beside the encoders.
 
-Legs feel each other through the trunk, so all joints are one group. The base's first attitude and rate come from the
-IMU, its height and velocity from the legs that carry weight, and what these leave open is averaged out with the rest of
-the first state. Where no two feet carry weight, nothing says how fast the trunk moves: no window begins there.
+The trunk's initial attitude and rate come from the IMU, its height and velocity from the legs that carry weight. What
+these leave open is averaged out with the rest of the initial state (``score/initial_state.py``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -16,29 +15,26 @@ from torch import Tensor
 from go1exp.effects.base import Measured
 from go1exp.env.plant import Plant
 from go1exp.gap.data.standing import StandingWindows, base_moved
+from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Rows
-from go1exp.gap.robots.hung import HungGo1
-from go1exp.gap.robots.standing import StandingGo1
 from go1exp.tensors.rotation import quat_multiply, rotate_inverse
 
 GRAVITY = 9.81
 """m/s2, MuJoCo's own default, which the scene leaves as it is."""
 
-TRUNK = "trunk"
-"""Name of the quantity of a ``Witness``: attitude w-x-y-z, and velocity in the world."""
 
-
-class Ears:
-    """Keeps the motion of the bases of a batch, and returns what their IMUs would say."""
+class ImuRecorder:
+    """Keeps the motion of the trunks of a batch, and returns what their IMUs would measure."""
 
     def __init__(self, steps: int, rows: int, site: np.ndarray) -> None:
         """Make room for ``steps`` steps of ``rows`` robots; the IMUs sit at ``site`` (3,) in the trunk, m."""
         self._quat, self._speed = torch.empty(steps, rows, 4).double(), torch.empty(steps, rows, 6).double()
         self._site = torch.as_tensor(site)
 
-    def take(self, k: int, plant: Plant) -> None:
-        """Note step ``k`` before it is made."""
+    def record(self, k: int, plant: Plant) -> None:
+        """Keep the state before step ``k``."""
         self._quat[k], self._speed[k] = plant.backend.qpos[:, 3:7], plant.backend.qvel[:, :6]
 
     def readings(self, plant: Plant, dt: float) -> Tensor:
@@ -62,8 +58,8 @@ class Ears:
         return beside(joints, imu, at)
 
 
-class Eyes(Ears):
-    """Returns also where the bases look and how fast they move."""
+class TrunkRecorder(ImuRecorder):
+    """Returns also the attitudes and velocities of the trunks."""
 
     def joined(self, joints: np.ndarray, at: np.ndarray, plant: Plant, dt: float) -> np.ndarray:
         """Put attitude w-x-y-z and velocity in the world beside the rest."""
@@ -88,35 +84,35 @@ class StandingReplayer(Replayer):
     """Replays windows of a robot on its feet, and those of the same robot hung.
 
     Attributes:
-        hung: replays the latter; made where it is needed.
+        held: the same robot with its trunk held.
+        hung: replays its windows; made where there are some.
     """
 
+    windows: StandingWindows
+    held: Machine = field(kw_only=True)
     hung: Replayer | None = None
 
     def run(self, rows: Rows, dt: float) -> np.ndarray:
-        """Return what sensors would say (R, n, 3, J) at the windows' sample times; nothing where they are not read."""
-        held = self._windows.held[rows.window]
+        """Return what sensors would measure (R, n, 3, J) at the windows' sample times; 0 where nothing is compared."""
+        held = self.windows.held[rows.window]
         if not held.any():
             return super().run(rows, dt)
-        assert isinstance(self.machine, StandingGo1)
         if self.hung is None:
-            machine = HungGo1(self.machine.config, groups=self.machine.groups, tolerances=self.machine.tolerances)
-            self.hung = Replayer(machine, self.windows, self.quats, self.max_rows, self.threads)
-        self.hung.windows = self._windows.plain()
-        found = np.zeros((len(held), self.windows.t.shape[1], len(self.windows.quantities), len(self.windows.joints)))
-        found[held, :, :2] = self.hung.run(rows.part(np.flatnonzero(held)), dt)
+            self.hung = Replayer(self.held, self.windows, self.quats, self.max_rows, self.threads)
+        self.hung.windows = self.windows.plain()
+        y = np.zeros((len(held), self.windows.t.shape[1], len(self.windows.quantities), len(self.windows.joints)))
+        y[held, :, :2] = self.hung.run(rows.part(np.flatnonzero(held)), dt)
         if not held.all():
-            found[~held] = super().run(rows.part(np.flatnonzero(~held)), dt)
-        return found
+            y[~held] = super().run(rows.part(np.flatnonzero(~held)), dt)
+        return y
 
-    @property
-    def _windows(self) -> StandingWindows:
-        assert isinstance(self.windows, StandingWindows)
-        return self.windows
+    def observing(self, windows: Windows) -> TrunkReplayer:
+        """Return a replayer of the same windows that tells all that a simulation can tell."""
+        return TrunkReplayer(self.machine, windows, self.quats, self.max_rows, self.threads, held=self.held)
 
     def _state(self, plant: Plant, rows: Rows, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Put a base (its IMU as tilted as it is believed to be) before the joints: qpos (R, 19), qvel (R, 18)."""
-        base = torch.as_tensor(self._windows.base[rows.window])
+        base = torch.as_tensor(self.windows.base[rows.window])
         if rows.base is not None:
             base = base_moved(base, torch.as_tensor(rows.base))
         place, attitude, speed, rate = base.split([3, 4, 3, 3], dim=1)
@@ -129,12 +125,12 @@ class StandingReplayer(Replayer):
         rate = rotate_inverse(back, rate)
         return torch.cat([place, attitude, q], dim=1), torch.cat([speed, rate, qd], dim=1)
 
-    def _ears(self, steps: int, rows: int) -> Ears:
-        return Ears(steps, rows, self._windows.imu_site)
+    def _recorder(self, steps: int, rows: int) -> ImuRecorder:
+        return ImuRecorder(steps, rows, self.windows.imu_site)
 
 
-class Witness(StandingReplayer):
+class TrunkReplayer(StandingReplayer):
     """Replays windows of a robot on its feet, and tells torques and the trunk's motion beside what is scored."""
 
-    def _ears(self, steps: int, rows: int) -> Eyes:
-        return Eyes(steps, rows, self._windows.imu_site)
+    def _recorder(self, steps: int, rows: int) -> TrunkRecorder:
+        return TrunkRecorder(steps, rows, self.windows.imu_site)

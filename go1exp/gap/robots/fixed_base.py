@@ -5,34 +5,34 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-import go1exp.actuator
-import go1exp.effects  # noqa: F401  (registers every effect)
+import go1exp.actuator  # noqa: F401  (registers every actuator)
 from go1exp.actuator.setup import Gains
+from go1exp.audit import AuditReport
 from go1exp.drive import DriveSetup
 from go1exp.effects.tolerances import DECLARED, Tolerances
-from go1exp.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
+from go1exp.gap.data.cutting import cut
+from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
+from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.machine import NEEDLESS, pd
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.result import GapSettings
+from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, gain_warnings, wrong_speeds
+from go1exp.gap.robots.description import ModelConfig
+from go1exp.physics.fixed_base import NO_SENSORS, FixedBaseError, build_fixed_base, feel_each_other
 from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.recording import Recording
 from go1exp.schema.registry import ConfigError, Entry, Term
 from go1exp.tensors.randomness import EnvRandom
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from go1exp.gap.robots.description import ModelConfig
-
-from go1exp.gap.replay.machine import pd
-from go1exp.gap.robots.hung import NEEDLESS
-
-# ---------------------------------------------------------------------- any other robot
-
 
 class TorqueDrive(Gains):
-    """A drive that makes the torque it is told: its target is a torque, N m, clipped at the peak. Gains do nothing."""
+    """A drive that is commanded a torque: its target is a torque, N m, clipped at the peak. Gains do nothing."""
 
     def __init__(self, setup: DriveSetup) -> None:
         """Note the peak torque."""
@@ -98,8 +98,6 @@ class FixedBase:
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` robots, and their drives."""
-        from go1exp.physics.fixed_base import NO_SENSORS
-
         backend = MujocoCpu(self.model(physics_dt, base_quat), NO_SENSORS, num, threads)
         like = backend.qpos
 
@@ -125,3 +123,36 @@ class FixedBase:
         if self.config.drive == "torque":
             return Term("torque", Entry("actuator", "torque", TorqueDrive), {})
         return pd()
+
+    def suited(self, recordings: Sequence[Recording]) -> FixedBase:
+        """Return itself: its base is always fixed."""
+        return self
+
+    def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
+        """Return why a recording cannot be compared, a line each."""
+        return flaws_of(recording, report, self.config)
+
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
+        """Return recordings with what they lack taken from the description, and windows whose number is affordable."""
+        warnings = []
+        wrong = wrong_speeds(recordings, reports, self.config)
+        if wrong:
+            warnings.append(f"Speeds are not compared, and first speeds come from the angles: {wrong}.")
+        whole = tuple(completed(r, self.config, bool(wrong)) for r in recordings)
+        warnings += [*clock_warnings(recordings, whole, self.config), *gain_warnings(recordings, self.config)]
+        settings, more = spaced(whole, settings, len(self.groups[0]))
+        return Ready(whole, settings, ("qd",) if wrong else (), (*warnings, *more))
+
+    def windows(self, ready: Ready) -> Windows:
+        """Cut recordings into windows; what is ignored has infinite noise."""
+        windows = cut(ready.recordings, ready.settings)
+        if self.config.clock == "speeds":
+            windows.scale[:, 0] = noise_in_time(ready.recordings)
+        for c, quantity in enumerate(windows.quantities):
+            if quantity in ready.ignored:
+                windows.scale[:, c] = np.inf
+        return windows
+
+    def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
+        """Return what runs this robot through windows."""
+        return Replayer(self, windows, quats, max_rows, threads)

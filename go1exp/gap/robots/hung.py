@@ -1,35 +1,53 @@
-"""Robots that the gap workflow can replay: the hung Go1, and any chain of hinges on a fixed base from a config."""
+"""A Go1 that hangs in a stand, its trunk held."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import go1exp.actuator
-import go1exp.effects  # noqa: F401  (registers every effect)
+import numpy as np
+
 from go1exp import robot
+from go1exp.audit import AuditReport
 from go1exp.drive import DriveSetup
 from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.env.plant import drive_setup
-from go1exp.gap.replay.machine import Machine
+from go1exp.gap.data.cutting import cut
+from go1exp.gap.data.prepare import Ready
+from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.machine import NEEDLESS, pd
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.result import GapSettings
+from go1exp.gap.robots.go1_logs import go1_flaws
+from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.robots.standing import ONE_GROUP, StandingGo1
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
+from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
+from go1exp.schema.registry import Term
 from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import TerrainConfig, build_terrain
 
-NEEDLESS = 1 << 4 | 1 << 13
-"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
+LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
 
 
 @dataclass(frozen=True)
 class HungGo1:
-    """A Go1 whose trunk is held, so that its legs do not feel each other."""
+    """A Go1 whose trunk is held, so that its legs do not feel each other.
+
+    Attributes:
+        config: of the robot.
+        joints: names.
+        groups: the legs.
+        base_probe: none, as the trunk is held.
+        tolerances: of nominal parameters.
+    """
 
     config: RobotConfig
     joints: tuple[str, ...] = robot.JOINTS
-    groups: tuple[tuple[int, ...], ...] = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
+    groups: tuple[tuple[int, ...], ...] = LEGS
     base_probe: tuple[float, ...] = ()
     tolerances: Tolerances = DECLARED
 
@@ -42,7 +60,33 @@ class HungGo1:
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
+    def drive(self) -> Term:
+        """Return the ideal PD law."""
+        return pd()
 
-def hung(config: RobotConfig, tolerances: Tolerances = DECLARED) -> Machine:
+    def suited(self, recordings: Sequence[Recording]) -> Robot:
+        """Return the Go1 on its feet if it is so in one of the recordings, else this one."""
+        if not any(r.meta.base == "floating" for r in recordings):
+            return self
+        return StandingGo1(self.config, replace(self, groups=ONE_GROUP), tolerances=self.tolerances)
+
+    def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
+        """Return why a recording cannot be compared, a line each."""
+        return go1_flaws(recording, report, self.joints, free=False)
+
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
+        """Return the recordings as they are."""
+        return Ready(tuple(recordings), settings)
+
+    def windows(self, ready: Ready) -> Windows:
+        """Cut recordings into windows."""
+        return cut(ready.recordings, ready.settings)
+
+    def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
+        """Return what replays windows of a held trunk."""
+        return Replayer(self, windows, quats, max_rows, threads)
+
+
+def hung(config: RobotConfig, tolerances: Tolerances = DECLARED) -> Robot:
     """Return a Go1 whose trunk is held."""
     return HungGo1(config, tolerances=tolerances)

@@ -7,35 +7,29 @@ from dataclasses import replace
 
 import numpy as np
 
-from go1exp.gap.data.prepare import Ready
-from go1exp.gap.data.standing import StandingWindows
-from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Theta, variants
-from go1exp.gap.replay.standing import StandingReplayer
 from go1exp.gap.score.initial_state import settled
 from go1exp.gap.score.likelihood import Scorer, scorer
 from go1exp.recording import Recording
 
 
-def measured(ready: Ready, windows: Windows, dt: float, coarse: float) -> tuple[Scorer, dict[str, float]]:
+def measured(replayer: Replayer, dt: float, coarse: float, clock_s: float) -> tuple[Scorer, dict[str, float]]:
     """Return what scores replays at step ``dt``, s, and the error of that step by quantity.
 
-    Where a robot is held, the influence of the first states is taken at the step ``coarse``, s.
+    Args:
+        replayer: of the windows.
+        dt: physics step, s.
+        coarse: step, s, at which the influence of the initial states of a held robot is measured.
+        clock_s: standard deviation of the time between stamps of commands and of readings, s.
     """
-    settings, machine = ready.settings, ready.machine
-    level = (1.0, 0.0, 0.0, 0.0)
-    quats = np.array([ready.recordings[e].meta.base_quat or level for e in windows.episode])
-    if isinstance(windows, StandingWindows):
-        return settled(
-            StandingReplayer(machine, windows, quats, settings.max_rows, settings.threads), dt, settings.clock_s
-        )
-    replayer = Replayer(machine, windows, quats, settings.max_rows, settings.threads)
+    if replayer.machine.base_probe:  # initial states of a free trunk matter so much that they are fitted first
+        return settled(replayer, dt, clock_s)
 
     def at(theta: Theta) -> tuple[Scorer, dict[str, float]]:
         scale, numerical = numerical_scale(replayer, dt, theta)
-        found = scorer(replayer, theta, scale, coarse, settings.clock_s)
-        return replace(found, renewed=lambda values: at(values)[0]), numerical
+        score = scorer(replayer, theta, scale, coarse, clock_s)
+        return replace(score, renewed=lambda values: at(values)[0]), numerical
 
     return at({})
 
@@ -61,11 +55,11 @@ def repeatability(recordings: Sequence[Recording]) -> dict[str, float] | None:
     pairs = [(r, by_name[r.meta.repeat_of]) for r in recordings if r.meta.repeat_of in by_name]
     if not pairs:
         return None
-    found = {}
+    rms = {}
     for name in ("q", "qd"):
         square = []
         for a, b in pairs:
             rows = min(len(a.t), len(b.t))
             square.append(np.mean((a.joint(name)[:rows] - b.joint(name)[:rows]) ** 2))
-        found[name] = float(np.sqrt(np.mean(square) / 2.0))
-    return found
+        rms[name] = float(np.sqrt(np.mean(square) / 2.0))
+    return rms

@@ -1,4 +1,4 @@
-"""From what was found to a choice of ``effect`` that training takes, and the proof that it holds there."""
+"""The stage ``apply``: an answer written as a choice of ``effect`` for training, and the proof that it holds there."""
 
 from __future__ import annotations
 
@@ -14,21 +14,19 @@ import numpy as np
 from go1exp.config import parse_parts
 from go1exp.effects.base import Effect, Param
 from go1exp.effects.tolerances import Tolerances
+from go1exp.gap.comparison import Comparison, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
-from go1exp.gap.data.prepare import prepare
-from go1exp.gap.data.splits import splits
 from go1exp.gap.files import GapFileError
-from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
-from go1exp.gap.robots.hung import hung
-from go1exp.gap.score.floors import measured
+from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.search.fit import scores
 from go1exp.gap.search.trial import excess, removed
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term, members
+from go1exp.tensors.threads import one_thread
 
 EFFECT, CALIBRATION, COMPENSATING = "effect.yaml", "calibration.yaml", "compensating.yaml"
 """What is missing; the nominal parameters within their tolerances; what only makes up for something unknown."""
@@ -74,7 +72,7 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
     folder.mkdir(parents=True, exist_ok=True)
     certified = [n for n in result.named if n.status == "certified"]
     rest = [n for n in result.named if n.status != "certified"]
-    found = []
+    written = []
     for name, about, lines in (
         (EFFECT, "What the model lacks.", _named_lines(certified)),
         (
@@ -89,8 +87,8 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
         if lines or name == EFFECT:
             head = [f"# {about}", *_provenance(result)]
             path.write_text("\n".join([*head, *(lines or ["{}"])]) + "\n")
-            found.append(path)
-    return tuple(found)
+            written.append(path)
+    return tuple(written)
 
 
 def _named_lines(named: Sequence[NamedEffect]) -> list[str]:
@@ -138,9 +136,9 @@ def _value(places: Mapping[str, float], param: Param) -> str:
 
 def _params(effect: str, names: Collection[str]) -> dict[str, Param]:
     """Return the declarations of an effect by name, of which ``names`` must be some."""
-    there = effect in members("effect")
-    known = {p.name: p for p in _kind(effect).params} if there else {}
-    strange = [f"{effect}.{name}" for name in names if name not in known] if there else [effect]
+    registered = effect in members("effect")
+    known = {p.name: p for p in _kind(effect).params} if registered else {}
+    strange = [f"{effect}.{name}" for name in names if name not in known] if registered else [effect]
     if strange:
         raise GapFileError(f"{strange[0]}: not in the library; the result is of another version of go1exp")
     return known
@@ -178,24 +176,24 @@ def terms_of(plain: Mapping[str, Any]) -> tuple[Term, ...]:
 
 def composed(*contents: Mapping[str, Any]) -> dict[str, Any]:
     """Return files' contents as one: later ones win, joint by joint, as when training composes them."""
-    found: dict[str, Any] = {}
+    whole: dict[str, Any] = {}
     for effect, params in (item for content in contents for item in content.items()):
-        mine = found.setdefault(effect, {})
+        mine = whole.setdefault(effect, {})
         for name, value in params.items():
             both = isinstance(value, Mapping) and isinstance(mine.get(name), Mapping)
             mine[name] = {**mine[name], **value} if both else value
-    return found
+    return whole
 
 
 def theta_of(terms: Sequence[Term], joints: Sequence[str]) -> Theta:
     """Return the values of effects per joint (J,), or (1,) for one of the robot, by (effect, parameter)."""
-    found: Theta = {}
+    theta: Theta = {}
     for term in terms:
         for p in _kind(term.entry.name).params:
             given = term.parameters[p.name]
             full = np.array([float(given)]) if p.per == ROBOT else np.nan_to_num(spread(given, joints), nan=p.null)
-            found[term.entry.name, p.name] = full
-    return found
+            theta[term.entry.name, p.name] = full
+    return theta
 
 
 def _reported(result: GapResult) -> float:
@@ -210,6 +208,7 @@ def _reported(result: GapResult) -> float:
 def _same_search(
     recordings: Sequence[Recording], settings: GapSettings, result: GapResult, tolerances: Tolerances
 ) -> None:
+    """Raise a ``GapFileError`` unless a result is of a search in these recordings with these settings."""
     before, now = result.provenance.get("settings", {}), asdict(settings)
     changed = [f"search.{k}" for k in SPLITTING if k in before and before[k] != now[k]]
     if changed:
@@ -232,7 +231,7 @@ SPLITTING = ("window_s", "burn_s", "stride_s", "confirm_fraction", "seed", "torq
 
 def prove(
     recordings: Sequence[Recording],
-    config: RobotConfig | Machine,
+    robot: RobotConfig | Robot,
     settings: GapSettings,
     result: GapResult,
     contents: Mapping[str, Mapping[str, Any]],
@@ -242,7 +241,7 @@ def prove(
 
     Args:
         recordings: those of the search.
-        config: the nominal Go1, or another robot as a machine.
+        robot: the nominal Go1, or another one.
         settings: those of the search.
         result: its outcome.
         contents: file name -> content, as read back from the files.
@@ -250,24 +249,30 @@ def prove(
 
     Raises:
         GapFileError: if logs or settings are not those of the search: what it held out would not be known.
+        NotComparable: if the recordings do not suit the robot.
     """
-    machine = hung(config) if isinstance(config, RobotConfig) else config
-    _same_search(recordings, settings, result, machine.tolerances)
-    ready = prepare(recordings, machine, settings)
-    recordings, settings, windows = ready.recordings, ready.settings, ready.windows()
-    dt = float(windows.period / np.ceil(windows.period / physics_dt - 1e-3))
-    judge, _ = measured(ready, windows, dt, dt)
-    rng = np.random.default_rng(settings.seed)
-    parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
-    held = parts.confirm if len(parts.confirm) else parts.select  # the values were fitted on all but the former
-    calibration, lacking = contents.get(CALIBRATION, {}), contents.get(EFFECT, {})
-    effect, both = (theta_of(terms_of(c), machine.joints) for c in (lacking, composed(calibration, lacking)))
-    renewed = judge.renewed
-    found = [
-        scores(judge if renewed is None or not theta else renewed(theta), [theta], held, dt)[0]
-        for theta in ({}, effect, both)
-    ]
-    before, alone, after = (excess(x) for x in found)
+    robot = robot_from(robot)
+    _same_search(recordings, settings, result, robot.tolerances)
+    with one_thread():
+        comparison = compare(recordings, robot, settings, physics_dt=physics_dt, fewest=1)
+        plain, effect_only, both = (excess(_held_out(comparison, theta)) for theta in _proposals(contents, robot))
     reported = _reported(result)
-    holds = after <= max(settings.adequate, 1.5 * reported + 0.1)
-    return Applied((), dt, before, after, alone, reported, removed(before, after), bool(holds))
+    holds = both <= max(settings.adequate, 1.5 * reported + 0.1)
+    closed = removed(plain, both)
+    return Applied((), comparison.dt, plain, both, effect_only, reported, closed, bool(holds))
+
+
+def _proposals(contents: Mapping[str, Mapping[str, Any]], robot: Robot) -> tuple[Theta, Theta, Theta]:
+    """Return the values of the plain model, with ``effect.yaml``, and with ``calibration.yaml`` as well."""
+    calibration, lacking = contents.get(CALIBRATION, {}), contents.get(EFFECT, {})
+    effect, both = (theta_of(terms_of(c), robot.joints) for c in (lacking, composed(calibration, lacking)))
+    return {}, effect, both
+
+
+def _held_out(comparison: Comparison, theta: Theta) -> np.ndarray:
+    """Return chi2 (V, G) of a model, by floors and initial states that suit it, on windows of the last check if any."""
+    parts = comparison.split(np.random.default_rng(comparison.settings.seed))
+    windows = parts.confirm if len(parts.confirm) else parts.select  # values were fitted on all but the former
+    renewed = comparison.scorer.renewed
+    scorer = comparison.scorer if renewed is None or not theta else renewed(theta)
+    return scores(scorer, [theta], windows, comparison.dt)[0]

@@ -1,4 +1,4 @@
-"""A first look: how good can any model be on these logs, where is ours wrong, and what could they not tell."""
+"""The stage ``check``: how good can any model be on these logs, where is ours wrong, and what could they not show."""
 
 from __future__ import annotations
 
@@ -7,27 +7,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from go1exp.gap import answer as words
-from go1exp.gap.data.prepare import prepare
-from go1exp.gap.data.splits import splits
-from go1exp.gap.replay.machine import Machine
+from go1exp.gap.answer import not_excited
+from go1exp.gap.comparison import NotComparable, Progress, compare, robot_from
 from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
-from go1exp.gap.robots.hung import hung
-from go1exp.gap.score.floors import measured, repeatability
+from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.localise import localise
 from go1exp.gap.search.fit import residuals
-from go1exp.gap.search.stepwise import Progress, Search
+from go1exp.gap.search.stepwise import Search
 from go1exp.gap.search.trial import excess
-from go1exp.gap.stages.explain import FEWEST
-from go1exp.recording import Recording, RecordingError
+from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
+from go1exp.tensors.threads import one_thread
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m", "imu_gyro": "rad/s", "imu_acc": "m/s2"}
 
 
 @dataclass(frozen=True)
-class Survey:
-    """What a first look found.
+class CheckResult:
+    """What a first look showed.
 
     Attributes:
         flaws: why the logs cannot be compared; empty if they can.
@@ -53,7 +50,7 @@ class Survey:
         return EXIT_CODES["bad log"] if self.flaws else 0
 
     def text(self) -> str:
-        """Say it in lines."""
+        """Return it as lines for people."""
         if self.flaws or self.floors is None:
             return "\n".join(["these logs cannot be compared with the model:", *(f"  {f}" for f in self.flaws)])
         lines = [f"{self.windows} windows; the plain model's error is {1 + self.excess:.3g} times the floor"]
@@ -69,48 +66,40 @@ class Survey:
         return "\n".join(lines)
 
 
-def survey(
+def check(
     recordings: Sequence[Recording],
-    config: RobotConfig | Machine,
+    robot: RobotConfig | Robot,
     settings: GapSettings,
     on_progress: Progress = lambda what, share: None,
     screen: bool = True,
-) -> Survey:
-    """Take a first look at recordings of a held robot; ``screen`` also asks what they could not tell."""
-    machine = hung(config) if isinstance(config, RobotConfig) else config
-    return _survey(recordings, machine, settings, on_progress, screen)
+) -> CheckResult:
+    """Take a first look at recordings of a robot.
 
-
-def _survey(
-    recordings: Sequence[Recording], machine: Machine, settings: GapSettings, on_progress: Progress, screen: bool
-) -> Survey:
-    on_progress("auditing the logs", 0.0)
-    ready = prepare(recordings, machine, settings)
-    if ready.flaws:
-        return Survey(ready.flaws)
-    recordings, settings = ready.recordings, ready.settings
-    try:
-        windows = ready.windows()
-    except RecordingError as error:
-        return Survey((str(error),))
-    if len(windows) < FEWEST:
-        return Survey((f"{len(windows)} windows of {settings.window_s:g} s; {FEWEST} are needed",))
-    dt = float(windows.period / np.ceil(windows.period / settings.physics_dt - 1e-3))
-    on_progress("measuring the floors", 0.1)
-    score, numerical = measured(ready, windows, dt, 2.0 * dt)
-    rng = np.random.default_rng(settings.seed)
-    everything = np.arange(len(windows))
-    noise = {name: value for name, value in windows.by_quantity(windows.scale).items() if np.isfinite(value)}
-    floors = Floors(noise, numerical, repeatability(recordings))
-    on_progress("where it is wrong", 0.4)
-    plain = residuals(score, [{}], everything, dt)[0]
-    where = localise(score, plain, everything, rng)
-    silent = None
-    if screen:
-        on_progress("what these logs can tell", 0.6)
-        parts = splits([r.meta for r in recordings], windows.episode, settings.confirm_fraction, rng)
-        search = Search(score, parts, settings, dt, rng, lambda what, share: None)
-        search.listen()
-        silent = words.not_excited(search.signal, held=not ready.machine.base_probe)
+    Args:
+        recordings: of one robot.
+        robot: the nominal Go1, or another one.
+        settings: how they are cut.
+        on_progress: called with what is being done, and which share of the work is finished.
+        screen: whether to ask also which effects the recordings could not show.
+    """
+    robot = robot_from(robot)
+    with one_thread():
+        try:
+            comparison = compare(recordings, robot, settings, on_progress)
+        except NotComparable as error:
+            return CheckResult(error.flaws)
+        on_progress("where it is wrong", 0.4)
+        score, everything = comparison.scorer, comparison.everything
+        rng = np.random.default_rng(settings.seed)
+        plain = residuals(score, [{}], everything, comparison.dt)[0]
+        where = localise(score, plain, everything, rng)
+        silent = None
+        if screen:
+            on_progress("what these logs can show", 0.6)
+            parts = comparison.split(rng)
+            search = Search(score, parts, comparison.settings, comparison.dt, rng, lambda what, share: None)
+            search.measure_signals()
+            silent = not_excited(search.signal, held=not comparison.robot.base_probe)
     on_progress("done", 1.0)
-    return Survey((), floors, len(windows), excess(score.chi2(plain, everything)), where, silent, ready.warnings)
+    error_of_all = excess(score.chi2(plain, everything))
+    return CheckResult((), comparison.floors(), len(everything), error_of_all, where, silent, comparison.ready.warnings)
