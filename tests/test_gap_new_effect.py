@@ -55,7 +55,8 @@ class Robots:
     """A held Go1 and one on its feet, with nothing of their configuration."""
 
     config: RobotConfig = None  # type: ignore[assignment]
-    held, standing = HungGo1(config), StandingGo1(config)
+    held = HungGo1(config)
+    standing = StandingGo1(config, held)
 
 
 @pytest.fixture

@@ -20,12 +20,14 @@ from go1exp.effects.tolerances import DECLARED, Tolerances, declared, sizes
 from go1exp.gap import files
 from go1exp.gap.report import tables, text, write_report
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
-from go1exp.gap.robots.choice import machine_of
+from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import parse_model
-from go1exp.gap.robots.standing import on_feet
+from go1exp.gap.robots.hung import hung
 from go1exp.gap.search import evidence, tolerances
 from go1exp.gap.stages.apply import prove, write
+from go1exp.gap.stages.explain import explain
 from go1exp.recording import Recording
+from go1exp.robot import JOINTS
 from go1exp.schema.registry import members
 from tests.laboratory import recorded
 
@@ -33,12 +35,12 @@ ADDED = ("armature", "added")
 JOINT = "FR_calf"
 
 
-def robot_of(*overrides: str) -> Any:
+def robot_given(*overrides: str) -> Any:
     """Return the robot of a command line of ``go1exp gap``."""
     container = compose("gap", choices_from_files(["logs=x", *overrides]))
     parts, problems = parse_parts(container, ("robot",))
     assert problems == []
-    return machine_of(parse_model(container["model"]), parts["robot"])
+    return robot_of(parse_model(container["model"]), parts["robot"])
 
 
 def answer(**changes: Any) -> GapResult:
@@ -79,7 +81,7 @@ def test_what_no_robot_replaces_is_as_declared() -> None:
 def test_a_user_gives_tolerances_on_the_command_line(
     overrides: list[str], key: tuple[str, str], tolerance: float
 ) -> None:
-    robot = robot_of(*overrides)
+    robot = robot_given(*overrides)
     assert robot.tolerances.param(key).tolerance == tolerance
     may = tolerances.Freedom(robot.tolerances)
     assert may.reach(key, 0) == tolerance
@@ -91,14 +93,14 @@ def test_a_user_gives_tolerances_on_the_command_line(
 def test_a_user_gives_tolerances_of_the_go1_in_a_file(tmp_path: Path) -> None:
     file = tmp_path / "known_worse.yaml"
     file.write_text("mjcf: null\ntolerances:\n  armature: {added: 0.004}\n")
-    robot = robot_of(f"model={file}")
+    robot = robot_given(f"model={file}")
     assert robot.tolerances.replaced == {ADDED: 0.004}
-    assert robot == replace(robot_of(), tolerances=robot.tolerances)
+    assert robot == replace(robot_given(), tolerances=robot.tolerances)
 
 
 def test_a_robot_on_its_feet_keeps_its_tolerances() -> None:
     (log, *_) = recorded(["seconds=1.0", "excitation=[squat]"])[1]
-    robot = on_feet(robot_of("model.tolerances.payload.mass=0.5"), [log])
+    robot = robot_given("model.tolerances.payload.mass=0.5").suited([log])
     assert robot.base_probe
     assert robot.tolerances.param(("payload", "mass")).tolerance == 0.5
 
@@ -161,4 +163,34 @@ def test_a_proof_refuses_other_tolerances_than_those_of_the_search() -> None:
     found = answer(tolerances=DECLARED.by_effect())
     logs: list[Recording] = []
     with pytest.raises(files.GapFileError, match=r"model.tolerances.coulomb.bound = 0.2: not as in the search .*0.05"):
-        prove(logs, robot_of("model.tolerances.coulomb.bound=0.2"), GapSettings(), found, {}, 0.002)
+        prove(logs, robot_given("model.tolerances.coulomb.bound=0.2"), GapSettings(), found, {}, 0.002)
+
+
+# ---------------------------------------------------------------------- what is found
+
+QUICK = GapSettings(
+    stride_s=0.4,
+    window_s=0.2,
+    effects=("coulomb", "viscous"),
+    shortlist=2,
+    iterations=2,
+    max_terms=1,
+    bags=0,
+    overlays=0,
+)
+
+
+def test_friction_that_is_within_the_users_tolerance_is_no_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = ("armature", "coulomb", "viscous")  # a replay has 10 variants then, and not 36
+    monkeypatch.setattr(tolerances, "nominal", lambda robot: few)
+    rig, logs = recorded(
+        ["physics_dt=0.0005", "seconds=3.0", "excitation=[chirp]", "gains=[[20,0.5],[35,0.6],[35,1.2]]"],
+        {"coulomb": {"bound": {"calf": 0.3}}},
+    )
+    worse_known = hung(rig.robot, Tolerances.of({"coulomb": {"bound": 0.5}}))
+    result = explain(logs, worse_known, QUICK)
+    assert result.verdict == "no gap"
+    assert result.tolerances["coulomb"] == {"bound": 0.5}
+    assert result.tolerances["armature"] == DECLARED.by_effect()["armature"]
+    for joint in (j for j in JOINTS if j.endswith("calf")):
+        assert result.box["coulomb"]["bound"][joint] == pytest.approx(0.3, abs=0.05)
