@@ -134,7 +134,7 @@ SMALL: dict[str, dict[str, Any]] = {
         "search.max_terms": 1,
         "search.shortlist": 1,
         "search.iterations": 1,
-        "search.bags": 0,
+        "search.bootstraps": 0,
         "search.overlays": 1,
         "search.threads": 1,
     },

@@ -11,7 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.gap.data.prepare import prepare
+from go1exp.effects.tolerances import declared, sizes
+from go1exp.gap.comparison import prepare
 from go1exp.gap.data.splits import splits
 from go1exp.gap.data.standing import StandingWindows
 from go1exp.gap.data.trunk import AGREE, Base, Log, base_state
@@ -20,11 +21,11 @@ from go1exp.gap.replay.rows import Probe, variants
 from go1exp.gap.replay.standing import StandingReplayer
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.hung import HungGo1
-from go1exp.gap.robots.standing import StandingGo1, on_feet
+from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.score.initial_state import settled
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import ON_FEET, REGIMES, localise
-from go1exp.gap.search import profile_likelihood, single_cause, tolerances
+from go1exp.gap.search import profile_likelihood, single_cause
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.search.trial import excess
@@ -36,7 +37,7 @@ from go1exp.robot import RobotConfig
 from go1exp.terrain import TerrainConfig, build_terrain
 from tests import laboratory
 
-QUICK = GapSettings(window_s=0.1, stride_s=0.25, physics_dt=0.002, bags=20, overlays=0)
+QUICK = GapSettings(window_s=0.1, stride_s=0.25, physics_dt=0.002, bootstraps=20, overlays=0)
 
 
 @cache
@@ -92,11 +93,12 @@ def test_a_walking_base_is_estimated_where_two_feet_agree_and_nowhere_else() -> 
 
 def ready(config: RobotConfig, recordings: tuple[Recording, ...]) -> tuple[StandingReplayer, float]:
     """Return the replayer of ``QUICK`` windows, and its step."""
-    done = prepare(recordings, HungGo1(config), QUICK)
-    windows = done.windows()
-    assert isinstance(windows, StandingWindows)
+    machine, done = prepare(recordings, HungGo1(config), QUICK)
+    windows = machine.windows(done)
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(windows), 1))
-    return StandingReplayer(done.machine, windows, level, 512, 1), float(windows.period)
+    replayer = machine.replayer(windows, level, 512, 1)
+    assert isinstance(replayer, StandingReplayer)
+    return replayer, float(windows.period)
 
 
 def test_the_replayed_imu_says_what_the_engine_s_own_sensors_say() -> None:
@@ -159,8 +161,8 @@ def test_regimes_of_the_ground_follow_the_feet() -> None:
 def test_hung_windows_among_standing_ones_are_replayed_as_by_themselves() -> None:
     config, recordings = recorded("excitation=[squat,gait]")
     _, hung = recorded("excitation=[chirp]", "support=hung")
-    assert isinstance(on_feet(HungGo1(config), (*recordings, *hung)), StandingGo1)
-    assert isinstance(on_feet(HungGo1(config), hung), HungGo1)
+    assert isinstance(HungGo1(config).suited((*recordings, *hung)), StandingGo1)
+    assert isinstance(HungGo1(config).suited(hung), HungGo1)
     replayer, dt = ready(config, (*recordings, *hung))
     windows = replayer.windows
     assert isinstance(windows, StandingWindows)
@@ -213,7 +215,7 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
     score, _ = settled(replayer, dt, 0.00015)
     everything, begun = np.arange(len(score.windows)), profile_likelihood.begun(score, dt)
     assert begun.windows is replayer.windows
-    found, _ = profile_likelihood.fitted(begun, tolerances.sizes("payload"), everything, dt)
+    found, _ = profile_likelihood.fitted(begun, sizes("payload"), everything, dt)
     assert found["payload", "mass"].item() == pytest.approx(2.0, abs=0.2)
     truth = {("payload", "mass"): np.array([2.0])}
     right, none = (np.log(profile_likelihood.chi2(begun, theta, everything, dt)).mean() for theta in (truth, {}))
@@ -225,7 +227,7 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
 
 
 def test_rungs_of_a_ladder_are_on_both_sides_of_null_and_no_farther_than_a_parameter_goes() -> None:
-    found = profile_likelihood.ladder(tolerances.param(("payload", "mass")))
+    found = profile_likelihood.ladder(declared(("payload", "mass")))
     assert found == pytest.approx([-0.8, -0.4, 0.0, 0.4, 0.8, 1.6, 3.2])
 
 

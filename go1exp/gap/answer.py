@@ -90,10 +90,10 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
         warnings: to which what was withdrawn is added.
     """
     settings = search.settings
-    plain = excess(search.held_out({}))
-    if search.terms and not search.confirmed():
+    plain = excess(search.state.held_out({}))
+    if search.state.terms and not search.confirmed():
         warnings.append(
-            f"Withdrawn, since episodes kept for a last check do not bear it out: {', '.join(search.terms)}."
+            f"Withdrawn, since episodes kept for a last check do not bear it out: {', '.join(search.state.terms)}."
         )
         search.withdraw("episodes kept for a last check do not bear it out")
     first, final = search.first, search.steps[-1][1]
@@ -103,11 +103,11 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
         doubtful = ", ".join(n.effect for n in named)
         warnings.append(f"Withdrawn, since the tolerances explain these logs and nothing else is sure: {doubtful}.")
         search.withdraw("the tolerances suffice, and resamples of the logs do not agree on it")
-        final, theta, named = search.first, search.theta, ()
+        final, theta, named = search.first, search.state.theta, ()
     verdict = decide(search, first, final)
     reached = {"null": plain, "box": first, "final": final}
     if len(search.splits.confirm):
-        confirmed = reached["confirm"] = excess(search.held_out(search.theta, search.splits.confirm))
+        confirmed = reached["confirm"] = excess(search.state.held_out(windows=search.splits.confirm))
         if named and verdict == "explained" and confirmed > 2.0 * settings.adequate:
             verdict = "partly explained"
             warnings.append(f"On episodes kept for a last check the error is {1 + confirmed:.3g} times the floor.")
@@ -120,28 +120,28 @@ def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
     Returns:
         The values, and by parameter of the terms their resampled values (B, J) or (B, 1).
     """
-    scorer, machine = search.scorer, search.scorer.replayer.machine
-    if not search.terms:
-        return search.theta, {}
+    scorer, machine = search.state.scorer, search.state.machine
+    if not search.state.terms:
+        return search.state.theta, {}
     fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
-    linear = search.linear(search.theta, fitted)
-    (best,) = fit(scorer, [search.model(search.theta)], linear, 1, search.dt)
+    linear = search.state.linear(search.state.theta, fitted)
+    (best,) = fit(scorer, [search.state.model(search.state.theta)], linear, 1, search.dt)
     assert best.chi2 is not None
     layout = Layout.of(machine, linear.probes)
     grams = linear.grams(scorer) / np.maximum(best.chi2, 1.0)[..., None, None]
-    limits = tolerances.bounds(layout, linear.probes, search.theta, search.may)
+    limits = tolerances.bounds(layout, linear.probes, search.state.theta, search.state.may)
     episode = scorer.windows.episode[fitted]
     drawn: dict[Key, list[np.ndarray]] = {}
     spread = 1.0 / np.sqrt(limits.weight)
-    for _ in range(max(search.settings.bags, FEWEST_BOOTSTRAPS)):
+    for _ in range(max(search.settings.bootstraps, FEWEST_BOOTSTRAPS)):
         matrix, right = layout.total(grams[significance.resampled(episode, search.rng)])
         # The nominal values are themselves uncertain by their tolerances, and motion fixes many of them only relative
         # to each other: drawing where they lie puts that uncertainty into the interval.
         centre = limits.centre + spread * search.rng.standard_normal(layout.size)
         x = tolerances.solve(matrix, right, replace(limits, centre=centre))
-        for key, value in tolerances.moved(search.theta, layout, linear.probes, x, machine).items():
-            if key[0] in search.terms:
-                null = search.robot_tolerances.param(key).null
+        for key, value in tolerances.moved(search.state.theta, layout, linear.probes, x, machine).items():
+            if key[0] in search.state.terms:
+                null = search.state.tolerances.param(key).null
                 law = 1.0 + LAW * search.rng.standard_normal(value.shape)
                 drawn.setdefault(key, []).append(null + (value - null) * law)
     return best.theta, {key: np.stack([np.ravel(v) for v in values]) for key, values in drawn.items()}
@@ -159,9 +159,9 @@ def name_terms(
         adequate: whether the model with them counts as right.
         mostly: whether they remove most of the excess, so that the first may be certified although a gap remains.
     """
-    joints, known = search.scorer.windows.joints, search.robot_tolerances
+    joints, known = search.state.scorer.windows.joints, search.state.tolerances
     named = []
-    for number, effect in enumerate(search.terms):
+    for number, effect in enumerate(search.state.terms):
         per_joint = [key for key in sizes(effect) if known.param(key).per == "joint"]
         at = _joints_beyond(per_joint, theta, drawn, joints, known)
         params: dict[str, dict[str, float]] = {}
@@ -211,7 +211,7 @@ def decide(search: Search, first: float, final: float) -> Verdict:
     """Return the verdict from the held-out excesses within the tolerances, and with the terms."""
     settings = search.settings
     loud = [effect for effect, s in search.signal.items() if s >= SILENT]
-    if search.terms:
+    if search.state.terms:
         return "explained" if final <= settings.adequate else "partly explained"
     if first > settings.adequate:
         return "unexplained"
@@ -239,7 +239,7 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], more: Se
         silent: effects that the data cannot show.
         more: what to record next, a sentence each.
     """
-    everyone = search.scorer.windows.joints
+    everyone = search.state.scorer.windows.joints
     first, final = 1.0 + answer.excess["box"], 1.0 + answer.excess["final"]
     parts = [_opening(answer.verdict, first), *(_lacking(effect, everyone) for effect in answer.named)]
     if answer.named:
@@ -289,7 +289,7 @@ def _lacking(effect: NamedEffect, everyone: Sequence[str]) -> str:
 def evidence(search: Search) -> tuple[Candidate, ...]:
     """Return the candidates, best first, with those that the data cannot show."""
     quiet = inaudible(search.signal, SILENT, [c.effect for c in search.candidates])
-    accepted = {c.effect for c in search.candidates if c.status == "accepted"} - set(search.terms)
+    accepted = {c.effect for c in search.candidates if c.status == "accepted"} - set(search.state.terms)
     kept = [
         replace(c, status="rejected", reason="dropped: the other terms do as well without it")
         if c.status == "accepted" and c.effect in accepted

@@ -240,9 +240,9 @@ def box(result: GapResult) -> Markup:
     return draw("box", "Parameters within their tolerances", paint) if rows else Markup()
 
 
-def bags(result: GapResult) -> Markup:
-    """Draw in which share of the bags each effect was found, with the line from which it is certified."""
-    rows = sorted(((n, v) for n, v in result.bags.items() if math.isfinite(v)), key=lambda pair: -pair[1])
+def bootstraps(result: GapResult) -> Markup:
+    """Draw in which share of the bootstraps each effect was named again, with the line from which it is certified."""
+    rows = sorted(((n, v) for n, v in result.bootstrap_share.items() if math.isfinite(v)), key=lambda pair: -pair[1])
     certified = words.limit(result, "certified")
 
     def paint() -> Figure:
@@ -267,7 +267,7 @@ def bags(result: GapResult) -> Markup:
         axes.set_xlim(0, 112)
         axes.set_xticks(range(0, 101, 20))
         axes.grid(axis="y", visible=False)
-        axes.set_xlabel(f"bags in which it was found, % (dashed: certified from {words.share(certified)})")
+        axes.set_xlabel(f"bootstraps in which it was named again, % (dashed: certified from {words.share(certified)})")
         return figure
 
-    return draw("bags", "Stability over bags", paint) if rows else Markup()
+    return draw("bootstraps", "Stability over bootstraps", paint) if rows else Markup()

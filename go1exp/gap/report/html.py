@@ -61,7 +61,7 @@ def _context(result: GapResult) -> dict[str, Any]:
                 "where": words.place(n.effect, n.joints, words.everyone(result)),
                 "sizes": words.sizes(n),
                 "rivals": words.rivals(n),
-                "bags": result.bags.get(n.effect),
+                "bootstrap_share": result.bootstrap_share.get(n.effect),
             }
             for n in result.named
         ],
@@ -85,5 +85,5 @@ def _context(result: GapResult) -> dict[str, Any]:
             figures.forest(n, name, k, words.tolerances(result)) for k, (n, name) in enumerate(forests[:MOST_FORESTS])
         ],
         "box": figures.box(result),
-        "bags": figures.bags(result),
+        "bootstraps": figures.bootstraps(result),
     }

@@ -213,7 +213,9 @@ def would_change(result: GapResult) -> list[str]:
             found.append(f"Data that separate {named.effect} from {' and '.join(rivals(named))} may change the name.")
         if named.status == "compensating":
             bar = share(limit(result, "certified"))
-            found.append(f"{named.effect} is certified only if it is found in {bar} of the bags and little is left.")
+            found.append(
+                f"{named.effect} is certified only if it is named again in {bar} of the bootstraps and little is left."
+            )
     if result.verdict == "unexplained" and result.candidates:
         near = max(result.candidates, key=lambda c: c.log_gain)
         if near.status == "rejected":

@@ -9,34 +9,29 @@ is the explanation, not a hundred numbers that happen to agree.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from go1exp.effects.tolerances import sizes
+from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import table
 from go1exp.gap.search import profile_likelihood, significance, tolerances
 from go1exp.gap.search.fit import Model, fit, scores
+from go1exp.gap.search.state import State
 from go1exp.gap.search.trial import excess, removed
 from go1exp.schema.registry import members
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from go1exp.gap.data.splits import Splits
-    from go1exp.gap.replay.rows import Theta
-    from go1exp.gap.result import GapSettings
 
 ITERATIONS = 4
 """Gauss-Newton steps of a fit: joints that stick make a payload's first ones short."""
 
 STRETCHES = (1.0, 0.85, 1.15, 1.4)
-"""Factors on what a fit found that are tried after it: where joints stick, small changes tell less than large ones."""
+"""Factors on fitted values that are tried after a fit: where joints stick, small changes tell less than large ones."""
 
 TURNS = 2
-"""Times that first states are moved to suit the best effect, and it is fitted again."""
+"""Times that initial states are moved to suit the best effect, and it is fitted again."""
 
 NEARLY_ALL = 0.8
 """Share of the held-out excess that an effect must remove alone."""
@@ -63,28 +58,29 @@ def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> M
 
 
 def refitted(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Model:
-    """Return a model fitted from where it is, by first states that suit it."""
+    """Return a model fitted from where it is, by initial states that suit it."""
     empty = table(scorer, {}, windows, [], dt)
-    (found,) = fit(scorer, [model], empty, ITERATIONS, dt)
-    return stretched(scorer, found, windows, dt)
+    (fitted,) = fit(scorer, [model], empty, ITERATIONS, dt)
+    return stretched(scorer, fitted, windows, dt)
 
 
-def clearest(begun: Scorer, search: Seeker) -> Model | None:
-    """Return the effect of the whole robot that does best, every model by first states of its own.
+def clearest(begun: Scorer, state: State) -> Model | None:
+    """Return the effect of the whole robot that does best, every model by initial states of its own.
 
     Args:
-        begun: scores from the first states that sensors tell (``gap/search/profile_likelihood.py``).
-        search: whose windows count.
+        begun: scores from the initial states that sensors tell (``profile_likelihood.py``).
+        state: of the search, whose windows count.
 
     Returns:
         None unless, on windows that no fit has seen, it does clearly better than all others, joints that are all off
         alike, and nothing at all.
     """
-    train, select, dt = search.splits.train, search.splits.select, search.dt
+    train, select, dt = state.splits.train, state.splits.select, state.dt
+    fitted = profile_likelihood.fitted
     none = profile_likelihood.cost(begun, {}, train, dt)
     machine = begun.replayer.machine
     fits = {
-        name: profile_likelihood.fitted(begun, sizes(name), train, dt, none)
+        name: fitted(begun, sizes(name), train, dt, none)
         for name in tolerances.nominal(machine)
         if tolerances.identification(name).needs_ground
     }
@@ -95,68 +91,43 @@ def clearest(begun: Scorer, search: Seeker) -> Model | None:
     chi2 = profile_likelihood.chi2(begun, best, select, dt)
 
     def loses(rival: Theta) -> bool:
-        return bool(
-            significance.gains(chi2, profile_likelihood.chi2(begun, rival, select, dt)[None]).mean()
-            < -significance.SAME
-        )
+        other = profile_likelihood.chi2(begun, rival, select, dt)
+        return bool(significance.gains(chi2, other[None]).mean() < -significance.SAME)
 
     # In the order of what they cost: the first that does as well ends it.
     if not loses({}) or not all(loses(rival) for rival, _ in fits.values() if rival):
         return None
     weights = [effect for effect in members("effect") if tolerances.identification(effect).weighs_on_legs]
-    clear = all(loses(profile_likelihood.fitted(begun, sizes(effect), train, dt, none)[0]) for effect in weights)
-    return Model(name, best, search.may.also(name), sizes(name)) if clear else None
+    clear = all(loses(fitted(begun, sizes(effect), train, dt, none)[0]) for effect in weights)
+    return Model(name, best, state.may.also(name), sizes(name)) if clear else None
 
 
-class Seeker(Protocol):
-    """What is needed of a search in progress (``gap/search/stepwise.py``)."""
-
-    scorer: Scorer
-    splits: Splits
-    settings: GapSettings
-    dt: float
-    single: str
-
-    @property
-    def progress(self) -> Callable[[str, float], None]:
-        """Told what goes on, and which share of all is done."""
-
-    @property
-    def may(self) -> tolerances.Freedom:
-        """What may leave its tolerance."""
-
-    def held_out(self, theta: Theta) -> np.ndarray:
-        """Return chi2 on windows no fit has seen."""
-
-    def judged(
-        self, stage: int, fitted: list[Model], train: np.ndarray, now: np.ndarray, small: bool = False
-    ) -> tuple[Model | None, Model | None]:
-        """Test fitted candidates and note the evidence."""
+Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model | None, Model | None]]
+"""Tests fitted candidates on held-out windows and notes the evidence (``Search._judged``)."""
 
 
-def cause(search: Seeker) -> Model | None:
+def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -> Model | None:
     """Return the effect of the whole robot that explains nearly everything by itself, if there is one.
 
-    First states that suit the nominal model hide a part of what is missing: effects are compared by first states of
-    their own, and the best is fitted again at states that suit it. The evidence is noted in the search.
+    Initial states that suit the nominal model hide a part of what is missing. So effects are compared by initial states
+    of their own, and the best is fitted again at states that suit it.
+
+    Args:
+        state: of a search that has not begun.
+        progress: called with what is being done, and which share of all is finished.
+        judged: tests the best effect.
     """
-    train, select, dt = search.splits.train, search.splits.select, search.dt
-    settings, kept = search.settings, search.scorer
-    plain, now = (scores(kept, [{}], part, dt)[0] for part in (train, select))
+    train, select, dt, settings = state.splits.train, state.splits.select, state.dt, state.settings
+    plain, now = (scores(state.scorer, [{}], part, dt)[0] for part in (train, select))
     if excess(now) < settings.material:
         return None
-    search.progress("looking for one cause alone", 0.08)
-    best = clearest(profile_likelihood.begun(kept, dt), search)
+    progress("looking for one cause alone", 0.08)
+    best = clearest(profile_likelihood.begun(state.scorer, dt), state)
     if best is None or (settings.effects and best.name not in settings.effects):
         return None
     for _ in range(TURNS):
-        assert kept.renewed is not None
-        search.scorer = kept.renewed(best.theta)
-        best = refitted(search.scorer, best, train, dt)
-    share = removed(excess(now), excess(search.held_out(best.theta)))
-    accepted, _ = search.judged(1, [best], plain, now)
-    search.scorer = kept
-    if accepted is None or share < NEARLY_ALL:
-        return None
-    search.single = best.name
-    return best
+        state = replace(state, theta=best.theta).renewed()
+        best = refitted(state.scorer, best, train, dt)
+    share = removed(excess(now), excess(state.held_out(best.theta)))
+    accepted, _ = judged([best], state, plain, now)
+    return best if accepted is not None and share >= NEARLY_ALL else None

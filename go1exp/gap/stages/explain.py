@@ -74,9 +74,9 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
         warnings.append("Too few episodes to keep some for a last check.")
     search = Search(comparison.scorer, parts, settings, comparison.dt, rng, on_progress)
     search.run()
-    if not len(parts.confirm) or search.terms or search.first > settings.adequate:
+    if not len(parts.confirm) or search.state.terms or search.first > settings.adequate:
         return search
-    unseen = excess(search.held_out(search.theta, parts.confirm))
+    unseen = excess(search.state.held_out(windows=parts.confirm))
     if unseen <= settings.adequate:
         return search
     warnings.append(
@@ -97,9 +97,9 @@ def written(
     start: float,
 ) -> GapResult:
     """Return the result: the answer, the evidence behind it, and where the model is wrong with and without it."""
-    score, parts, settings, dt = search.scorer, search.splits, search.settings, search.dt
+    score, parts, settings, dt = search.state.scorer, search.splits, search.settings, search.dt
     shown = np.sort(np.concatenate([parts.select, parts.confirm]))
-    before, after = residuals(score, [{}, search.theta], shown, dt)
+    before, after = residuals(score, [{}, search.state.theta], shown, dt)
     silent = not_excited(search.signal, held=not comparison.robot.base_probe)
     more = advice({n.effect: n.alias_set for n in answer.named})
     named = {n.effect: n for n in answer.named}
@@ -115,9 +115,9 @@ def written(
         after=localise(score, after, shown, search.rng),
         not_excited=silent,
         advice=more,
-        bags=dict(search.shares),
+        bootstrap_share=dict(search.shares),
         waterfall=(("model as it is", answer.excess["null"]), *search.steps),
-        overlays=overlays(score, comparison.recordings, search.theta, parts.select, settings.overlays, dt),
+        overlays=overlays(score, comparison.recordings, search.state.theta, parts.select, settings.overlays, dt),
         tolerances=comparison.robot.tolerances.by_effect(),
         box=_nested(answer.theta, score.windows.joints, named),
         provenance={**about, "simulation_steps": score.replayer.made},
