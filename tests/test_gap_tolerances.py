@@ -175,7 +175,7 @@ QUICK = GapSettings(
     shortlist=2,
     iterations=2,
     max_terms=1,
-    bags=0,
+    bootstraps=0,
     overlays=0,
 )
 
