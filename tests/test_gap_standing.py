@@ -1,4 +1,4 @@
-"""``go1exp.gap`` on a robot on its feet: the first state and the IMU against the truth, a null, a payload."""
+"""``go1exp.gap`` on a robot on its feet: the initial state and the IMU against the truth, a null, a payload."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
     right, none = (np.log(profile_likelihood.chi2(begun, theta, everything, dt)).mean() for theta in (truth, {}))
     assert right < 0.5
     assert none > right + 1.0
-    # By first states that suit the nominal model the truth is hidden.
+    # By initial states that suit the nominal model the truth is hidden.
     hidden = np.log(score.chi2(residuals(score, [truth], everything, dt)[0], everything)).mean()
     assert hidden > right + 0.5
 

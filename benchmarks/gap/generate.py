@@ -1,6 +1,6 @@
 """Write sealed cases: ``python -m benchmarks.gap.generate out=DIR kinds=null,single n=10 seed=123``.
 
-Each case is a folder of recordings under ``out``; ``out/told.json`` says what the solver may know. The answers go to a
+Each case is a folder of recordings under ``out``; ``out/known.json`` says what the solver may know. The answers go to a
 file of their own, whose SHA-256 is written to ``out/SEAL`` and printed before anything is simulated: publish it, run
 the solver, then show the answers. An interrupted run is continued by the same command. ``signals=DIR`` also simulates
 each robot without its effect and writes how many times the noise the angles change; that doubles the time.
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap import cases, logger, told
+from benchmarks.gap import cases, known, logger
 from benchmarks.gap.damage import damage, truncate
 from benchmarks.gap.simulate import simulate
 from go1exp.recording import Recording
@@ -89,7 +89,7 @@ def settings(arguments: Sequence[str]) -> argparse.Namespace:
         "usage: python -m benchmarks.gap.generate out=DIR seed=INT [kinds=null,single] [n=10] [episodes=8] "
         "[seconds=5] [effects=coulomb,lag] [sizes=1,2,5] [answers=FILE] [signals=DIR] [jobs=1]\n"
         f"kinds: {', '.join(cases.KINDS)}\n"
-        f"effects (of single and pair): {', '.join(told.LIBRARY)}"
+        f"effects (of single and pair): {', '.join(known.LIBRARY)}"
     )
     for argument in arguments:
         key, _, value = argument.partition("=")
@@ -111,9 +111,9 @@ def settings(arguments: Sequence[str]) -> argparse.Namespace:
     except ValueError:
         raise SystemExit(f"sizes={found.sizes}: not numbers\n{words}") from None
     found.effects = tuple(e for e in found.effects.split(",") if e)
-    for name, known in [*((k, cases.KINDS) for k in found.kinds), *((e, told.LIBRARY) for e in found.effects)]:
-        if name not in known:
-            raise SystemExit(f"{name!r}: there are {', '.join(known)}")
+    for name, allowed in [*((k, cases.KINDS) for k in found.kinds), *((e, known.LIBRARY) for e in found.effects)]:
+        if name not in allowed:
+            raise SystemExit(f"{name!r}: must be one of {', '.join(allowed)}")
     if found.episodes < 2 or found.seconds <= 0 or found.n < 1:
         raise SystemExit("episodes must be at least 2, seconds more than 0, n at least 1")
     for secret in (found.answers, found.signals):
@@ -136,8 +136,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     s.answers.parent.mkdir(parents=True, exist_ok=True)
     s.answers.write_bytes(text)
     mark.write_text(f"{digest}  {s.answers.name}\n")
-    (s.out / "told.json").write_text(
-        json.dumps({"nominal": told.NOMINAL, "tolerances": told.TOLERANCES, "library": told.LIBRARY}, indent=1) + "\n"
+    (s.out / "known.json").write_text(
+        json.dumps({"nominal": known.NOMINAL, "tolerances": known.TOLERANCES, "library": known.LIBRARY}, indent=1)
+        + "\n"
     )
     print(f"sealed {len(todo)} cases: sha256 {digest} of {s.answers}", flush=True)
     left = [case for case in todo if not (s.out / case.name).is_dir()]

@@ -107,7 +107,7 @@ def apply(truth: Truth, effect: str, values: Mapping[str, np.ndarray | float], j
 
     Args:
         truth: the robot; what it has already stays.
-        effect: a name of ``told.LIBRARY``.
+        effect: a name of ``known.LIBRARY``.
         values: parameter -> value, or values of ``joints`` one by one.
         joints: indices of the joints (or of their links).
 
@@ -165,7 +165,7 @@ def differences(truth: Truth, effect: str, joints: np.ndarray) -> dict[str, np.n
 
     Args:
         truth: the robot, with all its effects and its background.
-        effect: a name of ``told.LIBRARY``.
+        effect: a name of ``known.LIBRARY``.
         joints: indices of the joints at which the effect was added.
     """
     if effect == "base_tilt":

@@ -24,8 +24,8 @@ class Rows:
     Attributes:
         window: (R,) which window each replays.
         values: of the effects, (R, J) or (R, 1).
-        q: (R, J) added to the first angles, rad; None for nothing.
-        qd: (R, J) added to the first speeds, rad/s.
+        q: (R, J) added to the initial angles, rad; None for nothing.
+        qd: (R, J) added to the initial speeds, rad/s.
         base: (R, 9) added to a free base's first height, roll and pitch, velocity and rate.
     """
 
@@ -51,7 +51,7 @@ class Probe:
     """One changed simulation beside the unchanged one.
 
     Attributes:
-        key: parameter that is changed, or None for a first state.
+        key: parameter that is changed, or None for an initial state.
         place: which joint of each group; None for a parameter of the robot.
         delta: (J,) or (1,) by how much, per joint.
         also: other parameters that are set meanwhile (shapes), by key.

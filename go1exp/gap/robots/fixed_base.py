@@ -137,7 +137,7 @@ class FixedBase:
         warnings = []
         wrong = wrong_speeds(recordings, reports, self.config)
         if wrong:
-            warnings.append(f"Speeds are not compared, and first speeds come from the angles: {wrong}.")
+            warnings.append(f"Speeds are not compared, and initial speeds come from the angles: {wrong}.")
         whole = tuple(completed(r, self.config, bool(wrong)) for r in recordings)
         warnings += [*clock_warnings(recordings, whole, self.config), *gain_warnings(recordings, self.config)]
         settings, more = spaced(whole, settings, len(self.groups[0]))

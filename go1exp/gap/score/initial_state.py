@@ -1,10 +1,10 @@
-"""First states of robots whose motion hangs on them: moved to where they fit best, and how far a line describes them.
+"""Initial states of a robot on its feet: moved to where they fit best, with noise for what a line does not describe.
 
-A first state enters the score as a linear, Gaussian unknown (``likelihood.py``). On the ground that holds near the
-state only: a foot touches down or slides earlier or later. So the states are first moved to where each window fits
-best. What the line still misses, over what remains uncertain, and what the step of the engine changes beyond what a
-first state could, count as noise of the window: one in which small causes have large effects loses its say, and claims
-no gap.
+An initial state enters the score as a linear, Gaussian unknown (``likelihood.py``). On the ground that holds only near
+the state: a foot touches down or slides earlier or later. So the states are first moved to where each window fits best.
+Two errors remain: what the line still misses within the uncertainty of the state, and what a smaller physics step
+changes that no initial state could. Both count as noise of the window. A window in which small causes have large effects
+therefore counts little, and claims no gap.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import dataclasses
 
 import numpy as np
 
-from go1exp.gap.data.standing import StandingWindows
+from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Rows, Theta, variants
-from go1exp.gap.replay.standing import StandingReplayer
 from go1exp.gap.score.likelihood import Scorer, scorer
 
 ROUNDS = 6
@@ -48,8 +48,8 @@ def solved(state: np.ndarray, residual: np.ndarray, off: np.ndarray | None = Non
     return x, np.swapaxes(np.linalg.inv(np.linalg.cholesky(inner)), -1, -2)
 
 
-def _with(score: Scorer, windows: StandingWindows) -> Scorer:
-    """Return the scorer on other first states of the same windows; the batches of simulations are kept."""
+def _with(score: Scorer, windows: Windows) -> Scorer:
+    """Return the scorer on other initial states of the same windows; the batches of simulations are kept."""
     return dataclasses.replace(score, replayer=dataclasses.replace(score.replayer, windows=windows))
 
 
@@ -69,9 +69,9 @@ def _mean_square(score: Scorer, residual: np.ndarray) -> np.ndarray:
 
 
 def settled(
-    replayer: StandingReplayer, dt: float, clock_s: float, theta: Theta | None = None
+    replayer: Replayer, dt: float, clock_s: float, theta: Theta | None = None
 ) -> tuple[Scorer, dict[str, float]]:
-    """Move the windows' first states to where they fit best.
+    """Move the windows' initial states to where they fit best.
 
     Args:
         replayer: of a robot on its feet.
@@ -83,46 +83,58 @@ def settled(
         The scorer of those windows, which does the same for other values, and the error of the step by quantity.
     """
     theta = theta or {}
-    machine, everything = replayer.machine, np.arange(len(replayer.windows))
-    own = 2 * len(machine.joints) + len(machine.base_probe)
-    rows = variants(machine, theta, everything, [])
+    everything = np.arange(len(replayer.windows))
+    rows = variants(replayer.machine, theta, everything, [])
     fine = np.abs(replayer.run(rows, 0.5 * dt) - replayer.run(rows, dt))
-    first = np.hypot(replayer.windows.scale, 2.0 * np.sqrt(np.mean(fine**2, axis=1)))
-    score = scorer(replayer, theta, first, dt, clock_s)
-    going, off = everything, np.zeros((len(everything), own))  # off: from the estimates, which still count
-    for _ in range(ROUNDS):
-        part = rows.part(going)
-        residual = score.residual(part, dt)
-        before = score.chi2(residual, going)[:, 0] + np.sum(off[going] ** 2, axis=1) / score.size[going]
-        x, _ = solved(score.state[going, 0], residual[:, 0], off[going])
-        step = np.zeros((len(everything), own))
-        step[going] = x[:, :own].clip(-FARTHEST, FARTHEST)
-        windows, length, best = score.windows, np.zeros(len(everything)), before
-        assert isinstance(windows, StandingWindows)
-        for tried in LENGTHS:
-            trial = _with(score, windows.moved(tried * step))
-            found = trial.chi2(trial.residual(part, dt), going)[:, 0]
-            found += np.sum((off + tried * step)[going] ** 2, axis=1) / score.size[going]
-            length[going] = np.where(found < best, tried, length[going])
-            best = np.minimum(found, best)
-        score = _with(score, windows.moved(length[:, None] * step))
-        off += length[:, None] * step
-        moved = going[length[going] > 0]
-        if len(moved):
-            fresh = scorer(score.replayer, theta, first, dt, clock_s, moved)
-            score.state[moved] = fresh.state
-        going = going[np.log(before) - np.log(best) > GAIN]
-        if not len(going):
-            break
-    score = _rescaled(score, score.windows.scale / np.where(np.isfinite(first), first, 1.0))
+    rough = np.hypot(replayer.windows.scale, 2.0 * np.sqrt(np.mean(fine**2, axis=1)))
+    score = _fitted(scorer(replayer, theta, rough, dt, clock_s), rows, theta, dt)
+    score = _rescaled(score, score.windows.scale / np.where(np.isfinite(rough), rough, 1.0))
     score, numerical = _stepped(score, rows, dt)
     score = _bent(score, rows, dt)
     score = dataclasses.replace(score, expected=replayer.windows)
     return dataclasses.replace(score, renewed=lambda values: settled(replayer, dt, clock_s, values)[0]), numerical
 
 
+def _fitted(score: Scorer, rows: Rows, theta: Theta, dt: float) -> Scorer:
+    """Return the scorer on initial states at which each window fits best, in a few Gauss-Newton steps.
+
+    Args:
+        score: on the estimated states, which still count.
+        rows: the plain model on all windows.
+        theta: its values.
+        dt: physics step, s.
+    """
+    everything, machine = np.arange(len(score.windows)), score.replayer.machine
+    coordinates = 2 * len(machine.joints) + len(machine.base_probe)
+    active, off = everything, np.zeros((len(everything), coordinates))  # off: from the estimates
+    for _ in range(ROUNDS):
+        part = rows.part(active)
+        residual = score.residual(part, dt)
+        before = score.chi2(residual, active)[:, 0] + np.sum(off[active] ** 2, axis=1) / score.size[active]
+        x, _ = solved(score.state[active, 0], residual[:, 0], off[active])
+        step = np.zeros((len(everything), coordinates))
+        step[active] = x[:, :coordinates].clip(-FARTHEST, FARTHEST)
+        windows, length, best = score.windows, np.zeros(len(everything)), before
+        for tried in LENGTHS:
+            trial = _with(score, windows.moved(tried * step))
+            chi2 = trial.chi2(trial.residual(part, dt), active)[:, 0]
+            chi2 += np.sum((off + tried * step)[active] ** 2, axis=1) / score.size[active]
+            length[active] = np.where(chi2 < best, tried, length[active])
+            best = np.minimum(chi2, best)
+        score = _with(score, windows.moved(length[:, None] * step))
+        off += length[:, None] * step
+        moved = active[length[active] > 0]
+        if len(moved):
+            fresh = scorer(score.replayer, theta, score.scale, dt, score.clock_s, moved)
+            score.state[moved] = fresh.state
+        active = active[np.log(before) - np.log(best) > GAIN]
+        if not len(active):
+            break
+    return score
+
+
 def _stepped(score: Scorer, rows: Rows, dt: float) -> tuple[Scorer, dict[str, float]]:
-    """Add to the noise twice what half the step changes and no first state could; return also that, by quantity."""
+    """Add to the noise twice what half the step changes and no initial state could; return also that, by quantity."""
     everything, windows = np.arange(len(score.windows)), score.windows
     change = score.replayer.run(rows, dt) - score.replayer.run(rows, 0.5 * dt)
     whole = score.unit(change, everything)[:, 0]
@@ -133,7 +145,7 @@ def _stepped(score: Scorer, rows: Rows, dt: float) -> tuple[Scorer, dict[str, fl
 
 
 def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
-    """Add to the noise what the line misses, over first states drawn from what the data leave uncertain."""
+    """Add to the noise what the line misses, over initial states drawn from what the data leave uncertain."""
     replayer, windows = score.replayer, score.windows
     joints, own = len(windows.joints), 2 * len(windows.joints) + windows.base_sd.shape[1]
     everything = np.arange(len(windows))

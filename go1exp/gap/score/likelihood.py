@@ -1,7 +1,7 @@
-"""How well the model explains windows of data: Gaussian noise, with the unknown first state and clock averaged out.
+"""How well the model explains windows of data: Gaussian noise, with the unknown initial state and clock averaged out.
 
 A window's residual r and its change J per parameter, both in units of the noise, have the covariance I + S S', where S
-is the change per standard deviation of the first state, and of the time between stamps of commands and of readings.
+is the change per standard deviation of the initial state, and of the time between stamps of commands and of readings.
 All that fits and scores need is the Gram matrix of [J r] in the metric of that covariance, window by window and group
 of joints by group.
 """
@@ -20,7 +20,7 @@ from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Probe, Rows, Theta, variants
 
 STATE_PROBE = (1.0e-3, 0.05)
-"""Change of a first angle, rad, and speed, rad/s, by which its influence is measured."""
+"""Change of an initial angle, rad, and speed, rad/s, by which its influence is measured."""
 
 
 def grouped(machine: Machine, y: np.ndarray) -> np.ndarray:
@@ -51,11 +51,11 @@ class Scorer:
     Attributes:
         replayer: the model.
         scale: (W, C, J) standard deviation of noise and numerical error.
-        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the first state and
+        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the initial state and
             of the clock.
-        renewed: returns a scorer whose floors and first states suit other values of the model.
+        renewed: returns a scorer whose floors and initial states suit other values of the model.
         clock_s: what the clock was taken to be off by, s.
-        expected: the windows with their first states as sensors tell them, where those were moved; None if not.
+        expected: the windows with their initial states as sensors tell them, where those were moved; None if not.
     """
 
     replayer: Replayer
@@ -93,7 +93,7 @@ class Scorer:
 
 
 def state_probes(machine: Machine) -> list[Probe]:
-    """Return the probes of the first state: angles, then speeds, of each place in the groups; then of a free base."""
+    """Return the probes of the initial state: angles, then speeds, of each place in the groups; then of a free base."""
     places, joints = range(len(machine.groups[0])), len(machine.joints)
     found = [
         Probe(kind, place, np.full(joints, size))
@@ -104,7 +104,7 @@ def state_probes(machine: Machine) -> list[Probe]:
 
 
 def _start_sd(windows: Windows, machine: Machine, probe: Probe) -> np.ndarray:
-    """Return the standard deviation of a coordinate of the first state (W, G), in changes by its probe."""
+    """Return the standard deviation of a coordinate of the initial state (W, G), in changes by its probe."""
     if probe.key == "base":
         axis = int(np.argmax(probe.delta))
         return windows.base_sd[:, axis, None] / machine.base_probe[axis]
@@ -120,7 +120,7 @@ def scorer(
     clock_s: float = 0.0,
     some: np.ndarray | None = None,
 ) -> Scorer:
-    """Measure how the first states, and a clock that is off by ``clock_s``, act on the readings, at ``theta``.
+    """Measure how the initial states, and a clock that is off by ``clock_s``, act on the readings, at ``theta``.
 
     With the numbers of ``some`` windows, ``state`` is that of those alone.
     """

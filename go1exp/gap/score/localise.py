@@ -76,7 +76,7 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
 def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.random.Generator) -> Localisation:
     """Sort the excess of residuals (V, G, m) by joint and regime.
 
-    What the uncertainty of the first state explains is taken out. A cell is tested by giving the regimes of one window
+    What the uncertainty of the initial state explains is taken out. A cell is tested by giving the regimes of one window
     to another: whether the excess is larger there than elsewhere in the same joint.
     """
     w, groups = scorer.windows, np.array(scorer.replayer.machine.groups)

@@ -1,8 +1,8 @@
-"""Effects of the whole robot against first states of their own.
+"""Effects of the whole robot against initial states of their own.
 
-First states that were moved to suit the nominal model hide a part of what is missing, and where feet slip or land they
+Initial states that were moved to suit the nominal model hide a part of what is missing, and where feet slip or land they
 hold it fast: a payload of 2 kg on a walk, fitted at those, stops at 1 kg, and the truth looks worse than nothing.
-So every value is tried from the first states that sensors tell, which are then moved to suit that value alone; and as
+So every value is tried from the initial states that sensors tell, which are then moved to suit that value alone; and as
 derivatives tell little where feet stick, values are laddered and the best is closed in on.
 """
 
@@ -20,7 +20,7 @@ from go1exp.gap.score.initial_state import FARTHEST, solved
 from go1exp.gap.score.likelihood import Scorer, gram, scorer
 
 ROUNDS = 2
-"""Steps of the first states, all by the changes that were measured at the nominal model."""
+"""Steps of the initial states, all by the changes that were measured at the nominal model."""
 
 SHARES = (1.0, 0.4)
 """Shares of a step that are tried, window by window."""
@@ -33,7 +33,7 @@ CLOSER = 8
 
 
 def begun(score: Scorer, dt: float) -> Scorer:
-    """Return a scorer with the same floors whose first states are those that sensors tell.
+    """Return a scorer with the same floors whose initial states are those that sensors tell.
 
     Args:
         score: of a robot on its feet (``first_state.settled``), of the nominal model.
@@ -45,7 +45,7 @@ def begun(score: Scorer, dt: float) -> Scorer:
 
 
 def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndarray:
-    """Return chi2 per value (V, 1) of a model, each window's first state moved to suit it.
+    """Return chi2 per value (V, 1) of a model, each window's initial state moved to suit it.
 
     What the states are away from what sensors tell counts as much as readings do.
 

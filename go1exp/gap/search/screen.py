@@ -115,7 +115,7 @@ def _levels(machine: Machine, effect: str, how: Identification, mean: np.ndarray
 
 @dataclass(frozen=True)
 class Screened:
-    """What the linear model says of one variant.
+    """What the linear model predicts for one variant.
 
     Attributes:
         variant: which.
@@ -150,40 +150,50 @@ def screen(
         library: the variants.
         dt: physics step, s.
     """
-    machine = scorer.replayer.machine
-    known = len(own.probes)
     every = [p for v in library for p in v.probes]
     columns = _columns(scorer, theta, own.windows, every, dt)
-    size = scorer.size[own.windows][:, None]
-    found = []
-    full = Table(
-        own.windows, (*own.probes, *every), own.residual, np.concatenate([own.columns, columns], axis=-1), theta
-    )
-    grams = full.grams(scorer)
-    before = grams[..., -1, -1] / size
-    weight = 1.0 / np.maximum(before, 1.0)
-    plain, count = strain.cost(scorer, own)(may), strain.values(scorer, own)
-    at = known
+    whole = np.concatenate([own.columns, columns], axis=-1)
+    full = Table(own.windows, (*own.probes, *every), own.residual, whole, theta)
+    ranking = _Ranking(scorer, own, full, may)
+    screened, at = [], len(own.probes)
     for variant in library:
-        added = list(range(at, at + len(variant.probes)))
+        screened.append(ranking.screened(variant, at))
         at += len(variant.probes)
+    return sorted(screened, key=lambda s: -s.gain)
+
+
+class _Ranking:
+    """The linear model of all variants together, from which each is judged by itself."""
+
+    def __init__(self, scorer: Scorer, own: Table, full: Table, may: tolerances.Freedom) -> None:
+        """Take the linear model ``own`` of what may move already, and ``full``, which adds the probes of variants."""
+        self.own, self.full, self.may, self.machine = own, full, may, scorer.replayer.machine
+        self.size = scorer.size[own.windows][:, None]
+        self.grams = full.grams(scorer)
+        self.before = self.grams[..., -1, -1] / self.size
+        self.plain, self.count = strain.cost(scorer, own)(may), strain.values(scorer, own)
+
+    def screened(self, variant: Variant, at: int) -> Screened:
+        """Judge a variant whose probes begin at column ``at``."""
+        theta, known = self.full.theta, len(self.own.probes)
+        added = list(range(at, at + len(variant.probes)))
         pick = [*range(known), *added]
-        probes = [*own.probes, *variant.probes]
-        part = grams[:, :, [*pick, -1]][..., [*pick, -1]]
-        layout = Layout.of(machine, probes)
-        matrix, right = layout.total(part * weight[..., None, None])
-        freed = may.also(variant.effect)
+        probes = [*self.own.probes, *variant.probes]
+        part = self.grams[:, :, [*pick, -1]][..., [*pick, -1]]
+        layout = Layout.of(self.machine, probes)
+        matrix, right = layout.total(part * (1.0 / np.maximum(self.before, 1.0))[..., None, None])
+        freed = self.may.also(variant.effect)
         limits, strict = (tolerances.bounds(layout, probes, theta, freed, back) for back in (False, True))
         for some in (limits, strict) if variant.quadrature else ():
             some.low[layout.part(np.arange(known, len(probes)))] = -np.inf
-        relief = (plain - strain.price(matrix, right, strict)) / count
+        relief = (self.plain - strain.price(matrix, right, strict)) / self.count
         x = tolerances.solve(matrix, right, limits)
-        after = predicted(part, layout, x) / size
-        gain = float(np.mean(np.log(before.sum(1) / np.maximum(after, 0.3).sum(1))))
-        start = _start(theta, variant, own.probes, layout, x, machine)
-        mine = [*added, *(k for k, p in enumerate(own.probes) if p.key[0] == variant.effect)]
-        found.append(Screened(variant, start, gain, relief, _signal(grams, full.probes, mine, size, may.tolerances)))
-    return sorted(found, key=lambda s: -s.gain)
+        after = predicted(part, layout, x) / self.size
+        gain = float(np.mean(np.log(self.before.sum(1) / np.maximum(after, 0.3).sum(1))))
+        start = _start(theta, variant, self.own.probes, layout, x, self.machine)
+        mine = [*added, *(k for k, p in enumerate(self.own.probes) if p.key[0] == variant.effect)]
+        signal = _signal(self.grams, self.full.probes, mine, self.size, self.may.tolerances)
+        return Screened(variant, start, gain, relief, signal)
 
 
 def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Screened]:
@@ -211,8 +221,8 @@ def _start(
     if variant.probes:
         extra = Layout.of(machine, variant.probes)
         return variant.start(theta, extra, x[layout.size - extra.size :], machine)
-    own = np.array([known[k].key[0] == variant.effect for k in layout.probe])
-    return tolerances.moved(theta, layout, known, np.where(own, x, 0.0), machine)
+    of_it = np.array([known[k].key[0] == variant.effect for k in layout.probe])
+    return tolerances.moved(theta, layout, known, np.where(of_it, x, 0.0), machine)
 
 
 def _signal(
@@ -241,13 +251,13 @@ def _columns(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence
             lots[-1] += mine
         else:
             lots.append(list(mine))
-    found = np.zeros((len(windows), len(machine.groups), *_sizes(scorer), len(probes)), dtype=np.float32)
+    columns = np.zeros((len(windows), len(machine.groups), *_sizes(scorer), len(probes)), dtype=np.float32)
     for lot in lots:
         chosen = [probes[k] for k in lot]
         rows = variants(machine, theta, windows, chosen)
         y = replayer.run(rows, 2.0 * dt).reshape(len(windows), 1 + len(chosen), *scorer.windows.y.shape[1:])
-        found[..., lot] = differences(scorer, y, windows, chosen)
-    return found
+        columns[..., lot] = differences(scorer, y, windows, chosen)
+    return columns
 
 
 def _sizes(scorer: Scorer) -> tuple[int]:

@@ -45,7 +45,7 @@ class Trial:
         sizes: (M,) in tolerances.
         needed: share that one must remove.
         alpha: significance that one must have.
-        helps: (M,) which do both.
+        helps: (M,) which are significant and remove enough.
         alias: (M,) which do as well as the best of those that also leave their tolerances.
         aside: (M,) which do as well too, with more numbers.
         chosen: the one of these to accept; None if there is none, or if one within its tolerance does as well.
@@ -120,43 +120,57 @@ def tried(
         rng: of the sign flips.
         small: the gap is within the tolerances; which share of it a candidate removes means nothing.
     """
-    found = scores(scorer, [m.theta for m in fitted], windows, dt)
-    gain = significance.gains(now, found)
+    chi2 = scores(scorer, [m.theta for m in fitted], windows, dt)
+    gain = significance.gains(now, chi2)
     p = significance.max_t(gain, rng) if settings.judge == "max_t" else np.zeros(len(fitted))
     if settings.judge == "bic":
         p = (_bic(scorer, fitted, train) >= 0).astype(float)
-    before, after = excess(now), [excess(a) for a in found]
+    before, after = excess(now), [excess(one) for one in chi2]
     share = np.array([removed(before, a) for a in after])
     needed = settings.min_share if before > settings.adequate else max(MOSTLY, settings.min_share)
     needed = -math.inf if small else needed
     sizes = np.array([evidence.size(m.name, m.theta, m.may.tolerances) for m in fitted])
     helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
-    fit_for_it = np.flatnonzero(helps & (sizes > (CLEAR if small else 1.0)))
-    chosen, alias, aside = None, *np.zeros((2, len(fitted)), dtype=bool)
-    if len(fit_for_it):
-        best = int(max(fit_for_it, key=lambda k: gain[k].mean()))
-        alias = significance.equals(gain, best, rng) & np.isin(np.arange(len(fitted)), fit_for_it)
-        many = np.array([len(m.keys) for m in fitted])
-        aside = alias & (many > many[alias].min())  # what says the same with more numbers is no rival
-        alias &= ~aside
-        chosen = int(max(np.flatnonzero(alias), key=lambda k: gain[k].mean()))
-        inside = gain.mean(axis=1)[helps & (sizes <= 1.0)]
-        if len(inside) and inside.max() >= gain[chosen].mean() - significance.same(gain[chosen].mean()):
-            chosen, alias = (
-                None,
-                np.zeros(len(fitted), dtype=bool),
-            )  # a tolerance does as well: nothing must leave its own
+    outside = helps & (sizes > (CLEAR if small else 1.0))
+    numbers = np.array([len(m.keys) for m in fitted])
+    chosen, alias, aside = _choice(gain, outside, helps & (sizes <= 1.0), numbers, rng)
     names = [m.name for m in fitted]
     return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, aside, chosen)
+
+
+def _choice(
+    gain: np.ndarray, outside: np.ndarray, inside: np.ndarray, numbers: np.ndarray, rng: np.random.Generator
+) -> tuple[int | None, np.ndarray, np.ndarray]:
+    """Return the candidate to accept (or None), which do as well (M,), and which do so with more numbers (M,).
+
+    Args:
+        gain: (M, V G) fall of log chi2 of each candidate.
+        outside: (M,) which help and leave their tolerances.
+        inside: (M,) which help within their tolerances.
+        numbers: (M,) how many parameters each has.
+        rng: of the tests.
+    """
+    none = np.zeros(len(gain), dtype=bool)
+    if not outside.any():
+        return None, none, none
+    mean = np.asarray(gain.mean(axis=1))
+    best = int(max(np.flatnonzero(outside), key=lambda k: mean[k]))
+    alias = significance.equals(gain, best, rng) & outside
+    aside = alias & (numbers > numbers[alias].min())  # what explains the same with more numbers is no rival
+    alias &= ~aside
+    chosen = int(max(np.flatnonzero(alias), key=lambda k: mean[k]))
+    if inside.any() and mean[inside].max() >= mean[chosen] - significance.same(mean[chosen]):
+        return None, none, aside  # a tolerance does as well: nothing must leave its tolerance
+    return chosen, alias, aside
 
 
 def _bic(scorer: Scorer, fitted: Sequence[Model], train: np.ndarray) -> np.ndarray:
     """Return by how much Schwarz's criterion grows (M,) with each candidate; its errors are independent, as usual."""
     machine = scorer.replayer.machine
     values = train.size * float(scorer.size.mean())
-    found = []
+    growth = []
     for model in fitted:
         assert model.chi2 is not None
         unknowns = Layout.of(machine, tolerances.probes(machine, model.keys, model.theta)).size
-        found.append(values * np.log(model.chi2.mean() / train.mean()) + unknowns * np.log(values))
-    return np.array(found)
+        growth.append(values * np.log(model.chi2.mean() / train.mean()) + unknowns * np.log(values))
+    return np.array(growth)

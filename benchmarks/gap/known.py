@@ -1,4 +1,4 @@
-"""What the solver is told beside the logs: the nominal robot, the tolerances, and the names that it may give.
+"""What the solver may know beside the logs: the nominal robot, the tolerances, and the names that it may give.
 
 The numbers are copied from the effects' declared tolerances (``go1exp/effects``) on purpose and not imported: the
 benchmark must not change when the library does.
