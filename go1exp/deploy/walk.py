@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import resource
 import signal
@@ -26,6 +25,7 @@ from go1exp.deploy.log import About, Log, write_cycles
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.messages import Link
 from go1exp.deploy.safety import RULES, Fault, Safety, SafetyConfig
+from go1exp.files import write_json
 
 FAULTS = (*RULES, "no_state", "estimator", "command", "runtime")
 FIRST_STATUS = 20
@@ -305,7 +305,7 @@ def save(
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"{about.episode}.json", folder / f"{about.episode}.npz"]
-    files[0].write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")  # first: nothing else is as small
+    write_json(files[0], content, indent=1, allow_nan=False)  # first: nothing else is as small
     write_cycles(files[1], outcome.log)
     recording = outcome.log.recording(about, truth)
     if recording is not None:

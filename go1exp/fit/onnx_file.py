@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from go1exp.files import write_bytes
+
 OPSET = 20
 IR_VERSION = 10
 """The IR of that opset, which every runtime that knows the opset reads."""
@@ -72,4 +74,4 @@ def write_onnx(
     helper.set_model_props(model, dict(about))
     onnx.checker.check_model(model, full_check=True)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(model.SerializeToString())
+    write_bytes(path, model.SerializeToString())
