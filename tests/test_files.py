@@ -40,9 +40,14 @@ def test_a_full_disk_names_the_file_and_leaves_the_older_one(tmp_path: Path) -> 
 def test_an_interrupted_writer_leaves_the_older_file_and_nothing_beside_it(tmp_path: Path) -> None:
     path = tmp_path / "net.npz"
     path.write_bytes(b"older")
-    with pytest.raises(KeyboardInterrupt), files.opened(path) as file:
-        file.write(b"half of the new")
-        raise KeyboardInterrupt
+
+    def interrupted() -> None:
+        with files.opened(path) as file:
+            file.write(b"half of the new")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert path.read_bytes() == b"older"
     assert list(tmp_path.iterdir()) == [path]
 

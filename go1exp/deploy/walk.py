@@ -6,10 +6,9 @@ import contextlib
 import os
 import resource
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -17,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from go1exp import signals
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.commands import Limited, Wish, make, ranges_of
 from go1exp.deploy.controller import Controller, Cycle, Estimator
@@ -37,8 +37,6 @@ DONE = "walked to the end"
 
 TIME = "the end of its time"
 """Who ends a walk that nobody else ends."""
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True)
@@ -221,33 +219,19 @@ def _go(
 @contextmanager
 def stopping(safety: Safety) -> Iterator[None]:
     """Let signals stop the robot; leave their handlers as they were."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers
-        return
 
     def stop(number: int, frame: FrameType | None) -> None:
         safety.stop(signal.Signals(number).name)
+        if number == signal.SIGHUP:
+            signals.leave_terminal()
 
-    before = {number: signal.signal(number, stop) for number in SIGNALS}
-    try:
+    with signals.handled(stop):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
-@contextmanager
-def interruptible() -> Iterator[None]:
+def interruptible() -> AbstractContextManager[None]:
     """Let signals raise ``KeyboardInterrupt``, SIGINT also where a shell's background had it ignored; put them back."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return signals.handled(signals.interrupt)
 
 
 def resident() -> float | None:
