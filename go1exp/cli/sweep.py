@@ -63,6 +63,7 @@ class Sweep:
         Raises:
             ConfigError: with every problem of every job, each with the first job that has it.
         """
+        folder = str(config.hydra.sweep.dir)  # first: jobs take the time in it from the sweep, once that is known
         listed = _overrides_of_jobs(config)
         common = set.intersection(*map(set, listed)) if len(listed) > 1 else set()
         names = [" ".join(o for o in overrides if o not in common) for overrides in listed]
@@ -77,7 +78,7 @@ class Sweep:
                         problems.setdefault(line, []).append(number)
             if problems:
                 raise ConfigError([f"{line} ({_where(numbers, names)})" for line, numbers in problems.items()])
-        self.folder = str(config.hydra.sweep.dir)
+        self.folder = folder
         self.jobs = [(name, job.run) for name, job in zip(names, jobs, strict=True)]
 
     def _resolved(self, config: DictConfig, number: int, overrides: list[str], jobs: list[Job]) -> None:
