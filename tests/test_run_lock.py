@@ -99,8 +99,11 @@ def test_where_the_file_system_knows_no_locks_a_file_with_a_heartbeat_guards(
         with run_lock.locked(tmp_path):
             raise AssertionError("two at a time")
 
-    with pytest.warns(UserWarning, match="its file system knows no locks"), run_lock.locked(tmp_path):
-        with pytest.raises(run_lock.RunInUse, match=f"process {os.getpid()} on "):
-            second()
+    with (
+        pytest.warns(UserWarning, match="its file system knows no locks"),
+        run_lock.locked(tmp_path),
+        pytest.raises(run_lock.RunInUse, match=f"process {os.getpid()} on "),
+    ):
+        second()
     with pytest.warns(UserWarning, match="no locks"), run_lock.locked(tmp_path):
         pass
