@@ -197,50 +197,50 @@ class Recording:
 def problems(recording: Recording) -> list[str]:
     """List what breaks the format; each line names the channel and says what would be right."""
     meta, channels = recording.meta, recording.channels
-    found = _name_problems(meta, channels)
+    lines = _name_problems(meta, channels)
     if "t" not in channels:
-        return [*found, "t: required, but not given"]
+        return [*lines, "t: required, but not given"]
     shape = np.shape(channels["t"])
     if len(shape) != 1 or shape[0] == 0:
-        return [*found, f"t: must be one column of at least one row, not of shape {shape}"]
+        return [*lines, f"t: must be one column of at least one row, not of shape {shape}"]
     sound = []
     for name, values in channels.items():
         complaint = _value_problem(name, values, shape[0])
         if complaint:
-            found.append(complaint)
+            lines.append(complaint)
         else:
             sound.append(name)
     if "t" in sound:
-        found += _clock_problems(channels["t"], meta.rate_hz)
+        lines += _clock_problems(channels["t"], meta.rate_hz)
     for quantity in ("imu_quat", "base_quat"):
         if set(VECTORS[quantity]) <= set(sound):
             length = np.linalg.norm(recording.block(*VECTORS[quantity]), axis=1)
             worst = int(np.argmax(np.abs(length - 1)))
             if abs(length[worst] - 1) > UNIT_TOLERANCE:
-                found.append(f"{quantity}: must have length 1, but row {worst} has {length[worst]:.6g}")
-    return found
+                lines.append(f"{quantity}: must have length 1, but row {worst} has {length[worst]:.6g}")
+    return lines
 
 
 def _name_problems(meta: Meta, channels: Iterable[str]) -> list[str]:
     """Columns that no one knows, and quantities of which a part is missing."""
-    there = set(channels)
+    present = set(channels)
     wholes = {q: joint_channels(q, meta.joints) for q in JOINT_QUANTITIES} | {k: list(v) for k, v in VECTORS.items()}
     go1_like = set(meta.joints) == set(JOINTS)
     if go1_like:
         wholes["foot_force"] = [FOOT_FORCE + leg for leg in LEGS]
     known = {"t", FLAG}.union(*wholes.values())
-    found = []
-    for name in sorted(there - known):
+    lines = []
+    for name in sorted(present - known):
         if not go1_like and name.startswith(FOOT_FORCE) and name != FOOT_FORCE:
             continue  # another robot's legs have names of their own
         close = nearest(name, known)
         hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"joints are {', '.join(meta.joints)}"
-        found.append(f"{name}: unknown column; {hint}")
+        lines.append(f"{name}: unknown column; {hint}")
     for quantity, whole in wholes.items():
-        missing = [name for name in whole if name not in there]
+        missing = [name for name in whole if name not in present]
         if 0 < len(missing) < len(whole):
-            found.append(f"{quantity}: no column {', '.join(missing)}; a recording has all of a quantity or none")
-    return found
+            lines.append(f"{quantity}: no column {', '.join(missing)}; a recording has all of a quantity or none")
+    return lines
 
 
 def _value_problem(name: str, values: np.ndarray, rows: int) -> str | None:
@@ -267,8 +267,8 @@ def _clock_problems(t: np.ndarray, rate: float) -> list[str]:
     return []
 
 
-def _stop(where: Path | str, found: Iterable[str]) -> None:
-    lines = [f"{where}: {line}" for line in found]
+def _stop(where: Path | str, complaints: Iterable[str]) -> None:
+    lines = [f"{where}: {line}" for line in complaints]
     if lines:
         raise RecordingError("\n".join(lines))
 
@@ -310,20 +310,20 @@ def read(path: Path) -> Recording:
 
 def _schema_problems(file: pq.ParquetFile) -> list[str]:
     """Types are judged by Parquet's own schema first: only plain numbers are then turned into arrays."""
-    found = []
+    lines = []
     columns = [file.schema.column(i) for i in range(len(file.schema))]
     for column in columns:
         physical = "BOOLEAN" if column.path == FLAG else "DOUBLE"
         if column.physical_type != physical or column.max_repetition_level or column.logical_type.type != "NONE":
             kind = column.logical_type.type if column.logical_type.type != "NONE" else column.physical_type
-            found.append(f"{column.path}: is stored as {kind.lower()}, but must be {physical.lower()}")
-    found += [f"{name}: {n} columns of this name" for name, n in Counter(c.path for c in columns).items() if n > 1]
-    if not found:  # Arrow keeps its own types beside Parquet's
+            lines.append(f"{column.path}: is stored as {kind.lower()}, but must be {physical.lower()}")
+    lines += [f"{name}: {n} columns of this name" for name, n in Counter(c.path for c in columns).items() if n > 1]
+    if not lines:  # Arrow keeps its own types beside Parquet's
         for field in file.schema_arrow:
             right = "bool" if field.name == FLAG else "double"
             if str(field.type) != right or b"ARROW:extension:name" in (field.metadata or {}):
-                found.append(f"{field.name}: is of an extension type ({field.type}), but must be plain {right}")
-    return found
+                lines.append(f"{field.name}: is of an extension type ({field.type}), but must be plain {right}")
+    return lines
 
 
 def write(path: Path, recording: Recording) -> None:

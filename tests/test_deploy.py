@@ -32,10 +32,10 @@ from go1exp.deploy.commands import (
     Sinusoid,
     Table,
     Wish,
-    keys_of,
     make,
     parsed,
-    ranges_of,
+    range_array,
+    split_keys,
     stretched,
 )
 from go1exp.deploy.controller import LYING, PHASES, Cycle
@@ -52,7 +52,7 @@ from go1exp.export.build import build
 from go1exp.gap.prepare import unusable
 from go1exp.gap.standing import StandingGo1
 from go1exp.recording import VECTORS
-from go1exp.sim_robot.__main__ import sim_config, task_of
+from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
 from go1exp.sim_robot.server import TRUTH, Network, Server
 from go1exp.train import run_folder, trainer
@@ -212,7 +212,7 @@ def test_a_robot_that_is_gone_is_no_error_of_the_link() -> None:
 
 @pytest.mark.parametrize("start", ["standing", "lying", "hung"])
 def test_a_robot_begins_at_rest(file: str, start: str) -> None:
-    made = Robot(task_of(file, {}), sim_config({"start": start, "noise": 0.0}))
+    made = Robot(bundle_task(file, {}), sim_config({"start": start, "noise": 0.0}))
     state, true = made.sense()
     assert np.abs(state.joint_vel).max() < 0.3
     np.testing.assert_allclose(np.linalg.norm(state.imu_acc), 9.81, rtol=0.02)
@@ -224,7 +224,7 @@ def test_a_robot_begins_at_rest(file: str, start: str) -> None:
 
 
 def test_drives_obey_and_brake_when_nobody_speaks(file: str) -> None:
-    made = Robot(task_of(file, {}), sim_config({"start": "hung", "noise": 0.0}))
+    made = Robot(bundle_task(file, {}), sim_config({"start": "hung", "noise": 0.0}))
     target = robot.NOMINAL_STANCE + 0.1
     made.obey(make_command(joint_target=target, kp=np.full(12, 40.0), kd=np.full(12, 1.0)), 5)
     for _ in range(500):
@@ -245,7 +245,7 @@ def test_drives_obey_and_brake_when_nobody_speaks(file: str) -> None:
 
 
 def test_noise_is_that_of_table_ii(file: str) -> None:
-    loud, quiet = (Robot(task_of(file, {}), sim_config({"noise": noise})) for noise in (1.0, 0.0))
+    loud, quiet = (Robot(bundle_task(file, {}), sim_config({"noise": noise})) for noise in (1.0, 0.0))
     truth = quiet.sense()[0]
     states = [loud.sense()[0] for _ in range(1000)]
     for name in ("joint_pos", "joint_vel", "imu_gyro"):
@@ -271,7 +271,7 @@ def test_a_network_delays_and_loses() -> None:
 
 
 def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) -> None:
-    server = Server(Robot(task_of(file, {}), sim_config({})), sim_config({}))
+    server = Server(Robot(bundle_task(file, {}), sim_config({})), sim_config({}))
     mine, other = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     to = ("127.0.0.1", server.port)
     server.tick()
@@ -294,7 +294,7 @@ def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) ->
 
 
 def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Path]) -> None:
-    task = task_of(file, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
+    task = bundle_task(file, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
     with pytest.raises(Exception, match="'net' has no kp and kd to command"):
         Robot(task, sim_config({}))
 
@@ -375,7 +375,7 @@ def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(file: 
     done = play(file, tmp_path, job={"sim": {"noise": 0.1}, "other": {"effect": {"coulomb": {"bound": 0.4}}}})
     assert "coulomb" not in done.recording.meta.notes
     assert not any(name.startswith("base_") for name in done.recording.channels)
-    assert unusable(done.recording, audit(done.recording), StandingGo1(task_of(file, {}).robot)) == []
+    assert unusable(done.recording, audit(done.recording), StandingGo1(bundle_task(file, {}).robot)) == []
 
 
 def test_the_same_walk_gives_the_same_numbers(file: str, tmp_path: Path) -> None:
@@ -654,7 +654,7 @@ def test_a_constant_is_kept_within_the_ranges_and_cuts_are_counted() -> None:
     source = make(Wish((2.0, -0.1, -3.0)), RANGES, print)
     assert source(0.0).tolist() == source(1.0).tolist() == [1.0, -0.1, -1.0]
     assert source.cut.tolist() == [2, 0, 2]
-    assert ranges_of({"lin_vel_x": (-1.0, 2.0)}).tolist() == [[-1, 2], [-np.inf, np.inf], [-np.inf, np.inf]]
+    assert range_array({"lin_vel_x": (-1.0, 2.0)}).tolist() == [[-1, 2], [-np.inf, np.inf], [-np.inf, np.inf]]
     for wrong in ((1.0, 2.0), (np.nan, 0.0, 0.0)):
         with pytest.raises(CommandError, match="must be three finite numbers"):
             make(Wish(wrong), RANGES, print)
@@ -715,7 +715,7 @@ def test_keys_change_the_velocity_and_stop_the_robot() -> None:
         source.close()
         os.close(ours)
         os.close(theirs)
-    assert keys_of("w\x1b[A\x1b") == ["w", "\x1b[A", "\x1b"]
+    assert split_keys("w\x1b[A\x1b") == ["w", "\x1b[A", "\x1b"]
 
 
 def make_keyboard(descriptor: int, stops: list[str]) -> Keyboard:

@@ -38,7 +38,7 @@ from go1exp.env.core import Go1Core
 from go1exp.evaluate.policy import load_policy
 from go1exp.export import graph
 from go1exp.export.build import build, command_ranges, gains
-from go1exp.export.graph import DeployedPolicy, ExportError, inputs_of, to_onnx
+from go1exp.export.graph import DeployedPolicy, ExportError, required_inputs, to_onnx
 from go1exp.export.trace import readings
 from go1exp.mdp.types import Snapshot
 from go1exp.schema.registry import Entry, Term
@@ -201,7 +201,7 @@ def test_a_bundle_says_what_its_run_was(run: Path, good: Bundle) -> None:
         ("velocity_command", 9, 3),
         ("joint_position", 12, 12),
     ]
-    assert Metadata.of(json.loads(as_json(about.as_dict()))) == about
+    assert Metadata.from_dict(json.loads(as_json(about.as_dict()))) == about
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, data: bytes) -> None:
@@ -232,7 +232,7 @@ def term(name: str, function: Callable[[Snapshot], Tensor | None], size: int) ->
 
 def test_a_graph_takes_only_what_its_terms_read() -> None:
     terms = [term("a", lambda s: s.joint_vel, 12), term("b", lambda s: s.projected_gravity_b[:, :2], 2)]
-    assert [port.name for port in inputs_of(terms)] == ["joint_vel", "imu_quat"]
+    assert [port.name for port in required_inputs(terms)] == ["joint_vel", "imu_quat"]
     module = DeployedPolicy(network(14), terms, ActionConfig(scale=0.2, clip=100.0))
     assert {port.name: port.size for port in module.outputs} == {"joint_target": 12, "observation": 14, "action": 12}
 

@@ -38,31 +38,33 @@ def audit(recording: Recording) -> AuditReport:
     if not _computable(recording):
         return _report(recording, broken, ())
     log = Log(recording)
-    found = list(single.clock(log))
-    repeats_found, repeats = single.stale(log)
-    noise_found, floors = single.noise(log, repeats)
-    delay_found, delay = commands.timing(log)
-    found += [*repeats_found, *single.resolution(log), *noise_found, *single.dead(log), *single.frozen(log)]
-    found += [
+    findings = list(single.clock(log))
+    stale_findings, repeats = single.stale(log)
+    noise_findings, floors = single.noise(log, repeats)
+    delay_findings, delay = commands.timing(log)
+    findings += [*stale_findings, *single.resolution(log), *noise_findings, *single.dead(log), *single.frozen(log)]
+    findings += [
         *single.saturation(log),
         *single.ranges(log),
         *related.attitude_length(log),
         *related.speed(log),
         *related.torque(log),
     ]
-    found += [*related.rotation(log), *related.gravity(log), *commands.order_and_sign(log), *delay_found]
+    findings += [*related.rotation(log), *related.gravity(log), *commands.order_and_sign(log), *delay_findings]
     off = _times(log, ~log.on)
     still = _times(log, log.still)
     if off:
         total = sum(b - a for a, b in off)
-        found.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {len(off)} stretches"))
+        findings.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {len(off)} stretches"))
     if (share := float(log.still.mean())) > limits.STILL_SHARE:
-        found.append(finding("still", "all", "suspect", share, "", "no joint moves: nothing can be learned from this"))
-    named = {f.channel for f in found if f.verdict == "bad"}
-    found += [f for f in broken if f.channel not in named]
+        findings.append(
+            finding("still", "all", "suspect", share, "", "no joint moves: nothing can be learned from this")
+        )
+    named = {f.channel for f in findings if f.verdict == "bad"}
+    findings += [f for f in broken if f.channel not in named]
     table = []
     for name, values in recording.channels.items():
-        verdict = worst(f.verdict for f in found if _concerns(f, name, log))
+        verdict = worst(f.verdict for f in findings if _concerns(f, name, log))
         d = delay.get(name)
         table.append(
             Channel(
@@ -78,7 +80,7 @@ def audit(recording: Recording) -> AuditReport:
                 None if d is None else d.error * 1e3,
             )
         )
-    return _report(recording, found, tuple(table), off, still)
+    return _report(recording, findings, tuple(table), off, still)
 
 
 def _as_finding(line: str) -> Finding:
@@ -106,7 +108,7 @@ def _times(log: Log, flags: np.ndarray) -> tuple[tuple[float, float], ...]:
 
 def _report(
     recording: Recording,
-    found: list[Finding],
+    findings: list[Finding],
     table: tuple[Channel, ...],
     off: tuple[tuple[float, float], ...] = (),
     still: tuple[tuple[float, float], ...] = (),
@@ -115,9 +117,9 @@ def _report(
     steps = np.diff(t) if t.ndim == 1 else np.empty(0)
     middle = float(np.median(steps)) if len(steps) else 0.0
     if t.ndim == 1 and len(t) < SHORTEST:
-        said = f"{len(t)} samples are too few to judge; at least {SHORTEST} are needed"
-        found = [*found, finding("length", "all", "suspect", len(t), "samples", said)]
-    ranked = sorted(found, key=lambda f: -ORDER.index(f.verdict))
+        message = f"{len(t)} samples are too few to judge; at least {SHORTEST} are needed"
+        findings = [*findings, finding("length", "all", "suspect", len(t), "samples", message)]
+    ranked = sorted(findings, key=lambda f: -ORDER.index(f.verdict))
     duration = float(t[-1] - t[0]) if t.ndim == 1 and len(t) else 0.0
     rate = 1 / middle if middle > 0 else 0.0
     return AuditReport(recording.meta.episode, len(t), duration, rate, table, tuple(ranked), off, still)

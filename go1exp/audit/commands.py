@@ -32,14 +32,14 @@ def order_and_sign(log: Log) -> Iterator[Finding]:
     for j, joint in enumerate(log.joints):
         if j in partner:
             other = log.joints[partner[j]]
-            said = f"moves with q_{other} (correlation {match[j, partner[j]]:.2f}), not with its own joint"
-            said += f" ({match[j, j]:.2f}): "
+            message = f"moves with q_{other} (correlation {match[j, partner[j]]:.2f}), not with its own joint"
+            message += f" ({match[j, j]:.2f}): "
             swap = partner[partner[j]] == j
-            said += f"{joint} and {other} are swapped" if swap else f"what is called {other} is the joint it drives"
-            yield finding("order", joint_channel("q_target", joint), "bad", match[j, partner[j]], "", said)
+            message += f"{joint} and {other} are swapped" if swap else f"what is called {other} is the joint it drives"
+            yield finding("order", joint_channel("q_target", joint), "bad", match[j, partner[j]], "", message)
         elif match[j, j] < -limits.CLEARLY:
-            said = f"goes against q_target_{joint} (correlation {match[j, j]:.2f}): a sign is flipped"
-            yield finding("sign", joint_channel("q", joint), "bad", match[j, j], "", said)
+            message = f"goes against q_target_{joint} (correlation {match[j, j]:.2f}): a sign is flipped"
+            yield finding("sign", joint_channel("q", joint), "bad", match[j, j], "", message)
 
 
 def _enough(log: Log) -> bool:
@@ -74,7 +74,7 @@ def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
     q = log.recording.joint("q")
     estimates = delays(log.t, log.recording.joint(log.command), q, log.on)
     known = {j: d for j, d in zip(log.joints, estimates, strict=True) if d is not None}
-    found = []
+    findings = []
     middle = float(np.median([d.time for d in known.values()])) if known else 0.0
     threshold = limits.DELAY + log.dt
     late = {j: d for j, d in known.items() if abs(d.time) - 2 * d.error > threshold}
@@ -83,19 +83,19 @@ def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
         shown = f"answers {log.command} after {d.time * 1e3:.1f} ± {d.error * 1e3:.1f} ms"
         apart = abs(d.time - middle) - 2 * d.error > limits.DELAY_SPREAD and len(known) > 2
         if joint in late and d.time > 0:
-            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", f"{shown}: delay or clock offset"))
+            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", f"{shown}: delay or clock offset"))
         elif joint in late:
-            said = f"{shown}, before it is given: a clock offset, or a command logged late"
-            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", said))
+            message = f"{shown}, before it is given: a clock offset, or a command logged late"
+            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", message))
         elif apart:
-            said = f"{shown}, the other joints after {middle * 1e3:.1f} ms: delay or clock offset of this one"
-            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", said))
-    if known and not found:
+            message = f"{shown}, the other joints after {middle * 1e3:.1f} ms: delay or clock offset of this one"
+            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", message))
+    if known and not findings:
         low, high = (f(d.time for d in known.values()) * 1e3 for f in (min, max))
-        said = f"{len(known)} of {len(log.joints)} joints answer after {low:.1f} to {high:.1f} ms"
-        found.append(finding("delay", "q", "ok", middle * 1e3, "ms", said))
-    found += _trailing(log, [j for j in log.joints if j not in known])
-    return found, {joint_channel("q", joint): d for joint, d in known.items()}
+        message = f"{len(known)} of {len(log.joints)} joints answer after {low:.1f} to {high:.1f} ms"
+        findings.append(finding("delay", "q", "ok", middle * 1e3, "ms", message))
+    findings += _trailing(log, [j for j in log.joints if j not in known])
+    return findings, {joint_channel("q", joint): d for joint, d in known.items()}
 
 
 def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
@@ -114,5 +114,5 @@ def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
             trail[joint] = float(np.argmax(match)) * log.dt * 1e3
     if trail:
         low, high = min(trail.values()), max(trail.values())
-        said = f"{', '.join(trail)} trail their targets by {low:.3g} to {high:.3g} ms, delay and drive together; "
-        yield finding("trail", "q", "ok", high, "ms", said + "the motion does not tell them apart")
+        message = f"{', '.join(trail)} trail their targets by {low:.3g} to {high:.3g} ms, delay and drive together; "
+        yield finding("trail", "q", "ok", high, "ms", message + "the motion does not tell them apart")

@@ -62,7 +62,7 @@ def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray
     rows = np.flatnonzero(good)
     rows = rows[:: max(FINE, -(-len(rows) // MOST_ROWS))]
     shifts = np.arange(first, last + 1)
-    found: list[Delay | None] = []
+    results: list[Delay | None] = []
     for joint in range(q.shape[1]):
         others = np.delete(acceleration, joint, axis=1)
         known = [smooth_q[:, joint], speed[:, joint], np.sin(angles[:, joint]), np.cos(angles[:, joint])]
@@ -70,8 +70,8 @@ def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray
         base = np.column_stack([np.stack(known, axis=1)[rows], others[rows]])
         # row i, column k: the command shifts[k] before rows[i]
         windows = sliding_window_view(smooth_u[:, joint], len(shifts))[rows - last][:, ::-1]
-        found.append(_best(acceleration[rows, joint], base, windows, shifts * fine))
-    return found
+        results.append(_best(acceleration[rows, joint], base, windows, shifts * fine))
+    return results
 
 
 def _kernels(width: float, step: float, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -58,28 +58,28 @@ def speed(log: Log) -> Iterator[Finding]:
             continue
         if j in partner:
             other = log.joints[partner[j]]
-            said = (
+            message = (
                 f"is the speed of q_{other} (correlation {peak[partner[j], j]:.2f}), not of {angle} ({peak[j, j]:.2f})"
             )
-            yield finding("order", name, "bad", peak[partner[j], j], "", f"{said}: the joints are in another order")
+            yield finding("order", name, "bad", peak[partner[j], j], "", f"{message}: the joints are in another order")
             continue
         lag = int(lags[best[j, j]])
         s = signals.scale(change[:, j], whole[last + lag, j] - whole[first + lag, j])
         if s is None:
             continue
         if abs(s.correlation) < limits.RELATED:
-            said = f"does not follow the change of {angle} (correlation {s.correlation:.2f})"
-            yield finding("scale", name, "suspect", s.correlation, "", said)
+            message = f"does not follow the change of {angle} (correlation {s.correlation:.2f})"
+            yield finding("scale", name, "suspect", s.correlation, "", message)
             continue
         yield from _scale_finding("scale", name, f"the change of {angle}", s, limits.SCALE)
         rest, rest_now = 1 - peak[j, j] ** 2, 1 - match[most, j, j] ** 2
         sharp = s.correlation > limits.CLEARLY and rest_now > limits.LAG_GAIN * rest + 1e-3
         if sharp and abs(lag) * log.dt > limits.LAG + log.dt:
-            word = "trails" if lag > 0 else "leads"
-            said = (
-                f"{word} the change of {angle} by {abs(lag) * log.dt * 1e3:.3g} ms: filtered, or read at another time"
+            verb = "trails" if lag > 0 else "leads"
+            message = (
+                f"{verb} the change of {angle} by {abs(lag) * log.dt * 1e3:.3g} ms: filtered, or read at another time"
             )
-            yield finding("lag", name, "suspect", lag * log.dt * 1e3, "ms", said)
+            yield finding("lag", name, "suspect", lag * log.dt * 1e3, "ms", message)
 
 
 def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -157,8 +157,10 @@ def rotation(log: Log) -> Iterator[Finding]:
             s = signals.scale(change[:, b], integral[:, b])
             if b in partner:
                 a = partner[b]
-                said = f"follows the {'xyz'[a]} axis of {attitude} ({match[a, b]:.2f}), not its own ({match[b, b]:.2f})"
-                yield finding("order", name, "bad", match[a, b], "", said)
+                message = (
+                    f"follows the {'xyz'[a]} axis of {attitude} ({match[a, b]:.2f}), not its own ({match[b, b]:.2f})"
+                )
+                yield finding("order", name, "bad", match[a, b], "", message)
             elif s and moves[b] and abs(s.correlation) >= limits.CLEARLY:
                 yield from _scale_finding("scale", name, f"the rotation of {attitude}", s, limits.SCALE)
 
@@ -173,8 +175,8 @@ def attitude_length(log: Log) -> Iterator[Finding]:
         if set(VECTORS[quantity]) <= set(log.quantity):
             off = np.abs(np.linalg.norm(log.recording.block(*VECTORS[quantity]), axis=1) - 1)
             if off.max() > 1e-3:
-                said = f"its length differs from 1 by up to {off.max():.3g}; normalise, or look for a missing part"
-                yield finding("norm", quantity, "bad", off.max(), "", said)
+                message = f"its length differs from 1 by up to {off.max():.3g}; normalise, or look for a missing part"
+                yield finding("norm", quantity, "bad", off.max(), "", message)
 
 
 def gravity(log: Log) -> Iterator[Finding]:
@@ -189,13 +191,13 @@ def gravity(log: Log) -> Iterator[Finding]:
     off = abs(reading / limits.GRAVITY - 1)
     channel = "imu_acc"
     if off > limits.GRAVITY_ERROR[0]:
-        said = f"reads {reading:.4g} {where}; gravity is {limits.GRAVITY} m/s2"
+        message = f"reads {reading:.4g} {where}; gravity is {limits.GRAVITY} m/s2"
         guess = "g instead of m/s2" if 0.9 < reading < 1.1 else "milli-g" if 900 < reading < 1100 else ""
         guess = guess or ("gravity taken out" if reading < 0.5 else "")
         if guess:
-            yield finding("units", channel, "bad", reading, "m/s2", f"{said}: it looks like {guess}")
+            yield finding("units", channel, "bad", reading, "m/s2", f"{message}: it looks like {guess}")
         elif rest is log.still or off > limits.GRAVITY_ERROR[1]:
-            yield finding("gravity", channel, graded(off, limits.GRAVITY_ERROR), reading, "m/s2", said)
+            yield finding("gravity", channel, graded(off, limits.GRAVITY_ERROR), reading, "m/s2", message)
     source = next((q for q in ("imu_quat", "base_quat") if set(VECTORS[q]) <= set(log.quantity)), None)
     if source is None or reading < 0.5 or np.linalg.norm(log.recording.block(*VECTORS[source]), axis=1).min() < 1e-3:
         return
@@ -204,5 +206,5 @@ def gravity(log: Log) -> Iterator[Finding]:
     verdict = graded(tilt, limits.TILT)
     if verdict != "ok":
         why = "its sign is flipped (at rest it must read +9.81 upwards)" if tilt > 150 else "axes or quaternion order"
-        said = f"gravity {where} is {tilt:.0f} degrees off the vertical of {source}: {why}"
-        yield finding("gravity", channel, verdict, tilt, "degrees", said)
+        message = f"gravity {where} is {tilt:.0f} degrees off the vertical of {source}: {why}"
+        yield finding("gravity", channel, verdict, tilt, "degrees", message)

@@ -94,7 +94,7 @@ class AuditReport:
         """The worst verdict."""
         return worst(f.verdict for f in self.findings)
 
-    def of(self, check: str) -> list[Finding]:
+    def by_check(self, check: str) -> list[Finding]:
         """Return the findings of one check."""
         return [f for f in self.findings if f.check == check]
 
@@ -156,5 +156,5 @@ def _row(c: Channel) -> tuple[str, ...]:
 
 def _stretches(stretches: tuple[tuple[float, float], ...]) -> str:
     shown = ", ".join(f"{a:.2f}-{b:.2f}" for a, b in stretches[:6])
-    more = f" and {len(stretches) - 6} more" if len(stretches) > 6 else ""
-    return f"{shown}{more} s ({sum(b - a for a, b in stretches):.1f} s)"
+    rest = f" and {len(stretches) - 6} more" if len(stretches) > 6 else ""
+    return f"{shown}{rest} s ({sum(b - a for a, b in stretches):.1f} s)"

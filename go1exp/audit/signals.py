@@ -161,15 +161,15 @@ def mixed_up(match: np.ndarray) -> dict[int, int]:
     matches its new partner clearly, and clearly better than its own. One odd joint mixes up nothing.
     """
     size = np.abs(match)
-    own = np.diag(size)
+    diagonal = np.diag(size)
     _, partner = linear_sum_assignment(-(size**2))
-    found: dict[int, int] = {}
+    partners: dict[int, int] = {}
     for start in range(len(partner)):
         cycle, k = [start], int(partner[start])
         while k != start:
             cycle.append(k)
             k = int(partner[k])
-        better = [size[j, partner[j]] > max(limits.CLEARLY, own[j] + limits.BETTER) for j in cycle]
+        better = [size[j, partner[j]] > max(limits.CLEARLY, diagonal[j] + limits.BETTER) for j in cycle]
         if len(cycle) > 1 and all(better):
-            found[start] = int(partner[start])
-    return found
+            partners[start] = int(partner[start])
+    return partners

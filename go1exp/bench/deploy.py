@@ -42,7 +42,7 @@ def run(
 ) -> dict[str, float]:
     """Measure; return the medians over the rounds by name. ``container`` is a training's configuration."""
     little = container | {"ppo": container["ppo"] | LITTLE}
-    found: list[dict[str, float]] = []
+    results: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory(prefix="go1exp-") as folder:
         place = Path(folder)
         run_folder.write(place / "run", little)
@@ -53,9 +53,9 @@ def run(
         bundle = loads(data, str(file))
         for k in range(rounds):
             idle = loop(lambda now: True, RATE, seconds)
-            found.append(_walk(file, seconds, place / str(k)) | {"policy_us": _policy(bundle)} | _jitter(idle))
+            results.append(_walk(file, seconds, place / str(k)) | {"policy_us": _policy(bundle)} | _jitter(idle))
             on_round(k + 1, rounds)
-    return {name: float(np.median([one[name] for one in found])) for name in found[0]}
+    return {name: float(np.median([one[name] for one in results])) for name in results[0]}
 
 
 def _jitter(idle: Timing) -> dict[str, float]:
@@ -76,14 +76,14 @@ def _policy(bundle: Bundle) -> float:
 
 def _walk(file: Path, seconds: float, out: Path) -> dict[str, float]:
     """Walk once; return the runtime's own account."""
-    words = [str(file), "--rate", str(RATE), "--seconds", str(seconds), "--stand-up", "0.2", "--brake", "0.1"]
+    arguments = [str(file), "--rate", str(RATE), "--seconds", str(seconds), "--stand-up", "0.2", "--brake", "0.1"]
     with SimulatedRobot(str(file), {}, {}) as robot:
         done = subprocess.run(
             [
                 sys.executable,
                 "-m",
                 "go1exp.deploy",
-                *words,
+                *arguments,
                 "--robot",
                 str(robot.port),
                 "--stale",

@@ -170,16 +170,16 @@ def run(
         actuator = Term("net", members("actuator")["net"], {"file": str(net), "period": "exact"})
         subjects["net"] = env_subject(dataclasses.replace(config.task, actuator=actuator), num_envs)
     subjects |= {"train": train_subject(config), "numpy": border_subject(config)}
-    found = rates(subjects, rounds, seconds, on_round)
+    measured = rates(subjects, rounds, seconds, on_round)
     cold, warm = first_update_seconds([*overrides, f"ppo.num_envs={num_envs}"])
-    speed = {f"{name}_steps_per_s": float(np.median(values)) for name, values in found.items()}
-    with_net = {"gpu_net_over_bare": ratio(found, "net", "bare")} if net is not None else {}
+    speed = {f"{name}_steps_per_s": float(np.median(values)) for name, values in measured.items()}
+    with_net = {"gpu_net_over_bare": ratio(measured, "net", "bare")} if net is not None else {}
     return {
         **speed,
-        "gpu_env_over_bare": ratio(found, "env", "bare"),
+        "gpu_env_over_bare": ratio(measured, "env", "bare"),
         **with_net,
-        "gpu_train_over_env": ratio(found, "train", "env"),
-        "gpu_train_over_numpy": ratio(found, "train", "numpy"),
+        "gpu_train_over_env": ratio(measured, "train", "env"),
+        "gpu_train_over_numpy": ratio(measured, "train", "numpy"),
         "paper_minutes": PAPER_STEPS / speed["train_steps_per_s"] / 60.0,
         "first_update_cold_s": cold,
         "first_update_warm_s": warm,

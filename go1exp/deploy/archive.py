@@ -69,16 +69,16 @@ def unpack(data: bytes, members: tuple[str, ...], source: str) -> dict[str, byte
             if infos[0].header_offset or archive.comment or data[-22:-18] != b"PK\5\6":
                 raise BundleError(f"{source}: not a bundle, or damaged (bytes before or after the archive)")
             _check_names([info.filename for info in infos], members, source)
-            found = {info.filename: _member(archive, info, source) for info in infos}
+            contents = {info.filename: _member(archive, info, source) for info in infos}
     except (zipfile.BadZipFile, IndexError, OSError, struct.error, NotImplementedError, RuntimeError) as error:
         if isinstance(error, BundleError):
             raise
         raise BundleError(f"{source}: not a bundle, or damaged ({error})") from None
-    hashes = _hashes(found.pop(MANIFEST), members, source)
-    for name, content in found.items():
+    hashes = _hashes(contents.pop(MANIFEST), members, source)
+    for name, content in contents.items():
         if seal(content) != hashes[name]:
             raise BundleError(f"{source}: {name}: its SHA-256 is {seal(content)}, {MANIFEST} says {hashes[name]}")
-    return found
+    return contents
 
 
 def _check_names(names: list[str], members: tuple[str, ...], source: str) -> None:

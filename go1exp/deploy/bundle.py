@@ -65,8 +65,8 @@ def write(
     Raises:
         ValueError: if the data hold what JSON cannot say.
     """
-    said = {METADATA: metadata.as_dict(), CONFIG: config, VERSIONS: versions}
-    return pack({**{name: as_json(content) for name, content in said.items()}, POLICY: policy, TRACE: _npz(trace)})
+    documents = {METADATA: metadata.as_dict(), CONFIG: config, VERSIONS: versions}
+    return pack({**{name: as_json(content) for name, content in documents.items()}, POLICY: policy, TRACE: _npz(trace)})
 
 
 def load(path: str | Path) -> Bundle:
@@ -111,20 +111,20 @@ def replay(policy: OnnxPolicy, trace: Mapping[str, np.ndarray], source: str) -> 
     rows = len(trace["time"])
     inputs = {port.name: trace[f"input.{port.name}"] for port in policy.inputs}
     steps = [policy({name: values[k : k + 1] for name, values in inputs.items()}) for k in range(rows)]
-    found = {}
+    differences = {}
     for port in policy.outputs:
         got = np.concatenate([step[port.name] for step in steps])
         off = np.abs(got.astype(np.float64) - trace[f"output.{port.name}"])
         worst = float(np.max(off))  # NaN if anything is
         if not worst <= TOLERANCE:
             at = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
-            here, then = got[at], trace[f"output.{port.name}"][at]
+            replayed, then = got[at], trace[f"output.{port.name}"][at]
             raise BundleError(
-                f"{source}: {TRACE}: {port.name}[{at[1]}] at {trace['time'][at[0]]:.2f} s is {here:.6g} here and "
+                f"{source}: {TRACE}: {port.name}[{at[1]}] at {trace['time'][at[0]]:.2f} s is {replayed:.6g} here and "
                 f"{then:.6g} in the trace; they may differ by {TOLERANCE:g}"
             )
-        found[port.name] = worst
-    return found
+        differences[port.name] = worst
+    return differences
 
 
 def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: str) -> None:
@@ -139,19 +139,19 @@ def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: s
 
 def _metadata(content: bytes, source: str) -> Metadata:
     try:
-        return Metadata.of(_json(content, f"{source}: {METADATA}"))
+        return Metadata.from_dict(_json(content, f"{source}: {METADATA}"))
     except ValueError as error:
         raise BundleError(f"{source}: {METADATA}: {error}") from None
 
 
 def _json(content: bytes, where: str) -> dict[str, Any]:
     try:
-        found = json.loads(content)
+        document = json.loads(content)
     except ValueError as error:
         raise BundleError(f"{where}: no JSON ({error})") from None
-    if not isinstance(found, dict):
+    if not isinstance(document, dict):
         raise BundleError(f"{where}: must be a mapping")
-    return found
+    return document
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -172,10 +172,10 @@ def _trace(content: bytes, metadata: Metadata, source: str) -> dict[str, np.ndar
     except Exception as error:  # damage of a zip and of the arrays in it has many forms
         raise BundleError(f"{source}: {TRACE}: not NumPy's arrays ({error})") from None
 
-    def ports(prefix: str, found: tuple[Port, ...]) -> dict[str, int]:
-        return {f"{prefix}.{port.name}": port.size for port in found}
+    def port_sizes(prefix: str, ports: tuple[Port, ...]) -> dict[str, int]:
+        return {f"{prefix}.{port.name}": port.size for port in ports}
 
-    sizes = {**ports("input", metadata.inputs), **ports("output", metadata.outputs)}
+    sizes = {**port_sizes("input", metadata.inputs), **port_sizes("output", metadata.outputs)}
     if arrays.keys() != {"time", *sizes}:
         odd = ", ".join(sorted(arrays.keys() ^ {"time", *sizes}))
         raise BundleError(f"{source}: {TRACE}: arrays missing or too many: {odd}")

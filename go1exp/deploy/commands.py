@@ -177,7 +177,7 @@ class Keyboard(Constant):
             if not data:
                 self._stop("the end of the terminal")
                 return
-            for key in keys_of(data.decode(errors="replace")):
+            for key in split_keys(data.decode(errors="replace")):
                 self._press(key)
 
     def _press(self, key: str) -> None:
@@ -197,14 +197,14 @@ class Keyboard(Constant):
             termios.tcsetattr(self._keys, termios.TCSADRAIN, self._before)
 
 
-def keys_of(text: str) -> list[str]:
+def split_keys(text: str) -> list[str]:
     """Cut what a terminal sent into keys: an arrow is three characters, Esc alone is one."""
-    found, place = [], 0
+    keys, place = [], 0
     while place < len(text):
         size = 3 if text[place] == "\x1b" and text[place + 1 : place + 2] in ("[", "O") else 1
-        found.append(text[place : place + size])
+        keys.append(text[place : place + size])
         place += size
-    return found
+    return keys
 
 
 DEAD = 0.1
@@ -285,7 +285,7 @@ class Limited:
         self._source.close()
 
 
-def ranges_of(given: Mapping[str, tuple[float, float]]) -> np.ndarray:
+def range_array(given: Mapping[str, tuple[float, float]]) -> np.ndarray:
     """Return lowest and highest command (3, 2) of a bundle's metadata.
 
     An axis that the bundle says nothing of is not limited, since nobody knows what was trained.

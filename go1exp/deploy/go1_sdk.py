@@ -71,10 +71,10 @@ class SdkLink:
         """
         if self._failure is not None:
             raise RobotError(f"the SDK failed: {type(self._failure).__name__}: {self._failure}")
-        found = []
+        states = []
         while self._arrived:
-            found.append(self._arrived.popleft())
-        return found
+            states.append(self._arrived.popleft())
+        return states
 
     def send(self, command: LowCmd) -> None:
         """Hand over a command; it goes out within 2 ms, and again every 2 ms."""

@@ -104,8 +104,8 @@ class SimulatedRobot:
             if not part:
                 return {}
             text += part
-        found: dict[str, Any] = json.loads(text)
-        return found
+        answer: dict[str, Any] = json.loads(text)
+        return answer
 
     def close(self) -> None:
         """End it and take its account."""

@@ -60,8 +60,8 @@ class Ring:
 
     def part(self, name: str) -> np.ndarray:
         """Return a part of all rows that are kept, (T, width), or (T,) if its width is 1."""
-        found = self.rows()[:, self.columns[name]]
-        return found[:, 0] if found.shape[1] == 1 else found
+        values = self.rows()[:, self.columns[name]]
+        return values[:, 0] if values.shape[1] == 1 else values
 
 
 @dataclass(frozen=True)
@@ -193,10 +193,10 @@ class Log:
         # Where the robot does not tell what it obeys, it is taken to be the newest that was sent.
         by_number, by_time = np.searchsorted(number, known), np.searchsorted(at, self.states.part("t"), "right") - 1
         k = np.where(known >= 0, by_number, by_time)
-        there = (k >= 0) & (k < len(number)) & (known != 0) & ((known < 0) | (known >= number[0]))
+        in_force = (k >= 0) & (k < len(number)) & (known != 0) & ((known < 0) | (known >= number[0]))
         place = np.clip(k, 0, len(number) - 1)
-        there &= ~damping[place]
-        return (there, target[place[there]]) if there.any() else None
+        in_force &= ~damping[place]
+        return (in_force, target[place[in_force]]) if in_force.any() else None
 
 
 UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell what it obeys, and the way takes time"
@@ -204,9 +204,9 @@ UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell w
 
 def _joined(truth: Mapping[str, np.ndarray], clock: np.ndarray) -> dict[str, np.ndarray]:
     """Return the true columns at the times of a clock; NaN where they are unknown."""
-    found = np.clip(np.searchsorted(truth["clock"], clock - 1e-6), 0, len(truth["clock"]) - 1)
-    same = np.abs(truth["clock"][found] - clock) < 1e-6
-    return {name: np.where(same, values[found], np.nan) for name, values in truth.items() if name != "clock"}
+    nearest = np.clip(np.searchsorted(truth["clock"], clock - 1e-6), 0, len(truth["clock"]) - 1)
+    same = np.abs(truth["clock"][nearest] - clock) < 1e-6
+    return {name: np.where(same, values[nearest], np.nan) for name, values in truth.items() if name != "clock"}
 
 
 def write_cycles(path: Path, log: Log) -> None:

@@ -116,7 +116,7 @@ class Metadata:
         return dataclasses.asdict(self)
 
     @classmethod
-    def of(cls, content: Any) -> Metadata:
+    def from_dict(cls, content: Any) -> Metadata:
         """Build from plain data, such as JSON gives; raise ValueError that starts with the key that is wrong."""
         return _built(cls, content, "")
 

@@ -42,12 +42,12 @@ class OnnxPolicy:
         _compare("output", self._session.get_outputs(), self.outputs)
         self._names = [port.name for port in self.outputs]
         # One row, which is what a robot needs, goes through memory that the session knows already: a quarter faster.
-        self._given = {port.name: np.zeros((1, port.size), np.float32) for port in self.inputs}
-        self._found = {port.name: np.zeros((1, port.size), np.float32) for port in self.outputs}
+        self._inputs_buffer = {port.name: np.zeros((1, port.size), np.float32) for port in self.inputs}
+        self._outputs_buffer = {port.name: np.zeros((1, port.size), np.float32) for port in self.outputs}
         self._bound = self._session.io_binding()
-        for name, values in self._given.items():
+        for name, values in self._inputs_buffer.items():
             self._bound.bind_input(name, "cpu", 0, np.float32, values.shape, values.ctypes.data)
-        for name, values in self._found.items():
+        for name, values in self._outputs_buffer.items():
             self._bound.bind_output(name, "cpu", 0, np.float32, values.shape, values.ctypes.data)
 
     def __call__(self, readings: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -68,17 +68,17 @@ class OnnxPolicy:
             given[port.name] = reading
         if all(len(reading) == 1 for reading in given.values()):
             for name, reading in given.items():
-                self._given[name][:] = reading
+                self._inputs_buffer[name][:] = reading
             self._session.run_with_iobinding(self._bound)
-            return {name: values.copy() for name, values in self._found.items()}
+            return {name: values.copy() for name, values in self._outputs_buffer.items()}
         return dict(zip(self._names, self._session.run(self._names, given), strict=True))
 
 
-def _compare(what: str, found: Sequence[ort.NodeArg], wanted: Sequence[Port]) -> None:
-    names = [node.name for node in found]
+def _compare(what: str, nodes: Sequence[ort.NodeArg], wanted: Sequence[Port]) -> None:
+    names = [node.name for node in nodes]
     if names != [port.name for port in wanted]:
         raise ValueError(f"its {what}s are {', '.join(names)} instead of {', '.join(port.name for port in wanted)}")
-    for node, port in zip(found, wanted, strict=True):
+    for node, port in zip(nodes, wanted, strict=True):
         if node.type != "tensor(float)" or list(node.shape[1:]) != [port.size]:
             raise ValueError(
                 f"{what} {node.name}: {node.type} of shape {node.shape}; must be float (rows, {port.size})"

@@ -72,7 +72,7 @@ class UdpLink:
 
     def receive(self) -> Sequence[LowState]:
         """Return the states that have arrived since the last call, oldest first, without waiting."""
-        found = []
+        states = []
         for _ in range(AT_ONCE):
             try:
                 data, extra, _, _ = self._socket.recvmsg(wire.STATE_SIZE + 1, 64)
@@ -83,10 +83,10 @@ class UdpLink:
                 continue
             state = self._taken(data, extra)
             if state is not None:
-                found.append(state)
+                states.append(state)
         if self._last is None:
             self._greet()
-        return found
+        return states
 
     def _taken(self, data: bytes, extra: list[tuple[int, int, bytes]]) -> LowState | None:
         """Return the state of a datagram, or None and a count."""

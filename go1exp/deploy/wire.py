@@ -114,11 +114,11 @@ def _packed(message: LowState | LowCmd, parts: tuple[tuple[str, int], ...]) -> b
 
 def _unpacked(data: bytes, start: int, parts: tuple[tuple[str, int], ...]) -> dict[str, np.ndarray]:
     numbers = np.frombuffer(data, dtype="<f8", offset=start)  # read only, and no copy
-    found, place = {}, 0
+    arrays, place = {}, 0
     for name, size in parts:
-        found[name] = numbers[place : place + size]
+        arrays[name] = numbers[place : place + size]
         place += size
-    return found
+    return arrays
 
 
 def newer(number: int, than: int) -> int:

@@ -28,13 +28,13 @@ def levelled(
     up = acc[t <= t[0] + first].mean(axis=0)
     roll, pitch = np.arctan2(up[1], up[2]), np.arctan2(-up[0], np.hypot(up[1], up[2]))
     rotation = Rotation.from_euler("ZYX", [0.0, pitch, roll])
-    found = [rotation]
+    rotations = [rotation]
     for k in range(1, len(t)):
         vertical = rotation.as_matrix()[2]
         rate = gyro[k] + np.cross(acc[k] / GRAVITY, vertical) / seconds
         rotation = rotation * Rotation.from_rotvec(rate * (t[k] - t[k - 1]))
-        found.append(rotation)
-    return Rotation.concatenate(found).as_quat(scalar_first=True)
+        rotations.append(rotation)
+    return Rotation.concatenate(rotations).as_quat(scalar_first=True)
 
 
 def vertical(quat: np.ndarray) -> np.ndarray:

@@ -97,23 +97,23 @@ def judge(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Judgement:
     """
     (recording,) = import_recordings("scaler_walk_mocap", path, {})
     capture = motion_capture(load_npz(path), recording.t, recording.block(*VECTORS["imu_gyro"]))
-    found, rows = estimate(recording, config, log), samples(recording, log)
-    rotation = Rotation.from_quat(found.quat, scalar_first=True)
+    result, rows = estimate(recording, config, log), samples(recording, log)
+    rotation = Rotation.from_quat(result.quat, scalar_first=True)
     heading = _heading(rotation.as_matrix())
     leg_velocity = odometry(rows, config)
-    leg_place = np.cumsum(leg_velocity * np.gradient(found.t)[:, None], axis=0)
+    leg_place = np.cumsum(leg_velocity * np.gradient(result.t)[:, None], axis=0)
     grid, place, speed = truth(capture)
-    within = (grid >= found.t[0] + 0.05) & (grid <= found.t[-1])
+    within = (grid >= result.t[0] + 0.05) & (grid <= result.t[-1])
     if within.sum() < WINDOW:
         raise RecordingError(f"{path}: motion capture and the robot's log have less than {WINDOW * GRID:g} s in common")
     grid, place, speed = grid[within], place[within], speed[within]
     distance = _distance(place)
 
     def errors(velocity_w: np.ndarray, position_w: np.ndarray) -> tuple[float, float]:
-        error = np.interp(grid, found.t, _forward(velocity_w, heading)) - speed
-        return float(np.sqrt(np.mean(error**2))), _distance(interp1d(found.t, position_w, axis=0)(grid)) / distance - 1
+        error = np.interp(grid, result.t, _forward(velocity_w, heading)) - speed
+        return float(np.sqrt(np.mean(error**2))), _distance(interp1d(result.t, position_w, axis=0)(grid)) / distance - 1
 
-    filtered = errors(rotation.apply(found.velocity_b), found.position_w)
+    filtered = errors(rotation.apply(result.velocity_b), result.position_w)
     return Judgement(path.stem, distance, *filtered, *errors(leg_velocity, leg_place), capture.shift)
 
 

@@ -93,5 +93,7 @@ def estimate(recording: Recording, config: FilterConfig, log: Log | None = None)
         EstimatorError: if the filter is not built.
     """
     rows = samples(recording, log)
-    found = make_filter(config).run(rows)
-    return Estimate(rows[:, column.T], found[:, :3], found[:, 3:6], rows[:, column.QUAT], found[:, 6:10], found[:, 10])
+    states = make_filter(config).run(rows)
+    return Estimate(
+        rows[:, column.T], states[:, :3], states[:, 3:6], rows[:, column.QUAT], states[:, 6:10], states[:, 10]
+    )

@@ -32,10 +32,10 @@ class EstimatedVelocity:
             ConfigError: if the policy does not see the velocity.
             go1exp.estimation.EstimatorError: if the filter is not built.
         """
-        found = columns(core.task, TERM)
-        if found is None:
+        velocity_columns = columns(core.task, TERM)
+        if velocity_columns is None:
             raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
-        self._columns = found
+        self._columns = velocity_columns
         self._filters = [make_filter(go1()) for _ in range(core.num_envs)]
         self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
         self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])
@@ -43,20 +43,24 @@ class EstimatedVelocity:
 
     def put(self, observation: Tensor) -> Tensor:
         """Return the observation (N, O) with the estimated velocity in the place of the true one."""
-        found = np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])
+        velocities = np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])
         changed = observation.clone()
-        changed[:, self._columns] = torch.as_tensor(found, dtype=observation.dtype)
+        changed[:, self._columns] = torch.as_tensor(velocities, dtype=observation.dtype)
         return changed
 
     def _listen(self, target: Tensor) -> None:
         """Give every filter a sample, before a step."""
         true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}
-        seen = noisy(true, self._noise, self._rng)
+        readings = noisy(true, self._noise, self._rng)
         rows = np.full((len(self._filters), WIDTH), np.nan)
         rows[:, column.T] = self._steps * self._dt
-        rows[:, column.QUAT], rows[:, column.GYRO], rows[:, column.ACC] = seen["quat"], seen["gyro"], seen["acc"]
-        rows[:, column.Q], rows[:, column.QD] = seen["q"], seen["qd"]
-        rows[:, column.FOOT_FORCE] = seen["foot_force"]
+        rows[:, column.QUAT], rows[:, column.GYRO], rows[:, column.ACC] = (
+            readings["quat"],
+            readings["gyro"],
+            readings["acc"],
+        )
+        rows[:, column.Q], rows[:, column.QD] = readings["q"], readings["qd"]
+        rows[:, column.FOOT_FORCE] = readings["foot_force"]
         for one, row in zip(self._filters, rows, strict=True):
             one.update(row)
         self._steps += 1

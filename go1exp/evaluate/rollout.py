@@ -60,7 +60,7 @@ class EvalConfig:
     trunk_velocity: Literal["exact", "estimated"] = "exact"
 
     @classmethod
-    def of(cls, settings: Any, **changes: Any) -> EvalConfig:
+    def from_settings(cls, settings: Any, **changes: Any) -> EvalConfig:
         """Take what ``settings`` (of a verb) has of these attributes; ``changes`` give the rest."""
         shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(cls) if hasattr(settings, f.name)}
         return cls(**{**shared, **changes})
@@ -103,7 +103,9 @@ def evaluate(
     count = len(config.commands) * config.episodes
     estimated = config.trunk_velocity == "estimated"
     core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=estimated)
-    seen = EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
+    with_velocity = (
+        EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
+    )
     past = PastActions[torch.Tensor](task.sim.policy_dt, core.task.sim.policy_dt)
     held = columns(core.task, "previous_action") if past.cycles > 1 else None
     assert isinstance(core.command, FixedVelocity)
@@ -120,7 +122,7 @@ def evaluate(
     velocity_sum = torch.zeros(count, 3, dtype=torch.float64)
     square_sum = torch.zeros(count, 3, dtype=torch.float64)
     for step in range(steps):
-        result = core.step(policy(seen(observation)))
+        result = core.step(policy(with_velocity(observation)))
         core.check(result)
         observation = result.observation
         if held is not None:
@@ -141,16 +143,16 @@ def evaluate(
 
     rows = []
     for k, command in enumerate(config.commands):
-        mine = slice(k * config.episodes, (k + 1) * config.episodes)
-        n = float(samples[mine].sum())
+        group = slice(k * config.episodes, (k + 1) * config.episodes)
+        n = float(samples[group].sum())
         rows.append(
             {
                 "command": list(command),
-                "mean": _per_axis(velocity_sum[mine].sum(0) / n) if n else None,
-                "rmse": _per_axis((square_sum[mine].sum(0) / n).sqrt()) if n else None,
-                "falls": int(fell[mine].sum()),
+                "mean": _per_axis(velocity_sum[group].sum(0) / n) if n else None,
+                "rmse": _per_axis((square_sum[group].sum(0) / n).sqrt()) if n else None,
+                "falls": int(fell[group].sum()),
                 "episodes": config.episodes,
-                "mean_time_s": float(survived[mine].mean()),
+                "mean_time_s": float(survived[group].mean()),
             }
         )
     total = float(samples.sum())

@@ -15,12 +15,12 @@ def _triple(values: Any) -> str:
 
 def rows(report: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return one row of text per command of a report of ``rollout.evaluate``."""
-    found: list[tuple[str, ...]] = []
+    lines: list[tuple[str, ...]] = []
     for c in report["commands"]:
         mean = _triple(c["mean"][a] for a in AXES) if c["mean"] else "-"
         rmse = ", ".join(f"{c['rmse'][a]:.2f}" for a in AXES) if c["rmse"] else "-"
-        found.append((_triple(c["command"]), mean, rmse, f"{c['falls']}/{c['episodes']}", f"{c['mean_time_s']:.1f}"))
-    return found
+        lines.append((_triple(c["command"]), mean, rmse, f"{c['falls']}/{c['episodes']}", f"{c['mean_time_s']:.1f}"))
+    return lines
 
 
 def _summary(report: dict[str, Any]) -> str:

@@ -69,12 +69,12 @@ def steps(
                 at += rng.uniform(*hold)
             edges[joint].append((end, float(centre[joint])))
         now = end + rng.uniform(*turn)
-        mine, side = next(turns), rng.choice((-1.0, 1.0))
+        group, side = next(turns), rng.choice((-1.0, 1.0))
         for sign in (side, -side):
-            for joint in mine:
+            for joint in group:
                 edges[joint].append((now, float(wide[0][joint] + sign * wide[1][joint])))
             now += rng.uniform(*turn)
-        for joint in mine:
+        for joint in group:
             edges[joint].append((now, float(centre[joint])))
         now += rng.uniform(*turn)
     target = np.empty((len(t), joints))

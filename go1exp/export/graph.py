@@ -115,15 +115,15 @@ class Sensed:
 
 def blocks(terms: Sequence[Term]) -> tuple[Block, ...]:
     """Return the terms with their place in the flat observation."""
-    found, start = [], 0
+    placed, start = [], 0
     for term in terms:
         size = int(term.entry.traits["size"])
-        found.append(Block(term.key, term.entry.name, start, size, float(term.slots.get("noise", 0.0))))
+        placed.append(Block(term.key, term.entry.name, start, size, float(term.slots.get("noise", 0.0))))
         start += size
-    return tuple(found)
+    return tuple(placed)
 
 
-def inputs_of(terms: Sequence[Term]) -> tuple[Port, ...]:
+def required_inputs(terms: Sequence[Term]) -> tuple[Port, ...]:
     """Return the readings that the terms need, in the order of ``READINGS``.
 
     Raises:
@@ -154,7 +154,7 @@ class DeployedPolicy(nn.Module):
             ExportError: if a term reads what the robot does not measure.
         """
         super().__init__()
-        self.inputs = inputs_of(terms)
+        self.inputs = required_inputs(terms)
         size = sum(block.size for block in blocks(terms))
         self.outputs = tuple(dataclasses.replace(p, size=p.size or size) for p in OUTPUTS)
         self._terms, self._action = tuple(terms), action
@@ -245,7 +245,7 @@ class _OneTerm(nn.Module):
 def _culprit(module: DeployedPolicy) -> str:
     """Return ``.key`` of the first term that cannot be exported alone, or nothing."""
     for term in module._terms:
-        inputs = inputs_of([term])
+        inputs = required_inputs([term])
         try:
             _exported(_OneTerm(term, inputs), inputs, [term.key])
         except torch.onnx.errors.OnnxExporterError:

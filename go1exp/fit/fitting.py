@@ -100,18 +100,18 @@ def fit(
         kd=kd,
         provenance=provenance,
     )
-    group_of = np.array(info.group_of)
-    in_group = {part: group_of[rows.joint] for part, rows in picked.items()}
+    group_index = np.array(info.group_of)
+    in_group = {part: group_index[rows.joint] for part, rows in picked.items()}
     if len(picked["held_out"]) == 0:
         raise FitError("no rows to report on: the held-out episodes are shorter than the history, or drives are off")
 
     def networks(what: str, hidden: tuple[int, ...]) -> list[Trained]:
-        found = []
+        nets = []
         for k, group in enumerate(groups):
             rows, check = (picked[part].take(in_group[part] == k) for part in ("train", "validation"))
             tell = None if on_progress is None else partial(on_progress, f"{what} {group}")
-            found.append(train(rows, check, settings, hidden, tell))
-        return found
+            nets.append(train(rows, check, settings, hidden, tell))
+        return nets
 
     trained = networks("net", settings.hidden)
     held_out, group = picked["held_out"], in_group["held_out"]
@@ -127,12 +127,12 @@ def fit(
         hidden = tuple(max(1, width // 2) for width in settings.hidden)
         half = _assemble(replace(info, hidden=hidden), networks("half net", hidden), picked["train"], in_group["train"])
         others[-1] = Reference("half_net", _predict(half, held_out, group))
-    found = report(held_out, torque, others, thresholds(rows, joints), episodes, parts, settings.target)
+    held_out_report = report(held_out, torque, others, thresholds(rows, joints), episodes, parts, settings.target)
     provenance = replace(provenance, held_out_rmse=rmse(torque - held_out.y))
     net = replace(net, info=replace(info, provenance=provenance))
     torques = {"net": torque} | {r.name: r.torque for r in others if r.torque is not None}
     curves = {name: one.curve for name, one in zip(groups, trained, strict=True)}
-    return FitResult(net, found, held_out, episodes, torques, curves)
+    return FitResult(net, held_out_report, held_out, episodes, torques, curves)
 
 
 def _predict(net: ActuatorNet, rows: Rows, group: np.ndarray) -> np.ndarray:
@@ -145,7 +145,7 @@ def _predict(net: ActuatorNet, rows: Rows, group: np.ndarray) -> np.ndarray:
 def _assemble(info: NetInfo, trained: list[Trained], rows: Rows, group: np.ndarray) -> ActuatorNet:
     """Put the groups' networks side by side; the ranges of the inputs are those of the training rows."""
     per_input = rows.x.reshape(len(rows), len(info.inputs), info.history)
-    seen = [per_input[group == k] for k in range(len(info.groups))]
+    inputs = [per_input[group == k] for k in range(len(info.groups))]
     return ActuatorNet(
         info,
         tuple(np.stack(layer) for layer in zip(*(one.weights for one in trained), strict=True)),
@@ -155,8 +155,8 @@ def _assemble(info: NetInfo, trained: list[Trained], rows: Rows, group: np.ndarr
         input_std=np.stack([one.input_std for one in trained]),
         output_mean=np.array([one.output_mean for one in trained]),
         output_std=np.array([one.output_std for one in trained]),
-        input_low=np.stack([values.min(axis=(0, 2)) for values in seen]),
-        input_high=np.stack([values.max(axis=(0, 2)) for values in seen]),
+        input_low=np.stack([values.min(axis=(0, 2)) for values in inputs]),
+        input_high=np.stack([values.max(axis=(0, 2)) for values in inputs]),
     )
 
 
@@ -194,12 +194,12 @@ def _gains(
     recordings: Sequence[Recording], settings: FitSettings
 ) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
     """Return the gains that all recordings share, None where they differ and the net does not see the target."""
-    found = []
+    gains = []
     for key in ("kp", "kd"):
         values = {getattr(r.meta, key) for r in recordings}
         if len(values) > 1 and "position_error" in settings.inputs:
             raise FitError(
                 f"{key}: differs between the recordings; a net of position errors holds for one set of gains"
             )
-        found.append(values.pop() if len(values) == 1 else None)
-    return found[0], found[1]
+        gains.append(values.pop() if len(values) == 1 else None)
+    return gains[0], gains[1]

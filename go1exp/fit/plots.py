@@ -33,11 +33,11 @@ def plot(result: FitResult, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     files = []
     for j, joint in enumerate(result.net.info.joints):
-        mine = np.flatnonzero(result.rows.joint == j)
-        if not len(mine):
+        index = np.flatnonzero(result.rows.joint == j)
+        if not len(index):
             continue
-        rows = result.rows.take(mine)
-        torque = {name: values[mine] for name, values in result.torque.items()}
+        rows = result.rows.take(index)
+        torque = {name: values[index] for name, values in result.torque.items()}
         best = min(torque, key=lambda n: (n in ("net", "half_net"), rmse(torque[n] - rows.y)))
         figure = Figure(figsize=(12, 9), layout="constrained")
         FigureCanvasAgg(figure)
@@ -58,9 +58,9 @@ def _stretches(rows: Rows, net: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Cut the rows into stretches of one second; return the worst and the median by the net's error."""
     pieces = []
     for index in np.unique(rows.episode):
-        mine = np.flatnonzero(rows.episode == index)
-        number = ((rows.t[mine] - rows.t[mine[0]]) / STRETCH).astype(int)
-        pieces += [mine[number == n] for n in np.unique(number)]
+        in_episode = np.flatnonzero(rows.episode == index)
+        number = ((rows.t[in_episode] - rows.t[in_episode[0]]) / STRETCH).astype(int)
+        pieces += [in_episode[number == n] for n in np.unique(number)]
     longest = max(len(piece) for piece in pieces)
     whole = [piece for piece in pieces if len(piece) > longest / 2]
     order = sorted(whole, key=lambda piece: rmse(net[piece] - rows.y[piece]))

@@ -51,9 +51,9 @@ def linear(train: Rows, train_group: np.ndarray, rows: Rows, group: np.ndarray) 
     """
     torque = np.full(len(rows), np.nan)
     for k in np.unique(group):
-        mine, theirs = train.take(train_group == k), group == k
-        mean, std = mine.x.mean(axis=0), mine.x.std(axis=0)
+        train_rows, predicted = train.take(train_group == k), group == k
+        mean, std = train_rows.x.mean(axis=0), train_rows.x.std(axis=0)
         std = np.where(std > 0, std, 1.0)
-        weights = ridge((mine.x - mean) / std, mine.y - mine.y.mean())
-        torque[theirs] = mine.y.mean() + (rows.x[theirs] - mean) / std @ weights
+        weights = ridge((train_rows.x - mean) / std, train_rows.y - train_rows.y.mean())
+        torque[predicted] = train_rows.y.mean() + (rows.x[predicted] - mean) / std @ weights
     return Reference("linear", torque)

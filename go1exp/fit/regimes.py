@@ -33,15 +33,15 @@ class Thresholds:
 
 def thresholds(rows: Rows, joints: tuple[str, ...]) -> list[Thresholds]:
     """Derive each joint's limits from ``rows``, which should be those of all recordings."""
-    found = []
+    limits = []
     for j, joint in enumerate(joints):
-        mine = rows.take(rows.joint == j)
-        known = len(mine) > 0 and bool(np.isfinite(mine.speed).all())
-        speed = float(np.quantile(np.abs(mine.speed), QUANTILE)) if known else None
-        torque = float(np.quantile(np.abs(mine.y), QUANTILE)) if len(mine) else 0.0
+        joint_rows = rows.take(rows.joint == j)
+        known = len(joint_rows) > 0 and bool(np.isfinite(joint_rows.speed).all())
+        speed = float(np.quantile(np.abs(joint_rows.speed), QUANTILE)) if known else None
+        torque = float(np.quantile(np.abs(joint_rows.y), QUANTILE)) if len(joint_rows) else 0.0
         slow, fast = (None, None) if speed is None else (STILL * speed, FAST * speed)
-        found.append(Thresholds(joint, slow, fast, REVERSAL, HIGH * torque))
-    return found
+        limits.append(Thresholds(joint, slow, fast, REVERSAL, HIGH * torque))
+    return limits
 
 
 def masks(rows: Rows, limits: list[Thresholds]) -> dict[str, np.ndarray]:
@@ -62,16 +62,16 @@ def masks(rows: Rows, limits: list[Thresholds]) -> dict[str, np.ndarray]:
     }
 
 
-def as_words(limits: list[Thresholds]) -> list[str]:
+def as_text(limits: list[Thresholds]) -> list[str]:
     """Say the limits in one line per joint."""
     lines = []
     for x in limits:
         values = asdict(x)
-        words = "speed unknown: no still, slow, fast or reversal"
+        description = "speed unknown: no still, slow, fast or reversal"
         if x.still_below is not None:
-            words = (
+            description = (
                 "still below {still_below:.3g} rad/s, fast from {fast_above:.3g} rad/s, "
                 "reversal within {reversal_within:g} s of a sign change"
             ).format(**values)
-        lines.append(f"{x.joint}: {words}; high torque above {x.high_torque_above:.3g} N m")
+        lines.append(f"{x.joint}: {description}; high torque above {x.high_torque_above:.3g} N m")
     return lines

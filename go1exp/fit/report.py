@@ -9,7 +9,7 @@ import numpy as np
 
 from go1exp.fit.dataset import Rows, Split
 from go1exp.fit.references import NAMES, Reference
-from go1exp.fit.regimes import REGIMES, Thresholds, as_words, masks
+from go1exp.fit.regimes import REGIMES, Thresholds, as_text, masks
 
 
 @dataclass(frozen=True)
@@ -100,12 +100,12 @@ def report(
         return Cell(joint, regime, episode, int(which.sum()), rmse(rows.y[which]), errors)
 
     cells, by_episode = [], []
-    for joint, mine in joints.items():
+    for joint, joint_rows in joints.items():
         for regime in REGIMES:
-            if (mine & regimes[regime]).any():
-                cells.append(cell(joint, regime, "all", mine & regimes[regime]))
+            if (joint_rows & regimes[regime]).any():
+                cells.append(cell(joint, regime, "all", joint_rows & regimes[regime]))
         for index in np.unique(rows.episode):
-            which = mine & (rows.episode == index)
+            which = joint_rows & (rows.episode == index)
             if which.any():
                 by_episode.append(cell(joint, "all", episodes[index], which))
     missing = {r.name: r.reason for r in references if r.torque is None}
@@ -124,7 +124,7 @@ def text(report: Report) -> str:
         "",
         *(f"{name}: {NAMES[name]}" for name in NAMES if name in report.cells[0].rmse),
         *(f"{name}: none ({reason})" for name, reason in report.missing.items()),
-        *as_words(list(report.thresholds)),
+        *as_text(list(report.thresholds)),
     ]
     return "\n".join(parts)
 
@@ -139,6 +139,6 @@ def _table(cells: tuple[Cell, ...], key: str) -> str:
     widths = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
     laid = []
     for line in lines:
-        words = [line[k].ljust(widths[k]) if k < 2 else line[k].rjust(widths[k]) for k in range(len(line))]
-        laid.append("  ".join(words).rstrip())
+        padded = [line[k].ljust(widths[k]) if k < 2 else line[k].rjust(widths[k]) for k in range(len(line))]
+        laid.append("  ".join(padded).rstrip())
     return "\n".join(laid)

@@ -56,9 +56,9 @@ def smooth_motion(recording: Recording, window: float = WINDOW) -> SmoothMotion:
     half = length // 2 * step
     edge = half - step / 1000  # so that rounding of the clock takes no sample
     inner = (t >= grid[0] + edge) & (t <= grid[-1] - edge)
-    found = []
+    derivatives = []
     for order in range(3):
         smooth = savgol_filter(even, length, ORDER, deriv=order, delta=step, axis=0)
         back = np.stack([np.interp(t, grid, column) for column in smooth.T], axis=1)
-        found.append(np.where(inner[:, None], back, np.nan))
-    return SmoothMotion(*found)
+        derivatives.append(np.where(inner[:, None], back, np.nan))
+    return SmoothMotion(*derivatives)

@@ -53,5 +53,5 @@ def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list
     values, problems = entry.check(options, f"importer.{name}")
     if problems:
         raise ConfigError(problems)
-    found: list[Recording] = entry.target(Path(path), **values)
-    return found
+    recordings: list[Recording] = entry.target(Path(path), **values)
+    return recordings

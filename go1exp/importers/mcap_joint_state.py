@@ -90,13 +90,13 @@ def mcap_joint_state(
         RecordingError: if the extra is not installed, the log is damaged, or a topic or joint is missing.
     """
     topics = [state_topic] if command_topic is None else [state_topic, command_topic]
-    found = []
+    recordings = []
     for file in files(path, "*.mcap"):
         messages = _read(file, topics)
         names = joints or messages[state_topic][0].state.name
         names = JOINTS if joints is None and set(names) == set(JOINTS) else names
         channels, notes = _channels(file, state_topic, command_topic, messages, names)
-        found.append(
+        recordings.append(
             recording(
                 file,
                 "mcap_joint_state",
@@ -114,7 +114,7 @@ def mcap_joint_state(
                 notes=" ".join(notes),
             )
         )
-    return found
+    return recordings
 
 
 def _channels(
@@ -195,28 +195,30 @@ def _read(path: Path, topics: list[str]) -> dict[str, list[_Message]]:
         from mcap_ros2.decoder import DecoderFactory
     except ImportError as error:
         raise RecordingError(f'{path}: to read MCAP, pip install "go1exp[logs]" ({error})') from error
-    found: dict[str, list[_Message]] = {topic: [] for topic in topics}
-    there: set[str] = set()
+    messages: dict[str, list[_Message]] = {topic: [] for topic in topics}
+    topics_in_file: set[str] = set()
     factory = DecoderFactory()
     try:
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
             summary = reader.get_summary()
-            there = {channel.topic for channel in summary.channels.values()} if summary else set()
+            topics_in_file = {channel.topic for channel in summary.channels.values()} if summary else set()
             for schema, channel, message in reader.iter_messages(topics=topics):
                 where = f"{path}: {channel.topic}"
                 decode = _decoder(where, factory, schema, channel.message_encoding)
-                state = _checked(f"{where}: message {len(found[channel.topic])}", decode(message.data))
+                state = _checked(f"{where}: message {len(messages[channel.topic])}", decode(message.data))
                 stamp = state.header.stamp.sec * 10**9 + state.header.stamp.nanosec if state.header else 0
-                found[channel.topic].append(_Message(message.log_time, stamp, state))
+                messages[channel.topic].append(_Message(message.log_time, stamp, state))
     except RecordingError:
         raise
     except Exception as error:  # the reader and its decompressors share no base class of errors
         raise RecordingError(f"{path}: not a whole MCAP file ({error or type(error).__name__})") from error
     for topic in topics:
-        if not found[topic]:
-            raise RecordingError(f"{path}: no message on topic {topic!r}; it has {', '.join(sorted(there)) or 'none'}")
-    return found
+        if not messages[topic]:
+            raise RecordingError(
+                f"{path}: no message on topic {topic!r}; it has {', '.join(sorted(topics_in_file)) or 'none'}"
+            )
+    return messages
 
 
 def _decoder(where: str, factory: Any, schema: Any, encoding: str) -> Callable[[bytes], Any]:

@@ -151,7 +151,7 @@ def _foot_forces(data: Arrays, rows: np.ndarray) -> tuple[dict[str, np.ndarray],
     if len(wrench) <= rows[-1]:
         raise RecordingError(f"{data.path}: foot_wrench_raw: must have as many rows as t")
     force = np.linalg.norm(wrench[rows, :, :3], axis=2)
-    found, notes = {}, []
+    forces, notes = {}, []
     for leg, values in zip(LEGS, force.T, strict=True):
         wild = int((values > WILD_FORCE).sum())
         if not np.isfinite(values).all():
@@ -161,12 +161,12 @@ def _foot_forces(data: Arrays, rows: np.ndarray) -> tuple[dict[str, np.ndarray],
         elif wild > len(values) / 2:
             notes.append(f"The force sensor of {leg} was broken: {wild} of {len(values)} values exceed 200 N.")
         else:
-            found[FOOT_FORCE + leg] = np.ascontiguousarray(values)
+            forces[FOOT_FORCE + leg] = np.ascontiguousarray(values)
             if wild:
                 notes.append(f"foot_force_{leg} has {wild} wild values above 200 N.")
-    if found:
+    if forces:
         notes.append("Foot forces drift; they are magnitudes in the sensor's frame.")
-    return found, notes
+    return forces, notes
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,8 +255,8 @@ def _clock_error(t: np.ndarray, gyro: np.ndarray, clock: np.ndarray, position: n
     rate = (attitude[:-4].inv() * attitude[4:]).as_rotvec() / (clock[4:] - clock[:-4])[:, None]
 
     def match(shift: float) -> float:
-        seen = np.stack([np.interp(t, clock[2:-2] + shift, one) for one in np.clip(rate, -3.0, 3.0).T], axis=1)
-        return float((seen * (gyro - still)).sum() / np.sqrt((seen**2).sum() + 1e-12))
+        mocap_rate = np.stack([np.interp(t, clock[2:-2] + shift, one) for one in np.clip(rate, -3.0, 3.0).T], axis=1)
+        return float((mocap_rate * (gyro - still)).sum() / np.sqrt((mocap_rate**2).sum() + 1e-12))
 
     return float(max(rough + np.arange(-0.15, 0.151, 0.01), key=match))
 

@@ -69,8 +69,8 @@ def _one(path: Path) -> Recording:
         log = _Log.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         lines = explain(error, "", ()) if isinstance(error, ValidationError) else [str(error)]
-        more = [f"and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else []
-        raise RecordingError("\n".join(f"{path}: {line}" for line in lines[:MOST_LINES] + more)) from error
+        omitted = [f"and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else []
+        raise RecordingError("\n".join(f"{path}: {line}" for line in lines[:MOST_LINES] + omitted)) from error
     if not log.entries:
         raise RecordingError(f"{path}: entries: must not be empty")
     table = {key: np.array([getattr(row, key) for row in log.entries]) for key in _Row.model_fields}

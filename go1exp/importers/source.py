@@ -33,10 +33,10 @@ def files(path: Path, pattern: str) -> list[Path]:
         return [path]
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
-    found = sorted(path.rglob(pattern))
-    if not found:
+    matches = sorted(path.rglob(pattern))
+    if not matches:
         raise RecordingError(f"{path}: no {pattern} in this folder")
-    return found
+    return matches
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,8 @@ def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **abou
     except ValidationError as error:
         lines = explain(error, "metadata", Meta.__dataclass_fields__)
         raise RecordingError("\n".join(f"{path}: {line}" for line in lines)) from error
-    found = Recording(meta, channels)
-    wrong = problems(found)
+    result = Recording(meta, channels)
+    wrong = problems(result)
     if wrong:
         raise RecordingError("\n".join(f"{path}: {line}" for line in wrong))
-    return found
+    return result

@@ -81,25 +81,25 @@ def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Gen
     dt = 1.0 / config.rate_hz
     # A stamp is late by the bus, never early, and a late sample does not overtake the next.
     late = np.minimum(np.abs(config.jitter * rng.standard_normal(rows)), 0.9 * dt)
-    found: dict[str, np.ndarray] = {"t": np.arange(rows) * dt + late}
+    channels: dict[str, np.ndarray] = {"t": np.arange(rows) * dt + late}
     for name in ("q", "qd", "tau_est"):
         spoilt = _spoil(true[name], getattr(config, name), rng)
-        found |= dict(zip(joint_channels(name, robot.JOINTS), spoilt.T, strict=True))
-    found |= dict(zip(joint_channels("q_target", robot.JOINTS), true["q_target"].T, strict=True))
+        channels |= dict(zip(joint_channels(name, robot.JOINTS), spoilt.T, strict=True))
+    channels |= dict(zip(joint_channels("q_target", robot.JOINTS), true["q_target"].T, strict=True))
     for name in ("gyro", "acc"):
-        found |= dict(zip(VECTORS[f"imu_{name}"], _spoil(true[name], getattr(config, name), rng).T, strict=True))
+        channels |= dict(zip(VECTORS[f"imu_{name}"], _spoil(true[name], getattr(config, name), rng).T, strict=True))
     error = Rotation.from_rotvec(config.attitude.noise * rng.standard_normal((rows, 3)))
     attitude = Rotation.from_quat(true["quat"], scalar_first=True) * error
     quat = _stepped(attitude.as_quat(canonical=True, scalar_first=True), config.attitude)
-    found |= dict(zip(VECTORS["imu_quat"], quat.T, strict=True))
+    channels |= dict(zip(VECTORS["imu_quat"], quat.T, strict=True))
     forces = np.maximum(_spoil(true["foot_force"], config.foot_force, rng), 0.0)
-    found |= {f"foot_force_{leg}": forces[:, k] for k, leg in enumerate(robot.LEGS)}
+    channels |= {f"foot_force_{leg}": forces[:, k] for k, leg in enumerate(robot.LEGS)}
     if not true["torque_enable"].all():
-        found["torque_enable"] = true["torque_enable"].astype(bool)
+        channels["torque_enable"] = true["torque_enable"].astype(bool)
     if config.truth:
         for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel"):
             if name in true:
-                found |= dict(zip(VECTORS[name], true[name].T, strict=True))
+                channels |= dict(zip(VECTORS[name], true[name].T, strict=True))
     kept = rng.random(rows) >= config.dropped
     kept[0] = True
-    return {name: np.ascontiguousarray(values[kept]) for name, values in found.items()}
+    return {name: np.ascontiguousarray(values[kept]) for name, values in channels.items()}

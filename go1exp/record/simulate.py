@@ -60,7 +60,7 @@ def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int
 
     All must last equally long. Those that hang alike, or stand, share a batch. ``on_step`` is told the progress.
     """
-    found: dict[str, Recording] = {}
+    recordings: dict[str, Recording] = {}
     places = list(dict.fromkeys((e.hang, e.motion.height > 0) for e in episodes))
     for k, place in enumerate(places):
         group = [e for e in episodes if (e.hang, e.motion.height > 0) == place]
@@ -68,8 +68,8 @@ def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int
         def part(done: int, total: int, k: int = k) -> None:
             on_step(k * total + done, len(places) * total)
 
-        found |= {r.meta.episode: r for r in _play_alike(rig, group, sensors, seed, part)}
-    return [found[e.name] for e in episodes]
+        recordings |= {r.meta.episode: r for r in _play_alike(rig, group, sensors, seed, part)}
+    return [recordings[e.name] for e in episodes]
 
 
 def _play_alike(
@@ -218,7 +218,7 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
         walking &= ~fell
         on_step(step + 1, steps)
     tape.stop()
-    found = []
+    recordings = []
     for k, name in enumerate(walk.names):
         true = {key: values[: rows[k]] for key, values in tape.true(k).items()}
         about = meta(
@@ -232,8 +232,8 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
             episode=name,
             repeat_of=None,
         )
-        found.append(Recording(about, log(true, sensors, np.random.default_rng([seed, k]))))
-    return found
+        recordings.append(Recording(about, log(true, sensors, np.random.default_rng([seed, k]))))
+    return recordings
 
 
 def _configured(actuator: Term, gain: str) -> tuple[float, ...] | None:

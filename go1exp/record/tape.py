@@ -56,29 +56,29 @@ def sample(plant: Plant, target: Tensor) -> dict[str, Tensor]:
     """
     blocks, readings = plant.backend.sensors, plant.backend.sensordata
     quat = readings[:, blocks.imu_quat]
-    seen = plant.effects.measure(
+    measured = plant.effects.measure(
         Measured(plant.q, plant.speed(), gyro=readings[:, blocks.imu_gyro], acc=readings[:, blocks.imu_acc], quat=quat)
     )
-    assert seen.gyro is not None
-    assert seen.acc is not None
-    assert seen.quat is not None
+    assert measured.gyro is not None
+    assert measured.acc is not None
+    assert measured.quat is not None
     contact = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))
-    found = {
-        "q": seen.joint_pos,
-        "qd": seen.joint_vel,
+    values = {
+        "q": measured.joint_pos,
+        "qd": measured.joint_vel,
         "q_target": target,
         "tau_est": plant.torque,
-        "gyro": seen.gyro,
-        "acc": seen.acc,
-        "quat": seen.quat,
+        "gyro": measured.gyro,
+        "acc": measured.acc,
+        "quat": measured.quat,
         "foot_force": contact[..., 1:].norm(dim=-1),
     }
     qpos, qvel = plant.backend.qpos, plant.backend.qvel
     if qpos.shape[1] > robot.NUM_JOINTS:
-        found |= {
+        values |= {
             "base_pos": qpos[:, :3],
             "base_quat": qpos[:, 3:7],
             "base_lin_vel": qvel[:, :3],
             "base_ang_vel": qvel[:, 3:6],
         }
-    return found
+    return values

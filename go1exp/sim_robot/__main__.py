@@ -31,7 +31,7 @@ from go1exp.sim_robot.server import TRUTH, Server
 from go1exp.sim_robot.settings import SimConfig
 
 
-def task_of(bundle: str, other: dict[str, Any]) -> TaskConfig:
+def bundle_task(bundle: str, other: dict[str, Any]) -> TaskConfig:
     """Return the task that a bundle's policy was trained in, with other choices of actuator and effects if given.
 
     Raises:
@@ -82,7 +82,7 @@ def main() -> int:
     given = json.loads(_line(sys.stdin.fileno()))
     try:
         config = sim_config(given.get("sim", {}))
-        task = task_of(given["bundle"], given.get("robot", {}))
+        task = bundle_task(given["bundle"], given.get("robot", {}))
         server = Server(Robot(task, config), config, given.get("port", 0))
     except (ConfigError, Expected, OSError) as error:
         lines = error.problems if isinstance(error, ConfigError) else []

@@ -64,8 +64,8 @@ class Robot:
         random = EnvRandom(config.seed, 1, device=backend.qpos.device)
         self._plant = Plant(backend, drive_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
         self._plant.startup()
-        own = self._plant.actuator
-        self._own_gains = tuple(getattr(own, name).numpy().ravel().copy() for name in ("kp", "kd"))
+        actuator = self._plant.actuator
+        self._default_gains = tuple(getattr(actuator, name).numpy().ravel().copy() for name in ("kp", "kd"))
         self.clock, self.braking = 0.0, False
         self._commanded, self._in_force = -np.inf, 0
         self._measured = self.clock, self._in_force
@@ -84,8 +84,8 @@ class Robot:
         plant.backend.reset(everyone, qpos, qvel)
         self._target = qpos[:, -robot.NUM_JOINTS :].clone()
         plant.reset(everyone, self._target)
-        self._gains = self._own_gains
-        self._set_gains(*((np.zeros(robot.NUM_JOINTS), self._braking_kd) if start == "lying" else self._own_gains))
+        self._gains = self._default_gains
+        self._set_gains(*((np.zeros(robot.NUM_JOINTS), self._braking_kd) if start == "lying" else self._default_gains))
         for _ in range(round(SETTLE_S / TICK)):
             self._advance()
         plant.effects.reset(everyone)  # what drifts begins now
@@ -94,7 +94,7 @@ class Robot:
 
     def _set_gains(self, kp: np.ndarray, kd: np.ndarray) -> None:
         """Give the drives gains, if they have others."""
-        if all(np.array_equal(own, new) for own, new in zip(self._gains, (kp, kd), strict=True)):
+        if all(np.array_equal(present, new) for present, new in zip(self._gains, (kp, kd), strict=True)):
             return
         self._gains = (np.array(kp), np.array(kd))
         rows = (torch.as_tensor(values).unsqueeze(0) for values in self._gains)
@@ -135,9 +135,9 @@ class Robot:
         rate = speed[:, 3:6] if floats else readings[:, blocks.imu_gyro]
         about = {"acc": readings[:, blocks.imu_acc], "quat": readings[:, blocks.imu_quat]}
         imu = plant.effects.measure(Measured(plant.q, plant.speed(), gyro=rate, **about))
-        told = {"q": q, "qd": qd, "tau_est": plant.torque, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
-        told["foot_force"] = feet
-        self._now = {name: values[0].numpy().copy() for name, values in told.items() if values is not None}
+        readings_now = {"q": q, "qd": qd, "tau_est": plant.torque, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
+        readings_now["foot_force"] = feet
+        self._now = {name: values[0].numpy().copy() for name, values in readings_now.items() if values is not None}
         trunk = torch.cat([pose[:, :7], speed[:, :6]], dim=1)[0].numpy() if floats else np.full(13, np.nan)
         self._true = np.array(trunk)
 
@@ -147,19 +147,19 @@ class Robot:
         The truth is the trunk's place, attitude and velocities, in the columns of ``TRUTH``; NaN for a robot that
         hangs.
         """
-        seen = noisy(self._now, self._config.noise, self._rng)
+        readings = noisy(self._now, self._config.noise, self._rng)
         clock, in_force = self._measured
         state = LowState(
             t=clock,
             clock=clock,
             in_force=in_force,
-            joint_pos=seen["q"],
-            joint_vel=seen["qd"],
+            joint_pos=readings["q"],
+            joint_vel=readings["qd"],
             joint_torque=self._now["tau_est"],
-            imu_quat=seen["quat"],
-            imu_gyro=seen["gyro"],
-            imu_acc=seen["acc"],
-            foot_force=seen["foot_force"],
+            imu_quat=readings["quat"],
+            imu_gyro=readings["gyro"],
+            imu_acc=readings["acc"],
+            foot_force=readings["foot_force"],
         )
         return state, self._true
 

@@ -52,10 +52,10 @@ class Network:
 
     def take(self, now: float) -> list[bytes]:
         """Return the datagrams that are there by ``now``, in the order in which they arrive."""
-        found = []
+        arrived = []
         while self._way and self._way[0][0] <= now + 1e-9:
-            found.append(heapq.heappop(self._way)[2])
-        return found
+            arrived.append(heapq.heappop(self._way)[2])
+        return arrived
 
 
 class Truth:
@@ -120,7 +120,7 @@ class Server:
         """
         self._robot = robot
         rng = np.random.default_rng([config.seed, 1])
-        self._here, self._back = (Network(config.delay, config.loss, rng) for _ in range(2))
+        self._uplink, self._downlink = (Network(config.delay, config.loss, rng) for _ in range(2))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
@@ -153,21 +153,21 @@ class Server:
 
         timing = run(work, 1.0 / TICK, seconds, clock)
         self.counts.timing = asdict(timing)
-        self.counts.lost = self._here.lost + self._back.lost
+        self.counts.lost = self._uplink.lost + self._downlink.lost
         return timing
 
     def tick(self) -> None:
         """Listen, obey the newest command, move on by a tick, and send what the sensors said at its beginning."""
         robot, now = self._robot, self._robot.clock
         self._listen(now)
-        for data in self._here.take(now):
+        for data in self._uplink.take(now):
             self._obey(data)
         robot.step()
         state, true = robot.sense()
         self.truth.add(now, true)
         if self._peer is not None:
-            self._back.put(now, wire.pack_state(state, self.counts.ticks))
-            for data in self._back.take(now):
+            self._downlink.put(now, wire.pack_state(state, self.counts.ticks))
+            for data in self._downlink.take(now):
                 self._send(data)
         self.counts.ticks += 1
 
@@ -185,7 +185,7 @@ class Server:
                 continue
             self._peer = sender  # whoever speaks first
             if about.kind == wire.COMMAND:
-                self._here.put(now, data)
+                self._uplink.put(now, data)
 
     def _obey(self, data: bytes) -> None:
         about = wire.head(data)
