@@ -123,9 +123,11 @@ def lockstep(spoil: Spoil = lambda state: state) -> Iterator[World]:
         world.spins.append(spin)
         return SimpleNamespace(now=lambda: world.now, sleep_until=world.pass_until)
 
-    told = SimpleNamespace(perf_counter=lambda: world.now, time=lambda: 0.0)
+    host_time = SimpleNamespace(perf_counter=lambda: world.now, time=lambda: 0.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(udp, "time", told)  # stamps of arrival are not believed, and states are as old as the last cycle
+        patch.setattr(
+            udp, "time", host_time
+        )  # stamps of arrival are not believed, and states are as old as the last cycle
         patch.setattr(walk, "MonotonicClock", clock)
         patch.setattr(job, "SimulatedRobot", lambda *given: InProcess(world, *given))
         yield world

@@ -117,14 +117,14 @@ def realistic(recording: Recording, seed: int = 0) -> Recording:
     return with_(recording, **dirty)
 
 
-def flaws(report: AuditReport) -> set[tuple[str, str, str]]:
-    return {(f.check, f.channel, f.verdict) for f in report.flaws}
+def value(report: AuditReport) -> set[tuple[str, str, str]]:
+    return {(f.check, f.channel, f.verdict) for f in report.value}
 
 
 def size(report: AuditReport, check: str, channel: str) -> float:
-    (found,) = [f.size for f in report.by_check(check) if f.channel == channel]
-    assert found is not None
-    return found
+    (value,) = [f.size for f in report.by_check(check) if f.channel == channel]
+    assert value is not None
+    return value
 
 
 # ---------------------------------------------------------------------- no false alarms
@@ -384,32 +384,32 @@ def test_a_speed_that_trails_is_found_and_sized() -> None:
 def test_the_accelerometers_unit_is_checked(factor: float, what: str) -> None:
     changed = {k: factor * v for k, v in made().channels.items() if k.startswith("imu_acc")}
     report = audit(with_(made(), **changed))
-    (found,) = report.flaws
-    assert found.channel == "imu_acc"
-    assert found.verdict == "bad"
-    assert what in found.message
-    assert found.size == pytest.approx(9.81 * factor, rel=0.02)
+    (flaw,) = report.flaws
+    assert flaw.channel == "imu_acc"
+    assert flaw.verdict == "bad"
+    assert what in flaw.message
+    assert flaw.size == pytest.approx(9.81 * factor, rel=0.02)
     assert all(c.verdict == "bad" for c in report.channels if c.name.startswith("imu_acc"))
 
 
 def test_an_accelerometer_of_wrong_sign_or_axes_is_found() -> None:
     flipped = {k: -v for k, v in made().channels.items() if k.startswith("imu_acc")}
-    (found,) = audit(with_(made(), **flipped)).flaws
-    assert (found.check, found.channel, found.verdict) == ("gravity", "imu_acc", "bad")
-    assert "sign is flipped" in found.message
+    (flaw,) = audit(with_(made(), **flipped)).flaws
+    assert (flaw.check, flaw.channel, flaw.verdict) == ("gravity", "imu_acc", "bad")
+    assert "sign is flipped" in flaw.message
     c = made().channels
-    (found,) = audit(with_(made(), imu_acc_x=c["imu_acc_z"], imu_acc_z=c["imu_acc_x"])).flaws
-    assert found.size == pytest.approx(90, abs=15)
+    (flaw,) = audit(with_(made(), imu_acc_x=c["imu_acc_z"], imu_acc_z=c["imu_acc_x"])).flaws
+    assert flaw.size == pytest.approx(90, abs=15)
 
 
 def test_joints_beyond_their_stops_and_torques_beyond_their_limits_are_found() -> None:
     changed = with_(made(), q_FR_calf=made().channels["q_FR_calf"] + 0.4)
-    (found,) = audit(changed).by_check("limits")
-    assert (found.channel, found.verdict) == ("q_FR_calf", "suspect")
-    assert found.size == pytest.approx(changed.channels["q_FR_calf"].max() + 0.888, rel=1e-6)
+    (flaw,) = audit(changed).by_check("limits")
+    assert (flaw.channel, flaw.verdict) == ("q_FR_calf", "suspect")
+    assert flaw.size == pytest.approx(changed.channels["q_FR_calf"].max() + 0.888, rel=1e-6)
     assert audit(Recording(replace(META, robot="other"), changed.channels)).by_check("limits") == []
     report = audit(with_(made(), tau_est_FL_hip=10 * made().channels["tau_est_FL_hip"]))
-    assert ("limits", "tau_est_FL_hip", "bad") in flaws(report)
+    assert ("limits", "tau_est_FL_hip", "bad") in flaw(report)
 
 
 # ---------------------------------------------------------------------- sign and order
@@ -529,10 +529,10 @@ def test_an_answer_before_the_command_is_named() -> None:
     sound = made("multisine")
     late = {k: np.roll(v, 10, axis=0) for k, v in sound.channels.items() if k.startswith("q_target")}
     report = audit(with_(sound, **late))
-    found = [f for f in report.by_check("delay") if f.verdict == "suspect"]
-    assert len(found) >= 10
-    assert all("before it is given" in f.message for f in found)
-    assert np.median([f.size or 0 for f in found]) == pytest.approx(-20, abs=0.5)
+    flaws = [f for f in report.by_check("delay") if f.verdict == "suspect"]
+    assert len(flaws) >= 10
+    assert all("before it is given" in f.message for f in flaws)
+    assert np.median([f.size or 0 for f in flaws]) == pytest.approx(-20, abs=0.5)
 
 
 def test_where_the_delay_cannot_be_told_none_is_given() -> None:
@@ -613,7 +613,7 @@ def real(importer: str, *path: str) -> list[Recording]:
     return import_recordings(importer, folder.joinpath(importer, *path), {})
 
 
-def steps_of(report: AuditReport, prefix: str) -> list[float]:
+def encoder_steps(report: AuditReport, prefix: str) -> list[float]:
     return [c.step for c in report.channels if c.name.startswith(prefix) and c.step]
 
 
@@ -623,7 +623,7 @@ def test_the_go2_reports_speeds_that_are_too_large() -> None:
     assert flaws(report) == {("scale", name, "suspect") for name in joint_channels("qd", recording.meta.joints)}
     sizes = [f.size or 0 for f in report.by_check("scale")]
     assert 1.10 < min(sizes) < max(sizes) < 1.18  # its README says 1.11 to 1.17
-    for step in steps_of(report, "q_"):
+    for step in encoder_steps(report, "q_"):
         assert step == pytest.approx(2 * np.pi / 32768 / 6.33, rel=2e-3)
 
 
@@ -645,8 +645,8 @@ def test_scaler_reports_speeds_that_are_too_large_and_late() -> None:
 def test_the_ak80s_messages_are_recognised(design: str) -> None:
     (recording,) = real("ak80_double_pendulum", design, "trajectory_00.npz")
     report = audit(recording)
-    np.testing.assert_allclose(steps_of(report, "q_"), [3.8147e-4] * 2, rtol=1e-3)
-    np.testing.assert_allclose(steps_of(report, "tau_est"), [5.8608e-3] * 2, rtol=1e-3)
+    np.testing.assert_allclose(encoder_steps(report, "q_"), [3.8147e-4] * 2, rtol=1e-3)
+    np.testing.assert_allclose(encoder_steps(report, "tau_est"), [5.8608e-3] * 2, rtol=1e-3)
     assert {"T-Motor" in f.message for f in report.by_check("resolution")} == {True}
 
 
@@ -654,8 +654,8 @@ def test_the_servos_encoders_are_recognised() -> None:
     for importer, path in (("servo_pendulum_xl330", ""), ("so101_arm", "actuator_bandwidth.npz")):
         for recording in real(importer, path):
             report = audit(recording)
-            found = steps_of(report, "q_")
-            np.testing.assert_allclose(found, [2 * np.pi / 4096] * len(recording.meta.joints), rtol=1e-3)
+            steps = encoder_steps(report, "q_")
+            np.testing.assert_allclose(steps, [2 * np.pi / 4096] * len(recording.meta.joints), rtol=1e-3)
             assert "12 bits a turn" in report.by_check("resolution")[0].message
             assert "bad" not in {f.verdict for f in report.findings if f.check != "still"}
 
