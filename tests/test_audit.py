@@ -117,8 +117,8 @@ def realistic(recording: Recording, seed: int = 0) -> Recording:
     return with_(recording, **dirty)
 
 
-def value(report: AuditReport) -> set[tuple[str, str, str]]:
-    return {(f.check, f.channel, f.verdict) for f in report.value}
+def flaws(report: AuditReport) -> set[tuple[str, str, str]]:
+    return {(f.check, f.channel, f.verdict) for f in report.flaws}
 
 
 def size(report: AuditReport, check: str, channel: str) -> float:
@@ -409,7 +409,7 @@ def test_joints_beyond_their_stops_and_torques_beyond_their_limits_are_found() -
     assert flaw.size == pytest.approx(changed.channels["q_FR_calf"].max() + 0.888, rel=1e-6)
     assert audit(Recording(replace(META, robot="other"), changed.channels)).by_check("limits") == []
     report = audit(with_(made(), tau_est_FL_hip=10 * made().channels["tau_est_FL_hip"]))
-    assert ("limits", "tau_est_FL_hip", "bad") in flaw(report)
+    assert ("limits", "tau_est_FL_hip", "bad") in flaws(report)
 
 
 # ---------------------------------------------------------------------- sign and order
