@@ -57,31 +57,62 @@ def steps(
     duration = check(t, centre, limits)
     joints = len(centre)
     small, wide = (_kept_free(a, centre, limits, overshoot) for a in (amplitude, large))
-    edges: list[list[tuple[float, float]]] = [[(0.0, float(c))] for c in centre]
+    edges = _Edges(centre)
     now, turns = settle, _turns(rng, joints, at_once)
     while now <= duration:
         end = now + rng.uniform(*mixed)
-        for joint in range(joints):
-            at = now + rng.uniform(0, hold[1])
-            while at < end:
-                level = small[0][joint] + small[1][joint] * rng.uniform(-1, 1)
-                edges[joint].append((at, float(level)))
-                at += rng.uniform(*hold)
-            edges[joint].append((end, float(centre[joint])))
+        edges.add_ordinary(rng, now, end, small, hold)
         now = end + rng.uniform(*turn)
         group, side = next(turns), rng.choice((-1.0, 1.0))
         for sign in (side, -side):
-            for joint in group:
-                edges[joint].append((now, float(wide[0][joint] + sign * wide[1][joint])))
+            edges.add_jump(now, group, wide[0] + sign * wide[1])
             now += rng.uniform(*turn)
-        for joint in group:
-            edges[joint].append((now, float(centre[joint])))
+        edges.add_jump(now, group, centre)
         now += rng.uniform(*turn)
-    target = np.empty((len(t), joints))
-    for joint, changes in enumerate(edges):
-        at, levels = np.array(changes).T
-        target[:, joint] = levels[np.searchsorted(at, t - t[0], side="right") - 1]
-    return always_on(np.clip(target, limits[:, 0], limits[:, 1]), "hung")
+    return always_on(np.clip(edges.targets(t - t[0]), limits[:, 0], limits[:, 1]), "hung")
+
+
+class _Edges:
+    """The instants at which the target of each joint jumps, s, and the angle it jumps to, rad."""
+
+    def __init__(self, centre: np.ndarray) -> None:
+        """Start with every joint at its ``centre`` (J,), rad."""
+        self._centre = centre
+        self._edges: list[list[tuple[float, float]]] = [[(0.0, float(c))] for c in centre]
+
+    def add_ordinary(
+        self,
+        rng: np.random.Generator,
+        begin: float,
+        end: float,
+        swing: tuple[np.ndarray, np.ndarray],
+        hold: tuple[float, float],
+    ) -> None:
+        """Let every joint jump at its own random times from ``begin`` to ``end``, and then back to its centre.
+
+        ``swing`` is the middle and the half range (J,) of the levels; ``hold`` the shortest and longest time at one.
+        """
+        middle, half = swing
+        for joint, edges in enumerate(self._edges):
+            at = begin + rng.uniform(0, hold[1])
+            while at < end:
+                level = middle[joint] + half[joint] * rng.uniform(-1, 1)
+                edges.append((at, float(level)))
+                at += rng.uniform(*hold)
+            edges.append((end, float(self._centre[joint])))
+
+    def add_jump(self, at: float, joints: list[int], angles: np.ndarray) -> None:
+        """Let ``joints`` jump to their ``angles`` (J,) at one instant."""
+        for joint in joints:
+            self._edges[joint].append((at, float(angles[joint])))
+
+    def targets(self, t: np.ndarray) -> np.ndarray:
+        """Return the angles in force at ``t`` (T,): (T, J)."""
+        target = np.empty((len(t), len(self._edges)))
+        for joint, edges in enumerate(self._edges):
+            times, levels = np.array(edges).T
+            target[:, joint] = levels[np.searchsorted(times, t, side="right") - 1]
+        return target
 
 
 def _kept_free(

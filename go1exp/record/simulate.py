@@ -76,6 +76,17 @@ def _play_alike(
     rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress
 ) -> list[Recording]:
     """Simulate episodes that share a base."""
+    plant = _build_plant(rig, episodes, seed)
+    _put_down(plant, episodes, rig.physics_dt)
+    per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
+    tape = Tape(plant, per_sample, len(episodes[0].motion.target))
+    _follow_motions(plant, tape, episodes, sensors.rate_hz, per_sample, on_step)
+    tape.stop()
+    return [_recording(rig, sensors, e, tape.true(k)) for k, e in enumerate(episodes)]
+
+
+def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
+    """Build one robot for each episode, with the gains of that episode."""
     n, hang = len(episodes), episodes[0].hang
     model, blocks = build_model(
         rig.robot,
@@ -88,35 +99,49 @@ def _play_alike(
     random = EnvRandom(seed, n, device=backend.qpos.device, alike=True)  # one robot, in all its recordings
     plant = Plant(backend, drive_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
     if has_gains(rig.actuator):
+        # (n, 1) each, then the same gain for all joints: (n, 12)
         kp, kd = (torch.tensor([[getattr(e, g)] for e in episodes], dtype=plant.q.dtype) for g in ("kp", "kd"))
         plant.set_gains(kp.expand_as(plant.q), kd.expand_as(plant.q))
     plant.startup()
+    return plant
 
-    targets = torch.as_tensor(np.stack([e.motion.target for e in episodes], axis=1), dtype=plant.q.dtype)
-    enabled = torch.as_tensor(np.stack([e.motion.torque_enable for e in episodes], axis=1))
-    everyone = torch.ones(n, dtype=torch.bool)
+
+def _put_down(plant: Plant, episodes: Sequence[Episode], physics_dt: float) -> None:
+    """Reset every robot to the first angles of its motion and, unless it is to fall, let it settle there."""
+    backend = plant.backend
+    everyone = torch.ones(len(episodes), dtype=torch.bool)
     qpos, qvel = torch.zeros_like(backend.qpos), torch.zeros_like(backend.qvel)
     qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(np.stack([e.motion.start for e in episodes]))
-    if hang is None:
+    if episodes[0].hang is None:  # a free trunk has seven coordinates before the joints: position, then quaternion
         qpos[:, 2] = robot.NOMINAL_HEIGHT + torch.tensor([e.motion.height for e in episodes])
         qpos[:, 3] = 1.0
     backend.reset(everyone, qpos, qvel)
     start = qpos[:, -robot.NUM_JOINTS :].clone()
     plant.reset(everyone, start)
-    per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
     if episodes[0].motion.height == 0:
-        for _ in range(round(SETTLE_S / rig.physics_dt)):
+        for _ in range(round(SETTLE_S / physics_dt)):
             plant.step(start)
-        plant.effects.reset(everyone)  # what drifts within an episode begins with it
+        plant.effects.reset(everyone)  # an effect that drifts within an episode starts with the recording
 
+
+def _follow_motions(
+    plant: Plant, tape: Tape, episodes: Sequence[Episode], rate_hz: float, per_sample: int, on_step: Progress
+) -> None:
+    """Send every robot the targets of its motion, one each ``per_sample`` physics steps, while ``tape`` records.
+
+    When drives come back on, the target moves from the measured angle to the commanded one within ``soft_start``: a
+    sudden pull would hit the joint's torque limit.
+    """
+    targets = torch.as_tensor(np.stack([e.motion.target for e in episodes], axis=1), dtype=plant.q.dtype)  # (T, n, 12)
+    enabled = torch.as_tensor(np.stack([e.motion.torque_enable for e in episodes], axis=1))  # (T, n)
     rows = len(targets)
     soft = torch.tensor([[e.motion.soft_start] for e in episodes], dtype=plant.q.dtype)
-    since, origin = torch.full_like(soft, torch.inf), start.clone()
-    tape = Tape(plant, per_sample, rows)
+    # s since the drives came back on; infinite at the start, where nothing is blended
+    since, origin = torch.full_like(soft, torch.inf), targets[0].clone()
     plant.enabled = enabled[0]
     for row in range(rows):
         back_on = (enabled[row] & ~plant.enabled).unsqueeze(1)
-        since = torch.where(back_on, 0.0, since + 1.0 / sensors.rate_hz)
+        since = torch.where(back_on, 0.0, since + 1.0 / rate_hz)
         origin = torch.where(back_on, plant.q, origin)
         share = (since / soft.clamp(min=1e-9)).clamp(max=1.0)
         target = torch.lerp(origin, targets[row], share)
@@ -125,8 +150,6 @@ def _play_alike(
             plant.step(target)
         if row % 100 == 99 or row + 1 == rows:
             on_step(row + 1, rows)
-    tape.stop()
-    return [_recording(rig, sensors, e, tape.true(k)) for k, e in enumerate(episodes)]
 
 
 def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[str, np.ndarray]) -> Recording:
