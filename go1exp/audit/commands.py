@@ -15,15 +15,15 @@ from go1exp.audit.report import Finding
 from go1exp.recording import joint_channel
 
 SMOOTH = 0.2
-"""s; order and sign are judged below some 3 Hz, where a joint follows its target whatever its gains."""
+"""s of smoothing: order and sign are judged below about 3 Hz, where a joint follows its target at any gains."""
 LONGEST_LAG = 0.12
-"""s by which a joint may trail its target."""
+"""s by which a joint may trail its target (chosen: longer than the response of any drive under position control)."""
 LONGEST_TRAIL = 0.3
 """s; the same for a soft position servo."""
 
 
 def order_and_sign(log: Log) -> Iterator[Finding]:
-    """Does each joint follow its own target better than another's, and forward?"""
+    """Check that each joint follows its own target better than that of another joint, and with the right sign."""
     if not (log.recording.has("q_target") and log.recording.has("q")) or not _enough(log):
         return
     target, q = _matches_inputs(log)
@@ -47,7 +47,10 @@ def _enough(log: Log) -> bool:
 
 
 def _matches_inputs(log: Log) -> tuple[np.ndarray, np.ndarray]:
-    """Targets and angles without their mean and without what is fast; while the drives are off, as they stood."""
+    """Return targets and angles (T, J), smoothed and without their mean.
+
+    While the drives are off, both keep their last values: a free joint does not follow its target.
+    """
     n = log.samples(SMOOTH)
     held = np.maximum.accumulate(np.where(log.on, np.arange(len(log.t)), 0))
     target, q = (uniform_filter1d(log.recording.joint(name)[held], n, axis=0) for name in ("q_target", "q"))
@@ -55,7 +58,10 @@ def _matches_inputs(log: Log) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lagged_correlation(log: Log, target: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Largest correlation (by size) of each target (rows) with each joint (columns) that trails it; 0 if one rests."""
+    """Return the correlation (J, J) of each target (rows) with each joint (columns), at the lag where it is largest.
+
+    "Largest" is by absolute value. A pair of which one does not move has 0.
+    """
     best = np.zeros((target.shape[1], q.shape[1]))
     live = np.outer(np.ptp(target, axis=0) > limits.STILL_ANGLE, np.ptp(q, axis=0) > limits.STILL_ANGLE)
     for lag in range(0, log.samples(LONGEST_LAG) + 1, log.samples(0.01)):
@@ -68,7 +74,7 @@ def _lagged_correlation(log: Log, target: np.ndarray, q: np.ndarray) -> np.ndarr
 
 
 def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
-    """Delay of each joint; return it by the name of the ``q`` column too."""
+    """Check the delay of each joint; return the delays, too, by the name of the ``q`` column."""
     if log.command is None or not log.recording.has("q") or not _enough(log):
         return [], {}
     q = log.recording.joint("q")
@@ -77,6 +83,7 @@ def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
     findings = []
     middle = float(np.median([d.time for d in known.values()])) if known else 0.0
     threshold = limits.DELAY + log.dt
+    # An error of two standard deviations is allowed before a delay is reported.
     late = {j: d for j, d in known.items() if abs(d.time) - 2 * d.error > threshold}
     for joint, d in known.items():
         name = joint_channel("q", joint)
@@ -99,7 +106,7 @@ def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
 
 
 def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
-    """Tell by how much joints of unknown delay trail their targets: delay and response of the drive in one."""
+    """Report by how much joints of unknown delay trail their targets: delay and response of the drive together."""
     if log.command != "q_target" or not joints:
         return
     n, most = log.samples(0.05), log.samples(LONGEST_TRAIL)
@@ -107,6 +114,7 @@ def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
     for joint in joints:
         pair = (log.recording.channels[joint_channel(name, joint)] for name in ("q_target", "q"))
         a, b = (np.gradient(uniform_filter1d(x, n)) for x in pair)
+        # row k of the view: the joint k samples later than its target
         a, b = a[: len(a) - most], np.lib.stride_tricks.sliding_window_view(b, len(a) - most)
         spread = np.linalg.norm(a) * np.linalg.norm(b, axis=1)
         match = np.divide(b @ a, spread, out=np.zeros_like(spread), where=spread > 0)

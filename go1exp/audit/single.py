@@ -1,4 +1,4 @@
-"""Checks of the clock, and of each channel by itself."""
+"""Checks of the clock, and of each channel alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
 
 
 def clock(log: Log) -> Iterator[Finding]:
-    """Rate against the metadata, jitter, gaps."""
+    """Compare the rate with the metadata; measure jitter and gaps."""
     steps = np.diff(log.t)
     nominal = 1 / log.recording.meta.rate_hz
     for factor, unit in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
@@ -29,6 +29,7 @@ def clock(log: Log) -> Iterator[Finding]:
         yield finding("rate", "t", "ok", 1 / log.dt, "Hz", message)
     else:
         yield finding("rate", "t", verdict, 1 / log.dt, "Hz", f"{message}, but rate_hz = {1 / nominal:g}")
+    # Robust: the median of the deviations, as a standard deviation, so that the gaps themselves do not count.
     usual = 1.4826 * float(np.median(np.abs(steps - log.dt)))
     long = steps > max(limits.GAP_STEPS * log.dt, log.dt + 6 * usual)
     jitter = float(np.std(steps[~long]))
@@ -52,7 +53,7 @@ def clock(log: Log) -> Iterator[Finding]:
 
 
 def stale(log: Log) -> tuple[list[Finding], dict[str, float]]:
-    """Rows and channels that repeat although they move; return the share by channel too."""
+    """Find rows and channels that repeat although they move; return the share of repeats by channel, too."""
     reach = log.samples(0.02, 3)
     findings: list[Finding] = []
     each = {c: signals.repeats(log.recording.channels[c], log.steps[c], reach) for c in log.measured}
@@ -76,7 +77,7 @@ def stale(log: Log) -> tuple[list[Finding], dict[str, float]]:
 
 
 def resolution(log: Log) -> Iterator[Finding]:
-    """Quantisation step, by the name of a known encoder where it is one."""
+    """Report the quantisation step of each channel, with the name of the encoder where it is a known one."""
     for name, step in log.steps.items():
         if step == 0:
             continue
@@ -90,7 +91,11 @@ def resolution(log: Log) -> Iterator[Finding]:
 
 
 def noise(log: Log, repeats: dict[str, float]) -> tuple[list[Finding], dict[str, float]]:
-    """Noise floor of each channel; judged where it looks like noise and neither stale samples nor motion make it."""
+    """Measure the noise floor of each channel.
+
+    It is judged only if it looks white and the channel has few stale samples, since both stale samples and motion look
+    like noise otherwise.
+    """
     findings, floors = [], {}
     for name, (sigma, white) in log.floors.items():
         if not np.isfinite(sigma):
@@ -109,7 +114,7 @@ def noise(log: Log, repeats: dict[str, float]) -> tuple[list[Finding], dict[str,
 
 
 def dead(log: Log) -> Iterator[Finding]:
-    """Channels that never change although what they measure does."""
+    """Find channels that never change although the robot moves."""
     meta = log.recording.meta
     moved = {}
     if log.recording.has("q"):
@@ -144,7 +149,10 @@ def dead(log: Log) -> Iterator[Finding]:
 
 
 def frozen(log: Log) -> Iterator[Finding]:
-    """Joint angles that stop changing although their target goes on; one at the end of its range may lean on a stop."""
+    """Find joint angles that stop changing although their target still moves.
+
+    An angle at the end of its range is left out: the joint may be pressed against a stop.
+    """
     if not (log.recording.has("q") and log.recording.has("q_target")):
         return
     q, target = log.recording.joint("q"), log.recording.joint("q_target")
@@ -169,11 +177,11 @@ def frozen(log: Log) -> Iterator[Finding]:
 
 
 def saturation(log: Log) -> Iterator[Finding]:
-    """Values that stick at an extreme."""
+    """Find values that are clipped at their largest or smallest."""
     for name in log.measured:
         quantity = log.quantity[name]
         if quantity in ("q", "base_pos", "imu_quat", "base_quat", "foot_force"):
-            continue  # an angle may well rest where it is largest, a force at zero
+            continue  # an angle may rest where it is largest, and a force at zero, without being clipped
         values = log.recording.channels[name]
         use = log.on if quantity == "tau_est" else np.ones(len(values), dtype=bool)
         if use.sum() < limits.ENOUGH or np.ptp(values[use]) == 0:
@@ -207,7 +215,7 @@ def _torque_limit(log: Log, joint: str) -> float | None:
 
 
 def ranges(log: Log) -> Iterator[Finding]:
-    """Angles beyond the stops, torques and speeds beyond their limits (Go1), angles in degrees (any robot)."""
+    """Check angles against stops, torques and speeds against limits (Go1), and for degrees (any robot)."""
     go1 = log.recording.meta.robot == "go1"
     for name, quantity in log.quantity.items():
         values = log.recording.channels[name]

@@ -66,12 +66,12 @@ def mcap_joint_state(
     tau_limit: tuple[Positive, ...] | None = None,
     excitation: str | None = None,
 ) -> list[Recording]:
-    """Joint states, and commands where there are some, from the MCAP log of any ROS 2 robot.
+    """Joint states, and commands if there are any, from the MCAP log of any ROS 2 robot.
 
     State ``position``, ``velocity``, ``effort`` become ``q``, ``qd``, ``tau_est``; command ``position`` and ``effort``
     become ``q_target`` and ``tau_cmd``, held from one command to the next; rows before the first command are left out.
-    A velocity or effort that is zero or NaN throughout was never filled in and has no column. Messages may be CDR or
-    JSON.
+    A velocity or effort that is zero or NaN throughout is taken as not measured and has no column. Messages may be CDR
+    or JSON.
 
     Args:
         path: a ``.mcap``, or a folder of them.
@@ -124,7 +124,7 @@ def _channels(
     messages: dict[str, list[_Message]],
     joints: tuple[str, ...],
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Columns in the order of ``joints``, and the notes."""
+    """Return the columns, in the order of ``joints``, and the notes."""
     everything = [m for topic in messages.values() for m in topic]
     stamped = all(m.stamp_ns > 0 for m in everything)
     clock = {k: np.array([m.stamp_ns if stamped else m.log_ns for m in v], np.int64) for k, v in messages.items()}
@@ -142,6 +142,7 @@ def _channels(
         return channels, notes
     if (np.diff(clock[command_topic]) < 0).any():
         raise RecordingError(f"{path}: {command_topic}: time runs backwards")
+    # index of the command in force at each state; -1 before the first
     held = np.searchsorted(clock[command_topic], now, side="right") - 1
     kept = held >= 0
     if not kept.any():
@@ -164,7 +165,7 @@ def _quantity(
     key: Fields,
     notes: list[str],
 ) -> dict[str, np.ndarray]:
-    """Columns of one field, by joint name; none if the field is empty in every message or was never filled in."""
+    """Return the columns of one field by name; none if the field is empty, or zero or NaN, in every message."""
     if not any(getattr(m.state, key) for m in messages):
         return {}
     rows, orders = [], {}
