@@ -62,7 +62,7 @@ UNIT_TOLERANCE = 1e-3
 """The length of a quaternion may differ from 1 by this (chosen: accepts values rounded to three decimals)."""
 
 RATE_FACTOR = 2.0
-"""The median step of ``t`` may differ from 1 / ``rate_hz`` by this factor (chosen: finds ms in place of s, allows jitter)."""
+"""The median step of ``t`` may differ from 1 / ``rate_hz`` by this factor (chosen: ms in place of s is refused)."""
 
 Joint = Annotated[str, Field(min_length=1)]
 Quaternion = tuple[float, float, float, float]

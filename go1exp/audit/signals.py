@@ -74,7 +74,7 @@ def noise(values: np.ndarray) -> tuple[float, bool]:
 
 @dataclass(frozen=True)
 class Repeats:
-    """Samples (T,) at which a channel moved, those of them that are stale, and the share of stale ones beyond chance."""
+    """Samples (T,) at which a channel moved, the stale ones of them, and the share of stale ones beyond chance."""
 
     moving: np.ndarray
     stale: np.ndarray

@@ -1,4 +1,4 @@
-"""``suite=env``: how much of bare MuJoCo's speed the environment keeps, and what it costs in memory."""
+"""``suite=env``: speed of the environment relative to bare MuJoCo, and memory per environment."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from go1exp.schema.joint_values import spread
 from go1exp.terrain import build_terrain
 
 ACTION_SCALE = 0.5
-"""Standard deviation of the random actions, policy units: robots step about and few fall."""
+"""Standard deviation of the random actions, policy units (chosen: robots move their feet and few fall)."""
 
 
 def core_subject(task: TaskConfig, num_envs: int) -> Subject:

@@ -1,4 +1,4 @@
-"""``suite=gpu``: what is left of MuJoCo Warp's speed in an environment step and in training, on the GPU at hand."""
+"""``suite=gpu``: speed of the environment step and of training relative to bare MuJoCo Warp, on this GPU."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from go1exp.train import trainer
 from go1exp.train.ppo import AdaptivePPO
 
 STEPS = 24
-"""Policy steps between two looks at the clock, which wait for the device."""
+"""Policy steps between two readings of the clock; each reading waits for the device."""
 
 PAPER_STEPS = 4096 * 24 * 5000
-"""What the paper's policy learnt from (section III-A)."""
+"""Policy steps in the training of the paper (section III-A)."""
 
 
 def gpu() -> str:
@@ -113,7 +113,7 @@ def train_subject(config: TrainConfig) -> Subject:
 
 
 def border_subject(config: TrainConfig) -> Subject:
-    """The same through SB3's own loop and buffer, every step in numpy."""
+    """Training through SB3's own loop and buffer, with every step in numpy."""
     core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=True)
     ppo = AdaptivePPO(config.ppo, Go1VecEnv(core), config.process.seed, "cuda")
     size = config.ppo.num_envs * config.ppo.steps

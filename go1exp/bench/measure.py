@@ -1,4 +1,4 @@
-"""Timing that survives a busy machine: subjects take turns, and the median of the rounds counts."""
+"""Timing that is robust on a busy machine: subjects run in turns, and the median of the rounds counts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import torch
 
 @dataclass(frozen=True)
 class Subject:
-    """Something to measure: ``work()`` does one unit and returns how many environment steps that was."""
+    """A piece of work to measure: ``work()`` does one unit and returns its number of environment steps."""
 
     label: str
     work: Callable[[], int]

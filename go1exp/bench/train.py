@@ -1,4 +1,4 @@
-"""``suite=train``: how much of the environment's speed is left when a policy learns from it."""
+"""``suite=train``: speed of training relative to the environment alone."""
 
 from __future__ import annotations
 

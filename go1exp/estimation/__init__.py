@@ -1,7 +1,7 @@
-"""Velocity and place of a legged robot's trunk from its IMU, joints and contacts: a Kalman filter in C++.
+"""Velocity and position of a legged robot's trunk from its IMU, joints and contacts: a Kalman filter in C++.
 
-``make_filter(go1())`` gives the compiled filter; ``sample`` builds its input. The layer below the runtime on the robot:
-NumPy and pydantic are all that it imports.
+``make_filter(go1())`` gives the compiled filter; ``sample`` builds its input. The runtime on the robot uses this
+package, so it imports nothing but NumPy and pydantic.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SOURCES = ("force", "torque", "height")
 
 
 class EstimatorError(Expected):
-    """The compiled filter is missing or cannot be loaded; the message says what to do."""
+    """The compiled filter is missing or cannot be loaded; the message says how to build it."""
 
 
 def compiled() -> ModuleType:
@@ -83,7 +83,7 @@ def make_filter(config: FilterConfig) -> _kalman.Filter:
 
 
 def _plain(module: ModuleType, name: str, value: object) -> object:
-    """Turn a setting into what the extension takes."""
+    """Convert a setting to the type that the extension takes."""
     if name == "legs":
         assert isinstance(value, tuple)
         return [

@@ -1,4 +1,4 @@
-"""The filter in NumPy: short, slow, and the oracle of the C++ one in the tests. docs/estimation.md derives it."""
+"""The filter in NumPy: short and slow; the tests compare the C++ one with it. docs/estimation.md has the equations."""
 
 from __future__ import annotations
 

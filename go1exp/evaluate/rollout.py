@@ -1,4 +1,4 @@
-"""How well a policy follows commands: a grid of constant commands, many episodes of each, all at once."""
+"""How well a policy follows commands: a grid of constant commands, several episodes of each, as one batch."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ AXES = ("x", "y", "yaw")
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """What to run a policy through.
+    """Settings of an evaluation.
 
     Attributes:
         commands: the grid.
@@ -37,13 +37,13 @@ class EvalConfig:
         duration_s: length of an episode, s.
         settle_s: time at its start that counts for falls but not for tracking, s.
         noise: add the observation noise of training.
-        randomize: randomise robots and starts as in training; else the nominal robot.
+        randomize: randomise robots and starts as in training; if not, the nominal robot.
         push: push as in training.
-        train_ground: the ground of training; else flat.
+        train_ground: use the ground of training; if not, flat ground.
         policy_dt: another period of the policy, s, or None for that of training.
-        seed: of everything random.
-        physics_dt: another step of the physics, s, or None for that of training.
-        trunk_velocity: what the policy sees of it: ``exact``, or ``estimated`` by the filter from the robot's sensors.
+        seed: seed of everything random.
+        physics_dt: another physics step, s, or None for that of training.
+        trunk_velocity: velocity that the policy observes: ``exact``, or ``estimated`` from the sensors by the filter.
     """
 
     commands: tuple[Command, ...]
@@ -61,16 +61,16 @@ class EvalConfig:
 
     @classmethod
     def from_settings(cls, settings: Any, **changes: Any) -> EvalConfig:
-        """Take what ``settings`` (of a verb) has of these attributes; ``changes`` give the rest."""
+        """Build from those attributes that ``settings`` (of a verb) has; ``changes`` give the others."""
         shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(cls) if hasattr(settings, f.name)}
         return cls(**{**shared, **changes})
 
 
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
-    """Return the task in which a policy trained on ``task`` is judged: on the CPU, wherever it was trained.
+    """Return the task in which a policy trained on ``task`` is evaluated; always on the CPU.
 
     Raises:
-        ConfigError: if the times do not divide each other.
+        ConfigError: if physics step and policy period do not fit each other.
     """
     period = config.policy_dt or task.sim.policy_dt
     beyond = (math.ceil(config.duration_s / period) + 1) * period  # no time limit within the evaluation
@@ -98,7 +98,7 @@ def evaluate(
     """Run the grid and return a report of plain data.
 
     A robot counts until it falls. Tracking figures of a command are over all its robots and the time after
-    ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is told the progress in steps.
+    ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
     """
     count = len(config.commands) * config.episodes
     estimated = config.trunk_velocity == "estimated"

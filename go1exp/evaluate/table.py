@@ -35,7 +35,7 @@ def _summary(report: dict[str, Any]) -> str:
 
 
 def text(report: dict[str, Any]) -> str:
-    """Lay the report out for a terminal; m/s and rad/s."""
+    """Return the report as text for a terminal; m/s and rad/s."""
     lines = [HEADER, *rows(report)]
     widths = [max(len(line[k]) for line in lines) for k in range(len(HEADER))]
     laid = ["  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)) for line in lines]
@@ -43,6 +43,6 @@ def text(report: dict[str, Any]) -> str:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """Lay the report out for a document."""
+    """Return the report as a Markdown table."""
     lines = [f"| {' | '.join(line)} |" for line in [HEADER, ("---",) * len(HEADER), *rows(report)]]
     return "\n".join([*lines, "", _summary(report)])

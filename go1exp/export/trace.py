@@ -1,4 +1,4 @@
-"""Some seconds of the environment under a policy: what its sensors said, and what the environment made of it."""
+"""The trace: some seconds of the environment under a policy, inputs and outputs of each step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from go1exp.schema.backends import CpuBackend
 
 
 def readings(core: Go1Core) -> dict[str, Tensor]:
-    """Return what the robots' sensors and computers know at this moment, (N, size) by name, without noise."""
+    """Return the present readings of the robots' sensors and computers, (N, size) by name, without noise."""
     s = core.snapshot()
     assert s.base_lin_vel_b is not None
     measured = Measured(s.joint_pos, s.joint_vel, gyro=s.base_ang_vel_b, quat=s.base_quat_w)
@@ -40,7 +40,7 @@ def readings(core: Go1Core) -> dict[str, Tensor]:
 
 
 def traced_task(task: TaskConfig, seconds: float) -> TaskConfig:
-    """Return the task in which a trace is recorded: that of training, in one piece, on the CPU and on one thread."""
+    """Return the task in which a trace is recorded: that of training, as one episode, on the CPU with one thread."""
     period = task.sim.policy_dt
     sim = dataclasses.replace(task.sim, episode_s=(round(seconds / period) + 2) * period, spread_starts=False)
     return dataclasses.replace(task, sim=sim, backend=CpuBackend("cpu", threads=1), curriculum=())
@@ -56,16 +56,16 @@ def record(
 ) -> dict[str, np.ndarray]:
     """Run one robot and return ``time``, ``input.NAME`` and ``output.NAME``, a row per policy step.
 
-    Observations, actions and targets are the environment's own. The step that ends an episode is left out, since the
-    environment begins the next one before it can be asked.
+    Observations, actions and targets are those of the environment. The step that ends an episode is left out, because
+    the environment starts the next episode within that step.
 
     Args:
-        task: of the training; its robot, ground, commands and pushes are drawn as in training, without noise.
+        task: task of the training; its robot, ground, commands and pushes are drawn as in training, without noise.
         policy: observations (N, O) -> actions (N, 12).
         inputs: the readings to keep.
-        seconds: length.
-        seed: of everything random.
-        on_step: told the progress in steps.
+        seconds: length, s.
+        seed: seed of everything random.
+        on_step: called with the progress in steps.
     """
     core = Go1Core(traced_task(task, seconds), 1, seed, noise=False)
     observation = core.reset()

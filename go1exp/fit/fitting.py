@@ -24,19 +24,19 @@ OnProgress = Callable[[str, int, int, float, float], None]
 """``on_progress(what, done, total, train, validation)``: ``net hip`` or ``half net hip``, epochs, RMSE in N m."""
 
 SLACK = 0.9
-"""Taps may lie this part of a sampling period apart: a nominal 500 Hz clock that runs at 498 Hz still takes 2 ms."""
+"""Smallest distance of taps in sampling periods: a nominal 500 Hz clock that runs at 498 Hz still allows 2 ms."""
 
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """What a fit found.
+    """The result of a fit.
 
     Attributes:
         net: the network.
-        report: its errors, and the references', on the held-out episodes.
+        report: errors of the network and of the references on the held-out episodes.
         rows: the held-out rows; ``rows.episode`` indexes ``episodes``.
         episodes: names of all episodes.
-        torque: model -> torque at ``rows`` ``(R,)``, N m: ``net`` and the references that there are.
+        torque: model -> torque at ``rows`` ``(R,)``, N m: ``net`` and the available references.
         curves: group -> (epochs, 2) root mean square errors of training and validation, N m.
     """
 
@@ -58,8 +58,8 @@ def fit(
 
     Args:
         recordings: of one robot, one episode each.
-        settings: how.
-        on_progress: told of every epoch.
+        settings: how to fit.
+        on_progress: called after every epoch.
         joint_torque: torque at the joints of a recording, for ``settings.target = "joint_torque"``.
 
     Raises:
@@ -240,7 +240,7 @@ def _common(recordings: Sequence[Recording], settings: FitSettings) -> tuple[str
 def _gains(
     recordings: Sequence[Recording], settings: FitSettings
 ) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
-    """Return the gains that all recordings share, None where they differ and the net does not see the target."""
+    """Return the gains that all recordings share; None where they differ and the net does not use the target."""
     gains = []
     for key in ("kp", "kd"):
         values = {getattr(r.meta, key) for r in recordings}

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 OPSET = 20
 IR_VERSION = 10
-"""The IR of that opset, which every runtime that knows the opset reads."""
+"""Version of the intermediate representation that belongs to this opset."""
 
 
 def write_onnx(
@@ -32,7 +32,7 @@ def write_onnx(
         weights: layer by layer (K, in, out), normalisation folded in.
         biases: layer by layer (K, out).
         skip: linear map beside them, (K, F, 1); left out where it is zero.
-        about: the model's metadata, for whoever feeds it.
+        about: metadata of the model: what a program must know to compute its inputs.
     """
     import onnx
     from onnx import TensorProto, helper

@@ -1,4 +1,4 @@
-"""Kinds of motion that an actuator model can be good or bad at, told apart by each joint's own speed and torque."""
+"""Kinds of motion for which the errors of an actuator model are reported, by speed and torque of each joint."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 from go1exp.fit.dataset import Rows
 
 STILL, FAST, HIGH = 0.05, 0.5, 0.7
-"""Parts of a joint's speed scale below which it is still, above which fast; part of its torque scale that is high."""
+"""Share of a joint's speed scale below which it is still; above which it is fast; share of its torque scale that is
+high."""
 
 QUANTILE = 0.99
-"""The scales are this quantile of |speed| and |torque| over all recordings: a rare spike sets no scale."""
+"""The scales are this quantile of |speed| and |torque| over all recordings, so that rare spikes have no effect."""
 
 REVERSAL = 0.02
 """s; rows this close to a change of the velocity's sign count as reversal."""
@@ -22,7 +23,7 @@ REGIMES = ("all", "still", "slow", "fast", "reversal", "high torque")
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Limits of the regimes of one joint: speeds rad/s, torque N m, time s; None where there is no velocity."""
+    """Limits of the regimes of one joint: speeds rad/s, torque N m, time s; None if there is no velocity."""
 
     joint: str
     still_below: float | None
@@ -32,7 +33,7 @@ class Thresholds:
 
 
 def thresholds(rows: Rows, joints: tuple[str, ...]) -> list[Thresholds]:
-    """Derive each joint's limits from ``rows``, which should be those of all recordings."""
+    """Compute the limits of each joint from ``rows``, which should be those of all recordings."""
     limits = []
     for j, joint in enumerate(joints):
         joint_rows = rows.take(rows.joint == j)
@@ -63,7 +64,7 @@ def masks(rows: Rows, limits: list[Thresholds]) -> dict[str, np.ndarray]:
 
 
 def as_text(limits: list[Thresholds]) -> list[str]:
-    """Say the limits in one line per joint."""
+    """Return one line per joint with its limits."""
     lines = []
     for x in limits:
         values = asdict(x)

@@ -63,7 +63,7 @@ def scaler_walk_mocap(
 ) -> list[Recording]:
     """Walk of the 8.8 kg quadruped SCALER with motion-capture truth, from .npz.
 
-    Joints are ``FL_1`` ... ``RL_3`` in the source's order FL FR RR RL. ``foot_force_FL`` ... are magnitudes, because the
+    Joints are ``FL_1`` ... ``RL_3`` in the source's order FL FR RR RL. ``foot_force_FL`` ... are magnitudes: the
     axes of the sensor are not those of the body. A leg whose sensor gave nothing, or was broken throughout, has no
     column. Rows whose joints or IMU are not finite, or whose time does not advance, are left out.
 

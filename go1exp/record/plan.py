@@ -1,4 +1,4 @@
-"""From what a user wants recorded to the list of episodes."""
+"""Makes the list of episodes to record from the user's settings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Episode:
         kd: speed gain, N m s/rad.
         hang: roll and pitch at which a held trunk hangs, rad; None on the ground.
         repeat_of: name of the episode that this one repeats.
-        seed: of the logger's noise.
+        seed: seed of the logger's noise.
     """
 
     name: str
@@ -71,10 +71,12 @@ def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion
 
 
 def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
-    """Return every motion x seed x base x gain set, and the repetitions.
+    """Return an episode for each combination of motion, seed, base and gain set, and then the repetitions.
+
+    The first episode of each gain set is repeated.
 
     Raises:
-        ConfigError: if a motion cannot be made on the base that is wanted.
+        ConfigError: if a motion cannot be made on the wanted base, or two episodes would have one name.
     """
     planned: list[Episode] = []
     for term in terms:

@@ -1,4 +1,4 @@
-"""Drive simulated robots through motions and return what their loggers wrote."""
+"""Moves simulated robots and returns their recordings."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Rig:
-    """The robots of a recording: what they are, how they are driven, and the step at which they are simulated, s."""
+    """The robots of a recording: model, drives, effects, ground, engine, and the physics step, s."""
 
     robot: RobotConfig
     actuator: Term
@@ -50,7 +50,7 @@ class Rig:
 
 
 def held_quat(hang: tuple[float, float]) -> tuple[float, float, float, float]:
-    """Return the attitude w-x-y-z of a trunk that hangs with this roll and pitch, rad (about x, then about y)."""
+    """Return the attitude w-x-y-z of a trunk held at this roll and pitch, rad (about x, then about y)."""
     w, x, y, z = Rotation.from_euler("xyz", [*hang, 0.0]).as_quat(scalar_first=True)
     return float(w), float(x), float(y), float(z)
 
@@ -58,7 +58,8 @@ def held_quat(hang: tuple[float, float]) -> tuple[float, float, float, float]:
 def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
     """Simulate episodes side by side and return their recordings, in the same order.
 
-    All must last equally long. Those that hang alike, or stand, share a batch. ``on_step`` is told the progress.
+    All must be of equal length. Episodes with the same base (held at the same attitude, standing, or dropped) are
+    simulated as one batch. ``on_step`` is called with the progress.
     """
     recordings: dict[str, Recording] = {}
     places = list(dict.fromkeys((e.hang, e.motion.height > 0) for e in episodes))
@@ -153,7 +154,7 @@ def _follow_motions(
 
 
 def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[str, np.ndarray]) -> Recording:
-    """Write one robot's log."""
+    """Return the recording of one robot."""
     return Recording(
         meta(
             rig.robot,
@@ -171,7 +172,7 @@ def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[
 
 
 def meta(config: RobotConfig, sensors: SensorConfig, **changes: Any) -> Meta:
-    """Describe a recording of a simulated Go1; nothing in it tells which effects it has."""
+    """Return the metadata of a simulated Go1's recording; they do not reveal which effects the robot has."""
     limit = tuple(float(v) for v in robot.per_joint(config.effort_limit))
     usual: dict[str, Any] = {"robot": "go1", "joints": robot.JOINTS, "rate_hz": sensors.rate_hz, "tau_limit": limit}
     about: dict[str, Any] = {"source": "simulated", "tool": "go1exp record", "notes": ""}
@@ -202,9 +203,9 @@ class Walk:
     Attributes:
         trained: the task that it was trained in.
         policy: observations (N, O) -> actions (N, 12).
-        names: of the episodes, one robot each.
-        seconds: length of each.
-        hang: roll and pitch of a held trunk, rad, for a policy that treads the air; None on the ground.
+        names: names of the episodes, one robot each.
+        seconds: length of each, s.
+        hang: roll and pitch of a held trunk, rad, if the feet are to be in the air; None on the ground.
     """
 
     trained: TaskConfig
@@ -215,7 +216,7 @@ class Walk:
 
 
 def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
-    """Let a policy move robots under random commands and return the recordings.
+    """Move robots by a policy under random commands and return the recordings.
 
     A robot that falls is recorded up to its fall.
     """
@@ -260,6 +261,6 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
 
 
 def _configured(actuator: Term, gain: str) -> tuple[float, ...] | None:
-    """Return a gain as it is configured (not as effects make it), per joint; None if the actuator has none."""
+    """Return a gain as configured, per joint, without the effects on it; None if the actuator has no gains."""
     value = next((term.parameters[gain] for term, _ in drives(actuator) if gain in term.parameters), None)
     return None if value is None else tuple(float(v) for v in spread(value, robot.JOINTS))
