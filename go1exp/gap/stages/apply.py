@@ -14,6 +14,7 @@ import numpy as np
 from go1exp.config import parse_parts
 from go1exp.effects.base import Effect, Param
 from go1exp.effects.tolerances import Tolerances
+from go1exp.files import write_text
 from go1exp.gap.comparison import Comparison, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.files import GapFileError
@@ -86,7 +87,7 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
         path.unlink(missing_ok=True)
         if lines or name == EFFECT:
             head = [f"# {about}", *_provenance(result)]
-            path.write_text("\n".join([*head, *(lines or ["{}"])]) + "\n")
+            write_text(path, "\n".join([*head, *(lines or ["{}"])]) + "\n")
             written.append(path)
     return tuple(written)
 
