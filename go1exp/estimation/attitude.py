@@ -26,6 +26,7 @@ def levelled(
             may begin in the middle of a walk.
     """
     up = acc[t <= t[0] + first].mean(axis=0)
+    # Roll and pitch that bring the mean acceleration onto the vertical; the heading is not observable.
     roll, pitch = np.arctan2(up[1], up[2]), np.arctan2(-up[0], np.hypot(up[1], up[2]))
     rotation = Rotation.from_euler("ZYX", [0.0, pitch, roll])
     rotations = [rotation]
