@@ -41,5 +41,4 @@ def levelled(
 
 def vertical(quat: np.ndarray) -> np.ndarray:
     """Return the z axis of the world in the body frame, ``(T, 3)``, for attitudes w-x-y-z ``(T, 4)``."""
-    w, x, y, z = quat.T
-    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    return Rotation.from_quat(quat, scalar_first=True).as_matrix()[:, 2]
