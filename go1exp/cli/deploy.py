@@ -20,7 +20,7 @@ def _task(container: dict[str, Any]) -> int:
 
     from go1exp.cli.logs import writable
     from go1exp.deploy.commands import Wish
-    from go1exp.deploy.job import Job, do
+    from go1exp.deploy.job import Job, run_job
     from go1exp.deploy.launch import RefusedError
     from go1exp.deploy.walk import Plan
 
@@ -30,7 +30,7 @@ def _task(container: dict[str, Any]) -> int:
     plan = Plan(wish=wish, **{f.name: given[f.name] for f in dataclasses.fields(Plan) if f.name != "wish"})
     job = Job(settings.bundle, settings.link, plan, settings.out, given["sim"], other, settings.truth)
     try:
-        return do(job, lambda line: print(line, flush=True))
+        return run_job(job, lambda line: print(line, flush=True))
     except RefusedError as error:
         raise ConfigError(error.problems) from None
 

@@ -90,6 +90,7 @@ def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Gen
         channels |= dict(
             zip(VECTORS[f"imu_{name}"], _with_errors(true[name], getattr(config, name), rng).T, strict=True)
         )
+    # The error is a small rotation in the body's axes, so that it does not depend on the attitude.
     error = Rotation.from_rotvec(config.attitude.noise * rng.standard_normal((rows, 3)))
     attitude = Rotation.from_quat(true["quat"], scalar_first=True) * error
     quat = _quantised(attitude.as_quat(canonical=True, scalar_first=True), config.attitude)
@@ -102,6 +103,7 @@ def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Gen
         for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel"):
             if name in true:
                 channels |= dict(zip(VECTORS[name], true[name].T, strict=True))
+    # Samples are lost after everything else is drawn: the noise of the others does not depend on the loss.
     kept = rng.random(rows) >= config.dropped
     kept[0] = True
     return {name: np.ascontiguousarray(values[kept]) for name, values in channels.items()}
