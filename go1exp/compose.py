@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
-from hydra.core.config_store import ConfigStore
+from hydra import initialize
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from go1exp import data_root
-
-
-def config_folder() -> str:
-    """Return the absolute path of ``conf/``."""
-    return str(data_root() / "conf")
-
-
-def register_groups() -> None:
-    """Make the files of ``conf/randomization`` the group ``rand``: Hydra takes a group's name from its folder."""
-    for file in sorted((data_root() / "conf/randomization").glob("*.yaml")):
-        ConfigStore.instance().store(group="rand", name=file.stem, node=OmegaConf.load(file), provider=str(file))
+from go1exp.config_source import seen_by
 
 
 def as_container(config: DictConfig) -> dict[str, Any]:
@@ -32,11 +22,17 @@ def as_container(config: DictConfig) -> dict[str, Any]:
     return {str(k): v for k, v in container.items()}
 
 
-def compose(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Compose ``conf/<name>.yaml`` with command-line overrides outside a Hydra application."""
-    register_groups()
+@contextmanager
+def hydra_for(name: str, folders: Sequence[Path] = ()) -> Iterator[None]:
+    """Set Hydra up for what ``conf/<name>.yaml`` may choose from, with a user's ``folders`` of further choices."""
     GlobalHydra.instance().clear()
-    with initialize_config_dir(config_folder(), version_base="1.3"):
+    with seen_by(name, folders), initialize(config_path=None, version_base="1.3"):
+        yield
+
+
+def compose(name: str, overrides: Sequence[str] = (), folders: Sequence[Path] = ()) -> dict[str, Any]:
+    """Compose ``conf/<name>.yaml`` with command-line overrides outside a Hydra application."""
+    with hydra_for(name, folders):
         return as_container(hydra_compose(name, list(overrides)))
 
 
@@ -44,12 +40,12 @@ def key_values(container: Any, path: str = "") -> dict[str, Any]:
     """Flatten nested mappings: every key path, with its value (a mapping's own path is there too, with None)."""
     if not isinstance(container, dict):
         return {path: container}
-    found: dict[str, Any] = {path: None} if path else {}
+    flat: dict[str, Any] = {path: None} if path else {}
     for key, value in container.items():
-        found |= key_values(value, f"{path}.{key}" if path else str(key))
-    return found
+        flat |= key_values(value, f"{path}.{key}" if path else str(key))
+    return flat
 
 
-def flat_keys(name: str, overrides: Sequence[str] = ()) -> list[str]:
+def flat_keys(name: str, overrides: Sequence[str] = (), folders: Sequence[Path] = ()) -> list[str]:
     """Return every key path of ``conf/<name>.yaml`` composed with ``overrides``, groups included."""
-    return list(key_values(compose(name, overrides)))
+    return list(key_values(compose(name, overrides, folders)))

@@ -226,7 +226,7 @@ def test_a_file_can_be_added_where_a_verb_has_no_choice_of_the_group(tmp_path: P
     file.write_text(FILES["mine.yaml"])
     assert "effect" not in compose("gap", [])
     for given in (f"+effect={file}", f"+effect=[{file}]"):
-        assert compose("gap", choices_from_files([given]))["effect"] == {"coulomb": {"bound": 0.3}}
+        assert compose("gap", choices_from_files([given], "gap"))["effect"] == {"coulomb": {"bound": 0.3}}
     assert_refused(
         tmp_path, ["gap", f"+effect={tmp_path}/nowhere.yaml"], f"effect={tmp_path}/nowhere.yaml: no such file"
     )
@@ -297,20 +297,6 @@ def name(verb: str) -> str:
     return verb.replace(" ", "_")
 
 
-@pytest.mark.parametrize("verb", EVERY)
-def test_the_help_of_every_verb_says_what_it_does_its_settings_and_examples(verb: str, tmp_path: Path) -> None:
-    done = cli(tmp_path, *verb.split(), "--help")
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert done.stdout.startswith(f"go1exp {verb}: ")
-    settings, examples = done.stdout.split("Examples:")
-    assert len(re.findall(rf"^  go1exp {verb}\b", examples, re.MULTILINE)) >= 2
-    for key in map(str, OmegaConf.load(data_root() / f"conf/{name(verb)}.yaml")):
-        if key not in ("defaults", "hydra"):
-            assert re.search(rf"^{key}:", settings, re.MULTILINE), key
-    assert list(tmp_path.iterdir()) == []
-
-
 EXAMPLES = [
     line.strip()
     for verb in EVERY
@@ -333,7 +319,7 @@ def test_the_examples_of_the_help_are_commands_that_exist(
         verb, overrides = f"{verb}_{overrides[0]}", overrides[1:]
     if "-m" in overrides:
         overrides = [override.split(",")[0] for override in overrides if override != "-m"]
-    compose(verb, choices_from_files(_by_name(verb, overrides)))
+    compose(verb, choices_from_files(_by_name(verb, overrides), verb))
 
 
 @pytest.mark.parametrize(
@@ -342,11 +328,11 @@ def test_the_examples_of_the_help_are_commands_that_exist(
         ("list", ["effects"], ["group='effects'"]),
         ("list", ["what=terms", "effects"], ["what=terms", "group='effects'"]),
         ("record_audit", ["a.parquet", "b.parquet", "out=x"], ["out=x", "files=['a.parquet','b.parquet']"]),
-        ("record_audit", ["files=[a]", "--cfg", "job"], ["files=[a]", "--cfg", "job"]),
+        ("record_audit", ["files=[a]", "--cfg", "job"], ["--cfg", "job", "files=[a]"]),
         ("record_import", ["go2_in_air", "logs/it's.csv"], ["source='go2_in_air'", r"path='logs/it\'s.csv'"]),
         ("export_check", ["walk.zip"], ["file='walk.zip'"]),
         ("export", ["run=x", "walk.zip"], ["run=x", "walk.zip"]),
-        ("deploy", ["walk.zip", "robot=sim", "command=[1,0,0]"], ["link=sim", "commands=[1,0,0]", "bundle='walk.zip'"]),
+        ("deploy", ["walk.zip", "robot=sim", "command=[1,0,0]"], ["robot=sim", "command=[1,0,0]", "bundle='walk.zip'"]),
         ("deploy", ["robots=sim", "sim.loss=0"], ["robots=sim", "sim.loss=0"]),
         ("record_import", ["go2_in_air", "a", "b"], ["source='go2_in_air'", "path='a'", "b"]),
         ("train", ["reward=paper", "word"], ["reward=paper", "word"]),

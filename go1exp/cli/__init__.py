@@ -39,9 +39,6 @@ POSITIONAL: dict[str, tuple[str, ...]] = {
 }
 """Settings that may be given by position alone; ``files`` takes all that are left."""
 
-ALIASES = {"deploy": {"robot": "link", "command": "commands"}, "eval": {"observation": "trunk_velocity"}}
-"""Settings by the names that users give them where a group of choices has that name; Hydra would take that one."""
-
 VALUED = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn")
 """Options of Hydra whose value is the word after them."""
 
@@ -86,31 +83,37 @@ def main() -> int:
         return 2
     if rest and rest[0] in SUBVERBS.get(verb, ()):
         verb, rest = f"{verb}_{rest[0]}", rest[1:]
+    if {"-h", "--help"} & {*rest}:
+        from go1exp.cli.helptext import show
+
+        show(verb, f"go1exp {verb.replace('_', ' ')}", rest)
+        return 0
     return _module(verb).APP.run(_by_name(verb, rest))
 
 
 def _by_name(verb: str, arguments: list[str]) -> list[str]:
-    """Turn arguments by position into ``key=value``: those that are no override, no option and no option's value."""
+    """Turn arguments by position into ``key=value``: those that are no override, no option and no option's value.
+
+    Options come first: Hydra's parser takes none between overrides.
+    """
     keys = list(POSITIONAL.get(verb, ()))
     words: list[str] = []
-    rest: list[str] = []
-    for before, given in zip(["", *arguments], arguments, strict=False):
-        word = _own_name(verb, given)
-        own = "=" in word or word.startswith(("-", "~")) or before in VALUED
-        (rest if own or not keys else words).append(word)
+    options: list[str] = []
+    settings: list[str] = []
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        if word.startswith("-") or before in VALUED:
+            options.append(word)
+        elif "=" in word or word.startswith("~") or not keys:
+            settings.append(word)
+        else:
+            words.append(word)
     named = []
     for key in keys:
         if key == "files" and words:
-            return [*rest, f"files=[{','.join(_quoted(w) for w in words)}]"]
+            return [*options, *settings, f"files=[{','.join(_quoted(w) for w in words)}]"]
         if words:
             named.append(f"{key}={_quoted(words.pop(0))}")
-    return [*rest, *named, *words]
-
-
-def _own_name(verb: str, word: str) -> str:
-    """Return an override with the key that the verb's configuration has for it."""
-    key, equals, value = word.partition("=")
-    return ALIASES.get(verb, {}).get(key, key) + equals + value
+    return [*options, *settings, *named, *words]
 
 
 def _quoted(word: str) -> str:

@@ -8,7 +8,8 @@ from go1exp.cli.app import App, spinner
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import ExportSettings, checkpoint_file, parse, trained
+    from go1exp.cli.runs import checkpoint_file, trained
+    from go1exp.cli.settings import ExportSettings, parse
 
     settings = parse(ExportSettings, container)
     run, out = trained(settings.run, settings.policy, "bundle.zip", settings.out)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
-from go1exp.schema.registry import ConfigError, explain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,27 +34,14 @@ def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import FitActuatorSettings, parse
-    from go1exp.config import parse_parts
+    from go1exp.cli.settings import FitActuatorSettings, parse_with_groups
+    from go1exp.schema.settings import subset
 
-    parts, problems = parse_parts(container, ("robot",))
-    try:
-        settings = parse(FitActuatorSettings, {k: v for k, v in container.items() if k != "robot"})
-    except ConfigError as error:
-        raise ConfigError([*problems, *error.problems]) from None
-    if problems:
-        raise ConfigError(problems)
-
-    from pydantic import ValidationError
+    settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
     from go1exp import fit
     from go1exp.cli.logs import read_all, writable
 
-    own = {f.name: getattr(settings, f.name) for f in fields(fit.FitSettings)}
-    try:
-        how = fit.FitSettings(**own)
-    except ValidationError as error:
-        raise ConfigError(explain(error, "", own)) from None
     out = writable(settings.out)
     recordings = read_all(settings.recordings)
     bar = spinner(settings.epochs, "fitting")
@@ -71,7 +56,7 @@ def _task(container: dict[str, Any]) -> None:
     if settings.target == "joint_torque" and settings.smoothing is None:
         print("note: smoothing=0.02 usually serves target=joint_torque better (docs/actuators.md)")
     inverse = _inverse_dynamics(parts["robot"], settings.smoothing) if settings.target == "joint_torque" else None
-    result = fit.fit(recordings, how, progress, inverse)
+    result = fit.fit(recordings, subset(fit.FitSettings, settings), progress, inverse)
     result.net.save(out / "net.npz")
     result.net.export_onnx(out / "net.onnx")
     (out / "report.json").write_text(json.dumps(result.report.as_dict(), indent=2) + "\n")

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from go1exp.cli.app import App, spinner
-from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb
@@ -24,21 +23,10 @@ DOES_NOT_HOLD = 15
 
 
 def _task(container: dict[str, Any]) -> int:
-    from go1exp.cli.settings import GapVerb, parse
-    from go1exp.config import parse_parts
+    from go1exp.cli.settings import GapVerb, parse_with_groups
     from go1exp.gap.models import parse_model
 
-    parts, problems = parse_parts(container, ("robot",))
-    try:
-        settings = parse(GapVerb, {k: v for k, v in container.items() if k not in ("robot", "model")})
-    except ConfigError as error:
-        problems += error.problems
-    try:
-        model = parse_model(container["model"])
-    except ConfigError as error:
-        problems += error.problems
-    if problems:
-        raise ConfigError(problems)
+    settings, parts = parse_with_groups(GapVerb, container, ("robot",), model=parse_model)
     out = Path(settings.out)
 
     from go1exp.cli.logs import read_all, writable
@@ -52,7 +40,7 @@ def _task(container: dict[str, Any]) -> int:
 
     from go1exp.gap.machine import machine_of
 
-    machine = machine_of(model, parts["robot"])
+    machine = machine_of(parts["model"], parts["robot"])
     if settings.stage == "check":
         return _check(recordings, machine, settings)
     if settings.stage == "localise":

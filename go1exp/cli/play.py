@@ -10,7 +10,8 @@ from go1exp.cli.app import App, spinner
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import PlaySettings, checkpoint_file, parse, trained
+    from go1exp.cli.runs import checkpoint_file, trained
+    from go1exp.cli.settings import PlaySettings, parse
 
     other, container = other_robot.split(container)
     settings = parse(PlaySettings, container)

@@ -9,10 +9,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
+from go1exp.choices import config_folder
 from go1exp.cli.app import STOPPED, App, discard, run_dir
-from go1exp.cli.settings import run_folder as existing
-from go1exp.cli.settings import shipped_policies
-from go1exp.compose import config_folder, key_values
+from go1exp.cli.runs import run_folder as existing
+from go1exp.cli.runs import shipped_policies
+from go1exp.compose import key_values
 from go1exp.schema.registry import ConfigError, Expected
 
 RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "backend")
