@@ -405,62 +405,6 @@ def test_blas_has_one_thread_unless_the_user_says_otherwise(given: str | None, m
     assert os.environ[variable] == (given or one)
 
 
-# ---------------------------------------------------------------------- tab completion
-
-
-@pytest.mark.parametrize(
-    ("line", "offered"),
-    [
-        ("go1exp ", set(VERBS)),
-        ("go1exp tr", {"train"}),
-        ("go1exp train rand=ta", {"rand=table1"}),
-        ("go1exp train rand=table1 ppo.iterat", {"ppo.iterations="}),
-        ("go1exp eval epis", {"episodes="}),
-        ("go1exp trian rand=ta", set()),
-        ("go1exp record au", {"audit"}),
-        ("go1exp record seco", {"seconds="}),
-        ("go1exp record effect=cou", {"effect=coulomb"}),
-        ("go1exp record audit ou", {"out="}),
-        ("go1exp record import opt", {"options="}),
-        ("go1exp export ch", {"check", "checkpoint="}),
-        ("go1exp export seco", {"seconds="}),
-        ("go1exp export check fi", {"file="}),
-        ("go1exp fit-actuator epo", {"epochs=", "epoch_rows="}),
-    ],
-)
-def test_tab_completes(line: str, offered: set[str], tmp_path: Path) -> None:
-    done = cli(tmp_path, "-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
-    assert done.returncode == 0
-    assert set(done.stdout.split()) == offered
-    assert done.stderr == ""
-
-
-def test_tab_offers_words_and_settings_after_a_verb_that_has_both(tmp_path: Path) -> None:
-    line = "go1exp record "
-    done = cli(tmp_path, "-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
-    assert {*SUBVERBS["record"], "seconds=", "effect="} <= set(done.stdout.split())
-
-
-def test_tab_completes_in_a_real_bash(tmp_path: Path) -> None:
-    program = tmp_path / "bin/go1exp"
-    program.parent.mkdir()
-    program.write_text(f"#!/bin/sh\nexec '{sys.executable}' -c '{COMMAND_LINE}' \"$@\"\n")
-    program.chmod(0o755)
-    script = """
-eval "$(go1exp -sc install=bash)"
-complete -p go1exp
-COMP_LINE="go1exp train rand=ta"; COMP_POINT=${#COMP_LINE}; COMP_WORDS=($COMP_LINE); COMP_CWORD=2
-$(complete -p go1exp | sed 's/.*-F \\([^ ]*\\).*/\\1/')
-echo "offered: ${COMPREPLY[@]}"
-"""
-    path = f"{program.parent}:{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": path, "PYTHONPATH": str(data_root())}
-    done = subprocess.run(
-        ["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
-    )
-    assert "offered: rand=table1" in done.stdout, done.stderr
-
-
 # ---------------------------------------------------------------------- verbs
 
 

@@ -64,7 +64,9 @@ def main() -> int:
     os.environ.setdefault(*ONE_BLAS_THREAD)
     arguments = sys.argv[1:]
     if arguments[:1] == ["-sc"] and len(arguments) > 1:
-        return _complete(arguments[1])
+        from go1exp.cli import completion
+
+        return completion.serve(arguments[1])
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(HELP.format(verbs="\n".join(f"  {verb:12} {text}" for verb, text in VERBS.items())), end="")
         return 0
@@ -123,25 +125,3 @@ def _quoted(word: str) -> str:
 
 def _module(verb: str):  # type: ignore[no-untyped-def]  # a module with an APP
     return importlib.import_module(f"go1exp.cli.{MODULES.get(verb, verb)}")
-
-
-def _complete(request: str) -> int:
-    """Serve tab completion: verbs here, everything after the verb by that verb's Hydra application."""
-    action, _, shell = request.partition("=")
-    line = os.environ.get("COMP_LINE", "")
-    words = line.split(" ")
-    if action == "query" and len(words) <= 2:
-        print("\n".join(v for v in VERBS if v.startswith(words[-1] if len(words) == 2 else "")))
-        return 0
-    verb, after = words[1] if action == "query" else "train", words[2:]
-    if verb not in VERBS:
-        return 0
-    if action == "query":
-        second = SUBVERBS.get(verb, ())
-        if len(after) > 1 and after[0] in second:
-            verb, after = f"{verb}_{after[0]}", after[1:]
-        elif len(after) == 1:
-            print("".join(f"{word}\n" for word in second if word.startswith(after[0])), end="", flush=True)
-        os.environ["COMP_LINE"] = " ".join([words[0], *after])
-        os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
-    return _module(verb).APP.run(["-sc", f"{action}={shell}"])

@@ -1,7 +1,7 @@
 """The one idiom for settings: a frozen dataclass that pydantic checks, its attributes documented in its docstring.
 
-``settings`` makes such a class, ``parse`` fills it from a composed configuration, ``lines`` returns what each key means,
-which is what ``--help`` prints.
+``settings`` makes such a class, ``parse`` fills it from a composed configuration, ``lines`` returns what each key
+means, which is what ``--help`` prints.
 """
 
 from __future__ import annotations
