@@ -33,9 +33,13 @@ def conf(verb: str) -> str:
 def helped(*words: str) -> str:
     """What a command line prints, in this process."""
     printed, complained = io.StringIO(), io.StringIO()
-    with mock.patch.dict(os.environ, COLUMNS="120"), mock.patch.object(sys, "argv", ["go1exp", *words]):
-        with redirect_stdout(printed), redirect_stderr(complained):
-            assert main() == 0
+    with (
+        mock.patch.dict(os.environ, COLUMNS="120"),
+        mock.patch.object(sys, "argv", ["go1exp", *words]),
+        redirect_stdout(printed),
+        redirect_stderr(complained),
+    ):
+        assert main() == 0
     assert complained.getvalue() == ""
     return printed.getvalue()
 

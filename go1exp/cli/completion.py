@@ -1,7 +1,7 @@
 """Tab completion, answered at every key press: it reads file names and YAML, and imports neither Hydra nor torch.
 
-A shell asks ``go1exp -sc query=SHELL`` with the line in ``COMP_LINE`` and the place of the cursor in ``COMP_POINT``. The
-answer is one completion a line, each a whole word as typed; nothing is ever written to the terminal but that.
+A shell asks ``go1exp -sc query=SHELL`` with the line in ``COMP_LINE`` and the place of the cursor in ``COMP_POINT``.
+The answer is one completion a line; nothing but that is ever written to the terminal.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 from go1exp import data_root
 from go1exp.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in, groups_of, load
-from go1exp.cli import POSITIONAL, SUBVERBS, VERBS
+from go1exp.cli import POSITIONAL, SUBVERBS, VALUED, VERBS
 
 OPTIONS = ("--help", "--cfg", "--multirun", "--config-dir", "--resolve", "--package", "--info")
 STAGES = ("check", "localise", "replay", "explain", "apply", "report")
@@ -110,9 +110,8 @@ def completions(line: str) -> list[str]:
     """Return the words that the last word of a line, which may be empty, can become."""
     words, word = _split(line)
     if not words:
-        return [verb for verb in VERBS if verb.startswith(word)] + [
-            o for o in ("--help", "--version") if _begins(o, word)
-        ]
+        general = ("--help", "--version") if word else ()
+        return [known for known in (*VERBS, *general) if known.startswith(word)]
     verb, before = words[0], words[1:]
     if verb not in VERBS:
         return []
@@ -169,14 +168,13 @@ def _as_bash_inserts_them(words: Sequence[str], line: str, breaks: str) -> list[
     return [re.sub(r"([^\w/=.,:~+\[\]{}@%-])", r"\\\1", word[cut:]) for word in words]
 
 
-def _begins(option: str, word: str) -> bool:
-    return bool(word) and option.startswith(word)
-
-
 def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[Path]) -> list[str]:
     """Complete a word that is given by its place alone."""
     keys = POSITIONAL.get(verb, ())
-    place = sum("=" not in given and not given.startswith(("-", "~")) for given in before)
+    place = sum(
+        "=" not in given and not given.startswith(("-", "~")) and option not in VALUED
+        for option, given in zip(["", *before], before, strict=False)
+    )
     if not keys or (place >= len(keys) and keys != ("files",)):
         return []
     key = keys[min(place, len(keys) - 1)]
@@ -246,9 +244,8 @@ def _levels(names: Sequence[str] | dict[str, Path], value: str) -> list[str]:
     """Complete names with slashes one level at a time: ``ablation/`` before what lies in it."""
     depth = value.count("/") + 1
     matching = [name for name in names if name.startswith(value)]
-    return list(
-        dict.fromkeys("/".join(n.split("/")[:depth]) + ("/" if n.count("/") >= depth else "") for n in matching)
-    )
+    levels = ("/".join(name.split("/")[:depth]) + ("/" if name.count("/") >= depth else "") for name in matching)
+    return list(dict.fromkeys(levels))
 
 
 def _paths(value: str, suffixes: Sequence[str], is_leaf: Callable[[Path], bool] | None = None) -> Iterator[str]:
@@ -286,19 +283,23 @@ def _keys(verb: str, word: str, before: Sequence[str], folders: Sequence[Path]) 
     mark = word[:1] if word[:1] in ("+", "~") else ""
     word = word[len(mark) :]
     settings = _settings(verb, before, folders)
-    path, dot, last = word.rpartition(".")
+    path, dot, _ = word.rpartition(".")
     inside = _select(settings, path) if dot else settings
     known = inside if isinstance(inside, dict) else {}
+    groups = {} if dot else groups_of(verb)
     keys = []
     for name, value in known.items():
-        nested = isinstance(value, dict) and value and not (not dot and name in groups_of(verb))
-        keys.append(f"{path}{dot}{name}" + ("." if nested and not mark == "~" else "" if mark == "~" else "="))
-        if not dot and name in groups_of(verb) and isinstance(value, dict) and value and word and not mark:
-            keys.append(f"{name}.")
+        is_mapping = isinstance(value, dict) and bool(value)
+        if mark == "~":
+            keys.append(f"{path}{dot}{name}")
+        elif name in groups:
+            keys += [f"{name}=", f"{name}."] if is_mapping and word and not mark else [f"{name}="]
+        else:
+            keys.append(f"{path}{dot}{name}{'.' if is_mapping else '='}")
     if not dot:
-        keys += [f"{group}=" for group in groups_of(verb) if group not in known]
+        keys += [f"{group}=" for group in groups if group not in known]
         others = (group for folder in folders[1:] for group in groups_in(folder))
-        keys += [f"{group}=" for group in others if mark == "+" or group in groups_of(verb)]
+        keys += [f"{group}=" for group in others if mark == "+" or group in groups]
     return list(dict.fromkeys(mark + key for key in keys if key.startswith(word)))
 
 
@@ -318,7 +319,7 @@ def _settings(verb: str, words: Sequence[str] = (), folders: Sequence[Path] = ()
 
 
 def _file(files: dict[str, Path], choice: str, group: str) -> tuple[dict[str, Any], bool]:
-    """Return what a choice holds, with the files of its group that it builds on, and whether that is for every group."""
+    """Return what a choice holds, with the files that it builds on, and whether it sets keys of every group."""
     content = load(files[choice])
     whole: dict[str, Any] = {}
     for base in content.pop("defaults", ()):
@@ -343,6 +344,6 @@ def _select(settings: Any, path: str) -> Any:
 
 
 def _plain(value: Any) -> str:
-    return (
-        f"[{','.join(map(str, value))}]" if isinstance(value, list) else "" if isinstance(value, dict) else str(value)
-    )
+    if isinstance(value, dict):
+        return ""
+    return f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)

@@ -34,7 +34,8 @@ def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import FitActuatorSettings, parse_with_groups
+    from go1exp.cli.parts import parse_with_groups
+    from go1exp.cli.settings import FitActuatorSettings
     from go1exp.schema.settings import subset
 
     settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))

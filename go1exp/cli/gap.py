@@ -23,7 +23,8 @@ DOES_NOT_HOLD = 15
 
 
 def _task(container: dict[str, Any]) -> int:
-    from go1exp.cli.settings import GapVerb, parse_with_groups
+    from go1exp.cli.parts import parse_with_groups
+    from go1exp.cli.settings import GapVerb
     from go1exp.gap.models import parse_model
 
     settings, parts = parse_with_groups(GapVerb, container, ("robot",), model=parse_model)

@@ -47,8 +47,9 @@ def _task(container: dict[str, Any]) -> None:
     import go1exp.excitations
     import go1exp.record.policy  # noqa: F401  (registers every excitation)
     from go1exp import robot
+    from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.runs import trained
-    from go1exp.cli.settings import RecordSettings, parse_with_groups
+    from go1exp.cli.settings import RecordSettings
     from go1exp.effects.rules import drive_problems, has_gains
 
     settings, parts = parse_with_groups(RecordSettings, container, RIG, excitation=_motions)
