@@ -70,6 +70,11 @@ class _Folders(SearchPathPlugin):
             search_path.append("main" if folder == config_folder() else "user", f"{VerbSource.scheme()}://{folder}")
 
 
+def shown_folders() -> tuple[Path, ...]:
+    """Return ``conf/`` and the user's folders that Hydra looks into now."""
+    return _Folders.folders or (config_folder(),)
+
+
 @contextmanager
 def seen_by(verb: str, folders: Sequence[Path] = ()) -> Iterator[None]:
     """Let Hydra find ``conf/`` and the user's ``folders`` as ``verb`` sees them, for what is set up meanwhile."""

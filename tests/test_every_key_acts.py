@@ -162,6 +162,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "record_import:path": lambda walk: [str(walk.logs(1))],
     "record_import:options": lambda walk: [{"rate_hz": 100.0}],
     "fit-actuator:recordings": lambda walk: [str(walk.recorded("noisy", {**FIVE, "sensors.qd.noise": 0.3}))],
+    "fit-actuator:gains": lambda walk: [[20.0, 0.5]],
     "fit-actuator:inputs": lambda walk: [["position_error"]],
     "fit-actuator:period": lambda walk: [0.004],
     "fit-actuator:smoothing": lambda walk: [0.02],
@@ -522,6 +523,9 @@ class Walk:
             return [f"files=[{self.recorded('whole', {})}]"]
         if leaf.program == "record_import":
             return ["source=go2_in_air", f"path={self.logs(0)}"]
+        if leaf.program == "fit-actuator" and leaf.key == "gains":
+            two = {**FIVE, "gains": [[20.0, 0.5], [30.0, 0.5]]}
+            return [f"recordings={self.recorded('two gains', two)}", "inputs=[velocity]"]
         if leaf.program == "fit-actuator":
             return [f"recordings={self.recorded('five', FIVE)}"]
         if leaf.program == "export_check":

@@ -42,6 +42,12 @@ POSITIONAL: dict[str, tuple[str, ...]] = {
 VALUED = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn")
 """Options of Hydra whose value is the word after them."""
 
+FLAGS = (
+    *("--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m"),
+    *("--config-path", "-cp", "--experimental-rerun"),
+)
+"""Hydra's other options."""
+
 ONE_BLAS_THREAD = ("OPENBLAS_NUM_THREADS", "1")
 """Variable and value, read when NumPy is first imported: its matrices are small here, and threads that wait for each
 other spin. On two busy cores matrix products of ``go1exp gap`` took 40 times as long with two threads as with one."""
@@ -98,6 +104,8 @@ def _by_name(verb: str, arguments: list[str]) -> list[str]:
 
     Options come first: Hydra's parser takes none between overrides.
     """
+    from go1exp.cli.quoting import quoted
+
     keys = list(POSITIONAL.get(verb, ()))
     words: list[str] = []
     options: list[str] = []
@@ -112,15 +120,10 @@ def _by_name(verb: str, arguments: list[str]) -> list[str]:
     named = []
     for key in keys:
         if key == "files" and words:
-            return [*options, *settings, f"files=[{','.join(_quoted(w) for w in words)}]"]
+            return [*options, *settings, f"files=[{','.join(quoted(w) for w in words)}]"]
         if words:
-            named.append(f"{key}={_quoted(words.pop(0))}")
+            named.append(f"{key}={quoted(words.pop(0))}")
     return [*options, *settings, *named, *words]
-
-
-def _quoted(word: str) -> str:
-    """Write a word so that Hydra takes it as it is."""
-    return "'" + word.replace("'", "\\'") + "'"
 
 
 def _module(verb: str):  # type: ignore[no-untyped-def]  # a module with an APP

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.cli.quoting import command
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -29,7 +30,7 @@ def _task(container: dict[str, Any]) -> None:
     worst = max(found.differences.values())
     print(f"{len(found.trace['time'])} steps of the environment replayed, largest difference {worst:.1e}")
     print(f"written to {out} ({len(data) / 1e6:.2f} MB), SHA-256 {found.seal}")
-    print(f"now: go1exp export check {out}")
+    print(f"now: {command('export', 'check', str(out))}")
 
 
 APP = App("export", _task)

@@ -86,6 +86,6 @@ def _choice(group: str, file: str) -> str:
     named = content.get(PATHS.get(group, ""))
     if isinstance(named, str):
         content[PATHS[group]] = str((path.parent / named).resolve())
-    name = re.sub(r"\W", "_", str(path.with_suffix("")))
+    name = re.sub(r"\W", "_", str(path.with_suffix("")), flags=re.ASCII)  # else Hydra's grammar refuses it
     ConfigStore.instance().store(group=group, name=name, node=content, provider=str(path))
     return name

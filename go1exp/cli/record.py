@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.cli.quoting import command
 from go1exp.schema.registry import ConfigError, Term, bind
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ def _task(container: dict[str, Any]) -> None:
         recording.write(out / f"{r.meta.episode}.parquet", r)
     total = sum(float(r.t[-1] - r.t[0]) for r in recordings)
     print(f"{len(recordings)} recordings, {total:.0f} s, in {out}")
-    print(f"now: go1exp record audit {out}")
+    print(f"now: {command('record', 'audit', str(out))}")
 
 
 APP = App("record", _task)

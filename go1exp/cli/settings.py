@@ -273,11 +273,13 @@ class FitActuatorSettings(FitSettings):
 
     Attributes:
         recordings: folder of recordings, or a list of folders and files.
+        gains: take only recordings made with these, as [kp N m/rad, kd N m s/rad]; null takes all, which must agree.
         plots: draw torque over time, measured and predicted.
         out: folder for net.npz, net.onnx, report.json and the plots.
     """
 
     recordings: str | tuple[str, ...]
+    gains: tuple[NonNegative, NonNegative] | None
     plots: bool
     out: str
 
