@@ -17,8 +17,11 @@ def _task(container: dict[str, Any]) -> None:
     checkpoint = checkpoint_file(run, settings.checkpoint)
 
     from go1exp.cli.logs import writable
+    from go1exp.config import parse_parts
     from go1exp.deploy.bundle import loads
+    from go1exp.effects.rules import has_gains
     from go1exp.export.build import build
+    from go1exp.train import run_folder
 
     writable(str(out.parent))
     show = spinner(1, "recording a trace")
@@ -31,6 +34,12 @@ def _task(container: dict[str, Any]) -> None:
     print(f"{len(found.trace['time'])} steps of the environment replayed, largest difference {worst:.1e}")
     print(f"written to {out} ({len(data) / 1e6:.2f} MB), SHA-256 {found.seal}")
     print(f"now: {command('export', 'check', str(out))}")
+    parts, _ = parse_parts(run_folder.read_config(run), ("actuator",))
+    if not has_gains(parts["actuator"]):
+        print(
+            f"note: trained with actuator={parts['actuator'].entry.name}, which has no gains to command; on a simulated "
+            f"robot: {command('deploy', str(out), 'actuator=pd')}"
+        )
 
 
 APP = App("export", _task)
