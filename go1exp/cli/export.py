@@ -36,10 +36,8 @@ def _task(container: dict[str, Any]) -> None:
     print(f"now: {command('export', 'check', str(out))}")
     parts, _ = parse_parts(run_folder.read_config(run), ("actuator",))
     if not has_gains(parts["actuator"]):
-        print(
-            f"note: trained with actuator={parts['actuator'].entry.name}, which has no gains to command; on a simulated "
-            f"robot: {command('deploy', str(out), 'actuator=pd')}"
-        )
+        name, line = parts["actuator"].entry.name, command("deploy", str(out), "actuator=pd")
+        print(f"note: trained with actuator={name}, which has no gains to command; on a simulated robot: {line}")
 
 
 APP = App("export", _task)

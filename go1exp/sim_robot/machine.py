@@ -58,9 +58,7 @@ class Robot:
         if not has_gains(task.actuator):
             name = task.actuator.entry.name
             raise ConfigError(
-                [
-                    f"actuator = {name}: has no kp and kd to command, as the runtime does with every target; use actuator=pd"
-                ]
+                [f"actuator = {name}: has no kp and kd, which the runtime commands with every target; use actuator=pd"]
             )
         self._config, self._rng = config, np.random.default_rng(config.seed)
         held = (1.0, 0.0, 0.0, 0.0) if config.start == "hung" else None
