@@ -143,10 +143,11 @@ def test_gap_leaves_out_recordings_that_are_too_short(run: Run, tmp_path: Path) 
 
 def test_a_fit_of_several_sets_of_gains_says_which_there_are_and_leaves_no_folder(run: Run, tmp_path: Path) -> None:
     for kp in (20.0, 35.0):
-        made(tmp_path / "logs", f"kp{kp:g}", rows=50, kp=kp)
+        for k in range(3):
+            made(tmp_path / "logs", f"kp{kp:g}_{k}", rows=50, kp=kp)
     status, text = run("fit-actuator", "recordings=logs", "out=nets/mine")
     assert status == 1
-    assert "kp 20, kd 0.5 (1), kp 35, kd 0.5 (1); choose one, as gains=[20,0.5]" in text
+    assert "kp 20, kd 0.5 (3), kp 35, kd 0.5 (3); choose one, as gains=[20,0.5]" in text
     said = "go1exp fit-actuator: gains = [35,1]: no recording was made with these; there are [20,0.5], [35,0.5]\n"
     assert run("fit-actuator", "recordings=logs", "gains=[35,1]", "out=nets/mine") == (2, said)
     assert not (tmp_path / "nets").exists()

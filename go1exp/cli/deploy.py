@@ -22,7 +22,7 @@ def _task(container: dict[str, Any]) -> int:
 
     from go1exp.cli.logs import remove_empty, writable
     from go1exp.deploy.commands import Wish
-    from go1exp.deploy.job import Job, do
+    from go1exp.deploy.job import Job, run_job
     from go1exp.deploy.launch import RefusedError
     from go1exp.deploy.walk import Plan
 
@@ -32,7 +32,7 @@ def _task(container: dict[str, Any]) -> int:
     sim = dataclasses.asdict(settings.sim)
     job = Job(settings.bundle, settings.robot, plan, settings.out, sim, other, settings.truth)
     try:
-        return do(job, lambda line: print(line, flush=True))
+        return run_job(job, lambda line: print(line, flush=True))
     except RefusedError as error:
         raise ConfigError(error.problems) from None
     finally:

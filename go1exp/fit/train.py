@@ -1,4 +1,4 @@
-"""Training one network on rows: least squares, then Adam on what that leaves, stopped by the validation episodes."""
+"""Training of one network: least squares, then Adam on the residual, stopped by the validation episodes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ OnEpoch = Callable[[int, int, float, float], None]
 """``on_epoch(done, total, train, validation)``: epochs, and root mean square errors in N m."""
 
 RIDGE = 1e-3
-"""Penalty of the linear map in units of the normalised inputs' variance (chosen: taps 2 ms apart are nearly equal, and
-without it their weights grow large and opposite, which a noisier command than the training's then shows)."""
+"""Penalty of the linear map in units of the variance of the normalised inputs (chosen: taps 2 ms apart are nearly
+equal; without a penalty their weights become large and opposite, and amplify noise of a command)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """One trained network, in the terms of ``ActuatorNet``, without its leading axis K.
+    """One trained network: the arrays of ``ActuatorNet`` without the leading axis K.
 
     Attributes:
         weights: layer by layer (in, out).
@@ -62,14 +62,14 @@ def train(
         if len(part) == 0:
             raise FitError(f"no rows for {name}: its episodes are shorter than the history, or their drives are off")
     mean, std = rows.x.mean(axis=0), rows.x.std(axis=0)
-    std = np.where(std > 0, std, 1.0)  # an input that never moves tells nothing, and is not blown up
+    std = np.where(std > 0, std, 1.0)  # an input that never changes must not be divided by zero
     output_mean = float(rows.y.mean())
     z = (rows.x - mean) / std
     skip = ridge(z, rows.y - output_mean) if settings.skip else np.zeros(rows.x.shape[1])
     left = rows.y - output_mean - z @ skip
     output_std = float(left.std()) or 1.0
     left_validation = validation.y - output_mean - (validation.x - mean) / std @ skip
-    with one_thread():
+    with one_thread():  # more threads are slower for such small matrices, and change the order of sums
         net, curve, best = _descend(
             torch.tensor(z, dtype=torch.float32),
             torch.tensor(left / output_std, dtype=torch.float32),
@@ -116,12 +116,14 @@ def _descend(
     rows = min(len(x), settings.epoch_rows)
     batch = min(settings.batch, rows)
     steps = rows // batch
+    # fused: one kernel for all parameters; the networks are so small that calls cost more than arithmetic
     adam = torch.optim.Adam(net.parameters(), lr=settings.learning_rate, fused=True)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(adam, T_max=settings.epochs * steps)
     best, best_error, kept = 0, float("inf"), {}
     curve = []
     for epoch in range(settings.epochs):
         total = torch.zeros(())
+        # whole minibatches only; another random part of the rows in every epoch
         pick = torch.randperm(len(x), generator=draws)[: steps * batch]
         for x_batch, y_batch in zip(x[pick].split(batch), y[pick].split(batch), strict=True):
             loss = mse_loss(net(x_batch)[:, 0], y_batch)
@@ -151,6 +153,7 @@ def _build(features: int, hidden: tuple[int, ...], draws: torch.Generator) -> to
     layers: list[torch.nn.Module] = []
     widths = (features, *hidden, 1)
     for wide, narrow in pairwise(widths):
+        # Without this PyTorch draws the weights from its global generator, which others use too.
         layer = torch.nn.utils.skip_init(torch.nn.Linear, wide, narrow)
         with torch.no_grad():
             for values in (layer.weight, layer.bias):
