@@ -295,7 +295,7 @@ def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) ->
 
 def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Path]) -> None:
     task = bundle_task(file, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
-    with pytest.raises(Exception, match="'net' has no kp and kd to command"):
+    with pytest.raises(Exception, match=r"actuator = net: has no kp and kd, .*; use actuator=pd"):
         Robot(task, sim_config({}))
 
 

@@ -56,7 +56,10 @@ class Robot:
             ConfigError: if its drives have no gains, since commands set gains.
         """
         if not has_gains(task.actuator):
-            raise ConfigError([f"actuator: {task.actuator.entry.name!r} has no kp and kd to command; use actuator=pd"])
+            name = task.actuator.entry.name
+            raise ConfigError(
+                [f"actuator = {name}: has no kp and kd, which the runtime commands with every target; use actuator=pd"]
+            )
         self._config, self._rng = config, np.random.default_rng(config.seed)
         held = (1.0, 0.0, 0.0, 0.0) if config.start == "hung" else None
         model, blocks = build_model(task.robot, build_terrain(TerrainConfig()), TICK, imu=True, held=held)
