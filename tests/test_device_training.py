@@ -148,7 +148,6 @@ def test_an_update_is_sb3s(ours: type[AdaptivePPO], sb3s: type[AdaptivePPO], ove
         logs: list[dict[str, float]] = []
         ppo.after_iteration = lambda p, logs=logs: logs.append(dict(p.logger.name_to_value))
         torch.manual_seed(1)
-        np.random.seed(1)
         ppo.learn(48 * 4)
         found.append((ppo.policy.state_dict(), logs))
     (mine, my_logs), (theirs, their_logs) = found

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from go1exp import data_root
+from go1exp.deploy.controller import Stages
 from go1exp.gap.result import GapSettings
 from go1exp.record.plan import Wishes
 from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
@@ -173,8 +174,8 @@ class SinusoidSettings:
 
 
 @dataclass(frozen=True)
-class DeploySettings:
-    """``conf/deploy.yaml`` without the groups."""
+class DeploySettings(Stages):
+    """``conf/deploy.yaml`` without the groups; the times of the stages are those of the runtime."""
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
@@ -184,10 +185,6 @@ class DeploySettings:
     sinusoid: SinusoidSettings
     rate: Annotated[float, Field(ge=10, le=1000)] | None
     seconds: Positive | None
-    stand_up: NonNegative
-    lie_down: NonNegative
-    brake: NonNegative
-    patience: Positive
     keep: Annotated[float, Field(gt=0, le=3600)]
     stale: Positive
     spin: Annotated[float, Field(ge=0, le=0.01)]

@@ -26,6 +26,8 @@ def not_negative(text: str) -> float:
 
 def arguments(given: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
+    from go1exp.deploy.walk import Plan
+
     parser = argparse.ArgumentParser("python -m go1exp.deploy", description="Run a bundle's policy on a robot.")
     parser.add_argument("bundle", help="file that go1exp export wrote")
     parser.add_argument("--robot", default="sim", help="sim, go1, or the port where a simulated robot listens")
@@ -37,16 +39,23 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--amplitude", default="1,0.3,0.8", help="of the sinusoid")
     parser.add_argument("--period", type=positive, default=10.0, help="of the sinusoid, s")
     parser.add_argument(
-        "--stand-up", type=not_negative, default=2.0, help="s from the first pose to the nominal stance"
+        "--stand-up", type=not_negative, default=Plan.stand_up, help="s from the first pose to the nominal stance"
     )
     parser.add_argument(
-        "--lie-down", type=not_negative, default=2.0, help="s for lying down at the end of a walk; 0: brake at once"
+        "--lie-down",
+        type=not_negative,
+        default=Plan.lie_down,
+        help="s for lying down at the end of a walk; 0: brake at once",
     )
-    parser.add_argument("--brake", type=not_negative, default=2.0, help="s for which the drives brake at the end")
-    parser.add_argument("--keep", type=positive, default=120.0, help="newest seconds that the log has room for")
-    parser.add_argument("--stale", type=positive, default=0.03, help="s without a state after which the robot is lost")
     parser.add_argument(
-        "--spin", type=not_negative, default=0.0008, help="s before each cycle for which the core is kept busy"
+        "--brake", type=not_negative, default=Plan.brake, help="s for which the drives brake at the end"
+    )
+    parser.add_argument("--keep", type=positive, default=Plan.keep, help="newest seconds that the log has room for")
+    parser.add_argument(
+        "--stale", type=positive, default=Plan.stale, help="s without a state after which the robot is lost"
+    )
+    parser.add_argument(
+        "--spin", type=not_negative, default=Plan.spin, help="s before each cycle for which the core is kept busy"
     )
     parser.add_argument("--out", default="runs/deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
@@ -61,27 +70,27 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
 
 def main(given: Sequence[str]) -> int:
     """Walk as the command line says; return the exit status."""
-    found = arguments(given)
+    words = arguments(given)
     from go1exp.deploy.commands import Wish, parsed
     from go1exp.deploy.job import Job, do
     from go1exp.deploy.walk import Plan
 
     try:
-        amplitude = tuple(float(part) for part in found.amplitude.split(","))
-        wish = Wish(parsed(found.command), amplitude, found.period)
+        amplitude = tuple(float(part) for part in words.amplitude.split(","))
+        wish = Wish(parsed(words.command), amplitude, words.period)
         plan = Plan(
-            rate=found.rate,
-            seconds=found.seconds,
+            rate=words.rate,
+            seconds=words.seconds,
             wish=wish,
-            stand_up=found.stand_up,
-            lie_down=found.lie_down,
-            brake=found.brake,
-            keep=found.keep,
-            stale=found.stale,
-            spin=found.spin,
+            stand_up=words.stand_up,
+            lie_down=words.lie_down,
+            brake=words.brake,
+            keep=words.keep,
+            stale=words.stale,
+            spin=words.spin,
         )
-        sim = {name: getattr(found, name) for name in ("start", "noise", "delay", "loss", "seed")}
-        job = Job(found.bundle, found.robot, plan, found.out, sim, truth=found.truth)
+        sim = {name: getattr(words, name) for name in ("start", "noise", "delay", "loss", "seed")}
+        job = Job(words.bundle, words.robot, plan, words.out, sim, truth=words.truth)
         return do(job, lambda line: print(line, flush=True))
     except (Expected, OSError, ValueError) as error:
         print(f"go1exp.deploy: {error}", file=sys.stderr)
