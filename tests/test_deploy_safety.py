@@ -430,10 +430,12 @@ def test_a_stop_before_the_robot_has_said_anything_ends_the_loop() -> None:
 
 
 def test_times_of_a_walk_that_cannot_be_are_refused_together() -> None:
-    with pytest.raises(
-        ValueError, match="^stand_up = -1.0: must be at least 0\npatience = 0.0: must be greater than 0$"
-    ):
+    with pytest.raises(ValueError, match="must be") as error:
         Stages(stand_up=-1.0, patience=0.0)
+    assert str(error.value).split("\n") == [
+        "stand_up = -1.0: must be at least 0",
+        "patience = 0.0: must be greater than 0",
+    ]
 
 
 def test_gains_that_nobody_knows_have_to_be_given() -> None:
