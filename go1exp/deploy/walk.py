@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy.bundle import Bundle
-from go1exp.deploy.commands import Limited, Wish, make, ranges_of
+from go1exp.deploy.commands import Limited, Wish, make, range_array
 from go1exp.deploy.controller import Controller, Cycle, Estimator, Stages
 from go1exp.deploy.estimate import KalmanEstimator, NoEstimator, settings
 from go1exp.deploy.log import About, Log, write_cycles
@@ -130,7 +130,7 @@ def go(
     safety = Safety(*limits, SafetyConfig(stale=plan.stale))
     estimator = estimator_of(bundle, safety, contact)
     stop_requests: list[str] = []
-    ranges = ranges_of(about.command_ranges)
+    ranges = range_array(about.command_ranges)
     with contextlib.closing(make(plan.wish, ranges, safety.stop, stop_requests.append)) as commands:
         walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests)
         with stopping(safety):
