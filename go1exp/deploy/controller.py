@@ -65,7 +65,7 @@ class Cycle:
 
 
 class Controller:
-    """Runs a bundle's policy on whatever is at the other end of a link.
+    """Runs a bundle's policy on the robot at the other end of a link.
 
     Attributes:
         phase: one of ``PHASES``.

@@ -14,7 +14,7 @@ Part = Annotated[float, Field(gt=0, lt=1)]
 
 
 class FitError(Expected):
-    """Recordings that do not serve the fit that was asked for."""
+    """Recordings that cannot be used for the requested fit."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -26,11 +26,11 @@ class FitSettings:
     instead of 0.050 N m after as many epochs (``benchmarks/actuator_net_ak80.py --all``). False: the paper's alone.
 
     Attributes:
-        inputs: what the net sees, each with ``history`` taps.
+        inputs: quantities that the net gets, each with ``history`` taps.
         history: taps of each input (Walk These Ways: 3).
         period: time between taps, s; None takes the recordings' nominal sampling period.
         hidden: widths of the hidden layers.
-        skip: whether a linear map goes beside them.
+        skip: whether a linear map is added to them.
         share: one net for all joints (the paper's way), for each kind, or for each joint.
         target: ``tau_est``, what the drive reports, or ``joint_torque``, which the caller computes.
         smoothing: window over which the inputs' angle and speed are smoothed first, s; None takes them as measured.
@@ -39,8 +39,8 @@ class FitSettings:
         learning_rate: Adam's, at the start.
         patience: epochs without a better validation error before the training stops.
         epoch_rows: rows of one pass; where there are more, each pass draws that many afresh.
-        holdout: episodes never met before the report, by name or as a part of all.
-        validation: episodes that decide when to stop, by name or as a part of all.
+        holdout: held-out episodes, used for the report only, by name or as a share of all.
+        validation: episodes that decide when to stop, by name or as a share of all.
         half_net: whether to train a net of half the width too, as a reference.
         seed: of split, initial weights and minibatches.
     """
