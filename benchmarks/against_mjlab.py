@@ -11,8 +11,8 @@ rewards, noise, randomisation and contact model; the output lists those that cos
 FOLDER holds mjlab with its dependencies, which are older than those of go1exp, so each side is a process of its own;
 torch may come from there or from the Python that runs this. Neither side has a viewer, a logger or checkpoints;
 building, compiling, recording of graphs and the first iterations do not count. The processes work in turns, each for a
-round of at least ``seconds``, while the others wait for a line on their standard input. A side that fails is reported with its last
-output, and the other is still measured.
+round of at least ``seconds``, while the others wait for a line on their standard input. A side that fails is reported
+with its last output, and the other is still measured.
 """
 
 from __future__ import annotations

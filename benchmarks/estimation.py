@@ -3,7 +3,7 @@
 1. ``speed``: updates per second on one core, from C++ and one by one from Python.
 2. ``scaler``: the walks of a real robot under motion capture, compared with plain leg odometry; FOLDER holds such
    runs as ``.npz`` (default: ``scaler_walk_mocap`` in ``../shared/data`` beside the repository, or in GO1EXP_DATA).
-   With ``--leave-one-out`` the setting that distance depends on most, ``foot_drift``, is chosen for each run on the others.
+   With ``--leave-one-out`` the setting that matters most for distance, ``foot_drift``, is chosen on the other runs.
 3. ``sim``: a simulated Go1 under the policy of ``--run`` with random commands up to 1.5 m/s (and straight on
    at 1.5 m/s), sensors at 500 Hz with the standard deviations of the paper's Table II, on flat ground and on the
    paper's terrain; without a run it squats. ``--every 5`` feeds the filter at 100 Hz, ``--lost 0.2`` without a fifth.

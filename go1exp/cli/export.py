@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.files import write_bytes
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -22,9 +23,7 @@ def _task(container: dict[str, Any]) -> None:
     show = spinner(1, "recording a trace")
     data = build(run, checkpoint, seconds=settings.seconds, seed=settings.seed, on_step=show)
     found = loads(data, str(out))
-    partial = out.with_name(f"{out.name}.partial")
-    partial.write_bytes(data)
-    partial.replace(out)
+    write_bytes(out, data)
     worst = max(found.differences.values())
     print(f"{len(found.trace['time'])} steps of the environment replayed, largest difference {worst:.1e}")
     print(f"written to {out} ({len(data) / 1e6:.2f} MB), SHA-256 {found.seal}")

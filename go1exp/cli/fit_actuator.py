@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError, explain
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def _task(container: dict[str, Any]) -> None:
     result = fit.fit(recordings, how, progress, inverse)
     result.net.save(out / "net.npz")
     result.net.export_onnx(out / "net.onnx")
-    (out / "report.json").write_text(json.dumps(result.report.as_dict(), indent=2) + "\n")
+    write_json(out / "report.json", result.report.as_dict())
     pictures = fit.plot(result, out) if settings.plots else []
     print(fit.text(result.report))
     print(f"\nwritten to {out}: net.npz, net.onnx, report.json{''.join(f', {p.name}' for p in pictures)}")

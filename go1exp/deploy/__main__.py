@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from go1exp.errors import Expected
+from go1exp.signals import STOPPED, handled, interrupt, say
 
 FAILED = 1
 
@@ -61,7 +62,15 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
 
 def main(given: Sequence[str]) -> int:
     """Walk as the command line says; return the exit status."""
-    options = arguments(given)
+    try:
+        with handled(interrupt):
+            return _walk(arguments(given))
+    except KeyboardInterrupt:
+        say("go1exp.deploy: stopped")
+        return STOPPED
+
+
+def _walk(options: argparse.Namespace) -> int:
     from go1exp.deploy.commands import Wish, parsed
     from go1exp.deploy.job import Job, run_job
     from go1exp.deploy.walk import Plan

@@ -14,6 +14,7 @@ import numpy as np
 from go1exp import __version__
 from go1exp.deploy.controller import PHASES, Cycle
 from go1exp.deploy.metadata import Metadata
+from go1exp.files import opened
 
 if TYPE_CHECKING:
     from go1exp.recording import Recording
@@ -214,4 +215,5 @@ def _joined(truth: Mapping[str, np.ndarray], clock: np.ndarray) -> dict[str, np.
 def write_cycles(path: Path, log: Log) -> None:
     """Write the cycles as NumPy's archive: velocities commanded and estimated, targets, phases; the runtime's clock."""
     content: dict[str, Any] = {name: log.cycles.part(name) for name, _ in CYCLE}
-    np.savez(path, phases=np.array(PHASES), **content)
+    with opened(path) as file:
+        np.savez(file, phases=np.array(PHASES), **content)

@@ -117,7 +117,7 @@ class Safety:
     # ------------------------------------------------------------------ what callers use
 
     def stop(self, who: str) -> None:
-        """Stop at the next cycle; ``who`` (a key, a signal) asked for it. It only sets a flag, as a signal handler may."""
+        """Stop at the next cycle; ``who`` (a key, a signal) asked for it. Only a flag is set: signal-safe."""
         self._stop = who
 
     def review(self, state: LowState | None, command: LowCmd | None, now: float) -> LowCmd:

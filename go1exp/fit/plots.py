@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from go1exp.files import replacing
 from go1exp.fit.dataset import Rows
 from go1exp.fit.fitting import FitResult
 from go1exp.fit.report import rmse
@@ -49,7 +50,8 @@ def plot(result: FitResult, folder: Path) -> list[Path]:
         errors = f"net {rmse(torque['net'] - rows.y):.4f}, {best} {rmse(torque[best] - rows.y):.4f}"
         figure.suptitle(f"{joint}: {result.report.target} on held-out episodes, RMSE in N m: {errors}")
         file = folder / f"actuator_net_{joint}.png"
-        figure.savefig(file, dpi=110)
+        with replacing(file, keep_suffix=True) as partial:
+            figure.savefig(partial, dpi=110)
         files.append(file)
     return files
 
