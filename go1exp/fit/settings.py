@@ -26,7 +26,7 @@ class FitSettings:
     instead of 0.050 N m after as many epochs (``benchmarks/actuator_net_ak80.py --all``). False: the paper's alone.
 
     Attributes:
-        inputs: quantities that the net gets, each with ``history`` taps; ``tau_cmd`` for drives that are commanded a torque.
+        inputs: inputs of the net, each with ``history`` taps; ``tau_cmd`` for drives that are commanded a torque.
         history: taps of each input (Walk These Ways: 3).
         period: time between taps, s; None takes the recordings' nominal sampling period.
         hidden: widths of the hidden layers.
