@@ -86,11 +86,11 @@ def scene(recording: Recording) -> mujoco.MjSpec:
 
 def parameters() -> Any:
     """Return everything that is free, as deviations from null in tolerances."""
-    found = sysid.ParameterDict()
+    free = sysid.ParameterDict()
     for effect, (name, low, high, start) in FITTED.items():
         scaled = (np.array([start, low, high]) - known.null(effect, name)) / known.TOLERANCES[effect][name]
-        found.add(sysid.Parameter(effect, *(np.full(SLOTS[effect].max() + 1, v) for v in scaled)))
-    return found
+        free.add(sysid.Parameter(effect, *(np.full(SLOTS[effect].max() + 1, v) for v in scaled)))
+    return free
 
 
 def with_values(nominal: dict[int, mujoco.MjModel], params: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -179,10 +179,10 @@ def identify(recordings: Sequence[Recording]) -> dict[str, Any]:
     cut = int(np.ceil(FIT_SHARE * len(recordings)))
     fit, kept = Fit(recordings[:cut], sd), Fit(recordings[cut:], sd)
     options = {"max_iters": ITERATIONS, "xtol": 0.01, "x_scale": "jac", "output": io.StringIO()}
-    best, found = sysid.optimize(parameters(), fit.residual, verbose=False, jacobian=fit.jacobian, **options)
-    half = sysid.calculate_intervals(fit.residual(found.x, best)[0], found.jac)[1]
-    before, after = kept.rms(np.zeros_like(found.x)), kept.rms(found.x)
-    rows = candidates(found.x, half)
+    best, optimum = sysid.optimize(parameters(), fit.residual, verbose=False, jacobian=fit.jacobian, **options)
+    half = sysid.calculate_intervals(fit.residual(optimum.x, best)[0], optimum.jac)[1]
+    before, after = kept.rms(np.zeros_like(optimum.x)), kept.rms(optimum.x)
+    rows = candidates(optimum.x, half)
     named = [r for r in rows if any(r["params"].values())]
     return {
         "verdict": (("no gap", "unexplained"), ("explained", "partly explained"))[bool(named)][after >= GOOD],

@@ -185,17 +185,17 @@ BEYOND = ("armature", "base_tilt", "coulomb", "encoder_offset", "link_com", "lin
 def experiment(motions: Sequence[str], count: int, seconds: float, rng: np.random.Generator) -> list[Episode]:
     """Return ``count`` episodes, the last an exact repetition of another; gains and attitudes go round."""
     t = np.arange(round(seconds * RATE)) / RATE
-    first, found = int(rng.integers(3)), []
+    first, episodes = int(rng.integers(3)), []
     for k in range(count - 1):
         name = motions[k % len(motions)]
         target, on = MOTIONS[name](t, rng)
         kp, kd = GAINS[(first + k) % 3]
-        found.append(Episode(f"e{k:02d}", name, target, on, kp, kd, (0.0, PITCHES[k % 2])))
-    old = found[int(rng.integers(len(found)))]
+        episodes.append(Episode(f"e{k:02d}", name, target, on, kp, kd, (0.0, PITCHES[k % 2])))
+    old = episodes[int(rng.integers(len(episodes)))]
     again = Episode(
         f"e{count - 1:02d}", old.excitation, old.target, old.on, old.kp, old.kd, old.hang, repeat_of=old.name
     )
-    return [*found, again]
+    return [*episodes, again]
 
 
 # ---------------------------------------------------------------------- cases
@@ -273,11 +273,11 @@ def make(
         at = np.array([robot.JOINTS.index(name) for name in effect["joints"]], dtype=int)
         for key, value in differences(truth, effect["effect"], at).items():
             effect["params"][key] = value if isinstance(value, float) else [float(x) for x in value]
-    own = tuple(int(x) for x in noise.generate_state(4))
+    case_seed = tuple(int(x) for x in noise.generate_state(4))
     episodes = experiment(motions, count, seconds, rng)
     dt = 1e-4 if truth.yielding.any() else float(rng.choice([2e-4, 2.5e-4]))
     answer = {"kind": kind, "effects": effects, "background_beyond": beyond, "clean": clean, "dt": dt, **detail}
-    return Case(name, kind, truth, without, episodes, dt, logger.draw(rng), on, damage, own, answer)
+    return Case(name, kind, truth, without, episodes, dt, logger.draw(rng), on, damage, case_seed, answer)
 
 
 _CLASH = {"backlash", "flexibility", "asymmetric_friction"}

@@ -33,11 +33,11 @@ def recordings(case: cases.Case) -> list[Recording]:
     world, noise, harm = ([*case.seed, k] for k in range(3))
     samples = simulate(case.truth, case.episodes, case.dt, np.random.default_rng(world), case.on)
     rng = np.random.default_rng(noise)
-    found = [
+    whole = [
         Recording(logger.meta(e), logger.log(case.logger, samples, k, e.target, e.on, rng))
         for k, e in enumerate(case.episodes)
     ]
-    return damage(found, case.damage, np.random.default_rng(harm)) if case.damage else found
+    return damage(whole, case.damage, np.random.default_rng(harm)) if case.damage else whole
 
 
 def write_case(case: cases.Case, out: Path, signals: Path | None = None) -> None:
@@ -101,25 +101,25 @@ def settings(arguments: Sequence[str]) -> argparse.Namespace:
             raise SystemExit(f"{argument!r}: not a number\n{words}") from None
     if usual["out"] is None or usual["seed"] is None:
         raise SystemExit(words)
-    found = argparse.Namespace(**usual)
-    found.out = Path(found.out)
-    found.answers = Path(found.answers) if found.answers else found.out.with_name(found.out.name + ".answers.json")
-    found.signals = Path(found.signals) if found.signals else None
-    found.kinds = tuple(found.kinds.split(","))
+    chosen = argparse.Namespace(**usual)
+    chosen.out = Path(chosen.out)
+    chosen.answers = Path(chosen.answers) if chosen.answers else chosen.out.with_name(chosen.out.name + ".answers.json")
+    chosen.signals = Path(chosen.signals) if chosen.signals else None
+    chosen.kinds = tuple(chosen.kinds.split(","))
     try:
-        found.sizes = tuple(float(size) for size in found.sizes.split(","))
+        chosen.sizes = tuple(float(size) for size in chosen.sizes.split(","))
     except ValueError:
-        raise SystemExit(f"sizes={found.sizes}: not numbers\n{words}") from None
-    found.effects = tuple(e for e in found.effects.split(",") if e)
-    for name, allowed in [*((k, cases.KINDS) for k in found.kinds), *((e, known.LIBRARY) for e in found.effects)]:
+        raise SystemExit(f"sizes={chosen.sizes}: not numbers\n{words}") from None
+    chosen.effects = tuple(e for e in chosen.effects.split(",") if e)
+    for name, allowed in [*((k, cases.KINDS) for k in chosen.kinds), *((e, known.LIBRARY) for e in chosen.effects)]:
         if name not in allowed:
             raise SystemExit(f"{name!r}: must be one of {', '.join(allowed)}")
-    if found.episodes < 2 or found.seconds <= 0 or found.n < 1:
+    if chosen.episodes < 2 or chosen.seconds <= 0 or chosen.n < 1:
         raise SystemExit("episodes must be at least 2, seconds more than 0, n at least 1")
-    for secret in (found.answers, found.signals):
-        if secret and found.out in (secret, *secret.parents):
+    for secret in (chosen.answers, chosen.signals):
+        if secret and chosen.out in (secret, *secret.parents):
             raise SystemExit(f"{secret}: must not lie beside the cases, where a solver reads")
-    return found
+    return chosen
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

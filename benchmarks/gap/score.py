@@ -92,8 +92,8 @@ class Judged:
     def allowed(self) -> frozenset[str]:
         """Names that are no mistake: of the hidden effects' families, and a background that is beyond tolerance."""
         names = [*self.true, *([self.answer["background_beyond"]] if self.answer.get("background_beyond") else [])]
-        found = frozenset().union(*(known.family(n) for n in names))
-        return found.union(*(known.EQUIVALENT.get(n, frozenset()) for n in names))
+        collected = frozenset().union(*(known.family(n) for n in names))
+        return collected.union(*(known.EQUIVALENT.get(n, frozenset()) for n in names))
 
     @property
     def wrong(self) -> list[str]:
@@ -187,7 +187,7 @@ def judge(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
     library = singles + of("pair")
     _misses(score, "wrong_explained_library", [(c, c.verdict == "explained" and bool(c.wrong)) for c in library])
 
-    score.rate("pair_recall", ((c, all(_found(c, true) for true in c.true)) for c in of("pair")))
+    score.rate("pair_recall", ((c, all(_recovered(c, true) for true in c.true)) for c in of("pair")))
     score.rate("pair_precision", ((c, n["effect"] in c.allowed) for c in of("pair") for n in c.named))
     score.rate("not_excited_unnamed", ((c, c.result is not None and not c.mentioned) for c in of("not_excited")))
     score.rate("not_excited_said", ((c, c.verdict == "not excited") for c in of("not_excited")))
@@ -220,7 +220,7 @@ def _equivalent(case: Judged) -> bool:
     return any(known.EQUIVALENT.get(n, frozenset({"-"})) <= _sets(case) for n in case.true)
 
 
-def _found(case: Judged, true: str) -> bool:
+def _recovered(case: Judged, true: str) -> bool:
     names = {n["effect"] for n in case.named}
     return bool(names & known.family(true)) or bool(names & known.EQUIVALENT.get(true, frozenset()))
 
@@ -286,12 +286,12 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
 
 def flat(score: Score) -> dict[str, float | int | None]:
     """Return the figures as ``results.json`` holds them; intervals under ``<figure>_low`` and ``_high``."""
-    found: dict[str, float | int | None] = {}
+    collected: dict[str, float | int | None] = {}
     for name, (value, low, high, n) in score.figures.items():
-        found |= {name: value, f"{name}_n": n}
+        collected |= {name: value, f"{name}_n": n}
         if np.isfinite([low, high]).all():
-            found |= {f"{name}_low": low, f"{name}_high": high}
-    return found
+            collected |= {f"{name}_low": low, f"{name}_high": high}
+    return collected
 
 
 def table(score: Score) -> str:

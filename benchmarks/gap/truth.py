@@ -170,7 +170,7 @@ def differences(truth: Truth, effect: str, joints: np.ndarray) -> dict[str, np.n
     """
     if effect == "base_tilt":
         return {"roll": float(truth.tilt[0]), "pitch": float(truth.tilt[1])}
-    found = {
+    by_parameter = {
         "coulomb": {"bound": np.minimum(truth.forward, truth.backward)},
         "asymmetric_friction": {"forward": truth.forward, "backward": truth.backward},
         "viscous": {"damping": truth.viscous},
@@ -180,4 +180,4 @@ def differences(truth: Truth, effect: str, joints: np.ndarray) -> dict[str, np.n
         "link_mass": {"scale": truth.mass},
         "link_com": {"along": -truth.com[:, 2]},
     }.get(effect, {})
-    return {name: values[joints] for name, values in found.items()}
+    return {name: values[joints] for name, values in by_parameter.items()}

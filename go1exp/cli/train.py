@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +11,13 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
+from go1exp.choices import config_folder
 from go1exp.cli import sweep
 from go1exp.cli.app import App, discard, run_dir
-from go1exp.cli.settings import run_folder as existing
-from go1exp.cli.settings import shipped_policies
-from go1exp.compose import config_folder, key_values
+from go1exp.cli.quoting import command
+from go1exp.cli.runs import run_folder as existing
+from go1exp.cli.runs import shipped_policies
+from go1exp.compose import key_values
 from go1exp.schema.registry import ConfigError
 from go1exp.signals import STOPPED
 
@@ -161,7 +162,7 @@ def _is_finished(job: TrainJob) -> bool:
     if checkpoint.iterations_done(job.run) < wanted or checkpoint.load_latest(job.run)[0]["iteration"] < wanted:
         return False
     run_state.write(job.run, "done")
-    print(f"{job.run} has its {wanted} iterations already; now: {_command('eval', f'run={job.run}')}")
+    print(f"{job.run} has its {wanted} iterations already; now: {command('eval', settings={'run': job.run})}")
     return True
 
 
@@ -179,24 +180,19 @@ def _train(job: TrainJob, first: Weights | None) -> int | None:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             raise KeyboardInterrupt from None  # the jobs after this one do not start
         if not stopped.finished:
-            print(f"stopped; go on with: {_command('train', f'resume={job.run}')}")
+            print(f"stopped; go on with: {command('train', settings={'resume': job.run})}")
             return STOPPED
     except KeyboardInterrupt:
         run_state.write(job.run, "stopped")
-        print(f"stopped; go on with: {_command('train', f'resume={job.run}')}")
+        print(f"stopped; go on with: {command('train', settings={'resume': job.run})}")
         raise
     except Exception as error:
         run_state.note_failure(job.run, APP.cause(error))
         raise
     else:
         run_state.write(job.run, "done")
-    print(f"done; now: {_command('eval', f'run={job.run}')}")
+    print(f"done; now: {command('eval', settings={'run': job.run})}")
     return None
-
-
-def _command(verb: str, override: str) -> str:
-    """Return a command as a shell takes it."""
-    return shlex.join(["go1exp", verb, override])
 
 
 class _Train(App):

@@ -72,7 +72,7 @@ def main(given: Sequence[str]) -> int:
 
 def _walk(options: argparse.Namespace) -> int:
     from go1exp.deploy.commands import Wish, parsed
-    from go1exp.deploy.job import Job, do
+    from go1exp.deploy.job import Job, run_job
     from go1exp.deploy.walk import Plan
 
     try:
@@ -91,7 +91,7 @@ def _walk(options: argparse.Namespace) -> int:
         )
         sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "loss", "seed")}
         job = Job(options.bundle, options.robot, plan, options.out, sim, truth=options.truth)
-        return do(job, lambda line: print(line, flush=True))
+        return run_job(job, lambda line: print(line, flush=True))
     except (Expected, OSError, ValueError) as error:
         print(f"go1exp.deploy: {error}", file=sys.stderr)
         return FAILED

@@ -110,6 +110,7 @@ class Log:
         """Keep a cycle and the states received in it."""
         for state in cycle.fresh:
             row = self.states.next()
+            # in place, by the widths of STATE: nothing is allocated during the walk
             row[0], row[1], row[2] = state.t, state.clock, state.in_force
             row[3:15], row[15:27], row[27:39] = state.joint_pos, state.joint_vel, state.joint_torque
             row[39:43], row[43:46], row[46:49], row[49:53] = (
@@ -157,6 +158,7 @@ class Log:
             channels |= {FOOT_FORCE + leg: feet[:, k] for k, leg in enumerate(about.metadata.legs)}
         if truth is not None:
             channels |= _joined(truth, clock)
+        # A recording needs an increasing clock and finite values; other rows are dropped and counted in the notes.
         good = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
         good &= np.isfinite(np.stack([values for name, values in channels.items()])).all(axis=0)
         if good.sum() < 2:

@@ -117,7 +117,7 @@ def estimator_of(bundle: Bundle, safety: Safety, contact: str | None) -> Estimat
     return KalmanEstimator(settings(bundle.metadata.estimator, **changes), safety.fail)
 
 
-def go(
+def walk(
     bundle: Bundle,
     link: Link,
     plan: Plan,
@@ -252,7 +252,7 @@ def age() -> float | None:
         return None
 
 
-def account(bundle: Bundle, plan: Plan, outcome: Outcome, more: Mapping[str, Any]) -> dict[str, Any]:
+def account(bundle: Bundle, plan: Plan, outcome: Outcome, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return a walk as plain data."""
     log, fault = outcome.log, outcome.fault
     joints = bundle.metadata.joints
@@ -274,7 +274,7 @@ def account(bundle: Bundle, plan: Plan, outcome: Outcome, more: Mapping[str, Any
         "first_command_after_s": None if start is None or lived is None else lived - (time.perf_counter() - start),
         "memory_mb": outcome.memory_mb,
         "log": {"states": log.states.count, "overwritten": log.states.overwritten},
-        **more,
+        **extra,
     }
 
 

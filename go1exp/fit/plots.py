@@ -64,6 +64,7 @@ def _stretches(rows: Rows, net: np.ndarray) -> list[tuple[str, np.ndarray]]:
         number = ((rows.t[in_episode] - rows.t[in_episode[0]]) / STRETCH).astype(int)
         pieces += [in_episode[number == n] for n in np.unique(number)]
     longest = max(len(piece) for piece in pieces)
+    # The last piece of an episode may be short; its error says little.
     whole = [piece for piece in pieces if len(piece) > longest / 2]
     order = sorted(whole, key=lambda piece: rmse(net[piece] - rows.y[piece]))
     return [("worst", order[-1]), ("median", order[len(order) // 2])]

@@ -29,9 +29,9 @@ def write_report(result: GapResult, folder: Path) -> list[Path]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    said = json.dumps(result.as_dict(), indent=1, allow_nan=False, default=str)
+    plain = json.dumps(result.as_dict(), indent=1, allow_nan=False, default=str)
     written = []
-    for name, content in (("report.html", page(result)), ("report.json", said + "\n")):
+    for name, content in (("report.html", page(result)), ("report.json", plain + "\n")):
         file = folder / name
         write_text(file, content)
         written.append(file)

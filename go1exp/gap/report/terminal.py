@@ -44,19 +44,19 @@ def localisation_text(where: Localisation) -> str:
     for j, joint in enumerate(where.joints):
         cells = (short(float(where.excess[j, r])) + ("*" if where.flagged[j, r] else " ") for r in seen)
         rows.append((joint, *cells))
-    said = "Mean excess over the noise floor by joint and regime; 0 is right, * significant."
-    return "\n".join([said, *_table(rows)]) + "\n"
+    title = "Mean excess over the noise floor by joint and regime; 0 is right, * significant."
+    return "\n".join([title, *_table(rows)]) + "\n"
 
 
 def _rows(result: GapResult) -> list[tuple[str, ...]]:
-    found: list[tuple[str, ...]] = []
+    rows: list[tuple[str, ...]] = []
     for named in result.named:
         at = words.place(named.effect, named.joints, words.everyone(result))
         stable = words.share(result.bootstrap_share.get(named.effect, math.nan))
         name = " or ".join((named.effect, *words.rivals(named)))
         every = words.sizes(named)
         if not every:
-            found.append((name, at, words.NOTHING, words.NOTHING, named.status, stable))
+            rows.append((name, at, words.NOTHING, words.NOTHING, named.status, stable))
         for k, size in enumerate(every):
             pairs = named.interval.get(size.name, {}).values()
             interval = words.NOTHING
@@ -65,8 +65,8 @@ def _rows(result: GapResult) -> list[tuple[str, ...]]:
                 interval = f"{words.number(low)} to {words.number(high)}"
             first = (name, at) if k == 0 else ("", "")
             last = (named.status, stable) if k == 0 else ("", "")
-            found.append((*first, f"{size.name} {size.short}", interval, *last))
-    return found
+            rows.append((*first, f"{size.name} {size.short}", interval, *last))
+    return rows
 
 
 def _wrapped(sentence: str) -> list[str]:

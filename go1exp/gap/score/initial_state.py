@@ -3,8 +3,8 @@
 An initial state enters the score as a linear, Gaussian unknown (``likelihood.py``). On the ground that holds only near
 the state: a foot touches down or slides earlier or later. So the states are first moved to where each window fits best.
 Two errors remain: what the line still misses within the uncertainty of the state, and what a smaller physics step
-changes that no initial state could. Both count as noise of the window. A window in which small causes have large effects
-therefore counts little, and claims no gap.
+changes that no initial state could. Both count as noise of the window. So a window in which small causes have large
+effects counts little, and claims no gap.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _stepped(score: Scorer, rows: Rows, dt: float) -> tuple[Scorer, dict[str, fl
 def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
     """Add to the noise what the line misses, over initial states drawn from what the data leave uncertain."""
     replayer, windows = score.replayer, score.windows
-    joints, own = len(windows.joints), 2 * len(windows.joints) + windows.base_sd.shape[1]
+    joints, coordinates = len(windows.joints), 2 * len(windows.joints) + windows.base_sd.shape[1]
     everything = np.arange(len(windows))
     here = replayer.run(plain, dt)
     _, root = solved(score.state[:, 0], np.zeros(score.state.shape[::2][:1] + score.state.shape[2:3]))
@@ -155,9 +155,9 @@ def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
     rng, square = np.random.default_rng(0), np.zeros_like(score.scale)
     for _ in range(DRAWS):
         x = (root @ rng.standard_normal((len(windows), root.shape[1], 1)))[..., 0]
-        x[:, own:] = 0.0
-        off = x[:, :own] * sd
-        there = Rows(everything, plain.values, off[:, :joints], off[:, joints : 2 * joints], off[:, 2 * joints :])
-        change = score.unit(replayer.run(there, dt) - here, everything)[:, 0]
+        x[:, coordinates:] = 0.0
+        off = x[:, :coordinates] * sd
+        drawn = Rows(everything, plain.values, off[:, :joints], off[:, joints : 2 * joints], off[:, 2 * joints :])
+        change = score.unit(replayer.run(drawn, dt) - here, everything)[:, 0]
         square += _mean_square(score, change - (score.state[:, 0] @ x[..., None].astype(np.float32))[..., 0])
     return _rescaled(score, np.sqrt(1.0 + square / DRAWS))

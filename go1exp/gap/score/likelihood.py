@@ -40,8 +40,8 @@ def gram(columns: np.ndarray, state: np.ndarray) -> np.ndarray:
     inner = np.stack([a.T @ a for a in wide]).astype(np.float64)
     plain, cross = inner[:, :-k, :-k], inner[:, -k:, :-k]
     metric = inner[:, -k:, -k:] + np.eye(k)
-    found = plain - np.swapaxes(cross, -1, -2) @ np.linalg.solve(metric, cross)
-    return np.asarray(found.reshape(*shape[:-2], shape[-1], shape[-1]))
+    weighted = plain - np.swapaxes(cross, -1, -2) @ np.linalg.solve(metric, cross)
+    return np.asarray(weighted.reshape(*shape[:-2], shape[-1], shape[-1]))
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Scorer:
     Attributes:
         replayer: the model.
         scale: (W, C, J) standard deviation of noise and numerical error.
-        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the initial state and
-            of the clock.
+        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the initial state
+            and of the clock.
         renewed: returns a scorer whose floors and initial states suit other values of the model.
         clock_s: what the clock was taken to be off by, s.
         expected: the windows with their initial states as sensors tell them, where those were moved; None if not.
@@ -95,12 +95,12 @@ class Scorer:
 def state_probes(machine: Machine) -> list[Probe]:
     """Return the probes of the initial state: angles, then speeds, of each place in the groups; then of a free base."""
     places, joints = range(len(machine.groups[0])), len(machine.joints)
-    found = [
+    joints_probes = [
         Probe(kind, place, np.full(joints, size))
         for kind, size in zip(("q", "qd"), STATE_PROBE, strict=True)
         for place in places
     ]
-    return found + [Probe("base", None, row) for row in np.diag(machine.base_probe)]
+    return joints_probes + [Probe("base", None, row) for row in np.diag(machine.base_probe)]
 
 
 def _start_sd(windows: Windows, machine: Machine, probe: Probe) -> np.ndarray:

@@ -37,10 +37,10 @@ class Layout:
         joint: list[int] = []
         column: list[int] = []
         for p, probe in enumerate(probes):
-            own = [-1] if probe.place is None else [machine.groups[g][probe.place] for g in range(groups)]
+            joints = [-1] if probe.place is None else [machine.groups[g][probe.place] for g in range(groups)]
             index[:, p] = len(joint) + (np.zeros(groups, dtype=int) if probe.place is None else np.arange(groups))
-            joint += own
-            column += [p] * len(own)
+            joint += joints
+            column += [p] * len(joints)
         return Layout(index, len(joint), np.array(joint, dtype=int), np.array(column, dtype=int))
 
     def total(self, grams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,8 +114,8 @@ def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Pr
 
 def predicted(grams: np.ndarray, layout: Layout, x: np.ndarray) -> np.ndarray:
     """Return the chi2 sum (V, G) that the linear model promises for the unknowns ``x``."""
-    found = np.empty(grams.shape[:2])
+    chi2 = np.empty(grams.shape[:2])
     for g, at in enumerate(layout.index):
         full = np.append(-x[at], 1.0)
-        found[:, g] = np.einsum("i,wij,j->w", full, grams[:, g], full)
-    return found
+        chi2[:, g] = np.einsum("i,wij,j->w", full, grams[:, g], full)
+    return chi2

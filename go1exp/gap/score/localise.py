@@ -60,24 +60,24 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
     middle = np.median(q, axis=(0, 1))
     away = np.abs(q - middle)
     far = np.quantile(away, 2 / 3, axis=(0, 1))
-    found = [speed < AT_REST, turn, (speed >= AT_REST) & (speed < SLOW), speed >= FAST]
-    found += [demand > HIGH * np.maximum(demand.max((0, 1)), 1e-9), edge, np.broadcast_to(~on[..., None], q.shape)]
-    found += [time < third[0], time > third[1], away < 0.5 * far, away > far]
+    masks = [speed < AT_REST, turn, (speed >= AT_REST) & (speed < SLOW), speed >= FAST]
+    masks += [demand > HIGH * np.maximum(demand.max((0, 1)), 1e-9), edge, np.broadcast_to(~on[..., None], q.shape)]
+    masks += [time < third[0], time > third[1], away < 0.5 * far, away > far]
     loads = w.loads()
     if loads is not None:
         stance = loads[windows]
         touched = stance & ~np.concatenate([stance[:, :1], stance[:, :-1]], axis=1)
         long = max(round(IMPACT_S / w.period), 1)
         impact = np.stack([touched[:, max(k - long, 0) : k + 1].any(1) for k in range(stance.shape[1])], axis=1)
-        found += [stance, ~stance, impact]
-    return np.stack(found) & w.valid[windows][None, ..., None]
+        masks += [stance, ~stance, impact]
+    return np.stack(masks) & w.valid[windows][None, ..., None]
 
 
 def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.random.Generator) -> Localisation:
     """Sort the excess of residuals (V, G, m) by joint and regime.
 
-    What the uncertainty of the initial state explains is taken out. A cell is tested by giving the regimes of one window
-    to another: whether the excess is larger there than elsewhere in the same joint.
+    What the uncertainty of the initial state explains is taken out. A cell is tested by giving the regimes of one
+    window to another: whether the excess is larger there than elsewhere in the same joint.
     """
     w, groups = scorer.windows, np.array(scorer.replayer.machine.groups)
     state = scorer.state[windows].astype(float)
@@ -90,16 +90,16 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     for g, joints in enumerate(groups):
         scored = np.isfinite(scorer.scale[windows][:, : w.of_joints, joints]).sum(1)  # V K quantities
         square[:, :, joints] = (split[:, g, :, : w.of_joints] ** 2).sum(axis=2) / np.maximum(scored, 1)[:, None]
-    there = regimes(scorer, windows)
-    count = there.sum((1, 2))
+    inside = regimes(scorer, windows)
+    count = inside.sum((1, 2))
     score = np.log(np.maximum(square, 1e-3)) * w.valid[windows][..., None]  # a few violent samples must not decide
-    excess = np.divide((square * there).sum((1, 2)), count, where=count > 0, out=np.full(count.shape, np.nan)) - 1.0
+    excess = np.divide((square * inside).sum((1, 2)), count, where=count > 0, out=np.full(count.shape, np.nan)) - 1.0
     p = np.full(count.shape, np.nan)
-    seen = _means(score, there, count)
+    seen = _means(score, inside, count)
     larger = np.zeros(count.shape)
     for _ in range(SHUFFLES):
-        larger += _means(score, there[:, rng.permutation(len(windows))], count) >= seen
-    enough = (count > 20) & (there.any(2).sum(1) > 2)
+        larger += _means(score, inside[:, rng.permutation(len(windows))], count) >= seen
+    enough = (count > 20) & (inside.any(2).sum(1) > 2)
     p[enough] = ((1 + larger) / (SHUFFLES + 1))[enough]
     flagged = np.zeros(count.shape, dtype=bool)
     if enough.any():
@@ -108,5 +108,5 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     return Localisation(w.joints, names, count.T, excess.T, p.T, (flagged & (excess > 0.1)).T)
 
 
-def _means(score: np.ndarray, there: np.ndarray, count: np.ndarray) -> np.ndarray:
-    return np.asarray(np.einsum("vnj,rvnj->rj", score, there) / np.maximum(count, 1))
+def _means(score: np.ndarray, inside: np.ndarray, count: np.ndarray) -> np.ndarray:
+    return np.asarray(np.einsum("vnj,rvnj->rj", score, inside) / np.maximum(count, 1))

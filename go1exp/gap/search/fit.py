@@ -58,14 +58,14 @@ def residuals(scorer: Scorer, thetas: Sequence[Theta], windows: np.ndarray, dt: 
     """Return the residuals (M, V, G, m) of several models."""
     machine = scorer.replayer.machine
     rows = stacked([variants(machine, theta, windows, []) for theta in thetas])
-    found = scorer.residual(rows, dt)
-    return found.reshape(len(thetas), len(windows), *found.shape[1:])
+    flat = scorer.residual(rows, dt)
+    return flat.reshape(len(thetas), len(windows), *flat.shape[1:])
 
 
 def scores(scorer: Scorer, thetas: Sequence[Theta], windows: np.ndarray, dt: float) -> np.ndarray:
     """Return chi2 per value (M, V, G) of several models."""
-    found = residuals(scorer, thetas, windows, dt)
-    return np.stack([scorer.chi2(one, windows) for one in found])
+    by_model = residuals(scorer, thetas, windows, dt)
+    return np.stack([scorer.chi2(one, windows) for one in by_model])
 
 
 def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int, dt: float) -> list[Model]:
@@ -77,8 +77,8 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
     """
     windows = common.windows
     first = common.residual[None] if len(models) == 1 and models[0].theta is common.theta else None
-    found = residuals(scorer, [m.theta for m in models], windows, dt) if first is None else first
-    best = [_scored(scorer, m, r, windows) for m, r in zip(models, found, strict=True)]
+    tried = residuals(scorer, [m.theta for m in models], windows, dt) if first is None else first
+    best = [_scored(scorer, m, r, windows) for m, r in zip(models, tried, strict=True)]
     origin = np.log(scorer.chi2(common.residual, windows)).sum()
     alive = list(range(len(models)))
     for turn in range(iterations):
@@ -88,10 +88,10 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
         tries = [
             _moved(scorer, best[k], move, length) for k, move in zip(alive, moves, strict=True) for length in STEPS
         ]
-        found = residuals(scorer, tries, windows, dt)
+        tried = residuals(scorer, tries, windows, dt)
         for n, k in enumerate(alive):
             mine = slice(n * len(STEPS), (n + 1) * len(STEPS))
-            best[k] = _longest(scorer, best[k], moves[n], tries[mine], found[mine], windows)
+            best[k] = _longest(scorer, best[k], moves[n], tries[mine], tried[mine], windows)
         if turn == 0 and len(models) > 1:
             gain = {k: origin - misfit(best[k]) for k in alive}
             alive = [k for k in alive if gain[k] > 0.0 and gain[k] >= HOPELESS * max(gain.values())]
@@ -119,7 +119,7 @@ def _scored(scorer: Scorer, model: Model, residual: np.ndarray, windows: np.ndar
 def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) -> list[Move]:
     """Return a Gauss-Newton step for each model."""
     windows, machine = common.windows, scorer.replayer.machine
-    found = []
+    steps = []
     for model, (probes, fresh) in zip(models, _refreshed(scorer, models, windows, dt), strict=True):
         kept = [i for i, p in enumerate(common.probes) if p.key not in model.keys]
         every = [*(common.probes[i] for i in kept), *probes]
@@ -131,8 +131,8 @@ def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) ->
         weight = 1.0 / np.maximum(_chi2(model), 1.0)
         matrix, right = layout.total(grams * weight[..., None, None])
         limits = tolerances.bounds(layout, every, model.theta, model.may)
-        found.append((every, layout, tolerances.solve(matrix, right, limits), limits))
-    return found
+        steps.append((every, layout, tolerances.solve(matrix, right, limits), limits))
+    return steps
 
 
 def _moved(scorer: Scorer, model: Model, move: Move, length: float | np.ndarray) -> Theta:
@@ -149,22 +149,24 @@ def _prior(machine: Machine, move: Move, length: float) -> np.ndarray:
 
 
 def _longest(
-    scorer: Scorer, model: Model, move: Move, tries: Sequence[Theta], found: np.ndarray, windows: np.ndarray
+    scorer: Scorer, model: Model, move: Move, tries: Sequence[Theta], tried: np.ndarray, windows: np.ndarray
 ) -> Model:
     """Return the model moved so far that each group of joints does best; what all share goes where most like it."""
     machine, layout = scorer.replayer.machine, move[1]
-    chi2 = np.stack([_chi2(model), *(scorer.chi2(r, windows) for r in found)])  # L V G
+    chi2 = np.stack([_chi2(model), *(scorer.chi2(r, windows) for r in tried)])  # L V G
     lengths = np.array([0.0, *STEPS])
     value = (scorer.size[windows][:, None] * np.log(chi2)).sum(axis=1)  # L G
     value += np.stack([_prior(machine, move, length) for length in lengths])
     which = value.argmin(axis=0)
     shared = int(value.sum(axis=1).argmin())
-    own = np.full(len(machine.joints), lengths[shared])
+    lengths_of_joints = np.full(len(machine.joints), lengths[shared])
     for g, joints in enumerate(machine.groups):
-        own[list(joints)] = lengths[which[g]]
-    theta = _moved(scorer, model, move, np.where(layout.joint < 0, lengths[shared], own[layout.joint.clip(0)]))
+        lengths_of_joints[list(joints)] = lengths[which[g]]
+    theta = _moved(
+        scorer, model, move, np.where(layout.joint < 0, lengths[shared], lengths_of_joints[layout.joint.clip(0)])
+    )
     assert model.residual is not None
-    stacked_residuals = np.concatenate([model.residual[None], found])
+    stacked_residuals = np.concatenate([model.residual[None], tried])
     groups = np.arange(len(machine.groups))
     residual = np.moveaxis(stacked_residuals[which, :, groups], 0, 1)
     return replace(model, theta=theta, residual=residual, chi2=np.moveaxis(chi2[which, :, groups], 0, 1))
@@ -180,9 +182,9 @@ def _refreshed(
         return [([], np.empty(0)) for _ in models]
     parts = [variants(machine, m.theta, windows, probes) for m, probes in zip(models, lots, strict=True)]
     y = replayer.run(stacked(parts), 2.0 * dt)
-    found, at = [], 0
+    refreshed, at = [], 0
     for probes, rows in zip(lots, parts, strict=True):
         mine = y[at : at + len(rows.window)].reshape(len(windows), 1 + len(probes), *y.shape[1:])
         at += len(rows.window)
-        found.append((probes, differences(scorer, mine, windows, probes)))
-    return found
+        refreshed.append((probes, differences(scorer, mine, windows, probes)))
+    return refreshed

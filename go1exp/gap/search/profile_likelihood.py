@@ -1,9 +1,9 @@
-"""Effects of the whole robot against initial states of their own.
+"""Profile likelihood of effects of the whole robot: every value is scored by initial states that suit it.
 
-Initial states that were moved to suit the nominal model hide a part of what is missing, and where feet slip or land they
-hold it fast: a payload of 2 kg on a walk, fitted at those, stops at 1 kg, and the truth looks worse than nothing.
-So every value is tried from the initial states that sensors tell, which are then moved to suit that value alone; and as
-derivatives tell little where feet stick, values are laddered and the best is closed in on.
+Initial states that were moved to suit the nominal model hide a part of what is missing. Where feet slip or land, a fit
+at those states stops early: a payload of 2 kg on a walk comes out as 1 kg, and the truth looks worse than nothing. So
+for every value the windows begin at the states that sensors measure, which are then moved to suit that value alone.
+Where feet stick, derivatives say little. So values on a ladder are tried, and then values between the best rungs.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndar
         dt: physics step, s.
     """
     w = score.windows
-    joints, own = len(w.joints), 2 * len(w.joints) + w.base_sd.shape[1]
+    joints, coordinates = len(w.joints), 2 * len(w.joints) + w.base_sd.shape[1]
     sd = np.concatenate([w.q_sd, w.qd_sd, w.base_sd], axis=1)[windows]
     state = score.state[windows]
     rows = variants(score.replayer.machine, theta, windows, [])
@@ -66,18 +66,18 @@ def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndar
         q, qd, base = moved[:, :joints], moved[:, joints : 2 * joints], moved[:, 2 * joints :]
         residual = score.residual(dataclasses.replace(rows, q=q, qd=qd, base=base), dt)
         # As if the state had stayed, and the change by it were a line: then the priors are those of the metric.
-        back = residual + (state[..., :own] @ off[:, None, :, None].astype(np.float32))[..., 0]
+        back = residual + (state[..., :coordinates] @ off[:, None, :, None].astype(np.float32))[..., 0]
         return residual, np.asarray(gram(back[..., None], state)[..., 0, 0] / score.size[windows][:, None])
 
-    off = np.zeros((len(windows), own))
+    off = np.zeros((len(windows), coordinates))
     residual, best = at(off)
     for _ in range(ROUNDS):
-        step = solved(state[:, 0], residual[:, 0], off)[0][:, :own].clip(-FARTHEST, FARTHEST)
+        step = solved(state[:, 0], residual[:, 0], off)[0][:, :coordinates].clip(-FARTHEST, FARTHEST)
         begin = off.copy()
         for share in SHARES:
-            there, found = at(begin + share * step)
-            better = found[:, 0] < best[:, 0]
-            off[better], residual[better], best[better] = (begin + share * step)[better], there[better], found[better]
+            other, value = at(begin + share * step)
+            better = value[:, 0] < best[:, 0]
+            off[better], residual[better], best[better] = (begin + share * step)[better], other[better], value[better]
     return best
 
 
@@ -116,16 +116,16 @@ def fitted(
         if rungs[k] == p.null:
             continue
         between = rungs[max(k - 1, 0)], rungs[min(k + 1, len(rungs) - 1)]
-        found = minimize_scalar(at, bounds=between, options={"maxiter": CLOSER})
-        value, least = (found.x, float(found.fun)) if found.fun < costs[k] else (rungs[k], costs[k])
+        nearest = minimize_scalar(at, bounds=between, options={"maxiter": CLOSER})
+        value, least = (nearest.x, float(nearest.fun)) if nearest.fun < costs[k] else (rungs[k], costs[k])
         theta = {**theta, key: np.full(wide, value)}
     return theta, least
 
 
 def ladder(p: Param) -> list[float]:
     """Return the values of a parameter that are tried first, in order, the null value among them."""
-    found, far = {p.null}, FIRST * p.tolerance
+    rungs, far = {p.null}, FIRST * p.tolerance
     while p.null - far >= p.low or p.null + far <= p.high:
-        found |= {v for v in (p.null - far, p.null + far) if p.low <= v <= p.high}
+        rungs |= {v for v in (p.null - far, p.null + far) if p.low <= v <= p.high}
         far *= 2.0
-    return sorted(found)
+    return sorted(rungs)

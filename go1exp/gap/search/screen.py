@@ -135,7 +135,7 @@ class Screened:
 def screen(
     scorer: Scorer,
     theta: Theta,
-    own: Table,
+    present: Table,
     may: tolerances.Freedom,
     library: Sequence[Variant],
     dt: float,
@@ -145,17 +145,17 @@ def screen(
     Args:
         scorer: of the windows.
         theta: present values.
-        own: the linear model of what may move already.
+        present: the linear model of what may move already.
         may: what may leave its tolerance.
         library: the variants.
         dt: physics step, s.
     """
     every = [p for v in library for p in v.probes]
-    columns = _columns(scorer, theta, own.windows, every, dt)
-    whole = np.concatenate([own.columns, columns], axis=-1)
-    full = Table(own.windows, (*own.probes, *every), own.residual, whole, theta)
-    ranking = _Ranking(scorer, own, full, may)
-    screened, at = [], len(own.probes)
+    columns = _columns(scorer, theta, present.windows, every, dt)
+    whole = np.concatenate([present.columns, columns], axis=-1)
+    full = Table(present.windows, (*present.probes, *every), present.residual, whole, theta)
+    ranking = _Ranking(scorer, present, full, may)
+    screened, at = [], len(present.probes)
     for variant in library:
         screened.append(ranking.screened(variant, at))
         at += len(variant.probes)
@@ -165,20 +165,20 @@ def screen(
 class _Ranking:
     """The linear model of all variants together, from which each is judged by itself."""
 
-    def __init__(self, scorer: Scorer, own: Table, full: Table, may: tolerances.Freedom) -> None:
+    def __init__(self, scorer: Scorer, present: Table, full: Table, may: tolerances.Freedom) -> None:
         """Take the linear model ``own`` of what may move already, and ``full``, which adds the probes of variants."""
-        self.own, self.full, self.may, self.machine = own, full, may, scorer.replayer.machine
-        self.size = scorer.size[own.windows][:, None]
+        self.present, self.full, self.may, self.machine = present, full, may, scorer.replayer.machine
+        self.size = scorer.size[present.windows][:, None]
         self.grams = full.grams(scorer)
         self.before = self.grams[..., -1, -1] / self.size
-        self.plain, self.count = strain.cost(scorer, own)(may), strain.values(scorer, own)
+        self.plain, self.count = strain.cost(scorer, present)(may), strain.values(scorer, present)
 
     def screened(self, variant: Variant, at: int) -> Screened:
         """Judge a variant whose probes begin at column ``at``."""
-        theta, known = self.full.theta, len(self.own.probes)
+        theta, known = self.full.theta, len(self.present.probes)
         added = list(range(at, at + len(variant.probes)))
         pick = [*range(known), *added]
-        probes = [*self.own.probes, *variant.probes]
+        probes = [*self.present.probes, *variant.probes]
         part = self.grams[:, :, [*pick, -1]][..., [*pick, -1]]
         layout = Layout.of(self.machine, probes)
         matrix, right = layout.total(part * (1.0 / np.maximum(self.before, 1.0))[..., None, None])
@@ -190,8 +190,8 @@ class _Ranking:
         x = tolerances.solve(matrix, right, limits)
         after = predicted(part, layout, x) / self.size
         gain = float(np.mean(np.log(self.before.sum(1) / np.maximum(after, 0.3).sum(1))))
-        start = _start(theta, variant, self.own.probes, layout, x, self.machine)
-        mine = [*added, *(k for k, p in enumerate(self.own.probes) if p.key[0] == variant.effect)]
+        start = _start(theta, variant, self.present.probes, layout, x, self.machine)
+        mine = [*added, *(k for k, p in enumerate(self.present.probes) if p.key[0] == variant.effect)]
         signal = _signal(self.grams, self.full.probes, mine, self.size, self.may.tolerances)
         return Screened(variant, start, gain, relief, signal)
 

@@ -51,11 +51,11 @@ def same(gain: float) -> float:
 def equals(gain: np.ndarray, best: int, rng: np.random.Generator) -> np.ndarray:
     """Return which models (M,) do as well as ``best`` by their gains (M, V): all but so, or not significantly worse."""
     mean = gain.mean(axis=1)
-    found = mean >= mean[best] - same(mean[best])
-    for k in np.flatnonzero(~found & (mean > LEAST * mean[best])):
-        found[k] = max_t((gain[best] - gain[k])[None], rng)[0] > WORSE
-    found[best] = True
-    return np.asarray(found)
+    equal = mean >= mean[best] - same(mean[best])
+    for k in np.flatnonzero(~equal & (mean > LEAST * mean[best])):
+        equal[k] = max_t((gain[best] - gain[k])[None], rng)[0] > WORSE
+    equal[best] = True
+    return np.asarray(equal)
 
 
 def resampled(episode: np.ndarray, rng: np.random.Generator) -> np.ndarray:

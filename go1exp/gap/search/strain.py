@@ -22,22 +22,22 @@ CLEAR = 1.5
 """Tolerances that an effect must reach to be named where the tolerances close the gap."""
 
 
-def values(scorer: Scorer, own: Table) -> float:
+def values(scorer: Scorer, linear: Table) -> float:
     """Return how many values are compared in the windows of ``own``."""
-    return float(scorer.size[own.windows].sum()) * len(scorer.replayer.machine.groups)
+    return float(scorer.size[linear.windows].sum()) * len(scorer.replayer.machine.groups)
 
 
-def cost(scorer: Scorer, own: Table) -> Callable[[tolerances.Freedom], float]:
+def cost(scorer: Scorer, linear: Table) -> Callable[[tolerances.Freedom], float]:
     """Return a function that says how small chi2 and priors can be, to first order about ``own``, with some freedom."""
-    layout = Layout.of(scorer.replayer.machine, own.probes)
-    chi2 = scorer.chi2(own.residual, own.windows)
-    matrix, right = layout.total(own.grams(scorer) / np.maximum(chi2, 1.0)[..., None, None])
+    layout = Layout.of(scorer.replayer.machine, linear.probes)
+    chi2 = scorer.chi2(linear.residual, linear.windows)
+    matrix, right = layout.total(linear.grams(scorer) / np.maximum(chi2, 1.0)[..., None, None])
 
-    def found(may: tolerances.Freedom) -> float:
-        limits = tolerances.bounds(layout, own.probes, own.theta, may, back=True)
+    def smallest(may: tolerances.Freedom) -> float:
+        limits = tolerances.bounds(layout, linear.probes, linear.theta, may, back=True)
         return price(matrix, right, limits)
 
-    return found
+    return smallest
 
 
 def price(matrix: np.ndarray, right: np.ndarray, limits: tolerances.Bounds) -> float:
@@ -46,10 +46,10 @@ def price(matrix: np.ndarray, right: np.ndarray, limits: tolerances.Bounds) -> f
     return float(x @ matrix @ x - 2.0 * right @ x + (limits.weight * (x - limits.centre) ** 2).sum())
 
 
-def relief(scorer: Scorer, own: Table, may: tolerances.Freedom) -> dict[str, float]:
+def relief(scorer: Scorer, linear: Table, may: tolerances.Freedom) -> dict[str, float]:
     """Return by how much chi2 and priors would fall if an effect of ``own`` might leave its tolerance."""
-    effects = dict.fromkeys(p.key[0] for p in own.probes)
-    price = cost(scorer, own)
+    effects = dict.fromkeys(p.key[0] for p in linear.probes)
+    price = cost(scorer, linear)
     return {effect: price(may) - price(may.also(effect)) for effect in effects}
 
 

@@ -158,12 +158,12 @@ RIDGES = (1e-9, 1e-7, 1e-5)
 def _definite(matrix: np.ndarray) -> np.ndarray:
     """Return a matrix with a diagonal of ones (n, n), made positive definite by the least of the ridges that does."""
     for ridge in RIDGES:
-        found = matrix + ridge * np.eye(len(matrix))
+        raised = matrix + ridge * np.eye(len(matrix))
         try:
-            np.linalg.cholesky(found)
+            np.linalg.cholesky(raised)
         except np.linalg.LinAlgError:
             continue
-        return found
+        return raised
     raise np.linalg.LinAlgError("normal equations are indefinite by far more than their rounding")
 
 
