@@ -171,7 +171,7 @@ def test_a_users_own_file_names_its_model_from_where_it_lies(tmp_path: Path) -> 
     (tmp_path / "parts/mine.xml").write_text(source.read_text())
     own = {**description("xl330_pendulum"), "mjcf": "parts/mine.xml", "search": {"window_s": 0.7}}
     OmegaConf.save(OmegaConf.create(own), tmp_path / "mine.yaml")
-    given = choices_from_files([f"model={tmp_path}/mine.yaml"])
+    given = choices_from_files([f"model={tmp_path}/mine.yaml"], "gap")
     container = compose("gap", given)
     model = parse_model(container["model"])
     assert model is not None

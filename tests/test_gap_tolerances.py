@@ -37,7 +37,7 @@ JOINT = "FR_calf"
 
 def robot_given(*overrides: str) -> Any:
     """Return the robot of a command line of ``go1exp gap``."""
-    container = compose("gap", choices_from_files(["logs=x", *overrides]))
+    container = compose("gap", choices_from_files(["logs=x", *overrides], "gap"))
     parts, problems = parse_parts(container, ("robot",))
     assert problems == []
     return robot_of(parse_model(container["model"]), parts["robot"])
