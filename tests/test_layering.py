@@ -177,6 +177,28 @@ def test_a_layer_imports_nothing_from_above_it(place: str) -> None:
     assert broken == set()
 
 
+GAP_ROOMS = (
+    *("result.py", "files.py", "data/", "replay/", "robots/", "score/", "search/", "comparison.py", "answer.py"),
+    *("report/", "stages/"),
+)
+"""Rooms of the gap workflow from the ground up: each may import itself and those below it."""
+
+
+def test_each_room_of_gap_imports_only_itself_and_rooms_below_it() -> None:
+    def floor(name: str) -> int:
+        return next(k for k, room in enumerate(GAP_ROOMS) if name.startswith(f"gap/{room}"))
+
+    mine = [name for name in RELATIVE if name.startswith("gap/") and name != "gap/__init__.py"]
+    upwards = {
+        f"{name} imports {other}"
+        for name in mine
+        for other in own_imports(RELATIVE[name])
+        if other.startswith("gap/") and floor(other) > floor(name)
+    }
+    assert upwards == set()
+    assert {floor(name) for name in mine} == set(range(len(GAP_ROOMS)))
+
+
 def test_every_file_belongs_to_a_layer() -> None:
     placed = [n for n in RELATIVE if n in FORBIDDEN or any(n.startswith(p) for p in FORBIDDEN if p.endswith("/"))]
     assert set(RELATIVE) - set(placed) == {n for n in RELATIVE if n.startswith("cli/")}
