@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.gap import known
 from go1exp import robot
-from go1exp.gap.data.windows import noise
+from go1exp.gap.data.cutting import noise
 from go1exp.physics.model import load_robot
 from go1exp.recording import Recording, RecordingError, read_folder
 

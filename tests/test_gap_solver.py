@@ -14,8 +14,9 @@ from go1exp.cli.record import RIG
 from go1exp.compose import compose
 from go1exp.config import parse_parts
 from go1exp.gap.comparison import compare
+from go1exp.gap.data.cutting import even_clock, noise
 from go1exp.gap.data.splits import splits
-from go1exp.gap.data.windows import even_clock, held, noise
+from go1exp.gap.data.windows import held
 from go1exp.gap.replay.replayer import padded
 from go1exp.gap.replay.rows import Probe
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings

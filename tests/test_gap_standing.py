@@ -25,7 +25,7 @@ from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.score.initial_state import settled
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import ON_FEET, REGIMES, localise
-from go1exp.gap.search import profile_likelihood, single_cause
+from go1exp.gap.search import profile_likelihood
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.search.trial import excess
@@ -199,8 +199,8 @@ def search_in(*overrides: str) -> Search:
 
 def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it() -> None:
     search = search_in("+effect.payload.mass=1.0")
-    plain = excess(search.held_out({}))
-    found = single_cause.cause(search)
+    plain = excess(search.state.held_out({}))
+    found = search.single_cause()
     assert found is not None
     assert found.name == "payload"
     assert found.theta["payload", "mass"].item() == pytest.approx(1.0, abs=0.1)
@@ -233,10 +233,10 @@ def test_rungs_of_a_ladder_are_on_both_sides_of_null_and_no_farther_than_a_param
 
 def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
     search = search_in()
-    assert single_cause.cause(search) is None
+    assert search.single_cause() is None
     assert search.candidates == []
-    assert excess(search.held_out({})) < search.settings.material
+    assert excess(search.state.held_out({})) < search.settings.material
 
 
 def test_drives_that_are_all_a_little_weak_are_no_payload() -> None:
-    assert single_cause.cause(search_in("+effect.strength.scale=0.93")) is None
+    assert search_in("+effect.strength.scale=0.93").single_cause() is None

@@ -7,6 +7,7 @@ these leave open is averaged out with the rest of the initial state (``score/ini
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 import torch
@@ -108,7 +109,8 @@ class StandingReplayer(Replayer):
 
     def observing(self, windows: Windows) -> TrunkReplayer:
         """Return a replayer of the same windows that tells all that a simulation can tell."""
-        return TrunkReplayer(self.machine, windows, self.quats, self.max_rows, self.threads, held=self.held)
+        standing = cast(StandingWindows, windows)  # of the same robot
+        return TrunkReplayer(self.machine, standing, self.quats, self.max_rows, self.threads, held=self.held)
 
     def _state(self, plant: Plant, rows: Rows, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Put a base (its IMU as tilted as it is believed to be) before the joints: qpos (R, 19), qvel (R, 18)."""

@@ -148,10 +148,10 @@ def waterfall(result: GapResult) -> Markup:
             axes.barh(k, value - start, left=start, color=colour, height=0.62)
             if k:
                 axes.plot([start, start], [k - 1.31, k + 0.31], color=GREY, lw=0.7)
-            shown = words.number(steps[k][1])
+            caption = words.number(steps[k][1])
             if k and start > 0:
-                shown += f"   ({words.number(100 * (value / start - 1), 2)} %)"
-            axes.annotate(shown, (max(value, start, 1.0), k), (4, 0), textcoords="offset points", va="center")
+                caption += f"   ({words.number(100 * (value / start - 1), 2)} %)"
+            axes.annotate(caption, (max(value, start, 1.0), k), (4, 0), textcoords="offset points", va="center")
         axes.barh(rows - 1, shown[-1] - 1.0, left=1.0, color=MEASURED, height=0.62)
         axes.annotate(
             words.number(steps[-1][1]), (max(shown[-1], 1.0), rows - 1), (4, 0), textcoords="offset points", va="center"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -88,4 +88,5 @@ class StandingGo1:
 
     def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
         """Return what replays windows on the feet, and those of a held trunk among them."""
-        return StandingReplayer(self, windows, quats, max_rows, threads, held=self.held)
+        standing = cast(StandingWindows, windows)  # that this robot cut
+        return StandingReplayer(self, standing, quats, max_rows, threads, held=self.held)

@@ -17,6 +17,7 @@ from go1exp.gap.score.linear import Table, table
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.screen import free_shapes
+from go1exp.gap.search.tolerances import Freedom
 
 SETTLED = 0.01
 """Fall of log chi2 in a round of fitting, and log chi2 itself, below which more rounds are not worth their time."""
@@ -71,9 +72,9 @@ class State:
         return (*(key for effect in effects for key in sizes(effect)), *shapes)
 
     @property
-    def may(self) -> tolerances.Freedom:
+    def may(self) -> Freedom:
         """What may leave its tolerance."""
-        return tolerances.Freedom(self.tolerances, frozenset(self.terms), self.kept, not self.settings.calibrate)
+        return Freedom(self.tolerances, frozenset(self.terms), self.kept, not self.settings.calibrate)
 
     @property
     def table(self) -> Table:
