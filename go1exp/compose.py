@@ -44,10 +44,10 @@ def key_values(container: Any, path: str = "") -> dict[str, Any]:
     """Flatten nested mappings: every key path, with its value (a mapping's own path is there too, with None)."""
     if not isinstance(container, dict):
         return {path: container}
-    found: dict[str, Any] = {path: None} if path else {}
+    values: dict[str, Any] = {path: None} if path else {}
     for key, value in container.items():
-        found |= key_values(value, f"{path}.{key}" if path else str(key))
-    return found
+        values |= key_values(value, f"{path}.{key}" if path else str(key))
+    return values
 
 
 def flat_keys(name: str, overrides: Sequence[str] = ()) -> list[str]:
