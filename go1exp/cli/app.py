@@ -21,6 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from go1exp.cli import plugins
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import as_container, config_folder, flat_keys, register_groups
 from go1exp.schema.registry import ConfigError, Expected, nearest, unknown_name
@@ -57,7 +58,7 @@ class App:
 
         def task(config: DictConfig) -> None:
             try:
-                status.append(self.task(as_container(config)))
+                status.append(self.task(plugins.begin(self.name, as_container(config))))
             except Exception as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
                     raise  # the launcher, which may sit on another machine, has to know

@@ -45,7 +45,7 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
 
 def _refuse_other(run: Path, container: dict[str, Any]) -> None:
     """Raise ConfigError if ``run`` holds a run with another configuration: it would be neither one nor the other."""
-    from go1exp.train import run_folder
+    from go1exp.train import kept_plugins, run_folder
 
     if not (run / "config.yaml").is_file():
         return
@@ -54,6 +54,7 @@ def _refuse_other(run: Path, container: dict[str, Any]) -> None:
         OmegaConf.update(old, key, OmegaConf.select(new, key), merge=False)
     before, after = (key_values(OmegaConf.to_container(c)) for c in (old, new))
     differ = sorted(k for k in {*before, *after} if before.get(k) != after.get(k))
+    differ += [f"plugins ({name} has changed)" for name in kept_plugins.differing(run, container)]
     if differ:
         raise ConfigError([f"{run}: holds a run with other settings of {', '.join(differ)}; use another folder"])
 
@@ -81,9 +82,11 @@ def _task(container: dict[str, Any]) -> int | None:
         raise
     if config.process.resume:
         discard(run)
+        from go1exp.train import kept_plugins
+
         run = existing(config.process.resume, "resume")
         container = _resumed(run, list(HydraConfig.get().overrides.task))
-        config = parse_train(container)
+        config = parse_train(kept_plugins.own(run, container))
     else:
         _refuse_other(run, container)
 
