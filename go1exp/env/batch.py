@@ -10,7 +10,12 @@ from go1exp.env.core import Go1Core
 
 
 def make(
-    overrides: Sequence[str] = (), num_envs: int = 1024, seed: int = 0, *, noise: bool = True, spread_starts: bool = False
+    overrides: Sequence[str] = (),
+    num_envs: int = 1024,
+    seed: int = 0,
+    *,
+    noise: bool = True,
+    spread_starts: bool = False,
 ) -> Go1Core:
     """Return N robots that step together on torch tensors, as training has them.
 

@@ -1,5 +1,6 @@
 """What the MDP sees of one moment, ``Snapshot``, what a step of the environment returns, ``StepResult``, and what a term
-with memory is built from, ``TermSetup``."""
+with memory is built from, ``TermSetup``.
+"""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,15 +44,20 @@ class Plugin:
         name: as it was asked for.
         module: under which Python knows it.
         file: of a file, its path.
-        sha256: of a file, the hash of its content.
+        content: of a file, what was executed.
         entries: what it has registered.
     """
 
     name: str
     module: str
     file: Path | None
-    sha256: str | None
+    content: bytes | None
     entries: tuple[Entry, ...]
+
+    @property
+    def sha256(self) -> str | None:
+        """Of a file, the hash of its content."""
+        return None if self.content is None else hashlib.sha256(self.content).hexdigest()
 
 
 _loaded: dict[str, Plugin] = {}
@@ -71,7 +76,9 @@ def names(given: Any) -> list[str]:
         return []
     listed = [given] if isinstance(given, str) else given
     if not isinstance(listed, Sequence) or not all(isinstance(name, str) and name for name in listed):
-        raise ConfigError([f"{KEY} = {given!r}: must be a list of files and packages, such as [my_terms.py,my_package]"])
+        raise ConfigError(
+            [f"{KEY} = {given!r}: must be a list of files and packages, such as [my_terms.py,my_package]"]
+        )
     return list(listed)
 
 
@@ -215,7 +222,10 @@ def _module(name: str) -> tuple[str, Path | None]:
 
 
 def _activate(module: str, name: str, file: Path | None) -> None:
-    if module in _active or module in (_installed or {}):
+    if module in (_installed or {}):
+        return
+    if module in _active:
+        _active[module] = replace(_active[module], name=name, file=file)
         return
     plugin = _loaded.get(module)
     if plugin is None:
@@ -228,11 +238,19 @@ def _activate(module: str, name: str, file: Path | None) -> None:
         for entry in plugin.entries[:k]:
             registry.remove(entry)
         raise ConfigError([f"{KEY}: {error}"]) from None
-    _active[module] = plugin
+    _active[module] = replace(plugin, name=name, file=file)  # the same content may lie in another place by now
 
 
-class _FromSource(importlib.machinery.SourceFileLoader):
-    """Leaves no ``__pycache__`` beside a user's file and reads none: one of the same second would be stale."""
+class _FromContent(importlib.machinery.SourceFileLoader):
+    """Executes the content that was read once; no ``__pycache__`` comes to lie beside a user's file."""
+
+    def __init__(self, module: str, file: Path, content: bytes) -> None:
+        super().__init__(module, str(file))
+        self._content = content
+
+    def get_data(self, path: Any) -> bytes:
+        """Return the content."""
+        return self._content
 
     def path_stats(self, path: Any) -> Any:
         """Say that nothing is known that byte code could be compared with."""
@@ -242,12 +260,13 @@ class _FromSource(importlib.machinery.SourceFileLoader):
 def _import(module: str, name: str, file: Path | None) -> Plugin:
     """Execute a plugin; raise ConfigError in one line if it fails or registers nothing."""
     before = set(sys.modules)
+    content = file.read_bytes() if file else None
     try:
         with registry.collected() as new:
-            if file is None:
+            if file is None or content is None:
                 importlib.import_module(module)
             else:
-                spec = importlib.util.spec_from_file_location(module, file, loader=_FromSource(module, str(file)))
+                spec = importlib.util.spec_from_file_location(module, file, loader=_FromContent(module, file, content))
                 assert spec is not None
                 assert spec.loader is not None
                 sys.modules[module] = importlib.util.module_from_spec(spec)
@@ -260,8 +279,10 @@ def _import(module: str, name: str, file: Path | None) -> Plugin:
     mine = [e for e in registry.foreign() if _within(e.target.__module__, module)]  # imported by someone before
     entries = tuple({id(e): e for e in [*mine, *new]}.values())  # entries hold mappings: not hashable
     if not entries:
-        raise ConfigError([f"{KEY}: {name}: registers no term; decorate one, such as @reward('my_term') (go1exp.terms)"])
-    _loaded[module] = Plugin(name, module, file, sha256(file) if file else None, entries)
+        raise ConfigError(
+            [f"{KEY}: {name}: registers no term; decorate one, such as @reward('my_term') (go1exp.terms)"]
+        )
+    _loaded[module] = Plugin(name, module, file, content, entries)
     return _loaded[module]
 
 

@@ -30,7 +30,6 @@ from go1exp.sim_robot.machine import Robot
 from go1exp.sim_robot.server import TRUTH, Server
 from go1exp.sim_robot.settings import SimConfig
 
-
 WITHOUT_POLICY: dict[str, Any] = {
     **{group: {} for group in ("reward", "rand", "event", "termination", "curriculum")},
     "observation": {"joint_position": {}},

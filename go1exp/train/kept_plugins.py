@@ -9,7 +9,6 @@ import importlib
 import importlib.metadata
 import importlib.util
 import json
-import shutil
 import subprocess
 import warnings
 from collections.abc import Iterator, Mapping
@@ -128,6 +127,7 @@ def _copy_of(run: Path, plugin: Plugin) -> bool:
 def _file(run: Path, plugin: Plugin) -> dict[str, Any]:
     """Copy a plugin's file, unless it is the run's copy already."""
     assert plugin.file is not None
+    assert plugin.content is not None
     if _copy_of(run, plugin):
         for record in _records(run):
             if record.get("sha256") == plugin.sha256:
@@ -138,7 +138,7 @@ def _file(run: Path, plugin: Plugin) -> dict[str, Any]:
     target.parent.mkdir(exist_ok=True)
     if not target.is_file():
         partial = target.with_suffix(".partial")
-        shutil.copyfile(plugin.file, partial)
+        partial.write_bytes(plugin.content)
         partial.replace(target)
     return {"name": plugin.name, "file": target.relative_to(run).as_posix(), "sha256": plugin.sha256}
 
