@@ -132,7 +132,7 @@ def test_a_file_of_terms_is_there_for_the_configuration_that_names_it_and_for_no
     write("my_terms.py", LAZY)
     task = parse_task(compose("train", ["plugins=[my_terms.py]", "+reward.lazy.weight=-1"]))
     assert task.reward[-1].entry.name == "lazy"
-    with pytest.raises(ConfigError, match="reward.lazy: unknown reward term 'lazy'"):
+    with pytest.raises(ConfigError, match=r"reward\.lazy: unknown reward term 'lazy'"):
         parse_task(compose("train", ["+reward.lazy.weight=-1"]))
 
 

@@ -133,7 +133,7 @@ def inputs_of(terms: Sequence[Term]) -> tuple[Port, ...]:
     for term in terms:
         if term.entry.remembers:
             raise ExportError(
-                f"observation.{term.key}: remembers the past; a policy for the robot may only see functions of the present"
+                f"observation.{term.key}: remembers the past; what a policy sees on the robot must be of the present"
             )
         sensed = Sensed({port.name: torch.zeros(2, port.size) for port in READINGS}, term.key)
         term(cast(Snapshot, sensed))

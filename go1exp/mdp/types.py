@@ -1,5 +1,6 @@
-"""What the MDP sees of one moment, ``Snapshot``, what a step of the environment returns, ``StepResult``, and what a term
-with memory is built from, ``TermSetup``.
+"""What the MDP sees of one moment, ``Snapshot``, and what a step of the environment returns, ``StepResult``.
+
+``TermSetup`` is what a term with a memory is built from.
 """
 
 from __future__ import annotations

@@ -232,10 +232,10 @@ def _activate(module: str, name: str, file: Path | None) -> None:
         _active[module] = _import(module, name, file)
         return
     try:
-        for k, entry in enumerate(plugin.entries):
+        for entry in plugin.entries:
             registry.add(entry)
     except DuplicateError as error:
-        for entry in plugin.entries[:k]:
+        for entry in plugin.entries:  # those that came before it
             registry.remove(entry)
         raise ConfigError([f"{KEY}: {error}"]) from None
     _active[module] = replace(plugin, name=name, file=file)  # the same content may lie in another place by now

@@ -1,6 +1,7 @@
 """What a run folder keeps of the plugins that it was trained with, and how they are there again for whoever reads it.
 
-A file is copied to ``plugins/``; of a package, ``meta.json`` has version and commit. Evaluating a run executes its files.
+A file is copied to ``plugins/``; of a package, ``meta.json`` has version and commit. To read a run is to execute its
+files.
 """
 
 from __future__ import annotations

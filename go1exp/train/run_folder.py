@@ -1,8 +1,8 @@
 """The run folder: what was run, with what, and where its results are.
 
 ``config.yaml`` (resolved), ``meta.json`` (git commit, versions, machine, hashes of assets), ``metrics.csv``,
-``timing.csv``, ``checkpoints/``, ``actuator.npz`` (a copy of the actuator net, if there is one), ``plugins/`` (copies of
-the user's files with terms). Whatever comes later reads the run's own configuration, never today's ``conf/``.
+``timing.csv``, ``checkpoints/``, ``actuator.npz`` (a copy of the actuator net, if there is one), ``plugins/`` (copies
+of the user's files with terms). Whatever comes later reads the run's own configuration, never today's ``conf/``.
 """
 
 from __future__ import annotations
