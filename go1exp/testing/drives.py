@@ -68,7 +68,6 @@ def check_actuator(entry: Entry, parameters: dict[str, Any], exact: bool) -> Non
     batch, alone = make(5), make(1, 3)
     limit = go1_drives(1).effort_limit
     within = f"torques must stay within {limit.tolist()[:3]} N m"
-    continues = "it must continue from its saved state bit for bit"
     one, fresh = make(5), make(5)
     for k in range(30):
         inputs = _moment(5, k, size=10.0 if k % 10 == 9 else 1.0)
