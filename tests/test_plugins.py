@@ -377,7 +377,7 @@ def test_an_observation_that_remembers_cannot_be_exported_and_that_is_said() -> 
 
 def train(run: Path, *overrides: str, iterations: int = 2) -> Any:
     container = compose("train", [*SMALL, *overrides, f"ppo.iterations={iterations}"])
-    config = parse_train(kept_plugins.own(run, container))
+    config = parse_train(kept_plugins.with_copies(run, container))
     run_folder.write(run, container)
     return trainer.train(config, container, run)
 

@@ -26,5 +26,5 @@ def begin(verb: str, container: dict[str, Any]) -> dict[str, Any]:
     if isinstance(run, str) and (Path(run) / "config.yaml").is_file():
         from go1exp.train import kept_plugins
 
-        plugins.use(kept_plugins.own(Path(run), {})[plugins.KEY])
+        plugins.use(kept_plugins.with_copies(Path(run), {})[plugins.KEY])
     return {key: value for key, value in container.items() if key != plugins.KEY}

@@ -86,7 +86,7 @@ def _task(container: dict[str, Any]) -> int | None:
 
         run = existing(config.process.resume, "resume")
         container = _resumed(run, list(HydraConfig.get().overrides.task))
-        config = parse_train(kept_plugins.own(run, container))
+        config = parse_train(kept_plugins.with_copies(run, container))
     else:
         _refuse_other(run, container)
 

@@ -74,7 +74,7 @@ class Go1Core:
         units = getattr(self.backend, "units", None)
         self.random = EnvRandom(seed, num_envs, first_env, self.device, units=units)
         self._held = held
-        self._state = KinematicState.of(self.backend.qpos, self.backend.qvel, held)
+        self._state = KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
         self._build_terms(EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random)
 
@@ -185,7 +185,7 @@ class Go1Core:
         rows = mask.unsqueeze(1)
         self.spawn.copy_(torch.where(rows, self._origins[self.level, self.tile_column], self.spawn))
         qpos, qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
-        fresh = KinematicState.of(qpos, qvel, self._held)
+        fresh = KinematicState.view(qpos, qvel, self._held)
         fresh.base_pos_w.copy_(self.spawn)
         fresh.base_pos_w[:, 2] += robot.NOMINAL_HEIGHT
         fresh.base_quat_w[:, 0] = 1.0

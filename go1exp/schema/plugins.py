@@ -276,8 +276,8 @@ def _import(module: str, name: str, file: Path | None) -> Plugin:
         for other in [m for m in sys.modules if m.split(".")[0] == root and m not in before]:
             del sys.modules[other]
         raise ConfigError([f"{KEY}: {_reason(error, module, name, file)}"]) from error
-    mine = [e for e in registry.foreign() if _within(e.target.__module__, module)]  # imported by someone before
-    entries = tuple({id(e): e for e in [*mine, *new]}.values())  # entries hold mappings: not hashable
+    by_module = [e for e in registry.foreign() if _within(e.target.__module__, module)]  # imported by someone before
+    entries = tuple({id(e): e for e in [*by_module, *new]}.values())  # entries hold mappings: not hashable
     if not entries:
         raise ConfigError(
             [f"{KEY}: {name}: registers no term; decorate one, such as @reward('my_term') (go1exp.terms)"]

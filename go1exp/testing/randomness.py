@@ -47,17 +47,17 @@ def backend(n: int) -> MujocoCpu:
     return MujocoCpu(*_scene(), n, threads=1)
 
 
-def model_fields(of: MujocoCpu) -> dict[str, Tensor]:
+def model_fields(robots: MujocoCpu) -> dict[str, Tensor]:
     """Return copies of all fields that differ between robots."""
-    copies: dict[str, Tensor] = of.state_dict()["fields"]
+    copies: dict[str, Tensor] = robots.state_dict()["fields"]
     return copies
 
 
-def with_fields(of: MujocoCpu, entry: Entry) -> dict[str, Tensor]:
+def with_fields(robots: MujocoCpu, entry: Entry) -> dict[str, Tensor]:
     """Make the fields that a term declares differ between robots, and return them."""
     for name in entry.traits["fields"]:
-        of.field(name)
-    return model_fields(of)
+        robots.field(name)
+    return model_fields(robots)
 
 
 def start_states(n: int) -> KinematicState:
@@ -65,7 +65,7 @@ def start_states(n: int) -> KinematicState:
     qpos, qvel = torch.zeros(n, 19, dtype=torch.float64), torch.zeros(n, 18, dtype=torch.float64)
     qpos[:, 2], qpos[:, 3] = 0.33, 1.0
     qpos[:, 7:] = torch.as_tensor(robot.NOMINAL_STANCE)
-    return KinematicState.of(qpos, qvel)
+    return KinematicState.view(qpos, qvel)
 
 
 def parts(state: KinematicState) -> dict[str, Tensor]:

@@ -107,11 +107,11 @@ def check_termination(entry: Entry, parameters: dict[str, Any], exact: bool) -> 
 
 
 def _check(entry: Entry, values: dict[str, Any], exact: bool, shape: tuple[int, ...], dtype: torch.dtype) -> None:
-    seen = [random_snapshot(ODD, seed) for seed in range(4)]
+    moments = [random_snapshot(ODD, seed) for seed in range(4)]
     batch = _Made(entry, values, ODD)
     singles = {i: _Made(entry, values, 1) for i in (0, 17, ODD - 1)}
     part = _Made(entry, values, 8)
-    for k, s in enumerate(seen):
+    for k, s in enumerate(moments):
         together = batch(s)
         expect(entry, together.shape == (ODD, *shape), f"it must be (N{''.join(f', {x}' for x in shape)})")
         expect(entry, together.dtype == dtype, f"it must be {dtype}, and is {together.dtype}")
@@ -124,21 +124,21 @@ def _check(entry: Entry, values: dict[str, Any], exact: bool, shape: tuple[int, 
             expect(entry, alike(single(rows(s, slice(i, i + 1))), together[i : i + 1], exact), promise)
         expect(entry, alike(part(rows(s, slice(0, 8))), together[:8], exact), promise)
     if entry.remembers:
-        _check_memory(entry, values, seen)
+        _check_memory(entry, values, moments)
 
 
-def _check_memory(entry: Entry, values: dict[str, Any], seen: list[Snapshot]) -> None:
+def _check_memory(entry: Entry, values: dict[str, Any], moments: list[Snapshot]) -> None:
     """Check what a term with a memory promises beyond the others."""
     one, other, fresh = (_Made(entry, values, ODD) for _ in range(3))
     memory = one.object
     assert memory is not None
     expect(entry, one.numbers(), "a class must name its tensors in `memory`; a term without any is a function")
     held = {name: getattr(memory, name) for name in memory.memory}
-    for s in seen:
+    for s in moments:
         one(s)
         other(s)
     if one.advances:
-        expect(entry, torch.equal(memory(seen[0]), memory(seen[0])), "to read it twice must change nothing")
+        expect(entry, torch.equal(memory(moments[0]), memory(moments[0])), "to read it twice must change nothing")
     mask = torch.arange(ODD) % 3 == 0
     memory.reset(mask)
     for name, values_now in one.numbers().items():
@@ -147,7 +147,7 @@ def _check_memory(entry: Entry, values: dict[str, Any], seen: list[Snapshot]) ->
         expect(entry, torch.equal(values_now[~mask], other.numbers()[name][~mask]), "reset must touch masked rows only")
         expect(entry, torch.equal(values_now[mask], fresh.numbers()[name][mask]), "reset must forget the masked rows")
     fresh.object.load_state_dict(one.object.state_dict())  # type: ignore[union-attr]
-    for s in reversed(seen):
+    for s in reversed(moments):
         expect(entry, torch.equal(one(s), fresh(s)), "it must continue from its saved state bit for bit")
     kept = all(getattr(memory, name) is tensor for name, tensor in held.items())
     expect(entry, kept, "it must change its tensors in place: a captured GPU graph would not see an assignment")

@@ -35,7 +35,7 @@ def keep(run: Path, container: Mapping[str, Any]) -> list[dict[str, Any]]:
         OSError: if a file cannot be written.
     """
     named = plugins.names(container.get(plugins.KEY))
-    plugins.use(own(run, container)[plugins.KEY])
+    plugins.use(with_copies(run, container)[plugins.KEY])
     used = set(_used(container))
     records = []
     for plugin in plugins.in_force():
@@ -45,7 +45,7 @@ def keep(run: Path, container: Mapping[str, Any]) -> list[dict[str, Any]]:
     return records
 
 
-def own(run: Path, container: Mapping[str, Any]) -> dict[str, Any]:
+def with_copies(run: Path, container: Mapping[str, Any]) -> dict[str, Any]:
     """Return the configuration with the run's copies of its plugins in the place of what it names.
 
     Raises:
@@ -103,9 +103,9 @@ def _missing_package(run: Path, record: Mapping[str, Any]) -> list[str]:
     if missing:
         known = f" {version}" if version else ""
         return [f"{run}: was trained with package {name}{known} {_terms_of(record)}, which is not installed"]
-    here = _version(name)
-    if here != version:
-        warnings.warn(f"{run}: was trained with {name} {version}, here it is {here}", stacklevel=4)
+    installed = _version(name)
+    if installed != version:
+        warnings.warn(f"{run}: was trained with {name} {version}, here it is {installed}", stacklevel=4)
     return []
 
 

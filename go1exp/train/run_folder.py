@@ -65,7 +65,7 @@ def read_config(run: Path) -> dict[str, Any]:
         FileNotFoundError: if ``run`` is not a run folder.
         go1exp.schema.registry.ConfigError: if a plugin that it was trained with is missing.
     """
-    container = kept_plugins.own(run, read_as_written(run))
+    container = kept_plugins.with_copies(run, read_as_written(run))
     for settings in _with_files(container.get("actuator")):
         if (run / NET).is_file():
             settings["file"] = str(run / NET)
