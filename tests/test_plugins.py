@@ -21,10 +21,10 @@ from go1exp.compose import compose
 from go1exp.config import parse_task, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.policy import load_run
-from go1exp.export.graph import ExportError, inputs_of
+from go1exp.export.graph import ExportError, required_inputs
 from go1exp.schema import plugins, registry
 from go1exp.schema.registry import ConfigError
-from go1exp.sim_robot.__main__ import task_of
+from go1exp.sim_robot.__main__ import bundle_task
 from go1exp.train import checkpoint, kept_plugins, run_folder, start, trainer
 from tests.small_run import SMALL
 
@@ -369,7 +369,7 @@ def test_a_term_that_remembers_gives_a_robot_the_same_alone_and_in_a_batch() -> 
 def test_an_observation_that_remembers_cannot_be_exported_and_that_is_said() -> None:
     core = remembering()
     with pytest.raises(ExportError, match=r"observation\.memory_of_speed: remembers the past"):
-        inputs_of(core.task.observation)
+        required_inputs(core.task.observation)
 
 
 # ---------------------------------------------------------------------- run folders
@@ -430,7 +430,7 @@ def test_eval_export_and_the_simulated_robot_get_along_with_the_terms_of_a_run(
     assert go1exp("eval", f"run={trained}", *short) == 0, capsys.readouterr().err
     assert go1exp("export", f"run={trained}", "seconds=0.1", "out=bundle.zip") == 0, capsys.readouterr().err
     plugins.begin([])
-    assert task_of("bundle.zip", {}).actuator.entry.name == "pd"
+    assert bundle_task("bundle.zip", {}).actuator.entry.name == "pd"
 
 
 def test_a_resumed_run_has_its_own_terms_and_continues_bit_for_bit(

@@ -52,7 +52,7 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
     assert isinstance(task.backend, CpuBackend)
     batch = Batch(model, num_envs, nthread=task.backend.threads)
     qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
-    batch.bind("sensordata")
+    batch.bind("sensordata")  # so that sensors are computed and copied, as in the environment
     batch.reset(keyframe=0)
     origins = terrain.tile_origins.reshape(-1, 3)
     qpos[:, :3] += origins[np.arange(num_envs) % len(origins)]

@@ -90,6 +90,7 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
         for _ in range(task.sim.decimation):
             backend.step(torque)
 
+    # One graph for all substeps of a policy step, as in the environment.
     replay, _ = backend.capture(hold)  # type: ignore[attr-defined]  # this suite's backend can
 
     def step(given: torch.Tensor) -> None:

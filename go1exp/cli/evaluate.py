@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
+from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import EvalSettings, checkpoint_file, parse, trained
+    from go1exp.cli.runs import checkpoint_file, trained
+    from go1exp.cli.settings import EvalSettings, parse
 
     other, container = other_robot.split(container)
     settings = parse(EvalSettings, container)
@@ -36,7 +37,7 @@ def _task(container: dict[str, Any]) -> None:
         **evaluate(task, policy, config, spinner(1, "evaluating")),
     }
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(report, indent=2) + "\n")
+    write_json(out, report)
     print(table.text(report))
     print(f"\nwritten to {out}")
 

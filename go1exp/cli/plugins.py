@@ -7,6 +7,9 @@ from typing import Any
 
 from go1exp.schema import plugins
 
+MEANING = "files and packages with terms of your own, such as [my_terms.py] (docs/extending.md)"
+"""Of the key ``plugins``, for the help."""
+
 BY_CONFIGURATION = ("train",)
 """Verbs whose configuration is parsed with its plugins; the others have the key for themselves."""
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from go1exp.errors import Expected
+from go1exp.signals import STOPPED, handled, interrupt, say
 
 FAILED = 1
 
@@ -61,9 +62,17 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
 
 def main(given: Sequence[str]) -> int:
     """Walk as the command line says; return the exit status."""
-    options = arguments(given)
+    try:
+        with handled(interrupt):
+            return _walk(arguments(given))
+    except KeyboardInterrupt:
+        say("go1exp.deploy: stopped")
+        return STOPPED
+
+
+def _walk(options: argparse.Namespace) -> int:
     from go1exp.deploy.commands import Wish, parsed
-    from go1exp.deploy.job import Job, do
+    from go1exp.deploy.job import Job, run_job
     from go1exp.deploy.walk import Plan
 
     try:
@@ -82,7 +91,7 @@ def main(given: Sequence[str]) -> int:
         )
         sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "loss", "seed")}
         job = Job(options.bundle, options.robot, plan, options.out, sim, truth=options.truth)
-        return do(job, lambda line: print(line, flush=True))
+        return run_job(job, lambda line: print(line, flush=True))
     except (Expected, OSError, ValueError) as error:
         print(f"go1exp.deploy: {error}", file=sys.stderr)
         return FAILED

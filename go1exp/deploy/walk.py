@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import resource
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -18,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from go1exp import signals
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.commands import Limited, Wish, make, range_array
 from go1exp.deploy.controller import Controller, Cycle, Estimator
@@ -26,6 +25,7 @@ from go1exp.deploy.log import About, Log, write_cycles
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.messages import Link
 from go1exp.deploy.safety import RULES, Fault, Safety, SafetyConfig
+from go1exp.files import write_json
 
 FAULTS = (*RULES, "no_state", "estimator", "command", "runtime")
 FIRST_STATUS = 20
@@ -37,8 +37,6 @@ DONE = "walked to the end"
 
 TIME = "the end of its time"
 """Who ends a walk that nobody else ends."""
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ def estimator_of(bundle: Bundle, safety: Safety, contact: str | None) -> Estimat
     return KalmanEstimator(settings(bundle.metadata.estimator, **changes), safety.fail)
 
 
-def go(
+def walk(
     bundle: Bundle,
     link: Link,
     plan: Plan,
@@ -221,33 +219,19 @@ def _go(
 @contextmanager
 def stopping(safety: Safety) -> Iterator[None]:
     """Let signals stop the robot; leave their handlers as they were."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers
-        return
 
     def stop(number: int, frame: FrameType | None) -> None:
         safety.stop(signal.Signals(number).name)
+        if number == signal.SIGHUP:
+            signals.leave_terminal()
 
-    before = {number: signal.signal(number, stop) for number in SIGNALS}
-    try:
+    with signals.handled(stop):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
-@contextmanager
-def interruptible() -> Iterator[None]:
+def interruptible() -> AbstractContextManager[None]:
     """Let signals raise ``KeyboardInterrupt``, SIGINT also where a shell's background had it ignored; put them back."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return signals.handled(signals.interrupt)
 
 
 def resident() -> float | None:
@@ -268,7 +252,7 @@ def age() -> float | None:
         return None
 
 
-def account(bundle: Bundle, plan: Plan, outcome: Outcome, more: Mapping[str, Any]) -> dict[str, Any]:
+def account(bundle: Bundle, plan: Plan, outcome: Outcome, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return a walk as plain data."""
     log, fault = outcome.log, outcome.fault
     joints = bundle.metadata.joints
@@ -290,7 +274,7 @@ def account(bundle: Bundle, plan: Plan, outcome: Outcome, more: Mapping[str, Any
         "first_command_after_s": None if start is None or lived is None else lived - (time.perf_counter() - start),
         "memory_mb": outcome.memory_mb,
         "log": {"states": log.states.count, "overwritten": log.states.overwritten},
-        **more,
+        **extra,
     }
 
 
@@ -305,7 +289,7 @@ def save(
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"{about.episode}.json", folder / f"{about.episode}.npz"]
-    files[0].write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")  # first: nothing else is as small
+    write_json(files[0], content, indent=1, allow_nan=False)  # first: nothing else is as small
     write_cycles(files[1], outcome.log)
     recording = outcome.log.recording(about, truth)
     if recording is not None:

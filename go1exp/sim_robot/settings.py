@@ -15,7 +15,7 @@ class SimConfig:
     """How the simulated robot is set up.
 
     Attributes:
-        start: on its feet in the nominal stance, on its belly, or hung up so that no foot reaches the ground.
+        start: standing in the nominal stance, lying on its belly, or hung up so that no foot reaches the ground.
         noise: noise of its sensors, as a multiple of the paper's Table II.
         delay: delay of datagrams, each way, s.
         loss: share of the datagrams that are lost, each way.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from go1exp.schema.registry import ConfigError, Entry
 
-ALMOST = {"rtol": 1e-5, "atol": 1e-6}
+RTOL, ATOL = 1e-5, 1e-6
 """What float32 may round differently in a batch of another size."""
 
 
@@ -23,7 +23,7 @@ def alike(a: Tensor, b: Tensor, exact: bool) -> bool:
     """Return whether two results are the same, to the bit or but for rounding."""
     if a.shape != b.shape or a.dtype != b.dtype:
         return False
-    return torch.equal(a, b) if exact or not a.is_floating_point() else torch.allclose(a, b, **ALMOST)
+    return torch.equal(a, b) if exact or not a.is_floating_point() else torch.allclose(a, b, rtol=RTOL, atol=ATOL)
 
 
 def checked(entry: Entry, parameters: dict[str, Any]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ def check_excitation(entry: Entry, parameters: dict[str, Any], exact: bool) -> N
     def make(seed: int) -> Motion:
         motion = entry.target(t, centre, limits, np.random.default_rng(seed), **values)
         expect(entry, isinstance(motion, Motion), "it must return a Motion")
-        return motion  # type: ignore[no-any-return]
+        return motion
 
     motion, again = make(0), make(0)
     expect(entry, motion.target.shape == (len(t), len(centre)), "its targets must be (T, J)")

@@ -82,7 +82,7 @@ class _Made:
             return result
         if self.advances:
             self.object.advance(s)
-        return self.object(s).clone()  # type: ignore[no-any-return]
+        return self.object(s).clone()
 
     def numbers(self) -> dict[str, Tensor]:
         """Return what it remembers."""
