@@ -27,7 +27,7 @@ from go1exp.cli.record import _motions as motions
 from go1exp.compose import compose, hydra_for
 from go1exp.config import TrainConfig, parse_parts, parse_train
 from go1exp.env.core import Go1Core
-from go1exp.gap.models import parse_model
+from go1exp.gap.robots.description import parse_model
 from go1exp.mdp import rewards
 from go1exp.schema import registry
 from go1exp.schema.registry import Term
