@@ -38,7 +38,7 @@ def load(file: Path) -> dict[str, Any]:
 @cache
 def groups_of(verb: str) -> dict[str, str | None]:
     """Return the groups that ``conf/VERB.yaml`` names in its defaults, each with its default choice."""
-    chosen = {}
+    chosen: dict[str, str | None] = {}
     for item in load(config_folder() / f"{verb}.yaml").get("defaults", ()):
         if isinstance(item, dict):
             chosen |= {str(group): choice for group, choice in item.items() if not str(group).startswith("override ")}

@@ -50,8 +50,10 @@ def as_hydra_takes_them(overrides: Sequence[str]) -> list[str]:
     accepted = []
     for override in overrides:
         if match := VALUE_PER_JOINT.match(override):
-            accepted.append(f"{'++' if match['add'] else ''}{match['key']}=null")
-        accepted.append(f"++{override}" if OPEN.match(override) else override)
+            # Two spellings of the key, since a sweep keeps only the last override of each.
+            accepted += [f"{'++' if match['add'] else ''}{match['key']}=null", f"+{override.lstrip('+')}"]
+        else:
+            accepted.append(f"++{override}" if OPEN.match(override) else override)
     return accepted
 
 

@@ -65,6 +65,21 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     "deploy.yaml:hydra": "Hydra's own settings",
+    **{
+        f"{verb}.yaml:plugins": "tests/test_plugins.py shows what it does"
+        for verb in (
+            "train",
+            "eval",
+            "play",
+            "record",
+            "record_import",
+            "fit-actuator",
+            "gap",
+            "export",
+            "list",
+            "bench",
+        )
+    },
     "model/go1.yaml:model": "the Go1 is that of the group robot; test_gap_tolerances.py shows what its tolerances do",
     **{
         f"model/{name}.yaml:model": "a robot that is not simulated here; test_gap_machines.py shows what its keys do"
@@ -340,7 +355,7 @@ def parse(program: str, container: dict[str, Any]) -> Any:
         if problems:
             raise ConfigError(problems)
     kind, elsewhere = SETTINGS[program]
-    return settings.parse(kind, {k: v for k, v in container.items() if k not in elsewhere})
+    return settings.parse(kind, {k: v for k, v in container.items() if k not in (*elsewhere, "plugins")})
 
 
 SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {

@@ -75,3 +75,18 @@ def test_a_misspelt_parameter_with_a_mapping_is_refused_with_the_nearest_name(
     )
     assert status == 2
     assert "'effect.coulomb.bund'; did you mean 'effect.coulomb.bound'" in capsys.readouterr().err
+
+
+def test_a_sweep_over_mappings_gives_each_job_its_value(tmp_path: Path) -> None:
+    kept: list[dict[str, Any]] = []
+    status = App("train", kept.append).run(
+        [
+            "-m",
+            "effect=coulomb",
+            "effect.coulomb.bound={calf: 0.1},{hip: 0.2}",
+            f"hydra.sweep.dir={tmp_path}",
+            "hydra.sweep.subdir=${hydra.job.num}",
+        ]
+    )
+    assert status == 0
+    assert [config["effect"]["coulomb"]["bound"] for config in kept] == [{"calf": 0.1}, {"hip": 0.2}]

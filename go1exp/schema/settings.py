@@ -26,7 +26,7 @@ MISSING = "???"
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def settings(kind: type[T]) -> type[T]:
     """Class decorator: a frozen dataclass whose types and ranges are checked, strictly, whoever makes one."""
-    return pydantic_dataclass(kind, frozen=True, kw_only=True, config=STRICT)
+    return pydantic_dataclass(kind, frozen=True, kw_only=True, config=STRICT)  # type: ignore[return-value]
 
 
 def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, str] | None = None) -> T:
