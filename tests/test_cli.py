@@ -24,17 +24,9 @@ from go1exp.config import parse_train
 from go1exp.evaluate.camera import RenderingUnavailable, choose_gl
 from go1exp.schema import registry
 from go1exp.train import run_folder, trainer
+from tests.command import COMMAND_LINE, LIGHT, WITH_MODULES, run_alone
+from tests.command import run as cli
 
-COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
-WITH_MODULES = """
-import json, os, sys
-from go1exp.cli import main
-try:
-    sys.exit(main())
-finally:
-    with open(os.environ["MODULES"], "w") as file:
-        json.dump(list(sys.modules), file)
-"""
 SMALL = (
     "ppo=paper",
     "ppo.num_envs=4",
@@ -50,23 +42,11 @@ SMALL = (
 HEAVY = {"mujoco", "stable_baselines3", "gymnasium", "torch.nn", "wandb", "tensorboard", "matplotlib", "scipy"}
 
 
-def cli(cwd: Path, *arguments: str, code: str = COMMAND_LINE, **environment: str) -> subprocess.CompletedProcess[str]:
-    inherited = {k: v for k, v in os.environ.items() if k not in ("HYDRA_FULL_ERROR", "DISPLAY", "WAYLAND_DISPLAY")}
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=cwd,
-        env={**inherited, "PYTHONPATH": str(data_root()), **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
 def assert_refused(tmp_path: Path, arguments: list[str], *said: str) -> None:
     """Status 2, one message with everything of ``said``, nothing heavy loaded, nothing left behind."""
     here, modules = tmp_path / "here", tmp_path / "modules.json"
     here.mkdir()
-    done = cli(here, *arguments, code=WITH_MODULES, MODULES=str(modules))
+    done = cli(here, *arguments, code=WITH_MODULES, preload=LIGHT, MODULES=str(modules))
     first, *others = done.stderr.splitlines()
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
@@ -281,7 +261,7 @@ def test_a_traceback_is_there_for_who_asks_for_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]])
 def test_the_general_help_names_every_verb_and_loads_nothing(arguments: list[str], tmp_path: Path) -> None:
-    done = cli(tmp_path, *arguments, code=WITH_MODULES, MODULES=str(tmp_path / "modules.json"))
+    done = run_alone(tmp_path, *arguments, code=WITH_MODULES, MODULES=str(tmp_path / "modules.json"))
     assert done.returncode == 0
     for verb, text in VERBS.items():
         assert re.search(rf"^  {verb} +{re.escape(text)}$", done.stdout, re.MULTILINE)
@@ -443,7 +423,7 @@ def test_blas_has_one_thread_unless_the_user_says_otherwise(given: str | None, m
     ],
 )
 def test_tab_completes(line: str, offered: set[str], tmp_path: Path) -> None:
-    done = cli(tmp_path, "-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
+    done = cli(tmp_path, "-sc", "query=bash", preload=LIGHT, COMP_LINE=line, COMP_POINT=str(len(line)))
     assert done.returncode == 0
     assert set(done.stdout.split()) == offered
     assert done.stderr == ""
@@ -451,7 +431,7 @@ def test_tab_completes(line: str, offered: set[str], tmp_path: Path) -> None:
 
 def test_tab_offers_words_and_settings_after_a_verb_that_has_both(tmp_path: Path) -> None:
     line = "go1exp record "
-    done = cli(tmp_path, "-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
+    done = cli(tmp_path, "-sc", "query=bash", preload=LIGHT, COMP_LINE=line, COMP_POINT=str(len(line)))
     assert {*SUBVERBS["record"], "seconds=", "effect="} <= set(done.stdout.split())
 
 

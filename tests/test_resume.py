@@ -6,8 +6,6 @@ import csv
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -16,10 +14,11 @@ from typing import Any
 import pytest
 import torch
 
-from go1exp import data_root
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.train import checkpoint, metrics, run_folder, trainer
+from tests.command import run as cli
+from tests.command import run_alone
 
 SMALL = (
     "ppo.num_envs=8",
@@ -52,7 +51,6 @@ ROUGH = (
 )
 SIX = "ppo.iterations=6"
 
-COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
 SIGNALLED = """
 import os, signal, sys
 from go1exp.cli import main
@@ -65,13 +63,6 @@ def signalled(self, values, excluded, step=0):
 CsvWriter.write = signalled
 sys.exit(main())
 """
-
-
-def cli(cwd: Path, *arguments: str, code: str = COMMAND_LINE) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(data_root())}
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
-    )
 
 
 def train_here(run: Path, overrides: Sequence[str]) -> None:
@@ -209,7 +200,7 @@ def test_a_run_stopped_by_ctrl_c_goes_on_with_resume(flat: Path, folder: Path) -
     assert iterations(run / "metrics.csv") == [1, 2, 3]
     assert checkpoint.checkpoints(run)[-1].name == "000003.pt"
 
-    resumed = cli(folder, "train", f"resume={run}", SIX)
+    resumed = run_alone(folder, "train", f"resume={run}", SIX)
     assert resumed.returncode == 0, resumed.stderr
     assert "000003.pt" in resumed.stdout
     assert_the_same_run(run, flat)
