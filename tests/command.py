@@ -34,18 +34,23 @@ finally:
 """
 """The command line, and afterwards the names of all loaded modules in the file ``$MODULES``."""
 
-LIGHT = """
+COMPOSED = """
+from go1exp.compose import compose
+compose("train", ["seed=1", "ppo.hidden=[8]"])  # Hydra has looked for its plugins, and its parsers know their grammars
+"""
+
+LIGHT = f"""{COMPOSED}
 from go1exp.cli import MODULES, SUBVERBS, VERBS
 from go1exp.cli.app import defer
 import importlib
 defer("torch")
-for verb in [*VERBS, *(f"{verb}_{word}" for verb, words in SUBVERBS.items() for word in words)]:
-    importlib.import_module(f"go1exp.cli.{MODULES.get(verb, verb)}")
+for verb in [*VERBS, *(f"{{verb}}_{{word}}" for verb, words in SUBVERBS.items() for word in words)]:
+    importlib.import_module(f"go1exp.cli.{{MODULES.get(verb, verb)}}")
 import go1exp.config, go1exp.cli.settings, go1exp.excitations, go1exp.importers
 """
 """What a refusal needs: neither torch nor an engine. A refusal that loads them is seen, as they are not there yet."""
 
-WARM = """
+WARM = f"""{COMPOSED}
 import torch, mujoco, stable_baselines3
 import go1exp.train.trainer, go1exp.evaluate, go1exp.record.simulate, go1exp.excitations, go1exp.importers
 import go1exp.cli.app
@@ -69,6 +74,7 @@ for line in requests:
         continue
     os.close(requests.fileno())
     os.close(answers.fileno())
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where pytest runs in a shell's background
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["environment"])
