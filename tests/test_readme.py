@@ -86,7 +86,7 @@ class Command:
 def commands() -> list[Command]:
     """The commands in README's blocks without a language, from top to bottom."""
     blocks = re.findall(r"^```\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
-    lines = [line for block in blocks for line in block.splitlines() if line.startswith("go1exp ")]
+    lines = [line for block in blocks for line in block.splitlines() if re.match(r"go1exp [\w-]+ ", line)]
     parts = [(line, tuple(shlex.split(line, comments=True)[1:])) for line in lines]
     return [Command(shlex.join(["go1exp", *words]).replace("'", ""), words) for _, words in parts]
 
