@@ -113,8 +113,11 @@ def transfer(result: FitResult, recordings: list[Recording]) -> None:
         rows = windows([recording], info.inputs, info.history, info.period)
         torque = result.net.torque(rows.x)
         for j, joint in enumerate(info.joints):
-            mine = rows.joint == j
-            errors = (rmse(torque[mine] - rows.y[mine]), rmse(rows.command[mine] - rows.y[mine]))
+            joint_rows = rows.joint == j
+            errors = (
+                rmse(torque[joint_rows] - rows.y[joint_rows]),
+                rmse(rows.command[joint_rows] - rows.y[joint_rows]),
+            )
             mark = " *" if name(recording) in FOLLOWED["C"] else "  "
             print(f"{joint:<9} {name(recording)}{mark}    " + "".join(f"{v:10.4f}" for v in errors))
 

@@ -92,7 +92,7 @@ def go1exp_loop(num_envs: int, device: str) -> tuple[Loop, int, dict[str, str]]:
     return loop, size, described(device, (), ("go1exp", *ENGINE)) | about
 
 
-def mjlab_loop(num_envs: int, device: str, own_steps: bool) -> tuple[Loop, int, dict[str, str]]:
+def mjlab_loop(num_envs: int, device: str, its_steps: bool) -> tuple[Loop, int, dict[str, str]]:
     """Return mjlab's training, its steps an iteration, and its settings: what its ``train`` script does, unlogged."""
     from dataclasses import asdict
 
@@ -104,7 +104,7 @@ def mjlab_loop(num_envs: int, device: str, own_steps: bool) -> tuple[Loop, int, 
     backends.configure_torch_backends()
     config, agent = registry.load_env_cfg(TASK), registry.load_rl_cfg(TASK)
     config.scene.num_envs, config.seed = num_envs, agent.seed
-    if not own_steps:
+    if not its_steps:
         config.sim.mujoco.timestep, config.decimation = PHYSICS_DT, DECIMATION
     raw = envs.ManagerBasedRlEnv(cfg=config, device=device)
     env = rl.RslRlVecEnvWrapper(raw, clip_actions=agent.clip_actions)
@@ -153,11 +153,11 @@ def described(device: str, packages: Sequence[str], modules: Sequence[str]) -> d
     """Name the device, the versions that matter and what torch does to float32 in matrix products."""
     import torch
 
-    found = [f"{name} {version(name)}" for name in packages]
-    found += [f"{name} {importlib.import_module(name).__version__}" for name in modules]
+    versions = [f"{name} {version(name)}" for name in packages]
+    versions += [f"{name} {importlib.import_module(name).__version__}" for name in modules]
     where = torch.cuda.get_device_name(device) if device != "cpu" else "CPU"
     precision = "tf32" if torch.backends.cuda.matmul.fp32_precision == "tf32" else "float32"
-    return {"device": where, "versions": ", ".join(found), "products": precision}
+    return {"device": where, "versions": ", ".join(versions), "products": precision}
 
 
 def wait(device: str) -> None:
@@ -309,18 +309,18 @@ def report(sides: Sequence[Side]) -> str:
 
 def lacking(folder: Path) -> list[str]:
     """Return what of mjlab's needs is not in a folder, in words."""
-    there = {d.metadata["Name"].lower().replace("_", "-"): d.version for d in distributions(path=[str(folder)])}
+    installed = {d.metadata["Name"].lower().replace("_", "-"): d.version for d in distributions(path=[str(folder)])}
     return [
-        f"{name} {wanted}".strip() + (f" (there is {there[name]})" if name in there else "")
+        f"{name} {wanted}".strip() + (f" (there is {installed[name]})" if name in installed else "")
         for name, wanted in NEEDS.items()
-        if name not in there or not there[name].startswith(wanted)
+        if name not in installed or not installed[name].startswith(wanted)
     ]
 
 
 def pins() -> list[str]:
     """Return pip's words for the torch and the warp that are here, as far as they are."""
-    here = {d.metadata["Name"]: d.version.partition("+")[0] for d in distributions()}
-    return [f"{name}=={here[name]}" for name in ("torch", "warp-lang") if name in here]
+    installed = {d.metadata["Name"]: d.version.partition("+")[0] for d in distributions()}
+    return [f"{name}=={installed[name]}" for name in ("torch", "warp-lang") if name in installed]
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -332,19 +332,19 @@ def main(arguments: Sequence[str]) -> int:
             "usage: python -m benchmarks.against_mjlab site=FOLDER [num_envs=4096] [rounds=3] [seconds=20] "
             "[device=cuda:0] [own_steps=false]"
         )
-    device, own = given.get("device", "cuda:0"), given.get("own_steps", "false")
+    device, its_steps_setting = given.get("device", "cuda:0"), given.get("own_steps", "false")
     try:
         num_envs, rounds = int(given.get("num_envs", 4096)), int(given.get("rounds", 3))
         seconds = float(given.get("seconds", 20))
     except ValueError as error:
         raise SystemExit(f"num_envs and rounds must be whole numbers and seconds a number: {error}") from error
-    if own not in ("true", "false"):
-        raise SystemExit(f"own_steps={own}: true or false")
+    if its_steps_setting not in ("true", "false"):
+        raise SystemExit(f"own_steps={its_steps_setting}: true or false")
     if "worker" in given:
         if given["worker"] == "go1exp":
             serve(lambda: go1exp_loop(num_envs, device))
         else:
-            serve(lambda: mjlab_loop(num_envs, device, own == "true"))
+            serve(lambda: mjlab_loop(num_envs, device, its_steps_setting == "true"))
         return 0
     folder = Path(given["site"]).expanduser().resolve()
     if missing := lacking(folder):
@@ -353,13 +353,13 @@ def main(arguments: Sequence[str]) -> int:
             f"  {sys.executable} -m pip install --target FOLDER mjlab=={NEEDS['mjlab']} {' '.join(pins())}"
         )
 
-    def worker(which: str, own_steps: str) -> list[str]:
-        settings = [f"worker={which}", "site=", f"num_envs={num_envs}", f"device={device}", f"own_steps={own_steps}"]
+    def worker(which: str, its_steps: str) -> list[str]:
+        settings = [f"worker={which}", "site=", f"num_envs={num_envs}", f"device={device}", f"own_steps={its_steps}"]
         return [sys.executable, "-P", __file__, *settings]
 
-    here = os.pathsep.join(p for p in (str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH")) if p)
-    sides = [Side("go1exp", worker("go1exp", "false"), here), Side("mjlab", worker("mjlab", "false"), str(folder))]
-    if own == "true":
+    path = os.pathsep.join(p for p in (str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH")) if p)
+    sides = [Side("go1exp", worker("go1exp", "false"), path), Side("mjlab", worker("mjlab", "false"), str(folder))]
+    if its_steps_setting == "true":
         sides.append(Side("mjlab 5 ms x 4", worker("mjlab", "true"), str(folder)))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # not without ending the sides
     try:

@@ -25,9 +25,9 @@ def walk(bundle: str, rate: int, seconds: float, x: float) -> dict[str, Any]:
         SystemExit: if the walk did not come to its end.
     """
     with tempfile.TemporaryDirectory(prefix="go1exp-") as folder:
-        words = [bundle, "--rate", str(rate), "--seconds", str(seconds), "--command", f"{x},0,0", "--out", folder]
-        words += ["--stale", "0.2"]  # the machine may have something else to do
-        run = subprocess.run([sys.executable, "-m", "go1exp.deploy", *words], capture_output=True, text=True)
+        arguments = [bundle, "--rate", str(rate), "--seconds", str(seconds), "--command", f"{x},0,0", "--out", folder]
+        arguments += ["--stale", "0.2"]  # the machine may have something else to do
+        run = subprocess.run([sys.executable, "-m", "go1exp.deploy", *arguments], capture_output=True, text=True)
         if run.returncode:
             raise SystemExit(f"{rate} Hz: {run.stderr.strip() or run.stdout.strip()}")
         account: dict[str, Any] = json.loads(next(Path(folder).glob("*.json")).read_text())

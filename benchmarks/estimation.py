@@ -93,7 +93,7 @@ def speed() -> None:
 
 def real(folder: Path, leave_one_out: bool) -> None:
     """Print the table of SCALER's walks; a run that cannot be judged has its reason there."""
-    found: dict[Path, Judgement] = {}
+    judgements: dict[Path, Judgement] = {}
     print("| run | distance, m | odometry: v RMSE | distance | filter: v RMSE | distance | clock |")
     print("|---|---|---|---|---|---|---|")
     for file in files(folder, "*.npz"):
@@ -102,23 +102,23 @@ def real(folder: Path, leave_one_out: bool) -> None:
         except RecordingError as error:
             print(f"| {file.stem} | left out: {error} |")
             continue
-        found[file] = j
+        judgements[file] = j
         odometry = f"{j.odometry_rmse:.3f} | {100 * j.odometry_distance:+.1f} %"
         filtered = f"{j.filter_rmse:.3f} | {100 * j.filter_distance:+.1f} %"
         clock = f"{j.clock_shift:+.2f} s" if j.clock_shift else ""
         print(f"| {j.run} | {j.truth_distance:.2f} | {odometry} | {filtered} | {clock} |")
-    if not found:
+    if not judgements:
         return
-    of = list(found.values())
+    runs = list(judgements.values())
     columns = [
-        (np.mean([j.odometry_rmse for j in of]), np.mean([abs(j.odometry_distance) for j in of])),
-        (np.mean([j.filter_rmse for j in of]), np.mean([abs(j.filter_distance) for j in of])),
+        (np.mean([j.odometry_rmse for j in runs]), np.mean([abs(j.odometry_distance) for j in runs])),
+        (np.mean([j.filter_rmse for j in runs]), np.mean([abs(j.filter_distance) for j in runs])),
     ]
     print("| mean (distance: of sizes) | | " + " | ".join(f"{v:.3f} | {100 * d:.1f} %" for v, d in columns) + " | |")
-    if leave_one_out and len(found) > 1:
-        errors = np.array([[judge(f, scaler(foot_drift=d)).filter_distance for d in DRIFTS] for f in found])
+    if leave_one_out and len(judgements) > 1:
+        errors = np.array([[judge(f, scaler(foot_drift=d)).filter_distance for d in DRIFTS] for f in judgements])
         held = []
-        for k in range(len(found)):
+        for k in range(len(judgements)):
             others = np.delete(errors, k, axis=0)
             held.append(errors[k, np.argmin((others**2).mean(axis=0))])
         print(
@@ -140,16 +140,16 @@ def score(recordings: Sequence[Recording], ground: str, every: int, lost: float)
     for r in recordings:
         fed = kept(len(r.t), every, lost)
         t = r.t[fed]
-        found = make_filter(config).run(samples(r)[fed])
+        states = make_filter(config).run(samples(r)[fed])
         attitude = Rotation.from_quat(r.block(*VECTORS["base_quat"]), scalar_first=True)
         velocity = attitude.inv().apply(r.block(*VECTORS["base_lin_vel"]))[fed]
         later = t > t[0] + 0.5
-        error = (found[:, 3:6] - velocity)[later]
+        error = (states[:, 3:6] - velocity)[later]
         axes = " ".join(f"{x:.3f}" for x in np.sqrt((error**2).mean(axis=0)))
         whole = np.sqrt((error**2).sum(axis=1).mean())
         tail = np.sqrt((error[t[later] > t[-1] - 30] ** 2).sum(axis=1).mean())
         horizontal = np.linalg.norm(velocity[later, :2], axis=1)
-        odd = int((found[1:, -1] != Status.OK).sum())
+        odd = int((states[1:, -1] != Status.OK).sum())
         print(
             f"| {ground} | {r.meta.episode} | {t[-1]:.0f} | {horizontal.mean():.2f} ({horizontal.max():.2f}) "
             f"| {axes} | {whole:.3f} | {tail:.3f} | {np.abs(error).max():.2f} | {odd} |",

@@ -67,19 +67,19 @@ def main() -> None:
     for target in ("tau_est", "joint_torque"):
         command("fit-actuator", f"recordings={out / 'recordings'}", f"target={target}", f"out={out / target}", *taps)
     hidden = trajectories(HIDDEN)
-    found = {"pd": trajectories([])}
+    results = {"pd": trajectories([])}
     for target in ("tau_est", "joint_torque"):
         net = out / target / "net.npz"
-        found[target] = trajectories(["actuator=net", f"actuator.file={net}", "actuator.period=resample"])
-    heads = "".join(f"{name:>14}" for name in found)
+        results[target] = trajectories(["actuator=net", f"actuator.file={net}", "actuator.period=resample"])
+    heads = "".join(f"{name:>14}" for name in results)
     print(f"\nRMSE of the joint angles to the hidden drive's, mrad\n{'motion':16}{heads}")
-    total = {name: 0.0 for name in found}
+    total = {name: 0.0 for name in results}
     for motion, truth in hidden.items():
-        errors = {name: float(np.sqrt(np.mean((q[motion] - truth) ** 2))) for name, q in found.items()}
-        total = {name: total[name] + errors[name] ** 2 / len(hidden) for name in found}
+        errors = {name: float(np.sqrt(np.mean((q[motion] - truth) ** 2))) for name, q in results.items()}
+        total = {name: total[name] + errors[name] ** 2 / len(hidden) for name in results}
         print(f"{motion:16}" + "".join(f"{1e3 * e:14.2f}" for e in errors.values()))
     print(f"{'all':16}" + "".join(f"{1e3 * e**0.5:14.2f}" for e in total.values()))
-    for name in list(found)[1:]:
+    for name in list(results)[1:]:
         print(f"net fitted to {name}: {(total['pd'] / total[name]) ** 0.5:.1f} times closer than pd")
 
 

@@ -56,10 +56,10 @@ def shipped(run: Path, to: Path) -> None:
         old.unlink(missing_ok=True)
     kept = {name: state[name] for name in ("format", "policy", "iteration", "num_timesteps")}
     torch.save(kept, to / "checkpoints" / path.name)
-    told(run, to)
+    copy_origin(run, to)
 
 
-def told(run: Path, to: Path) -> None:
+def copy_origin(run: Path, to: Path) -> None:
     """Copy what tells of a run: configuration, origin, curves."""
     to.mkdir(exist_ok=True)
     for name in ("config.yaml", "meta.json", start.FILE):
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str]) -> None:
     if "run" in given:
         shipped(Path(given["run"]), to)
         if "first" in given:
-            told(Path(given["first"]), to / FIRST)
+            copy_origin(Path(given["first"]), to / FIRST)
     config, policy, about = load_run(to)
     about["file"] = str(Path(about["file"]).relative_to(data_root()))
     usual = {"duration_s": 20.0, "settle_s": 2.0, "policy_dt": None, "seed": 1}

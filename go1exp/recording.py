@@ -1,6 +1,6 @@
-"""One episode of a robot or of its simulation in one Parquet file: read, written and checked here and nowhere else.
+"""One episode of a robot, or of its simulation, in one Parquet file. Only this module reads, writes and checks them.
 
-A column is one channel; a channel that was not recorded has no column, and never zeros in its place. The schema
+A column is one channel. A channel that was not recorded has no column; it is never filled with zeros. The schema
 metadata key ``go1exp`` holds one JSON object, :class:`Meta`. SI units, quaternions w-x-y-z:
 
 =====================================================  =================================================================
@@ -17,7 +17,7 @@ column                                                 meaning
 ``torque_enable``                                      bool, false while the drives are off
 =====================================================  =================================================================
 
-A quantity is there for all its joints (or axes) or for none. Nothing in here unpickles: columns of numbers only.
+A recording has a quantity for all its joints (or axes) or for none. Columns hold numbers only; nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -59,17 +59,17 @@ FOOT_FORCE = "foot_force_"
 FLAG = "torque_enable"
 
 UNIT_TOLERANCE = 1e-3
-"""A quaternion's length may differ from 1 by this (chosen: passes values that were rounded to three decimals)."""
+"""The length of a quaternion may differ from 1 by this (chosen: accepts values rounded to three decimals)."""
 
 RATE_FACTOR = 2.0
-"""The median step of ``t`` may differ from 1 / ``rate_hz`` by this factor (chosen: tells s from ms, not jitter)."""
+"""The median step of ``t`` may differ from 1 / ``rate_hz`` by this factor (chosen: ms in place of s is refused)."""
 
 Joint = Annotated[str, Field(min_length=1)]
 Quaternion = tuple[float, float, float, float]
 
 
 class RecordingError(Expected):
-    """A recording that breaks the format; the message starts with the file (or episode) and names the channel."""
+    """A recording that breaks the format. The message starts with the file (or episode) and names the channel."""
 
 
 def joint_channel(quantity: str, joint: str) -> str:
@@ -84,7 +84,7 @@ def joint_channels(quantity: str, joints: Iterable[str]) -> list[str]:
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Meta:
-    """What a recording says about itself. Wrong types, values or lengths raise pydantic's ``ValidationError``.
+    """Metadata of a recording. Wrong types, values or lengths raise pydantic's ``ValidationError``.
 
     Attributes:
         robot: ``go1``, or another robot's name.
@@ -95,13 +95,13 @@ class Meta:
         kp: position gain of the joint controller, N m/rad, or None where unknown.
         kd: velocity gain, N m s/rad, or None where unknown.
         tau_limit: torque at which the controller clips, N m, or None where unknown.
-        excitation: name of the motion that was asked for, or None.
-        episode: a name of the recording that is unique among those it is used with.
+        excitation: name of the commanded motion, or None.
+        episode: name of the recording; unique among those it is used with.
         repeat_of: episode that this one repeats under the same commands, or None.
         source: ``measured`` on hardware or ``simulated``.
         tool: program that wrote the file.
-        versions: package -> version, of the tool and of what it ran with.
-        notes: known flaws and whatever a reader must know, in words.
+        versions: package -> version, of the tool and of the packages it used.
+        notes: known flaws and anything else that a reader must know.
         format: version of the format.
     """
 
@@ -153,8 +153,8 @@ class Recording:
     """One episode.
 
     Attributes:
-        meta: what it says about itself.
-        channels: column -> ``(T,)`` float64 (``torque_enable``: bool); ``t`` is always there.
+        meta: its metadata.
+        channels: column -> ``(T,)`` float64 (``torque_enable``: bool); ``t`` is required.
     """
 
     meta: Meta
@@ -181,7 +181,7 @@ class Recording:
         """Return the named columns side by side, ``(T, len(names))``.
 
         Raises:
-            RecordingError: if one is not there.
+            RecordingError: if one is missing.
         """
         return np.stack([self._column(name) for name in names], axis=1)
 
@@ -195,52 +195,52 @@ class Recording:
 
 
 def problems(recording: Recording) -> list[str]:
-    """List what breaks the format; each line names the channel and says what would be right."""
+    """List the problems of the format; each line names the channel and says what would be right."""
     meta, channels = recording.meta, recording.channels
-    found = _name_problems(meta, channels)
+    lines = _name_problems(meta, channels)
     if "t" not in channels:
-        return [*found, "t: required, but not given"]
+        return [*lines, "t: required, but not given"]
     shape = np.shape(channels["t"])
     if len(shape) != 1 or shape[0] == 0:
-        return [*found, f"t: must be one column of at least one row, not of shape {shape}"]
+        return [*lines, f"t: must be one column of at least one row, not of shape {shape}"]
     sound = []
     for name, values in channels.items():
         complaint = _value_problem(name, values, shape[0])
         if complaint:
-            found.append(complaint)
+            lines.append(complaint)
         else:
             sound.append(name)
     if "t" in sound:
-        found += _clock_problems(channels["t"], meta.rate_hz)
+        lines += _clock_problems(channels["t"], meta.rate_hz)
     for quantity in ("imu_quat", "base_quat"):
         if set(VECTORS[quantity]) <= set(sound):
             length = np.linalg.norm(recording.block(*VECTORS[quantity]), axis=1)
             worst = int(np.argmax(np.abs(length - 1)))
             if abs(length[worst] - 1) > UNIT_TOLERANCE:
-                found.append(f"{quantity}: must have length 1, but row {worst} has {length[worst]:.6g}")
-    return found
+                lines.append(f"{quantity}: must have length 1, but row {worst} has {length[worst]:.6g}")
+    return lines
 
 
 def _name_problems(meta: Meta, channels: Iterable[str]) -> list[str]:
-    """Columns that no one knows, and quantities of which a part is missing."""
-    there = set(channels)
+    """List unknown columns, and quantities of which a part is missing."""
+    present = set(channels)
     wholes = {q: joint_channels(q, meta.joints) for q in JOINT_QUANTITIES} | {k: list(v) for k, v in VECTORS.items()}
     go1_like = set(meta.joints) == set(JOINTS)
     if go1_like:
         wholes["foot_force"] = [FOOT_FORCE + leg for leg in LEGS]
     known = {"t", FLAG}.union(*wholes.values())
-    found = []
-    for name in sorted(there - known):
+    lines = []
+    for name in sorted(present - known):
         if not go1_like and name.startswith(FOOT_FORCE) and name != FOOT_FORCE:
-            continue  # another robot's legs have names of their own
+            continue  # legs of other robots may have any name
         close = nearest(name, known)
         hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"joints are {', '.join(meta.joints)}"
-        found.append(f"{name}: unknown column; {hint}")
+        lines.append(f"{name}: unknown column; {hint}")
     for quantity, whole in wholes.items():
-        missing = [name for name in whole if name not in there]
+        missing = [name for name in whole if name not in present]
         if 0 < len(missing) < len(whole):
-            found.append(f"{quantity}: no column {', '.join(missing)}; a recording has all of a quantity or none")
-    return found
+            lines.append(f"{quantity}: no column {', '.join(missing)}; a recording has all of a quantity or none")
+    return lines
 
 
 def _value_problem(name: str, values: np.ndarray, rows: int) -> str | None:
@@ -267,8 +267,8 @@ def _clock_problems(t: np.ndarray, rate: float) -> list[str]:
     return []
 
 
-def _stop(where: Path | str, found: Iterable[str]) -> None:
-    lines = [f"{where}: {line}" for line in found]
+def _stop(where: Path | str, complaints: Iterable[str]) -> None:
+    lines = [f"{where}: {line}" for line in complaints]
     if lines:
         raise RecordingError("\n".join(lines))
 
@@ -277,7 +277,7 @@ def _stop(where: Path | str, found: Iterable[str]) -> None:
 
 
 def read(path: Path) -> Recording:
-    """Read and check one recording; nothing is ever mended.
+    """Read and check one recording; nothing is corrected.
 
     Raises:
         RecordingError: if the file is missing, truncated, damaged, no Parquet, or breaks the format in any way.
@@ -309,27 +309,27 @@ def read(path: Path) -> Recording:
 
 
 def _schema_problems(file: pq.ParquetFile) -> list[str]:
-    """Types are judged by Parquet's own schema first: only plain numbers are then turned into arrays."""
-    found = []
+    """List columns of a wrong type. Parquet's own schema is checked first: only plain numbers become arrays."""
+    lines = []
     columns = [file.schema.column(i) for i in range(len(file.schema))]
     for column in columns:
         physical = "BOOLEAN" if column.path == FLAG else "DOUBLE"
         if column.physical_type != physical or column.max_repetition_level or column.logical_type.type != "NONE":
             kind = column.logical_type.type if column.logical_type.type != "NONE" else column.physical_type
-            found.append(f"{column.path}: is stored as {kind.lower()}, but must be {physical.lower()}")
-    found += [f"{name}: {n} columns of this name" for name, n in Counter(c.path for c in columns).items() if n > 1]
-    if not found:  # Arrow keeps its own types beside Parquet's
+            lines.append(f"{column.path}: is stored as {kind.lower()}, but must be {physical.lower()}")
+    lines += [f"{name}: {n} columns of this name" for name, n in Counter(c.path for c in columns).items() if n > 1]
+    if not lines:  # Arrow stores its own types in addition to Parquet's
         for field in file.schema_arrow:
             right = "bool" if field.name == FLAG else "double"
             if str(field.type) != right or b"ARROW:extension:name" in (field.metadata or {}):
-                found.append(f"{field.name}: is of an extension type ({field.type}), but must be plain {right}")
-    return found
+                lines.append(f"{field.name}: is of an extension type ({field.type}), but must be plain {right}")
+    return lines
 
 
 def write(path: Path, recording: Recording) -> None:
-    """Check a recording and write it, whole or not at all: ``path`` is replaced in one step.
+    """Check a recording and write it. ``path`` is replaced in one step, so that no partial file is ever left.
 
-    Values are stored as they are, bit for bit; folders are made as needed.
+    Values are stored bit for bit; folders are made as needed.
 
     Raises:
         RecordingError: if the recording breaks the format; nothing is written then.

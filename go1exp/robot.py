@@ -1,6 +1,6 @@
 """The Unitree Go1 in numbers: order of legs and joints, limits, nominal stance, frames.
 
-Everything else in the package takes order and names from here. SI units; trunk frame x forward, y left, z up;
+All other modules take order and names from here. SI units; trunk frame x forward, y left, z up;
 quaternions w-x-y-z. Sources: vendor URDF (unitree_ros, go1.urdf, 2024-05) unless a line says otherwise.
 """
 
@@ -32,7 +32,7 @@ MIRROR_JOINT_SIGNS = (-1.0, 1.0, 1.0) * NUM_LEGS
 """A mirrored robot has ``q[MIRROR_JOINTS] * MIRROR_JOINT_SIGNS``: hips turn about +x on both sides, so they flip."""
 
 NOMINAL_STANCE = np.array([-0.1, 0.8, -1.5, 0.1, 0.8, -1.5, -0.1, 1.0, -1.5, 0.1, 1.0, -1.5])
-"""Joint angles (12,), rad. The stance Isaac Lab and walk-these-ways train and deploy with (feet outside the hips)."""
+"""Joint angles (12,), rad: the stance that Isaac Lab and walk-these-ways use (feet outside the hips)."""
 
 NOMINAL_HEIGHT = 0.33
 """Trunk height over flat ground, m, at which the nominal stance is spawned (first touch at 0.3248)."""
@@ -41,7 +41,7 @@ JOINT_POS_LIMITS = np.tile([[-0.863, 0.863], [-0.686, 4.501], [-2.818, -0.888]],
 """Hard stops (12, 2), rad."""
 
 EFFORT_LIMIT = (23.7, 23.7, 35.55)
-"""Peak torque of hip, thigh, calf, N m. The calf is driven through a further 1.5:1 linkage."""
+"""Peak torque of hip, thigh, calf, N m. The calf has an additional linkage of 1.5:1."""
 
 VELOCITY_LIMIT = (30.1, 30.1, 20.06)
 """Top speed of hip, thigh, calf, rad/s."""
@@ -72,7 +72,7 @@ def soft_limits(factor: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """Which Go1: every choice that published models disagree on. Triples are hip, thigh, calf.
+    """The variant of the Go1: every value on which published models differ. Triples are hip, thigh, calf.
 
     Attributes:
         inertia: ``merged`` (12.743 kg) or ``rotor_complete`` (13.099 kg, with the four hip rotors).

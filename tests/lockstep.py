@@ -17,7 +17,7 @@ import pytest
 from go1exp.deploy import job, udp, walk
 from go1exp.deploy.loop import Deadlines
 from go1exp.deploy.messages import LowCmd, LowState
-from go1exp.sim_robot.__main__ import sim_config, task_of
+from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.machine import TICK, Robot
 from go1exp.sim_robot.server import TRUTH, Server
 
@@ -93,7 +93,7 @@ class InProcess:
 
     def __init__(self, world: World, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any]) -> None:
         config = sim_config(dict(sim))
-        robot = Listening(task_of(bundle, dict(other)), config)
+        robot = Listening(bundle_task(bundle, dict(other)), config)
         robot.world, world.robot = world, robot
         self.world, self._server = world, Mutable(robot, config)
         world.server = self._server
@@ -123,9 +123,11 @@ def lockstep(spoil: Spoil = lambda state: state) -> Iterator[World]:
         world.spins.append(spin)
         return SimpleNamespace(now=lambda: world.now, sleep_until=world.pass_until)
 
-    told = SimpleNamespace(perf_counter=lambda: world.now, time=lambda: 0.0)
+    host_time = SimpleNamespace(perf_counter=lambda: world.now, time=lambda: 0.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(udp, "time", told)  # stamps of arrival are not believed, and states are as old as the last cycle
+        patch.setattr(
+            udp, "time", host_time
+        )  # stamps of arrival are not believed, and states are as old as the last cycle
         patch.setattr(walk, "MonotonicClock", clock)
         patch.setattr(job, "SimulatedRobot", lambda *given: InProcess(world, *given))
         yield world

@@ -122,9 +122,9 @@ def flaws(report: AuditReport) -> set[tuple[str, str, str]]:
 
 
 def size(report: AuditReport, check: str, channel: str) -> float:
-    (found,) = [f.size for f in report.of(check) if f.channel == channel]
-    assert found is not None
-    return found
+    (value,) = [f.size for f in report.by_check(check) if f.channel == channel]
+    assert value is not None
+    return value
 
 
 # ---------------------------------------------------------------------- no false alarms
@@ -169,15 +169,15 @@ def test_another_rate_is_found() -> None:
     report = audit(Recording(replace(sound.meta, rate_hz=400.0), sound.channels))
     assert flaws(report) == {("rate", "t", "bad")}
     assert size(report, "rate", "t") == pytest.approx(500)
-    assert "500 Hz" in report.of("rate")[0].message
-    assert "rate_hz = 400" in report.of("rate")[0].message
+    assert "500 Hz" in report.by_check("rate")[0].message
+    assert "rate_hz = 400" in report.by_check("rate")[0].message
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])
 def test_a_clock_in_other_units_is_found(factor: float, unit: str) -> None:
     report = audit(with_(made(), t=made().t * factor))
     assert ("rate", "t", "bad") in flaws(report)
-    assert unit in report.of("rate")[0].message
+    assert unit in report.by_check("rate")[0].message
 
 
 def test_jitter_is_found_and_sized() -> None:
@@ -194,7 +194,7 @@ def test_missing_samples_are_counted() -> None:
     report = audit(Recording(made().meta, {k: v[keep] for k, v in made().channels.items()}))
     assert flaws(report) == {("gaps", "t", "suspect")}
     assert size(report, "gaps", "t") == 5
-    assert "in 3 gaps, the longest 8 ms at 1.398 s" in report.of("gaps")[0].message
+    assert "in 3 gaps, the longest 8 ms at 1.398 s" in report.by_check("gaps")[0].message
     keep[1000:1100] = False
     assert ("gaps", "t", "bad") in flaws(
         audit(Recording(made().meta, {k: v[keep] for k, v in made().channels.items()}))
@@ -203,8 +203,8 @@ def test_missing_samples_are_counted() -> None:
 
 def test_a_clock_that_was_counted_is_told_for_measured_data_only() -> None:
     measured = Recording(replace(META, source="measured"), made().channels)
-    assert "was counted" in audit(measured).of("jitter")[0].message
-    assert "was counted" not in audit(made()).of("jitter")[0].message
+    assert "was counted" in audit(measured).by_check("jitter")[0].message
+    assert "was counted" not in audit(made()).by_check("jitter")[0].message
 
 
 # ---------------------------------------------------------------------- single channels
@@ -241,7 +241,7 @@ def test_a_channel_that_is_read_at_another_rate_is_named() -> None:
     report = audit(with_(made("gait"), qd_RR_calf=values))
     assert ("repeats", "qd_RR_calf", "bad") in flaws(report)
     assert size(report, "repeats", "qd_RR_calf") == pytest.approx(0.8, abs=0.03)
-    (message,) = [f.message for f in report.of("repeats")]
+    (message,) = [f.message for f in report.by_check("repeats")]
     assert float(message.split()[-2]) == pytest.approx(100, rel=0.15)
 
 
@@ -253,7 +253,7 @@ def test_the_step_of_an_encoder_is_found(step: float) -> None:
     assert size(report, "resolution", "q_FR_calf") == pytest.approx(step, rel=1e-3)
     assert next(c.step for c in report.channels if c.name == "q_FR_calf") == pytest.approx(step, rel=1e-3)
     assert ("resolution", "q_FR_calf", "suspect") in flaws(report) or step < 4e-3
-    assert len(report.of("resolution")) == 1
+    assert len(report.by_check("resolution")) == 1
     assert all(c.step == 0 for c in report.channels if c.step is not None and c.name != "q_FR_calf")
 
 
@@ -261,7 +261,7 @@ def test_known_encoders_are_called_by_name() -> None:
     for bits, name in ((4096, "XL330"), (32768 * 6.33, "GO-M8010-6"), (16384, "14 bits a turn")):
         step = 2 * np.pi / bits
         values = step * np.round(made("chirp").channels["q_FR_hip"] / step)
-        assert name in audit(with_(made("chirp"), q_FR_hip=values)).of("resolution")[0].message
+        assert name in audit(with_(made("chirp"), q_FR_hip=values)).by_check("resolution")[0].message
 
 
 def test_steps_survive_decimal_text_and_continuous_values_have_none() -> None:
@@ -323,7 +323,7 @@ def test_a_dead_imu_axis_is_named() -> None:
 def test_a_sensor_that_saturates_is_named() -> None:
     report = audit(with_(made(), imu_gyro_y=np.clip(made().channels["imu_gyro_y"], -0.6, 0.6)))
     assert ("saturation", "imu_gyro_y", "bad") in flaws(report)
-    assert "0.6" in next(f.message for f in report.of("saturation"))
+    assert "0.6" in next(f.message for f in report.by_check("saturation"))
     share = np.mean(np.abs(made().channels["imu_gyro_y"]) > 0.6)
     assert size(report, "saturation", "imu_gyro_y") == pytest.approx(share, rel=0.05)
 
@@ -331,7 +331,7 @@ def test_a_sensor_that_saturates_is_named() -> None:
 def test_a_drive_at_its_limit_is_a_fact_and_below_it_a_flaw() -> None:
     limited = made(limit=0.3)
     report = audit(limited)
-    at_limit = [f for f in report.of("saturation") if f.verdict == "ok"]
+    at_limit = [f for f in report.by_check("saturation") if f.verdict == "ok"]
     assert len(at_limit) >= 3
     assert "the drive's limit" in at_limit[0].message
     assert report.flaws == []
@@ -351,7 +351,7 @@ def test_degrees_are_recognised(robot: str) -> None:
         changed = with_(Recording(replace(sound.meta, robot=robot), sound.channels))
         report = audit(with_(changed, **{name: np.degrees(sound.channels[name])}))
         assert ("units", name, "bad") in flaws(report)
-        assert "degrees" in next(f.message for f in report.of("units") if f.channel == name)
+        assert "degrees" in next(f.message for f in report.by_check("units") if f.channel == name)
 
 
 def test_speed_in_degrees_is_recognised() -> None:
@@ -384,30 +384,30 @@ def test_a_speed_that_trails_is_found_and_sized() -> None:
 def test_the_accelerometers_unit_is_checked(factor: float, what: str) -> None:
     changed = {k: factor * v for k, v in made().channels.items() if k.startswith("imu_acc")}
     report = audit(with_(made(), **changed))
-    (found,) = report.flaws
-    assert found.channel == "imu_acc"
-    assert found.verdict == "bad"
-    assert what in found.message
-    assert found.size == pytest.approx(9.81 * factor, rel=0.02)
+    (flaw,) = report.flaws
+    assert flaw.channel == "imu_acc"
+    assert flaw.verdict == "bad"
+    assert what in flaw.message
+    assert flaw.size == pytest.approx(9.81 * factor, rel=0.02)
     assert all(c.verdict == "bad" for c in report.channels if c.name.startswith("imu_acc"))
 
 
 def test_an_accelerometer_of_wrong_sign_or_axes_is_found() -> None:
     flipped = {k: -v for k, v in made().channels.items() if k.startswith("imu_acc")}
-    (found,) = audit(with_(made(), **flipped)).flaws
-    assert (found.check, found.channel, found.verdict) == ("gravity", "imu_acc", "bad")
-    assert "sign is flipped" in found.message
+    (flaw,) = audit(with_(made(), **flipped)).flaws
+    assert (flaw.check, flaw.channel, flaw.verdict) == ("gravity", "imu_acc", "bad")
+    assert "sign is flipped" in flaw.message
     c = made().channels
-    (found,) = audit(with_(made(), imu_acc_x=c["imu_acc_z"], imu_acc_z=c["imu_acc_x"])).flaws
-    assert found.size == pytest.approx(90, abs=15)
+    (flaw,) = audit(with_(made(), imu_acc_x=c["imu_acc_z"], imu_acc_z=c["imu_acc_x"])).flaws
+    assert flaw.size == pytest.approx(90, abs=15)
 
 
 def test_joints_beyond_their_stops_and_torques_beyond_their_limits_are_found() -> None:
     changed = with_(made(), q_FR_calf=made().channels["q_FR_calf"] + 0.4)
-    (found,) = audit(changed).of("limits")
-    assert (found.channel, found.verdict) == ("q_FR_calf", "suspect")
-    assert found.size == pytest.approx(changed.channels["q_FR_calf"].max() + 0.888, rel=1e-6)
-    assert audit(Recording(replace(META, robot="other"), changed.channels)).of("limits") == []
+    (flaw,) = audit(changed).by_check("limits")
+    assert (flaw.channel, flaw.verdict) == ("q_FR_calf", "suspect")
+    assert flaw.size == pytest.approx(changed.channels["q_FR_calf"].max() + 0.888, rel=1e-6)
+    assert audit(Recording(replace(META, robot="other"), changed.channels)).by_check("limits") == []
     report = audit(with_(made(), tau_est_FL_hip=10 * made().channels["tau_est_FL_hip"]))
     assert ("limits", "tau_est_FL_hip", "bad") in flaws(report)
 
@@ -443,7 +443,7 @@ def test_swapped_joints_are_named(name: str) -> None:
             leg = "F" + joint[0]
             swapped[key] = sound.channels[key.replace(leg, other[leg])]
     report = audit(Recording(sound.meta, swapped))
-    orders = {f.channel: f.message for f in report.of("order")}
+    orders = {f.channel: f.message for f in report.by_check("order")}
     assert set(orders) == {f"q_target_{leg}_{kind}" for leg in other for kind in ("hip", "thigh", "calf")}
     assert "FR_thigh and FL_thigh are swapped" in orders["q_target_FR_thigh"]
 
@@ -454,7 +454,7 @@ def test_an_order_of_three_joints_is_named() -> None:
     turned = {f"q_{a}": sound.channels[f"q_{b}"] for a, b in zip(leg, leg[1:] + leg[:1], strict=True)}
     turned |= {f"qd_{a}": sound.channels[f"qd_{b}"] for a, b in zip(leg, leg[1:] + leg[:1], strict=True)}
     report = audit(with_(sound, **turned))
-    orders = {f.channel: f.message for f in report.of("order")}
+    orders = {f.channel: f.message for f in report.by_check("order")}
     assert set(orders) == {f"q_target_{a}" for a in leg}
     assert "what is called FR_hip is the joint it drives" in orders["q_target_FR_thigh"]
 
@@ -462,8 +462,8 @@ def test_an_order_of_three_joints_is_named() -> None:
 def test_speeds_of_swapped_joints_are_named() -> None:
     sound = made("multisine")
     report = audit(with_(sound, qd_FR_hip=sound.channels["qd_RL_calf"], qd_RL_calf=sound.channels["qd_FR_hip"]))
-    assert {f.channel for f in report.of("order")} == {"qd_FR_hip", "qd_RL_calf"}
-    assert "is the speed of q_RL_calf" in report.of("order")[0].message
+    assert {f.channel for f in report.by_check("order")} == {"qd_FR_hip", "qd_RL_calf"}
+    assert "is the speed of q_RL_calf" in report.by_check("order")[0].message
 
 
 def test_mixed_up_axes_of_the_gyroscope_are_named() -> None:
@@ -510,10 +510,10 @@ def test_the_delay_from_command_to_answer_is_measured(name: str, delay: float) -
         assert error is not None
         assert error < 2
         assert abs(ms - 1e3 * delay) < min(1.5, 4 * error)
-    late = {f.channel for f in report.of("delay") if f.verdict == "suspect"}
+    late = {f.channel for f in report.by_check("delay") if f.verdict == "suspect"}
     assert late == (set(measured) if delay > 0.01 else set())
     if late:
-        assert all("delay or clock offset" in f.message for f in report.of("delay"))
+        assert all("delay or clock offset" in f.message for f in report.by_check("delay"))
     assert {f.check for f in report.flaws} <= {"delay"}
 
 
@@ -529,16 +529,16 @@ def test_an_answer_before_the_command_is_named() -> None:
     sound = made("multisine")
     late = {k: np.roll(v, 10, axis=0) for k, v in sound.channels.items() if k.startswith("q_target")}
     report = audit(with_(sound, **late))
-    found = [f for f in report.of("delay") if f.verdict == "suspect"]
-    assert len(found) >= 10
-    assert all("before it is given" in f.message for f in found)
-    assert np.median([f.size or 0 for f in found]) == pytest.approx(-20, abs=0.5)
+    flaws = [f for f in report.by_check("delay") if f.verdict == "suspect"]
+    assert len(flaws) >= 10
+    assert all("before it is given" in f.message for f in flaws)
+    assert np.median([f.size or 0 for f in flaws]) == pytest.approx(-20, abs=0.5)
 
 
 def test_where_the_delay_cannot_be_told_none_is_given() -> None:
     report = audit(made("drop"))
     assert all(c.delay_ms is None for c in report.channels)
-    assert report.of("delay") == []
+    assert report.by_check("delay") == []
 
 
 # ---------------------------------------------------------------------- the report
@@ -613,7 +613,7 @@ def real(importer: str, *path: str) -> list[Recording]:
     return import_recordings(importer, folder.joinpath(importer, *path), {})
 
 
-def steps_of(report: AuditReport, prefix: str) -> list[float]:
+def encoder_steps(report: AuditReport, prefix: str) -> list[float]:
     return [c.step for c in report.channels if c.name.startswith(prefix) and c.step]
 
 
@@ -621,9 +621,9 @@ def test_the_go2_reports_speeds_that_are_too_large() -> None:
     (recording,) = real("go2_in_air")
     report = audit(recording)
     assert flaws(report) == {("scale", name, "suspect") for name in joint_channels("qd", recording.meta.joints)}
-    sizes = [f.size or 0 for f in report.of("scale")]
+    sizes = [f.size or 0 for f in report.by_check("scale")]
     assert 1.10 < min(sizes) < max(sizes) < 1.18  # its README says 1.11 to 1.17
-    for step in steps_of(report, "q_"):
+    for step in encoder_steps(report, "q_"):
         assert step == pytest.approx(2 * np.pi / 32768 / 6.33, rel=2e-3)
 
 
@@ -633,30 +633,30 @@ def test_scaler_reports_speeds_that_are_too_large_and_late() -> None:
     speed = np.load(folder / "scaler_walk_mocap/run_15.npz", allow_pickle=False)["joint_vel"].reshape(-1, 12)
     names = joint_channels("qd", recording.meta.joints)  # left out by the importer, for this very flaw
     report = audit(with_(recording, **dict(zip(names, np.ascontiguousarray(speed.T), strict=True))))
-    assert {f.channel for f in report.of("scale") if f.verdict == "bad"} == set(names)
-    sizes = [f.size or 0 for f in report.of("scale")]
+    assert {f.channel for f in report.by_check("scale") if f.verdict == "bad"} == set(names)
+    sizes = [f.size or 0 for f in report.by_check("scale")]
     assert 1.5 < min(sizes) < max(sizes) < 1.85  # its README says 1.5 to 1.7
-    assert {f.channel for f in report.of("lag")} == set(names)
-    assert {f.channel for f in report.of("repeats")} >= set(joint_channels("q", recording.meta.joints))
-    assert report.of("order") == []
+    assert {f.channel for f in report.by_check("lag")} == set(names)
+    assert {f.channel for f in report.by_check("repeats")} >= set(joint_channels("q", recording.meta.joints))
+    assert report.by_check("order") == []
 
 
 @pytest.mark.parametrize("design", ["design_A_0", "design_C_0"])
 def test_the_ak80s_messages_are_recognised(design: str) -> None:
     (recording,) = real("ak80_double_pendulum", design, "trajectory_00.npz")
     report = audit(recording)
-    np.testing.assert_allclose(steps_of(report, "q_"), [3.8147e-4] * 2, rtol=1e-3)
-    np.testing.assert_allclose(steps_of(report, "tau_est"), [5.8608e-3] * 2, rtol=1e-3)
-    assert {"T-Motor" in f.message for f in report.of("resolution")} == {True}
+    np.testing.assert_allclose(encoder_steps(report, "q_"), [3.8147e-4] * 2, rtol=1e-3)
+    np.testing.assert_allclose(encoder_steps(report, "tau_est"), [5.8608e-3] * 2, rtol=1e-3)
+    assert {"T-Motor" in f.message for f in report.by_check("resolution")} == {True}
 
 
 def test_the_servos_encoders_are_recognised() -> None:
     for importer, path in (("servo_pendulum_xl330", ""), ("so101_arm", "actuator_bandwidth.npz")):
         for recording in real(importer, path):
             report = audit(recording)
-            found = steps_of(report, "q_")
-            np.testing.assert_allclose(found, [2 * np.pi / 4096] * len(recording.meta.joints), rtol=1e-3)
-            assert "12 bits a turn" in report.of("resolution")[0].message
+            steps = encoder_steps(report, "q_")
+            np.testing.assert_allclose(steps, [2 * np.pi / 4096] * len(recording.meta.joints), rtol=1e-3)
+            assert "12 bits a turn" in report.by_check("resolution")[0].message
             assert "bad" not in {f.verdict for f in report.findings if f.check != "still"}
 
 

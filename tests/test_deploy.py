@@ -32,10 +32,10 @@ from go1exp.deploy.commands import (
     Sinusoid,
     Table,
     Wish,
-    keys_of,
     make,
     parsed,
-    ranges_of,
+    range_array,
+    split_keys,
     stretched,
 )
 from go1exp.deploy.controller import LYING, PHASES, Cycle
@@ -52,7 +52,7 @@ from go1exp.export.build import build
 from go1exp.gap.prepare import unusable
 from go1exp.gap.standing import StandingGo1
 from go1exp.recording import VECTORS
-from go1exp.sim_robot.__main__ import sim_config, task_of
+from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
 from go1exp.sim_robot.server import TRUTH, Network, Server
 from go1exp.train import run_folder, trainer
@@ -174,8 +174,8 @@ def test_a_link_drops_garbage_and_what_is_late_and_counts_it(
     assert link.traffic.foreign == len(garbage()) + 1
     for number in (7, 8, 8, 6, 11, 10):
         other.sendto(wire.pack_state(make_state(0.001 * number), number), address)
-    found = link.receive()
-    assert [round(1e3 * state.clock) for state in found] == [7, 8, 11]
+    states = link.receive()
+    assert [round(1e3 * state.clock) for state in states] == [7, 8, 11]
     assert (link.traffic.received, link.traffic.late, link.traffic.lost) == (3, 3, 2)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(wire.pack_state(make_state(), 12), address)
@@ -212,7 +212,7 @@ def test_a_robot_that_is_gone_is_no_error_of_the_link() -> None:
 
 @pytest.mark.parametrize("start", ["standing", "lying", "hung"])
 def test_a_robot_begins_at_rest(file: str, start: str) -> None:
-    made = Robot(task_of(file, {}), sim_config({"start": start, "noise": 0.0}))
+    made = Robot(bundle_task(file, {}), sim_config({"start": start, "noise": 0.0}))
     state, true = made.sense()
     assert np.abs(state.joint_vel).max() < 0.3
     np.testing.assert_allclose(np.linalg.norm(state.imu_acc), 9.81, rtol=0.02)
@@ -224,7 +224,7 @@ def test_a_robot_begins_at_rest(file: str, start: str) -> None:
 
 
 def test_drives_obey_and_brake_when_nobody_speaks(file: str) -> None:
-    made = Robot(task_of(file, {}), sim_config({"start": "hung", "noise": 0.0}))
+    made = Robot(bundle_task(file, {}), sim_config({"start": "hung", "noise": 0.0}))
     target = robot.NOMINAL_STANCE + 0.1
     made.obey(make_command(joint_target=target, kp=np.full(12, 40.0), kd=np.full(12, 1.0)), 5)
     for _ in range(500):
@@ -245,7 +245,7 @@ def test_drives_obey_and_brake_when_nobody_speaks(file: str) -> None:
 
 
 def test_noise_is_that_of_table_ii(file: str) -> None:
-    loud, quiet = (Robot(task_of(file, {}), sim_config({"noise": noise})) for noise in (1.0, 0.0))
+    loud, quiet = (Robot(bundle_task(file, {}), sim_config({"noise": noise})) for noise in (1.0, 0.0))
     truth = quiet.sense()[0]
     states = [loud.sense()[0] for _ in range(1000)]
     for name in ("joint_pos", "joint_vel", "imu_gyro"):
@@ -271,30 +271,30 @@ def test_a_network_delays_and_loses() -> None:
 
 
 def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) -> None:
-    server = Server(Robot(task_of(file, {}), sim_config({})), sim_config({}))
-    mine, other = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    server = Server(Robot(bundle_task(file, {}), sim_config({})), sim_config({}))
+    client, other = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     to = ("127.0.0.1", server.port)
     server.tick()
     for number in (3, 5, 4):
-        mine.sendto(wire.pack_command(make_command(), number, 0.0), to)
+        client.sendto(wire.pack_command(make_command(), number, 0.0), to)
     other.sendto(wire.pack_command(make_command(), 9, 0.0), to)
-    mine.sendto(wire.pack_command(make_command(kp=np.full(12, np.nan)), 10, 0.0), to)
-    mine.sendto(wire.pack_state(make_state(), 11), to)
-    mine.sendto(b"G1XP", to)
+    client.sendto(wire.pack_command(make_command(kp=np.full(12, np.nan)), 10, 0.0), to)
+    client.sendto(wire.pack_state(make_state(), 11), to)
+    client.sendto(b"G1XP", to)
     server.tick()
     counts = server.counts
     assert (counts.commands, counts.old, counts.foreign) == (2, 1, 4)
-    mine.settimeout(5.0)
-    data = mine.recv(2000)
+    client.settimeout(5.0)
+    data = client.recv(2000)
     about = wire.head(data)
     assert about is not None
     assert wire.unpack_state(data, about, 0.0).in_force == 5
-    for opened in (mine, other, server):
+    for opened in (client, other, server):
         opened.close()
 
 
 def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Path]) -> None:
-    task = task_of(file, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
+    task = bundle_task(file, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
     with pytest.raises(Exception, match="'net' has no kp and kd to command"):
         Robot(task, sim_config({}))
 
@@ -308,19 +308,19 @@ def play(
     """Walk; return status, what was said, the account, the recording, the cycles and the world."""
     usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "lie_down": 0.0, "brake": 0.1}
     usual["wish"] = Wish((0.4, 0.0, 0.0))
-    said: list[str] = []
+    output: list[str] = []
     with lockstep(spoil) as world:
-        status = do(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), said.append)
+        status = do(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), output.append)
     (account,) = out.glob("*.json")
     kept = list(out.glob("*.parquet"))
     with np.load(next(out.glob("*.npz"))) as cycles:
-        found = {name: cycles[name] for name in cycles.files}
+        cycle_columns = {name: cycles[name] for name in cycles.files}
     return SimpleNamespace(
         status=status,
-        said=said,
+        output=output,
         account=json.loads(account.read_text()),
         recording=recording.read(kept[0]) if kept else None,
-        cycles=found,
+        cycles=cycle_columns,
         world=world,
     )
 
@@ -329,7 +329,7 @@ def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> N
     done = play(file, tmp_path, job={"sim": {"noise": 0.0}, "truth": True})
     assert done.status == 0
     assert done.account["ended"] == "walked to the end"
-    assert done.said[-1] == "walked for 1.0 s, to the end"
+    assert done.output[-1] == "walked for 1.0 s, to the end"
     assert done.account["walked_s"] == pytest.approx(1.0)
     phases = [PHASES[int(k)] for k in done.cycles["phase"]]
     counts = [phases.count(name) for name in PHASES]
@@ -375,7 +375,7 @@ def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(file: 
     done = play(file, tmp_path, job={"sim": {"noise": 0.1}, "other": {"effect": {"coulomb": {"bound": 0.4}}}})
     assert "coulomb" not in done.recording.meta.notes
     assert not any(name.startswith("base_") for name in done.recording.channels)
-    assert unusable(done.recording, audit(done.recording), StandingGo1(task_of(file, {}).robot)) == []
+    assert unusable(done.recording, audit(done.recording), StandingGo1(bundle_task(file, {}).robot)) == []
 
 
 def test_the_same_walk_gives_the_same_numbers(file: str, tmp_path: Path) -> None:
@@ -399,7 +399,7 @@ def test_delay_and_loss_are_in_the_log_as_the_robot_lived_them(file: str, tmp_pa
 def test_another_rate_is_the_policys(file: str, tmp_path: Path, rate: float) -> None:
     done = play(file, tmp_path, rate=rate, seconds=0.2)
     assert done.status == 0
-    assert done.said[0] == f"note: the policy was trained at 50 Hz and runs at {rate:g} Hz"
+    assert done.output[0] == f"note: the policy was trained at 50 Hz and runs at {rate:g} Hz"
     walking = done.cycles["phase"] == PHASES.index("walking")
     assert walking.sum() == round(0.2 * rate)
     assert len(np.unique(done.cycles["q_target"][walking], axis=0)) > 0.9 * walking.sum()
@@ -496,7 +496,7 @@ def test_a_key_ends_a_walk_in_order_and_twice_at_once(
         assert done.account["ended"] == "operator_stop"
     else:
         assert done.account["ended"] == "asked for by the q key"
-        assert done.said[-1] == "walked for 0.3 s, until the q key"
+        assert done.output[-1] == "walked for 0.3 s, until the q key"
         assert ended(done)[0] < 0.1
 
 
@@ -536,16 +536,16 @@ FAULTY: list[tuple[str, Callable[[LowState], LowState | None], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "what", "said"), FAULTY, ids=[f"{f[0]} {f[2]}" for f in FAULTY])
+@pytest.mark.parametrize(("name", "what", "message"), FAULTY, ids=[f"{f[0]} {f[2]}" for f in FAULTY])
 def test_a_fault_over_the_link_makes_the_drives_brake_and_has_a_name_in_the_log(
-    file: str, tmp_path: Path, name: str, what: Callable[[LowState], LowState | None], said: str
+    file: str, tmp_path: Path, name: str, what: Callable[[LowState], LowState | None], message: str
 ) -> None:
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     done = play(file, tmp_path, from_(0.5, what), seconds=2.0)
     assert done.status == STATUS[name]
     assert done.account["ended"] == name
-    assert said in done.account["fault"]["message"]
-    assert done.said[-1].startswith(f"fault: {name} at ")
+    assert message in done.account["fault"]["message"]
+    assert done.output[-1].startswith(f"fault: {name} at ")
     assert 0.49 < done.account["fault"]["t"] - BEGIN < 0.65
     assert done.world.robot.braking
     assert done.world.obeyed[max(done.world.obeyed)].damping
@@ -654,7 +654,7 @@ def test_a_constant_is_kept_within_the_ranges_and_cuts_are_counted() -> None:
     source = make(Wish((2.0, -0.1, -3.0)), RANGES, print)
     assert source(0.0).tolist() == source(1.0).tolist() == [1.0, -0.1, -1.0]
     assert source.cut.tolist() == [2, 0, 2]
-    assert ranges_of({"lin_vel_x": (-1.0, 2.0)}).tolist() == [[-1, 2], [-np.inf, np.inf], [-np.inf, np.inf]]
+    assert range_array({"lin_vel_x": (-1.0, 2.0)}).tolist() == [[-1, 2], [-np.inf, np.inf], [-np.inf, np.inf]]
     for wrong in ((1.0, 2.0), (np.nan, 0.0, 0.0)):
         with pytest.raises(CommandError, match="must be three finite numbers"):
             make(Wish(wrong), RANGES, print)
@@ -668,7 +668,7 @@ def test_rows_of_a_file_are_held(tmp_path: Path) -> None:
     source = Table(path)
     assert [source(t)[0] for t in (0.0, 0.49, 0.5, 0.99, 1.0, 50.0)] == [0.0, 0.0, 0.4, 0.4, 0.8, 0.8]
     assert source(1.5).tolist() == [0.8, 0.1, -0.2]
-    for content, said in (
+    for content, message in (
         ("", "no rows"),
         ("t,x\n", r"c\.csv:1: 't,x' must be"),
         ("0,1,2\n", r"c\.csv:1: must be four"),
@@ -677,7 +677,7 @@ def test_rows_of_a_file_are_held(tmp_path: Path) -> None:
         ("0,1,2,3\n1,x,2,3\n", r"c\.csv:2: '1,x,2,3' must be"),
     ):
         path.write_text(content)
-        with pytest.raises(CommandError, match=said):
+        with pytest.raises(CommandError, match=message):
             Table(path)
 
 
@@ -715,7 +715,7 @@ def test_keys_change_the_velocity_and_stop_the_robot() -> None:
         source.close()
         os.close(ours)
         os.close(theirs)
-    assert keys_of("w\x1b[A\x1b") == ["w", "\x1b[A", "\x1b"]
+    assert split_keys("w\x1b[A\x1b") == ["w", "\x1b[A", "\x1b"]
 
 
 def make_keyboard(descriptor: int, stops: list[str]) -> Keyboard:
@@ -793,13 +793,13 @@ def test_a_robot_that_does_not_tell_what_it_obeys_is_taken_to_obey_the_newest(fi
     for t, phase, target in steps:
         log.note(cycle(t, phase, [make_state(t - k, **silent) for k in (0.006, 0.002)], target))
     log.note(cycle(0.04, "damping", [make_state(0.038, **silent)]))
-    found = log.recording(About(about, np.full(12, 20.0), np.full(12, 0.5), False, False, "e"))
-    assert found is not None
-    np.testing.assert_allclose(found.t, [0.014, 0.018, 0.024, 0.028])
-    assert found.joint("q_target")[:, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
-    assert not any(name.startswith("foot_force") for name in found.channels)  # in no unit that anybody knows
-    assert found.meta.source == "measured"
-    assert "does not tell what it obeys" in found.meta.notes
+    result = log.recording(About(about, np.full(12, 20.0), np.full(12, 0.5), False, False, "e"))
+    assert result is not None
+    np.testing.assert_allclose(result.t, [0.014, 0.018, 0.024, 0.028])
+    assert result.joint("q_target")[:, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
+    assert not any(name.startswith("foot_force") for name in result.channels)  # in no unit that anybody knows
+    assert result.meta.source == "measured"
+    assert "does not tell what it obeys" in result.meta.notes
 
 
 def test_a_long_walk_keeps_its_newest_seconds(file: str, tmp_path: Path) -> None:
@@ -904,25 +904,25 @@ def test_the_verb_walks_against_another_process_in_real_time(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(data_root()))
-    words = ["deploy", file, "robot=sim", "command=[0.3,0,0]", "seconds=1.5", "stand_up=0.5", "brake=0.2"]
-    monkeypatch.setattr(sys, "argv", ["go1exp", *words, f"stale={BUSY}", "effect=payload", "out=logs"])
+    arguments = ["deploy", file, "robot=sim", "command=[0.3,0,0]", "seconds=1.5", "stand_up=0.5", "brake=0.2"]
+    monkeypatch.setattr(sys, "argv", ["go1exp", *arguments, f"stale={BUSY}", "effect=payload", "out=logs"])
     assert cli.main() == 0
-    said = capsys.readouterr().out
-    assert "walking: " in said
-    assert said.splitlines()[-1] == "walked for 1.5 s, to the end"
+    output = capsys.readouterr().out
+    assert "walking: " in output
+    assert output.splitlines()[-1] == "walked for 1.5 s, to the end"
     (kept,) = (tmp_path / "logs").glob("*.parquet")
-    found = recording.read(kept)
-    assert found.t[-1] - found.t[0] > 0.5  # on a machine that stands still for the rest of it
+    result = recording.read(kept)
+    assert result.t[-1] - result.t[0] > 0.5  # on a machine that stands still for the rest of it
     account = json.loads(kept.with_suffix(".json").read_text())
     assert account["simulated_robot"]["what"] == "ended"
     assert account["simulated_robot"]["ticks"] > 250
     assert account["memory_mb"] > 0
 
 
-def begun(folder: Path, *words: str) -> tuple[subprocess.Popen[str], IO[str]]:
+def begun(folder: Path, *arguments: str) -> tuple[subprocess.Popen[str], IO[str]]:
     """Start Python in a folder, with warnings as errors; return the process and what it prints."""
     process = subprocess.Popen(
-        [sys.executable, "-W", "error", *words],
+        [sys.executable, "-W", "error", *arguments],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(data_root())},
         stdout=subprocess.PIPE,
@@ -939,16 +939,28 @@ def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_
         "with open('modules.json', 'w') as file:\n"
         "    json.dump(sorted({name.split('.')[0] for name in sys.modules}), file)\nsys.exit(status)"
     )
-    words = [file, "--command", "0.2,0,0", "--stand-up", "0.2", "--brake", "0.2", "--stale", str(BUSY), "--out", "logs"]
-    process, told = begun(tmp_path, "-c", code, *words)
-    seen = []
-    for line in told:
-        seen.append(line)
+    arguments = [
+        file,
+        "--command",
+        "0.2,0,0",
+        "--stand-up",
+        "0.2",
+        "--brake",
+        "0.2",
+        "--stale",
+        str(BUSY),
+        "--out",
+        "logs",
+    ]
+    process, pipe = begun(tmp_path, "-c", code, *arguments)
+    lines = []
+    for line in pipe:
+        lines.append(line)
         if line.startswith("walking: "):
             process.send_signal(signal.SIGINT)
             break
     rest, errors = process.communicate(timeout=60)
-    assert process.returncode == STATUS["operator_stop"], (seen, rest, errors)
+    assert process.returncode == STATUS["operator_stop"], (lines, rest, errors)
     assert errors == ""
     assert rest.splitlines()[-1].endswith("asked for by SIGINT")
     heavy = {"torch", "stable_baselines3", "gymnasium", "mujoco", "hydra", "omegaconf", "scipy", "onnx"}
@@ -959,7 +971,7 @@ def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_
 
 
 def children(pid: int) -> list[int]:
-    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [int(number) for number in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="children are found in Linux's /proc")
@@ -968,11 +980,11 @@ def children(pid: int) -> list[int]:
 def test_a_signal_while_the_robot_starts_ends_both_at_once(
     file: str, tmp_path: Path, way: str, number: signal.Signals
 ) -> None:
-    words = ["deploy", file, "out=logs"] if way == "go1exp.cli" else [file, "--out", "logs"]
-    process, told = begun(tmp_path, "-m", way, *words)
-    seen = [next(told)]
-    while "starting the simulated robot" not in seen[-1]:
-        seen.append(next(told))
+    arguments = ["deploy", file, "out=logs"] if way == "go1exp.cli" else [file, "--out", "logs"]
+    process, pipe = begun(tmp_path, "-m", way, *arguments)
+    lines = [next(pipe)]
+    while "starting the simulated robot" not in lines[-1]:
+        lines.append(next(pipe))
     while not (robots := children(process.pid)):
         time.sleep(0.001)
     time.sleep(0.05)  # it has begun to import, which takes seconds
@@ -1007,10 +1019,10 @@ def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytes
     assert "-5: must be greater than 0" in capfd.readouterr().err
     with pytest.raises(RefusedError, match=r"sim\.loss = 2"):
         do(Job(file, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
-    said: list[str] = []
+    output: list[str] = []
     with pytest.raises(NotADirectoryError):  # before the robot is started, not when the log is due
-        do(Job(file, "sim", Plan(), f"{file}/logs"), said.append)
-    assert said == []
+        do(Job(file, "sim", Plan(), f"{file}/logs"), output.append)
+    assert output == []
     assert list(tmp_path.iterdir()) == []
 
 

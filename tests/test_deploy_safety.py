@@ -116,9 +116,9 @@ def cycles(name: str) -> int:
 CASES = [(name, *case) for name, cases in FAULTS.items() for case in cases]
 
 
-@pytest.mark.parametrize(("name", "state", "command", "now", "said"), CASES, ids=[f"{c[0]}: {c[4]}" for c in CASES])
+@pytest.mark.parametrize(("name", "state", "command", "now", "message"), CASES, ids=[f"{c[0]}: {c[4]}" for c in CASES])
 def test_a_fault_is_named_and_the_drives_brake_from_then_on(
-    name: str, state: LowState, command: LowCmd, now: float, said: str
+    name: str, state: LowState, command: LowCmd, now: float, message: str
 ) -> None:
     safety = make_safety()
     for _ in range(cycles(name) - 1):
@@ -126,7 +126,7 @@ def test_a_fault_is_named_and_the_drives_brake_from_then_on(
     sent = safety.review(state, command, now)
     assert safety.fault is not None
     assert (safety.fault.name, safety.fault.t) == (name, now)
-    assert said in safety.fault.message
+    assert message in safety.fault.message
     for later in (sent, safety.review(make_state(now), make_command(), now)):
         assert later.damping
         assert (later.kp == 0).all()
@@ -265,10 +265,10 @@ class FakePolicy:
     )
 
     def __init__(self) -> None:
-        self.seen: list[dict[str, np.ndarray]] = []
+        self.calls: list[dict[str, np.ndarray]] = []
 
     def __call__(self, readings: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        self.seen.append({name: values.copy() for name, values in readings.items()})
+        self.calls.append({name: values.copy() for name, values in readings.items()})
         action = np.repeat(readings["command"][:, :1], 12, axis=1)
         target = np.asarray(NOMINAL, np.float32) + 0.1 * action
         return {"joint_target": target, "observation": readings["joint_pos"], "action": action}
@@ -306,10 +306,10 @@ def controller(
     usual: dict[str, Any] = {"rate": 25.0, "stand_up": 0.1, "brake": 0.045, "on_cycle": log.append}
     made = Controller(bundle, link, commands, estimator or Velocity(), make_safety(), **{**usual, **settings})
 
-    def go(cycles: int, start: int = 0) -> list[bool]:
+    def run_cycles(cycles: int, start: int = 0) -> list[bool]:
         return [made.cycle(0.01 * k) for k in range(start, start + cycles)]
 
-    return SimpleNamespace(it=made, link=link, policy=policy, log=log, go=go, safety=made.safety)
+    return SimpleNamespace(it=made, link=link, policy=policy, log=log, run_cycles=run_cycles, safety=made.safety)
 
 
 def test_a_robot_stands_up_and_then_walks() -> None:
@@ -319,41 +319,41 @@ def test_a_robot_stands_up_and_then_walks() -> None:
         return [make_state(0.01 * cycle, joint_pos=lying)] if cycle >= 3 else []
 
     made = controller(script)
-    assert all(made.go(30))
+    assert all(made.run_cycles(30))
     assert [c.phase for c in made.log] == ["waiting"] * 3 + ["standing_up"] * 10 + ["walking"] * 17
     assert [c.command is None for c in made.log] == [True] * 3 + [False] * 27  # nothing is sent to who says nothing
     thighs = [c.command.joint_target[1] for c in made.log[3:13]]
     np.testing.assert_allclose(thighs, 1.8 + (NOMINAL[1] - 1.8) * np.arange(10) / 10, atol=1e-9)
     assert all((c.kp == KP).all() and (c.kd == KD).all() and not c.damping for c in made.link.sent)
     np.testing.assert_allclose(made.link.sent[-1].joint_target[0], NOMINAL[0] + 0.03, atol=1e-6)
-    actions = [seen["previous_action"][0, 0] for seen in made.policy.seen]
+    actions = [readings["previous_action"][0, 0] for readings in made.policy.calls]
     np.testing.assert_allclose(actions, [0.0] + [0.3] * 16, atol=1e-6)
 
 
 def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate() -> None:
     made = controller()
-    made.go(20)
+    made.run_cycles(20)
     assert made.it._estimator.count == 100
-    assert [seen["base_lin_vel_b"][0, 0] for seen in made.policy.seen] == [5.0 * k for k in range(11, 21)]
+    assert [readings["base_lin_vel_b"][0, 0] for readings in made.policy.calls] == [5.0 * k for k in range(11, 21)]
 
 
 def test_at_another_rate_the_previous_action_is_that_of_a_training_period_ago() -> None:
     made = controller(commands=lambda t: np.array([1.0 + t, 0.0, 0.0]), rate=100.0)  # 4 cycles in a training period
-    made.go(30)
-    actions = [float(seen["command"][0, 0]) for seen in made.policy.seen]  # what ``FakePolicy`` answers with
-    seen = [float(seen["previous_action"][0, 0]) for seen in made.policy.seen]
-    assert seen == [0.0] * 4 + actions[:-4]
+    made.run_cycles(30)
+    actions = [float(readings["command"][0, 0]) for readings in made.policy.calls]  # what ``FakePolicy`` answers with
+    previous = [float(readings["previous_action"][0, 0]) for readings in made.policy.calls]
+    assert previous == [0.0] * 4 + actions[:-4]
 
 
 def test_a_rehearsal_leaves_no_trace() -> None:
     beyond = lambda t: np.array([9.0, 0.0, 0.0])  # targets 0.9 rad off, which are cut  # noqa: E731
     plain, rehearsed = controller(commands=beyond), controller(commands=beyond)
     for k in range(30):
-        asked = len(rehearsed.policy.seen)
+        asked = len(rehearsed.policy.calls)
         rehearsed.it.rehearse()
-        assert len(rehearsed.policy.seen) - asked == (rehearsed.it.phase == "walking")  # and nothing before it
-        plain.go(1, k)
-        rehearsed.go(1, k)
+        assert len(rehearsed.policy.calls) - asked == (rehearsed.it.phase == "walking")  # and nothing before it
+        plain.run_cycles(1, k)
+        rehearsed.run_cycles(1, k)
     assert rehearsed.safety.clamped.any()
     assert (rehearsed.safety.clamped == plain.safety.clamped).all()
     assert len(rehearsed.link.sent) == len(plain.link.sent) == 30
@@ -372,7 +372,7 @@ def test_the_reach_of_a_target_follows_the_gains() -> None:
 def test_the_command_source_is_asked_for_the_time_since_walking_began() -> None:
     asked: list[float] = []
     made = controller(commands=lambda t: asked.append(t) or np.zeros(3))  # type: ignore[func-returns-value]
-    made.go(15)
+    made.run_cycles(15)
     np.testing.assert_allclose(asked, 0.01 * np.arange(5), atol=1e-9)
 
 
@@ -405,7 +405,7 @@ def test_whatever_goes_wrong_while_walking_the_robot_brakes_and_the_loop_ends(
     name: str, settings: dict[str, Any]
 ) -> None:
     made = controller(**settings)
-    going = made.go(30)
+    going = made.run_cycles(30)
     fault = made.safety.fault
     assert fault is not None
     assert fault.name == name
@@ -419,9 +419,9 @@ def test_whatever_goes_wrong_while_walking_the_robot_brakes_and_the_loop_ends(
 
 def test_a_stop_before_the_robot_has_said_anything_ends_the_loop() -> None:
     made = controller(lambda k: [])
-    made.go(2)
+    made.run_cycles(2)
     made.safety.stop("a key")
-    assert made.go(1, 2) == [True]
+    assert made.run_cycles(1, 2) == [True]
     assert made.it.phase == "damping"
     assert made.link.sent[-1].damping
 
@@ -531,21 +531,21 @@ def test_percentiles_are_numpys_and_the_oldest_cycles_are_forgotten() -> None:
 
 
 def test_reports_come_about_every_second() -> None:
-    clock, told = FakeClock(), list[int]()
-    run(lambda now: True, 10.0, seconds=3.5, clock=clock, on_report=lambda t: told.append(t.cycles))
-    assert told == [11, 21, 31]
+    clock, reported = FakeClock(), list[int]()
+    run(lambda now: True, 10.0, seconds=3.5, clock=clock, on_report=lambda t: reported.append(t.cycles))
+    assert reported == [11, 21, 31]
 
 
 def test_the_collector_is_off_in_the_loop_and_back_after_it() -> None:
-    seen: list[bool] = []
+    readings: list[bool] = []
 
     def work(now: float) -> bool:
-        seen.append(gc.isenabled())
+        readings.append(gc.isenabled())
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run(work, 100.0, clock=FakeClock())
-    assert seen == [False]
+    assert readings == [False]
     assert gc.isenabled()
 
 

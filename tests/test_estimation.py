@@ -64,29 +64,29 @@ def random_motion(config: FilterConfig, rows: int, seed: int) -> np.ndarray:
     )
     t = np.cumsum(rng.choice([0.002, 0.01, 0.2, 0.0, -0.003], p=[0.6, 0.36, 0.01, 0.02, 0.01], size=rows))
     phase = 12.0 * t[:, None]
-    found = np.empty((rows, WIDTH))
-    found[:, readings.T] = t
-    found[:, readings.QUAT] = Rotation.from_rotvec(rng.normal(0, 0.1, (rows, 3))).as_quat(scalar_first=True)
-    found[:, readings.GYRO] = rng.normal(0, 0.5, (rows, 3))
-    found[:, readings.ACC] = GRAVITY + rng.normal(0, 2.0, (rows, 3)) * rng.choice(
+    states = np.empty((rows, WIDTH))
+    states[:, readings.T] = t
+    states[:, readings.QUAT] = Rotation.from_rotvec(rng.normal(0, 0.1, (rows, 3))).as_quat(scalar_first=True)
+    states[:, readings.GYRO] = rng.normal(0, 0.5, (rows, 3))
+    states[:, readings.ACC] = GRAVITY + rng.normal(0, 2.0, (rows, 3)) * rng.choice(
         [1, 20], p=[0.99, 0.01], size=(rows, 1)
     )
-    found[:, readings.Q] = rest + 0.1 * np.sin(phase + np.arange(12)) + rng.normal(0, 0.01, (rows, 12))
-    found[:, readings.QD] = 1.2 * np.cos(phase + np.arange(12)) + rng.normal(0, 0.1, (rows, 12))
-    found[:, readings.TAU] = rng.normal(0, 6.0, (rows, 12)) + [0.0, 0.0, 6.0] * 4
-    found[:, readings.FOOT_FORCE] = 60 * np.sin(phase + np.array([0, np.pi, np.pi, 0])) + rng.normal(0, 3.0, (rows, 4))
+    states[:, readings.Q] = rest + 0.1 * np.sin(phase + np.arange(12)) + rng.normal(0, 0.01, (rows, 12))
+    states[:, readings.QD] = 1.2 * np.cos(phase + np.arange(12)) + rng.normal(0, 0.1, (rows, 12))
+    states[:, readings.TAU] = rng.normal(0, 6.0, (rows, 12)) + [0.0, 0.0, 6.0] * 4
+    states[:, readings.FOOT_FORCE] = 60 * np.sin(phase + np.array([0, np.pi, np.pi, 0])) + rng.normal(0, 3.0, (rows, 4))
     broken = rng.random(rows) < 0.02
-    found[broken, rng.integers(0, WIDTH, broken.sum())] = rng.choice([np.nan, np.inf, -np.inf], broken.sum())
-    return found
+    states[broken, rng.integers(0, WIDTH, broken.sum())] = rng.choice([np.nan, np.inf, -np.inf], broken.sum())
+    return states
 
 
 def check_twins(config: FilterConfig, rows: int, seed: int) -> set[Status]:
     """Run both filters side by side; return what became of the samples."""
-    fast, slow, seen = make_filter(config), NumpyFilter(config), set()
+    fast, slow, statuses = make_filter(config), NumpyFilter(config), set()
     for row in random_motion(config, rows, seed):
         status = Status(fast.update(row))
         assert status == slow.update(row)
-        seen.add(status)
+        statuses.add(status)
         if slow.running:
             np.testing.assert_allclose(fast.state, slow.x, rtol=0, atol=1e-9)
             np.testing.assert_allclose(fast.covariance, slow.P, rtol=0, atol=1e-9)
@@ -94,7 +94,7 @@ def check_twins(config: FilterConfig, rows: int, seed: int) -> set[Status]:
             np.testing.assert_allclose(fast.position_w, slow.position_w, rtol=0, atol=1e-9)
             np.testing.assert_allclose(fast.contact, slow.contact, rtol=0, atol=1e-12)
     assert np.isfinite(fast.state).all()
-    return seen
+    return statuses
 
 
 # ---------------------------------------------------------------------- a motion that is known exactly
@@ -192,8 +192,8 @@ def test_both_kinematics_agree_and_their_jacobian_is_the_slope(config: FilterCon
             else module.Leg.polynomial(leg.centre, leg.scale, np.array([leg.x, leg.y, leg.z]))
         )
         for q in centre + rng.uniform(-0.2, 0.2, (20, 3)):
-            for mine, theirs in zip(foot(leg, q), fast.foot(q), strict=True):
-                np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-13)
+            for numpy_result, cpp_result in zip(foot(leg, q), fast.foot(q), strict=True):
+                np.testing.assert_allclose(numpy_result, cpp_result, rtol=0, atol=1e-13)
             steps = 1e-6 * np.eye(3)
             slope = np.stack([(foot(leg, q + s)[0] - foot(leg, q - s)[0]) / 2e-6 for s in steps], axis=1)
             np.testing.assert_allclose(foot(leg, q)[1], slope, atol=1e-8)
@@ -216,18 +216,18 @@ def test_a_chains_link_turns_as_its_joints_say() -> None:
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_cpp_and_numpy_agree_over_random_motions(name: str) -> None:
-    seen = check_twins(CONFIGS[name](), rows=600, seed=1)
-    assert seen == set(Status), "the motion must try everything that a sample can be"
+    statuses = check_twins(CONFIGS[name](), rows=600, seed=1)
+    assert statuses == set(Status), "the motion must try everything that a sample can be"
 
 
 def test_many_samples_at_once_are_the_same_as_one_by_one() -> None:
     rows = random_motion(go1(), 300, seed=2)
     whole, single = make_filter(go1()), make_filter(go1())
-    found = whole.run(rows)
+    states = whole.run(rows)
     for k, row in enumerate(rows):
         status = single.update(row)
         expected = np.concatenate([single.position_w, single.velocity_b, single.contact, [status]])
-        np.testing.assert_array_equal(found[k], expected)
+        np.testing.assert_array_equal(states[k], expected)
 
 
 # ---------------------------------------------------------------------- what it must find
@@ -235,33 +235,33 @@ def test_many_samples_at_once_are_the_same_as_one_by_one() -> None:
 
 def test_a_swaying_robot_is_followed_exactly() -> None:
     rows, truth = stroll(exact(), seconds=4.0)
-    found = make_filter(exact()).run(rows)
+    states = make_filter(exact()).run(rows)
     assert np.abs(truth).max() > 0.08
-    np.testing.assert_allclose(found[100:, 3:6], truth[100:], atol=2e-3)
+    np.testing.assert_allclose(states[100:, 3:6], truth[100:], atol=2e-3)
 
 
 def test_the_height_over_ground_is_that_of_the_trunk() -> None:
-    found = make_filter(exact(foot_radius=robot.FOOT_RADIUS)).run(np.array([standing(k * 0.01) for k in range(100)]))
+    states = make_filter(exact(foot_radius=robot.FOOT_RADIUS)).run(np.array([standing(k * 0.01) for k in range(100)]))
     feet = [foot(leg, q)[0][2] for leg, q in zip(go1().legs, STANCE.reshape(4, 3), strict=True)]
-    assert found[-1, 2] == pytest.approx(robot.FOOT_RADIUS - min(feet), abs=2e-3)
-    np.testing.assert_allclose(found[-1, 3:6], 0.0, atol=1e-3)
+    assert states[-1, 2] == pytest.approx(robot.FOOT_RADIUS - min(feet), abs=2e-3)
+    np.testing.assert_allclose(states[-1, 3:6], 0.0, atol=1e-3)
 
 
 def test_without_any_foot_on_the_ground_it_falls_freely() -> None:
     config = exact(initial_bias=0.0)
     rows = np.array([standing(k * 0.01, acc=np.zeros(3), foot_force=np.zeros(4)) for k in range(31)])
-    found = make_filter(config).run(rows)
-    np.testing.assert_allclose(found[-1, 3:6], [0, 0, -9.81 * 0.3], atol=1e-9)
-    np.testing.assert_allclose(found[-1, 2] - found[0, 2], -9.81 * 0.3**2 / 2, atol=1e-9)
+    states = make_filter(config).run(rows)
+    np.testing.assert_allclose(states[-1, 3:6], [0, 0, -9.81 * 0.3], atol=1e-9)
+    np.testing.assert_allclose(states[-1, 2] - states[0, 2], -9.81 * 0.3**2 / 2, atol=1e-9)
 
 
 def test_an_offset_of_the_accelerometer_is_learnt_while_standing() -> None:
     offset = np.array([0.15, -0.1, 0.0])
     rows = np.array([standing(k * 0.01, acc=GRAVITY + offset) for k in range(2000)])
     fast = make_filter(exact(initial_bias=0.2))
-    found = fast.run(rows)
+    states = fast.run(rows)
     np.testing.assert_allclose(fast.state[6:8], offset[:2], atol=0.01)
-    np.testing.assert_allclose(found[-1, 3:6], 0.0, atol=2e-3)
+    np.testing.assert_allclose(states[-1, 3:6], 0.0, atol=2e-3)
 
 
 def test_one_slipping_foot_moves_the_estimate_little() -> None:
@@ -269,8 +269,8 @@ def test_one_slipping_foot_moves_the_estimate_little() -> None:
     rows, truth = (values.copy() for values in stroll(config, 4.0))
     for row in rows[200:]:  # its leg says that the trunk goes backward at 1.5 m/s, and nothing else does
         row[readings.QD][6:9] += np.linalg.solve(foot(config.legs[2], row[readings.Q][6:9])[1], [1.5, 0.0, 0.0])
-    found = make_filter(config).run(rows)
-    assert np.abs(found[200:, 3:6] - truth[200:]).max() < 0.05
+    states = make_filter(config).run(rows)
+    assert np.abs(states[200:, 3:6] - truth[200:]).max() < 0.05
     trusting = make_filter(exact(gate=1e12)).run(rows)
     assert np.abs(trusting[200:, 3:6] - truth[200:]).max() > 0.2
 
@@ -287,9 +287,9 @@ def test_all_feet_contradicting_makes_it_give_way() -> None:
         rows.append(
             standing(1.99 + k * 0.01, q=q, qd=np.concatenate([np.linalg.solve(J, [-1.2, 0, 0]) for J in slopes]))
         )
-    found = make_filter(config).run(np.array(rows))
-    assert abs(found[202, 3]) < 0.3
-    assert found[-1, 3] == pytest.approx(1.2, abs=0.1)
+    states = make_filter(config).run(np.array(rows))
+    assert abs(states[202, 3]) < 0.3
+    assert states[-1, 3] == pytest.approx(1.2, abs=0.1)
 
 
 def sinking_steps(config: FilterConfig, slope: float) -> np.ndarray:
@@ -315,8 +315,8 @@ def sinking_steps(config: FilterConfig, slope: float) -> np.ndarray:
 def test_ground_that_gives_way_does_not_make_the_trunk_sink(slope: float) -> None:
     config = go1(foot_radius=0.0)
     rows = sinking_steps(config, slope)
-    found = make_filter(config).run(rows)[500:, 3:6].mean(axis=0)
-    np.testing.assert_allclose(found, [0.5, 0.0, 0.5 * slope], atol=0.02)
+    states = make_filter(config).run(rows)[500:, 3:6].mean(axis=0)
+    np.testing.assert_allclose(states, [0.5, 0.0, 0.5 * slope], atol=0.02)
     without = make_filter(go1(foot_radius=0.0, level_noise=0.0)).run(rows)[500:, 3:6].mean(axis=0)
     assert without[2] < 0.5 * slope - 0.04
 
@@ -351,9 +351,9 @@ def test_what_the_settings_do_not_use_may_be_missing() -> None:
 def test_late_samples_are_left_out() -> None:
     rows, _ = stroll(exact(), 1.0)
     shuffled = np.insert(rows, 50, rows[20:23], axis=0)
-    found = make_filter(exact()).run(shuffled)
-    assert (found[50:53, -1] == Status.LATE).all()
-    np.testing.assert_array_equal(np.delete(found, [50, 51, 52], axis=0), make_filter(exact()).run(rows))
+    states = make_filter(exact()).run(shuffled)
+    assert (states[50:53, -1] == Status.LATE).all()
+    np.testing.assert_array_equal(np.delete(states, [50, 51, 52], axis=0), make_filter(exact()).run(rows))
 
 
 def test_one_wrong_stamp_far_ahead_does_not_stop_it() -> None:
@@ -361,27 +361,27 @@ def test_one_wrong_stamp_far_ahead_does_not_stop_it() -> None:
     wrong = rows.copy()
     wrong[100, readings.T] = 1e300
     fast = make_filter(exact())
-    found = fast.run(wrong)
-    assert (found[101:110, -1] == Status.LATE).all()
-    assert found[110, -1] == Status.RESTARTED
-    np.testing.assert_allclose(found[130:, 3:6], truth[130:], atol=0.02)
+    states = fast.run(wrong)
+    assert (states[101:110, -1] == Status.LATE).all()
+    assert states[110, -1] == Status.RESTARTED
+    np.testing.assert_allclose(states[130:, 3:6], truth[130:], atol=0.02)
 
 
 def test_dropped_samples_cost_little() -> None:
     rows, truth = stroll(exact(), 4.0)
     kept = np.random.default_rng(0).random(len(rows)) < 0.7
     kept[0] = True
-    found = make_filter(exact()).run(rows[kept])
-    assert (found[1:, -1] == Status.OK).all()
-    np.testing.assert_allclose(found[100:, 3:6], truth[kept][100:], atol=5e-3)
+    states = make_filter(exact()).run(rows[kept])
+    assert (states[1:, -1] == Status.OK).all()
+    np.testing.assert_allclose(states[100:, 3:6], truth[kept][100:], atol=5e-3)
 
 
 def test_after_a_gap_the_place_is_kept_and_the_speed_learnt_anew() -> None:
     rows, truth = stroll(exact(), 4.0)
     cut = np.delete(rows, slice(150, 200), axis=0)
-    found = make_filter(exact()).run(cut)
-    assert found[150, -1] == Status.RESTARTED
-    np.testing.assert_allclose(found[160:, 3:6], np.delete(truth, slice(150, 200), axis=0)[160:], atol=0.02)
+    states = make_filter(exact()).run(cut)
+    assert states[150, -1] == Status.RESTARTED
+    np.testing.assert_allclose(states[160:, 3:6], np.delete(truth, slice(150, 200), axis=0)[160:], atol=0.02)
 
 
 def test_the_covariance_stays_sound_for_long() -> None:
@@ -473,14 +473,14 @@ def test_a_simulated_go1_that_squats_is_followed(source: Literal["force", "torqu
     assert squat is not None
     episode = Episode("squat", "squat", make_motion(squat, 3.0, 500.0, 0), 60.0, 1.5, None, None, 0)
     (recording,) = play(rig, [episode], sensors, 0, lambda *_: None)
-    found = estimate(recording, go1(contact_source=source))
+    states = estimate(recording, go1(contact_source=source))
     attitude = Rotation.from_quat(recording.block(*VECTORS["base_quat"]), scalar_first=True)
     velocity = attitude.inv().apply(recording.block(*VECTORS["base_lin_vel"]))
-    error = (found.velocity_b - velocity)[250:]
+    error = (states.velocity_b - velocity)[250:]
     assert np.sqrt((velocity[250:] ** 2).sum(axis=1).mean()) > 0.1
     assert np.sqrt((error**2).sum(axis=1).mean()) < 0.02
     height = recording.block("base_pos_z_w")[:, 0]
-    assert np.abs(found.position_w[250:, 2] - height[250:]).max() < 0.02
+    assert np.abs(states.position_w[250:, 2] - height[250:]).max() < 0.02
 
 
 def test_on_the_real_scaler_it_beats_leg_odometry_by_far() -> None:
@@ -490,10 +490,10 @@ def test_on_the_real_scaler_it_beats_leg_odometry_by_far() -> None:
     if not (root / "scaler_walk_mocap").is_dir():
         pytest.skip(f"no scaler_walk_mocap in {root}; set GO1EXP_DATA")
     for run in (15, 23):
-        found = judge(root / f"scaler_walk_mocap/run_{run}.npz", scaler())
-        assert found.filter_rmse < 0.09, found
-        assert found.filter_rmse < 0.7 * found.odometry_rmse, found
-        assert abs(found.filter_distance) < 0.6 * abs(found.odometry_distance), found
+        states = judge(root / f"scaler_walk_mocap/run_{run}.npz", scaler())
+        assert states.filter_rmse < 0.09, states
+        assert states.filter_rmse < 0.7 * states.odometry_rmse, states
+        assert abs(states.filter_distance) < 0.6 * abs(states.odometry_distance), states
 
 
 def _main(folder: Path, motions: Callable[[], None]) -> None:
@@ -511,8 +511,8 @@ def _main(folder: Path, motions: Callable[[], None]) -> None:
 
 def _motions() -> None:
     for name, config in CONFIGS.items():
-        seen = check_twins(config(), rows=2000, seed=4)
-        print(f"{name}: 2000 samples, {', '.join(sorted(s.name.lower() for s in seen))}; C++ equals NumPy")
+        statuses = check_twins(config(), rows=2000, seed=4)
+        print(f"{name}: 2000 samples, {', '.join(sorted(s.name.lower() for s in statuses))}; C++ equals NumPy")
     make_filter(go1()).run(random_motion(go1(), 20000, seed=5))
     print("20000 samples in one call: no finding")
 

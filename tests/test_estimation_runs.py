@@ -53,14 +53,14 @@ def test_the_accelerometer_is_turned_back_to_specific_force() -> None:
     capture = motion_capture(load_npz(DATA / "run_15.npz"), r.t, r.block(*VECTORS["imu_gyro"]))
     grid = np.arange(1.0, 6.5, 0.01)
     place = np.stack([np.interp(grid, capture.t, one) for one in capture.position.T], axis=1)
-    seen = (place[20:] - 2 * place[10:-10] + place[:-20]) / 0.1**2  # mean over a triangle of 0.2 s
+    acceleration = (place[20:] - 2 * place[10:-10] + place[:-20]) / 0.1**2  # mean over a triangle of 0.2 s
     attitude = Rotation.from_quat(r.block(*VECTORS["base_quat"]), scalar_first=True)
     triangle = np.convolve(np.ones(10) / 10, np.ones(10) / 10)
     for recording, sign in ((r, 1.0), (logged, -1.0)):
         world = attitude.apply(recording.block(*VECTORS["imu_acc"])) - [0.0, 0.0, 9.81]
         felt = np.stack([np.interp(grid, r.t, one) for one in world.T], axis=1)
         smooth = np.stack([np.convolve(one, triangle, "same") for one in felt.T], axis=1)[10:-10]
-        match = np.corrcoef(smooth[20:-20].T, seen[20:-20].T).diagonal(3)
+        match = np.corrcoef(smooth[20:-20].T, acceleration[20:-20].T).diagonal(3)
         assert (sign * match > 0.6).all(), (sign, match)
     np.testing.assert_array_equal(logged.block(*VECTORS["imu_acc"]), arrays["accel_body"])
     assert "imu_acc is worked out" in r.meta.notes
@@ -90,9 +90,9 @@ def test_motion_capture_a_stride_off_is_moved_back(number: int, tmp_path: Path) 
     if number == 15:
         arrays["mocap_t"] = arrays["mocap_t"] - 0.51
     path = saved(tmp_path, arrays)
-    found = judge(path, scaler())
-    assert found.clock_shift == pytest.approx(0.51, abs=0.03)
-    assert found.truth_distance == pytest.approx(right.truth_distance, rel=0.02)  # the same walk
+    result = judge(path, scaler())
+    assert result.clock_shift == pytest.approx(0.51, abs=0.03)
+    assert result.truth_distance == pytest.approx(right.truth_distance, rel=0.02)  # the same walk
     (r,) = import_recordings("scaler_walk_mocap", path, {})
     assert "clock was moved by +0.5" in r.meta.notes
     (left,) = import_recordings("scaler_walk_mocap", path, {"resync": False})
@@ -114,10 +114,10 @@ def test_broken_rows_and_missing_sensors_do_not_stop_a_run(tmp_path: Path) -> No
     (r,) = import_recordings("scaler_walk_mocap", path, {})
     assert len(r.t) == len(arrays["t"]) - 3
     assert "3 rows were not finite or not newer" in r.meta.notes
-    found = judge(path, scaler())
+    result = judge(path, scaler())
     assert whole is not None
-    assert found.filter_rmse == pytest.approx(whole.filter_rmse, abs=0.01)
-    assert found.filter_distance == pytest.approx(whole.filter_distance, abs=0.02)
+    assert result.filter_rmse == pytest.approx(whole.filter_rmse, abs=0.01)
+    assert result.filter_distance == pytest.approx(whole.filter_distance, abs=0.02)
 
 
 def test_the_table_names_the_runs_that_it_leaves_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -249,7 +249,7 @@ def test_an_update_allocates_nothing(tmp_path: Path) -> None:
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
-    _, few, many, few_again, many_again, *outcomes = (int(word) for word in done.stdout.split())
+    _, few, many, few_again, many_again, *outcomes = (int(number) for number in done.stdout.split())
     assert outcomes == [0, 1, 2, 3, 4]
     assert few == few_again > 0, "the samples and what is found have arrays of their own"
     assert many == many_again == few

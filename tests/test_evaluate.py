@@ -69,8 +69,8 @@ def task(make_task: MakeTask) -> TaskConfig:
 def test_an_estimated_velocity_stands_in_the_place_of_the_true_one(make_task: MakeTask) -> None:
     """A robot that sways: but for the velocity it sees what it would see anyway, and the estimate follows the truth."""
     task = make_task("backend.threads=1")
-    seen: dict[str, list[Tensor]] = {"exact": [], "estimated": []}
-    for how, kept in seen.items():
+    by_source: dict[str, list[Tensor]] = {"exact": [], "estimated": []}
+    for how, kept in by_source.items():
 
         def sway(observation: Tensor, kept: list[Tensor] = kept) -> Tensor:
             kept.append(observation.clone())
@@ -78,7 +78,7 @@ def test_an_estimated_velocity_stands_in_the_place_of_the_true_one(make_task: Ma
             return torch.tensor([0.0, swing, -swing] * 4).repeat(len(observation), 1)
 
         evaluate(task, sway, settings(trunk_velocity=how, duration_s=2.0))
-    exact, estimated = (torch.stack(kept) for kept in seen.values())
+    exact, estimated = (torch.stack(kept) for kept in by_source.values())
     assert torch.equal(exact[:, :, 3:], estimated[:, :, 3:])
     assert not torch.equal(exact[:, :, :3], estimated[:, :, :3])
     assert exact[25:, :, :3].abs().max() > 0.1
@@ -103,7 +103,7 @@ def by_hand(task: TaskConfig, policy: Policy, config: EvalConfig) -> list[dict[s
     observation = core.reset()
     running, times = [True] * robots, [0] * robots
     fell = [False] * robots
-    seen: list[list[np.ndarray]] = [[] for _ in range(robots)]
+    velocities: list[list[np.ndarray]] = [[] for _ in range(robots)]
     dt = core.task.sim.policy_dt
     for step in range(round(config.duration_s / dt)):
         result = core.step(policy(observation))
@@ -116,18 +116,18 @@ def by_hand(task: TaskConfig, policy: Policy, config: EvalConfig) -> list[dict[s
                 qpos, qvel = core.backend.qpos[i].numpy(), core.backend.qvel[i].numpy()
                 to_body = Rotation.from_quat(qpos[3:7], scalar_first=True).inv()
                 if step * dt >= config.settle_s - 1e-9:
-                    seen[i].append(np.array([*to_body.apply(qvel[:3])[:2], qvel[5]]))
+                    velocities[i].append(np.array([*to_body.apply(qvel[:3])[:2], qvel[5]]))
     rows = []
     for k, command in enumerate(config.commands):
-        mine = range(k * config.episodes, (k + 1) * config.episodes)
-        samples = np.array([v for i in mine for v in seen[i]])
+        group = range(k * config.episodes, (k + 1) * config.episodes)
+        samples = np.array([v for i in group for v in velocities[i]])
         rows.append(
             {
                 "command": list(command),
                 "mean": samples.mean(0) if len(samples) else None,
                 "rmse": np.sqrt(((samples - command) ** 2).mean(0)) if len(samples) else None,
-                "falls": sum(fell[i] for i in mine),
-                "mean_time_s": float(np.mean([times[i] * dt for i in mine])),
+                "falls": sum(fell[i] for i in group),
+                "mean_time_s": float(np.mean([times[i] * dt for i in group])),
                 "samples": samples,
             }
         )
@@ -196,10 +196,10 @@ def test_leaving_the_map_ends_the_counting_and_is_no_fall(task: TaskConfig, monk
 
 def test_each_robot_gets_the_command_of_its_row_and_its_policy_sees_it(task: TaskConfig) -> None:
     commands = ((1.5, 0.0, 0.0), (0.0, -0.25, 0.75))
-    seen: list[Tensor] = []
+    inputs: list[Tensor] = []
 
     def policy(observation: Tensor) -> Tensor:
-        seen.append(observation.clone())
+        inputs.append(observation.clone())
         return stand(observation)
 
     evaluate(task, policy, settings(*commands, duration_s=0.1, settle_s=0.0))
@@ -208,32 +208,32 @@ def test_each_robot_gets_the_command_of_its_row_and_its_policy_sees_it(task: Tas
         if "command" in term.key:
             break
         start += term.entry.traits["size"]
-    for observation in seen:
+    for observation in inputs:
         for row, command in zip(observation, [commands[0]] * 2 + [commands[1]] * 2, strict=True):
             np.testing.assert_allclose(row[start : start + 3], command, rtol=1e-6)
 
 
 def test_progress_is_told_in_steps(task: TaskConfig) -> None:
-    told: list[tuple[int, int]] = []
-    evaluate(task, stand, settings(duration_s=0.2, settle_s=0.0), lambda done, total: told.append((done, total)))
-    assert told == [(k, 10) for k in range(1, 11)]
-    told.clear()
+    progress: list[tuple[int, int]] = []
+    evaluate(task, stand, settings(duration_s=0.2, settle_s=0.0), lambda done, total: progress.append((done, total)))
+    assert progress == [(k, 10) for k in range(1, 11)]
+    progress.clear()
     faster = settings(duration_s=0.2, settle_s=0.0, policy_dt=0.01)
-    evaluate(task, stand, faster, lambda done, total: told.append((done, total)))
-    assert told[-1] == (20, 20)
+    evaluate(task, stand, faster, lambda done, total: progress.append((done, total)))
+    assert progress[-1] == (20, 20)
 
 
 def test_at_another_rate_the_previous_action_is_that_of_a_training_period_ago(task: TaskConfig) -> None:
     where = columns(task, "previous_action")
     for policy_dt, cycles in ((None, 1), (0.01, 2), (0.004, 5)):
-        seen: list[float] = []
+        inputs: list[float] = []
 
         def policy(observation: torch.Tensor) -> torch.Tensor:
-            seen.append(float(observation[0, where].mean()))  # noqa: B023
-            return torch.full((len(observation), 12), 0.01 * len(seen))  # noqa: B023
+            inputs.append(float(observation[0, where].mean()))  # noqa: B023
+            return torch.full((len(observation), 12), 0.01 * len(inputs))  # noqa: B023
 
         evaluate(task, policy, settings(duration_s=0.2, settle_s=0.0, policy_dt=policy_dt))
-        assert seen == pytest.approx([0.0] * cycles + [0.01 * (k + 1) for k in range(len(seen) - cycles)], abs=1e-6)
+        assert inputs == pytest.approx([0.0] * cycles + [0.01 * (k + 1) for k in range(len(inputs) - cycles)], abs=1e-6)
 
 
 def test_the_same_seed_gives_the_same_report(task: TaskConfig) -> None:
@@ -273,8 +273,8 @@ def test_no_time_limit_falls_into_the_evaluation(make_task: MakeTask) -> None:
 
 def test_the_report_says_under_what_it_was_made(task: TaskConfig) -> None:
     config = settings(duration_s=0.1, settle_s=0.0, seed=7)
-    said = evaluate(task, stand, config)["settings"]
-    assert said == {k: v for k, v in dataclasses.asdict(config).items() if k != "commands"}
+    reported = evaluate(task, stand, config)["settings"]
+    assert reported == {k: v for k, v in dataclasses.asdict(config).items() if k != "commands"}
 
 
 # ---------------------------------------------------------------------- grid

@@ -168,19 +168,19 @@ def test_a_multisine_has_each_joints_own_lines() -> None:
     t = clock(1000.0, 50.0)
     target = go1("multisine", t=t, lines=6).target
     part = np.geomspace(0.15, 8.0, 7)
-    seen: list[np.ndarray] = []
+    collected: list[np.ndarray] = []
     for joint in range(12):
         frequency, density = signal.periodogram(target[:, joint] - target[:, joint].mean(), 50.0, window="hann")
         peaks = []
         for low, high in pairwise(part):
-            here = (frequency >= low) & (frequency < high)
-            peaks.append(frequency[here][np.argmax(density[here])])
+            in_band = (frequency >= low) & (frequency < high)
+            peaks.append(frequency[in_band][np.argmax(density[in_band])])
         lines = np.array(peaks)
         for i, low in enumerate(lines):
             for high in lines[i + 1 :]:
                 assert np.all(np.abs(high / low / np.arange(2, 6) - 1) > 0.01)
-        assert all(np.any(np.abs(lines / other - 1) > 0.02) for other in seen)
-        seen.append(lines)
+        assert all(np.any(np.abs(lines / other - 1) > 0.02) for other in collected)
+        collected.append(lines)
     np.testing.assert_allclose(np.abs(target - GO1[0]).max(axis=0)[[0, 1]], [0.3, 0.4], rtol=0.1)
 
 
@@ -213,15 +213,15 @@ def test_steps_are_many_some_large_and_off_the_policys_grid() -> None:
 def test_large_steps_are_taken_by_two_joints_while_the_others_rest() -> None:
     target = go1("steps").target
     change = np.abs(np.diff(target, axis=0))
-    seen = set()
+    collected = set()
     for row in np.flatnonzero((change > 0.65).any(axis=1)):
         movers = np.flatnonzero(change[row] > 0)
         assert len(movers) == 2
         assert movers[1] - movers[0] == 6
         others = np.delete(target[row], movers)
         np.testing.assert_array_equal(others, np.delete(GO1[0], movers))
-        seen |= set(movers.tolist())
-    assert seen == set(range(12))
+        collected |= set(movers.tolist())
+    assert collected == set(range(12))
 
 
 def test_a_gait_steps_at_its_rate_with_diagonal_legs_together() -> None:

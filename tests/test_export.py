@@ -38,7 +38,7 @@ from go1exp.env.core import Go1Core
 from go1exp.evaluate.policy import load_policy
 from go1exp.export import graph
 from go1exp.export.build import build, command_ranges, gains
-from go1exp.export.graph import DeployedPolicy, ExportError, inputs_of, to_onnx
+from go1exp.export.graph import DeployedPolicy, ExportError, required_inputs, to_onnx
 from go1exp.export.trace import readings
 from go1exp.mdp.types import Snapshot
 from go1exp.schema.registry import Entry, Term
@@ -117,16 +117,16 @@ def test_torch_onnx_and_the_environment_agree(choice: str, make_task: Callable[.
     sensing = parse_task(compose("train", ["backend.threads=1", "effect=[encoder_offset,base_tilt]"])).effect
     for effects in ((), sensing):
         core = Go1Core(dataclasses.replace(task, effect=effects), ROWS, noise=False)
-        seen = scattered(core)
+        observed = scattered(core)
         given = readings(core)
         named = {port.name: given[port.name] for port in module.inputs}
         by_onnx = session({name: values.numpy() for name, values in named.items()})
         by_torch = dict(zip(by_onnx, module(*named.values()), strict=True))
-        wanted = policy._predict(seen, deterministic=True).detach()
+        wanted = policy._predict(observed, deterministic=True).detach()
         core.step(wanted)
         action = wanted.clamp(-2.0, 2.0)
         target = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32) + task.action.scale * action
-        expected = {"joint_target": target, "observation": seen, "action": action}
+        expected = {"joint_target": target, "observation": observed, "action": action}
         kept = core.steps > 0  # the others have fallen, and stand again
         assert kept.any()
         torch.testing.assert_close(core.target[kept], target[kept], rtol=0, atol=1e-6)
@@ -146,15 +146,15 @@ def test_a_bundle_holds_the_policy_of_its_run(run: Path, good: Bundle) -> None:
     given["imu_quat"] /= np.linalg.norm(given["imu_quat"], axis=1, keepdims=True)
     out = good.policy(given)
     gravity = Rotation.from_quat(given["imu_quat"], scalar_first=True).inv().apply([0.0, 0.0, -1.0])
-    seen = np.concatenate(
+    observed = np.concatenate(
         [
             *(given["base_lin_vel_b"], given["imu_gyro"], gravity, given["command"]),
             *(given["joint_pos"] - robot.NOMINAL_STANCE, given["joint_vel"], given["previous_action"]),
         ],
         axis=1,
     )
-    np.testing.assert_allclose(out["observation"], seen, rtol=0, atol=1e-5)
-    action = policy(torch.as_tensor(seen, dtype=torch.float32)).numpy()
+    np.testing.assert_allclose(out["observation"], observed, rtol=0, atol=1e-5)
+    action = policy(torch.as_tensor(observed, dtype=torch.float32)).numpy()
     np.testing.assert_allclose(out["action"], action, rtol=0, atol=1e-5)
     np.testing.assert_allclose(out["joint_target"], robot.NOMINAL_STANCE + 0.3 * action, rtol=0, atol=1e-5)
 
@@ -165,15 +165,15 @@ def test_the_trace_is_the_environments(run: Path, good: Bundle) -> None:
     policy, _ = load_policy(run, config.ppo)
     sim = dataclasses.replace(config.task.sim, spread_starts=False)
     core = Go1Core(dataclasses.replace(config.task, sim=sim), 1, 0, noise=False)
-    observation, found = core.reset(), []
+    observation, recorded = core.reset(), []
     for _ in range(50):
-        seen = observation.clone()
+        observed = observation.clone()
         result = core.step(policy(observation))
         if not result.terminated:
-            found.append((seen, core.target.clone(), core.action.clone()))
+            recorded.append((observed, core.target.clone(), core.action.clone()))
         observation = result.observation
     for k, name in enumerate(("observation", "joint_target", "action")):
-        assert good.trace[f"output.{name}"].tobytes() == torch.cat([row[k] for row in found]).numpy().tobytes()
+        assert good.trace[f"output.{name}"].tobytes() == torch.cat([row[k] for row in recorded]).numpy().tobytes()
     fed, made = good.trace["input.previous_action"], good.trace["output.action"]
     follows = np.isclose(np.diff(good.trace["time"]), 0.02) & (fed[1:] != 0).any(axis=1)
     assert follows.sum() > 10
@@ -201,7 +201,7 @@ def test_a_bundle_says_what_its_run_was(run: Path, good: Bundle) -> None:
         ("velocity_command", 9, 3),
         ("joint_position", 12, 12),
     ]
-    assert Metadata.of(json.loads(as_json(about.as_dict()))) == about
+    assert Metadata.from_dict(json.loads(as_json(about.as_dict()))) == about
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, data: bytes) -> None:
@@ -232,7 +232,7 @@ def term(name: str, function: Callable[[Snapshot], Tensor | None], size: int) ->
 
 def test_a_graph_takes_only_what_its_terms_read() -> None:
     terms = [term("a", lambda s: s.joint_vel, 12), term("b", lambda s: s.projected_gravity_b[:, :2], 2)]
-    assert [port.name for port in inputs_of(terms)] == ["joint_vel", "imu_quat"]
+    assert [port.name for port in required_inputs(terms)] == ["joint_vel", "imu_quat"]
     module = DeployedPolicy(network(14), terms, ActionConfig(scale=0.2, clip=100.0))
     assert {port.name: port.size for port in module.outputs} == {"joint_target": 12, "observation": 14, "action": 12}
 
@@ -356,7 +356,7 @@ def test_another_form_of_the_same_archive_is_refused(data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda m: b"{", "no JSON"),
         (lambda m: as_json([]), "must hold format and sha256"),
@@ -367,11 +367,11 @@ def test_another_form_of_the_same_archive_is_refused(data: bytes) -> None:
     ],
 )
 def test_a_changed_manifest_is_refused(
-    change: Callable[[Any], bytes], said: str, data: bytes, members: dict[str, bytes]
+    change: Callable[[Any], bytes], message: str, data: bytes, members: dict[str, bytes]
 ) -> None:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         manifest = json.loads(archive.read("manifest.json"))
-    assert refused(stored({"manifest.json": change(manifest), **members})).startswith(f"manifest.json: {said}")
+    assert refused(stored({"manifest.json": change(manifest), **members})).startswith(f"manifest.json: {message}")
 
 
 def test_a_changed_hash_is_named(data: bytes, members: dict[str, bytes]) -> None:
@@ -431,7 +431,7 @@ def test_a_trace_of_other_outputs_is_refused(name: str, good: Bundle, members: d
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda t: t.pop("input.imu_gyro"), "arrays missing or too many: input.imu_gyro"),
         (lambda t: t.update({"input.x": t["time"]}), "arrays missing or too many: input.x"),
@@ -443,11 +443,11 @@ def test_a_trace_of_other_outputs_is_refused(name: str, good: Bundle, members: d
     ids=["missing", "too many", "another type", "another length", "empty", "NaN"],
 )
 def test_a_damaged_trace_is_refused(
-    change: Callable[[Any], Any], said: str, good: Bundle, members: dict[str, bytes]
+    change: Callable[[Any], Any], message: str, good: Bundle, members: dict[str, bytes]
 ) -> None:
     trace = {key: values.copy() for key, values in good.trace.items()}
     change(trace)
-    assert refused(pack({**members, "trace.npz": bundle._npz(trace)})).startswith(f"trace.npz: {said}")
+    assert refused(pack({**members, "trace.npz": bundle._npz(trace)})).startswith(f"trace.npz: {message}")
 
 
 def test_a_trace_is_never_unpickled(good: Bundle, members: dict[str, bytes]) -> None:
@@ -458,7 +458,7 @@ def test_a_trace_is_never_unpickled(good: Bundle, members: dict[str, bytes]) -> 
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"kp": [20.0]}, "kp: 1 values for 12 joints"),
         ({"joints": "FR_hip"}, "joints: must be a list"),
@@ -477,10 +477,10 @@ def test_a_trace_is_never_unpickled(good: Bundle, members: dict[str, bytes]) -> 
     ],
     ids=str,
 )
-def test_wrong_metadata_are_refused_by_key(change: dict[str, Any], said: str, members: dict[str, bytes]) -> None:
+def test_wrong_metadata_are_refused_by_key(change: dict[str, Any], message: str, members: dict[str, bytes]) -> None:
     content = {**json.loads(members["metadata.json"]), **change}
     content = {name: value for name, value in content.items() if value is not ...}
-    assert refused(pack({**members, "metadata.json": as_json(content)})).startswith(f"metadata.json: {said}")
+    assert refused(pack({**members, "metadata.json": as_json(content)})).startswith(f"metadata.json: {message}")
 
 
 @pytest.mark.parametrize("name", ["metadata.json", "config.json", "versions.json"])
@@ -493,7 +493,7 @@ def test_what_is_no_json_is_refused(name: str, members: dict[str, bytes]) -> Non
 
 
 @pytest.mark.parametrize(
-    ("reading", "said"),
+    ("reading", "message"),
     [
         (None, "joint_pos: missing"),
         (np.zeros((1, 12)), "joint_pos: float64 of shape"),
@@ -501,10 +501,10 @@ def test_what_is_no_json_is_refused(name: str, members: dict[str, bytes]) -> Non
         (np.zeros((1, 3), np.float32), r"joint_pos: float32 of shape \(1, 3\); must be float32 \(rows, 12\)"),
     ],
 )
-def test_a_wrong_reading_is_named(reading: np.ndarray | None, said: str, good: Bundle) -> None:
+def test_a_wrong_reading_is_named(reading: np.ndarray | None, message: str, good: Bundle) -> None:
     given: dict[str, Any] = {port.name: np.zeros((1, port.size), np.float32) for port in good.policy.inputs}
     given["joint_pos"] = reading
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         good.policy(given)
 
 
@@ -536,17 +536,17 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
         for k in range(rows)
     ]
     sent: list[LowCmd] = []
-    seen: list[Any] = []
+    observed: list[Any] = []
     link = SimpleNamespace(receive=lambda: [states[len(sent)]], send=sent.append)
     commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
     estimator = SimpleNamespace(update=lambda state: trace["input.base_lin_vel_b"][len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
-    runtime = Controller(good, cast(Link, link), commands, estimator, safety, stand_up=0.0, on_cycle=seen.append)
+    runtime = Controller(good, cast(Link, link), commands, estimator, safety, stand_up=0.0, on_cycle=observed.append)
     for state in states:
         assert runtime.cycle(state.t)
     assert safety.fault is None
     assert not safety.clamped.any()
-    np.testing.assert_allclose([c.observation for c in seen], trace["output.observation"][:rows], rtol=0, atol=1e-5)
+    np.testing.assert_allclose([c.observation for c in observed], trace["output.observation"][:rows], rtol=0, atol=1e-5)
     np.testing.assert_allclose([c.joint_target for c in sent], trace["output.joint_target"][:rows], rtol=0, atol=1e-5)
     assert all((c.kp == good.metadata.kp).all() and (c.kd == good.metadata.kd).all() for c in sent)
 
@@ -587,18 +587,18 @@ def test_export_writes_a_bundle_and_check_says_what_is_in_it(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert verb(monkeypatch, "export", f"run={run}", "seconds=0.5", "out=there/walk.zip", "checkpoint=000002.pt") == 0
-    said = capsys.readouterr().out
+    message = capsys.readouterr().out
     assert [p.name for p in (tmp_path / "there").iterdir()] == ["walk.zip"]
     sealed = seal((tmp_path / "there/walk.zip").read_bytes())
-    assert f"SHA-256 {sealed}" in said
-    assert said.splitlines()[-1] == "now: go1exp export check there/walk.zip"
+    assert f"SHA-256 {sealed}" in message
+    assert message.splitlines()[-1] == "now: go1exp export check there/walk.zip"
 
     assert verb(monkeypatch, "export", "check", "there/walk.zip") == 0
-    said = capsys.readouterr().out
+    message = capsys.readouterr().out
     for part in (sealed, "imu_quat", "projected_gravity", "FR_hip", "policy 50 Hz", "trace.npz", "lin_vel_x -2 to 3"):
-        assert part in said
-    assert said.splitlines()[-1].startswith("good: every hash matches, ")
-    assert max(map(len, said.splitlines())) <= 120
+        assert part in message
+    assert message.splitlines()[-1].startswith("good: every hash matches, ")
+    assert max(map(len, message.splitlines())) <= 120
 
     whole = (tmp_path / "there/walk.zip").read_bytes()
     (tmp_path / "bad.zip").write_bytes(whole.replace(b'"ppo": {', b'"PPO": {'))

@@ -188,15 +188,15 @@ def test_episodes_are_split_whole_and_repeats_stay_together() -> None:
         drive("r1", 9, 0.2, repeat_of="r0"),
         drive("x", 9, 0.2, repeat_of="y"),
     ]
-    seen = set()
+    drawn = set()
     for seed in range(8):
         parts = split(made, 0.25, 0.25, seed)
         everything = [*parts.train, *parts.validation, *parts.held_out]
         assert sorted(everything) == sorted(r.meta.episode for r in made)
         assert sum({"e0", "r0", "r1"} <= set(p) for p in (parts.train, parts.validation, parts.held_out)) == 1
         assert parts == split(made, 0.25, 0.25, seed)
-        seen.add(parts.held_out)
-    assert len(seen) > 3
+        drawn.add(parts.held_out)
+    assert len(drawn) > 3
     assert split(made, ("r0",), 0.2, 0).held_out == ("e0", "r0", "r1")
     assert split(made, ("e1",), ("e2", "e3"), 0).validation == ("e2", "e3")
 
@@ -234,7 +234,7 @@ def test_recordings_that_do_not_fit_together_are_refused(recordings: list[Record
 
 
 @pytest.mark.parametrize(
-    ("wrong", "words"),
+    ("wrong", "message"),
     [
         ({"inputs": ()}, "at least 1 item"),
         ({"inputs": ("torque",)}, "position_error"),
@@ -251,8 +251,8 @@ def test_recordings_that_do_not_fit_together_are_refused(recordings: list[Record
         ({"batches": 3}, "batches"),
     ],
 )
-def test_wrong_settings_are_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValidationError, match=words):
+def test_wrong_settings_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         FitSettings(**wrong)
 
 
@@ -306,11 +306,11 @@ def test_training_stops_when_validation_does_not_get_better(recordings: list[Rec
 
 
 def test_progress_is_told(recordings: list[Recording]) -> None:
-    told: list[tuple[str, int, int, float, float]] = []
-    fit(recordings, replace(QUICK, epochs=2, share="kind"), lambda *what: told.append(what))
+    progress: list[tuple[str, int, int, float, float]] = []
+    fit(recordings, replace(QUICK, epochs=2, share="kind"), lambda *what: progress.append(what))
     expected = [(f"{size} {kind}", n, 2) for size in ("net", "half net") for kind in ("hip", "calf") for n in (1, 2)]
-    assert [what[:3] for what in told] == expected
-    assert all(np.isfinite(what[3:]).all() for what in told)
+    assert [what[:3] for what in progress] == expected
+    assert all(np.isfinite(what[3:]).all() for what in progress)
 
 
 def test_the_papers_form_has_no_linear_part(recordings: list[Recording]) -> None:
@@ -323,7 +323,7 @@ def test_the_papers_form_has_no_linear_part(recordings: list[Recording]) -> None
 
 
 def test_the_reports_numbers_are_those_of_net_and_recordings(recordings: list[Recording], result: FitResult) -> None:
-    truth, mine, ideal = [], [], []
+    truth, predicted, ideal = [], [], []
     for recording in recordings[5:]:
         calf = {n: recording.channels[f"{n}_FR_calf"] for n in ("q", "qd", "q_target", "tau_est")}
         rows = windows([recording], QUICK.inputs, 6, 0.005)
@@ -331,8 +331,8 @@ def test_the_reports_numbers_are_those_of_net_and_recordings(recordings: list[Re
         keep = np.isin(recording.t, rows.t)
         truth.append(calf["tau_est"][keep])
         ideal.append((KP * (calf["q_target"] - calf["q"]) - KD * calf["qd"])[keep])
-        mine.append(result.net.torque(rows.x))
-    error = np.concatenate(mine) - np.concatenate(truth)
+        predicted.append(result.net.torque(rows.x))
+    error = np.concatenate(predicted) - np.concatenate(truth)
     cell = result.report.cell("FR_calf")
     assert cell.rows == len(error)
     assert cell.rmse["net"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
@@ -369,9 +369,9 @@ def test_what_cannot_be_had_is_missing_with_a_reason(recordings: list[Recording]
     got = fit(bare, replace(QUICK, epochs=1, half_net=False))
     assert set(got.report.missing) == {"command", "pd", "half_net"}
     assert set(got.report.cell().rmse) == {"net", "linear"}
-    told = text(got.report)
-    assert "pd: none (kp and kd" in told
-    assert "e5" in told
+    printed = text(got.report)
+    assert "pd: none (kp and kd" in printed
+    assert "e5" in printed
     torques = {f"tau_cmd_{joint}": np.cos(recordings[0].t) for joint in JOINTS}
     rows = windows([Recording(bare[0].meta, {**bare[0].channels, **torques})], ("tau_cmd",), 1, 0.005)
     np.testing.assert_array_equal(rows.command, np.cos(rows.t))
@@ -411,8 +411,8 @@ def test_a_damaged_or_foreign_file_is_refused(result: FitResult, tmp_path: Path)
     arrays = dict(np.load(good, allow_pickle=False))
     bad = tmp_path / "bad.npz"
 
-    def refused(words: str) -> None:
-        with pytest.raises(NetFileError, match=rf"bad\.npz: .*{words}"):
+    def refused(message: str) -> None:
+        with pytest.raises(NetFileError, match=rf"bad\.npz: .*{message}"):
             load(bad)
 
     with pytest.raises(NetFileError, match="no such file"):
@@ -436,7 +436,7 @@ def test_a_damaged_or_foreign_file_is_refused(result: FitResult, tmp_path: Path)
     refused("input_std: must be positive")
     np.savez(bad, **{name: values for name, values in arrays.items() if name != "bias_1"})
     refused("arrays missing: bias_1")
-    for old, new, words in (
+    for old, new, message in (
         ('"format":1', '"format":2', "header.format"),
         ('"history":6', '"history":"6"', "header.history"),
         ('"groups":["all"]', '"groups":["hip"]', "header.groups"),
@@ -444,7 +444,7 @@ def test_a_damaged_or_foreign_file_is_refused(result: FitResult, tmp_path: Path)
         text = str(arrays["header"])
         assert old in text
         np.savez(bad, **{**arrays, "header": np.array(text.replace(old, new))})
-        refused(words)
+        refused(message)
     with zipfile.ZipFile(bad, "w") as archive:
         archive.writestr("header.npy", "nonsense")
     refused("not an actuator net")

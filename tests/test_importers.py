@@ -54,19 +54,19 @@ def multiples(values: np.ndarray, step: float, tolerance: float) -> bool:
 
 @pytest.mark.parametrize("name", COUNTS)
 def test_every_recording_is_sound_and_survives_the_file(name: str, tmp_path: Path) -> None:
-    found = imported(name)
-    assert len(found) == COUNTS[name]
-    assert len({r.meta.episode for r in found}) == len(found)
-    for r in found:
+    recordings = imported(name)
+    assert len(recordings) == COUNTS[name]
+    assert len({r.meta.episode for r in recordings}) == len(recordings)
+    for r in recordings:
         assert recording.problems(r) == []
         assert r.meta.source == "measured"
         assert r.meta.notes
         assert r.has("q")
     path = tmp_path / "x.parquet"
-    recording.write(path, found[0])
+    recording.write(path, recordings[0])
     again = recording.read(path)
-    assert again.meta == found[0].meta
-    assert all(again.channels[k].tobytes() == v.tobytes() for k, v in found[0].channels.items())
+    assert again.meta == recordings[0].meta
+    assert all(again.channels[k].tobytes() == v.tobytes() for k, v in recordings[0].channels.items())
 
 
 def test_a_file_gives_what_its_folder_gives() -> None:
@@ -119,9 +119,9 @@ def test_go2_speed_is_too_large_by_the_factor_its_notes_state() -> None:
 
 
 def test_ak80_sits_on_the_steps_of_the_motors_messages() -> None:
-    found = imported("ak80_double_pendulum")
-    assert [r.meta.robot for r in found].count("ak80_double_pendulum_a") == 9
-    for r in found:
+    recordings = imported("ak80_double_pendulum")
+    assert [r.meta.robot for r in recordings].count("ak80_double_pendulum_a") == 9
+    for r in recordings:
         assert r.meta.joints == ("shoulder", "elbow")
         assert 495 < r.meta.rate_hz < 670
         assert 5.9 < r.t[-1] < 10.1
@@ -131,10 +131,10 @@ def test_ak80_sits_on_the_steps_of_the_motors_messages() -> None:
 
 
 def test_ak80_has_a_target_exactly_where_a_controller_followed_one() -> None:
-    found = imported("ak80_double_pendulum")
-    followed = {r.meta.episode for r in found if r.has("q_target")}
+    recordings = imported("ak80_double_pendulum")
+    followed = {r.meta.episode for r in recordings if r.has("q_target")}
     assert followed == {"ak80_a_trajectory_11", "ak80_c_trajectory_12", "ak80_c_trajectory_13"}
-    for r in found:
+    for r in recordings:
         assert not any("q_target" in name for name in r.channels) or r.has("q_target")
         assert r.has("tau_cmd")
         assert r.has("tau_est")
@@ -151,8 +151,8 @@ def test_ak80_reports_the_torque_it_was_given_with_the_same_sign() -> None:
 
 
 def test_xl330_sits_on_4096_steps_a_turn_and_says_when_it_is_off() -> None:
-    found = imported("servo_pendulum_xl330")
-    for r in found:
+    recordings = imported("servo_pendulum_xl330")
+    for r in recordings:
         assert r.meta.joints == ("pendulum",)
         assert r.meta.kp is None  # the firmware's gain is no N m/rad
         assert 5.9 < r.t[-1] < 6.1
@@ -160,8 +160,8 @@ def test_xl330_sits_on_4096_steps_a_turn_and_says_when_it_is_off() -> None:
         falls = r.meta.excitation == "lift_and_drop"
         assert (280 < r.meta.rate_hz < 290) if falls else (186 < r.meta.rate_hz < 190)
         assert r.channels["torque_enable"].all() != falls
-    assert {r.meta.excitation for r in found} == {"sin_sin", "sin_time_square", "up_and_down", "lift_and_drop"}
-    assert "gain 800 in the firmware's own unit" in found[-1].meta.notes
+    assert {r.meta.excitation for r in recordings} == {"sin_sin", "sin_time_square", "up_and_down", "lift_and_drop"}
+    assert "gain 800 in the firmware's own unit" in recordings[-1].meta.notes
 
 
 def test_xl330_follows_its_target_and_hangs_down_after_its_fall() -> None:
@@ -210,19 +210,19 @@ def test_scaler_turns_with_its_gyro() -> None:
     """Rotations over 0.1 s are those of the gyro: axes, signs and clocks fit together; pitch is small in this gait."""
     for r in imported("scaler_walk_mocap"):
         attitude = Rotation.from_quat(r.block("base_quat_x", "base_quat_y", "base_quat_z", "base_quat_w"))
-        seen = (attitude[:-10].inv() * attitude[10:]).as_rotvec()
+        mocap_turn = (attitude[:-10].inv() * attitude[10:]).as_rotvec()
         gyro = r.block("imu_gyro_x", "imu_gyro_y", "imu_gyro_z")
         turned = np.cumsum(gyro * np.gradient(r.t)[:, None], axis=0)
-        agreement = np.corrcoef(seen.T, (turned[10:] - turned[:-10]).T).diagonal(3)
+        agreement = np.corrcoef(mocap_turn.T, (turned[10:] - turned[:-10]).T).diagonal(3)
         assert (agreement > [0.9, 0.4, 0.8]).all()
 
 
 def test_scaler_has_foot_forces_only_where_a_sensor_worked() -> None:
     legs = {r.meta.episode[-2:]: {c[-2:] for c in r.channels if "foot" in c} for r in imported("scaler_walk_mocap")}
     everything = {"FL", "FR", "RR", "RL"}
-    assert {run for run, there in legs.items() if not there} == {"19", "20", "22"}
+    assert {run for run, legs_present in legs.items() if not legs_present} == {"19", "20", "22"}
     assert legs.pop("14") == everything - {"FR"}  # its sensor reads some 1500 N throughout
-    assert all(there == everything for run, there in legs.items() if run in ("13", "15", "17", "23"))
+    assert all(legs_present == everything for run, legs_present in legs.items() if run in ("13", "15", "17", "23"))
 
 
 def test_scaler_without_near_motion_capture_has_no_truth() -> None:
@@ -424,9 +424,9 @@ def test_names_and_options_are_checked_before_any_file_is_opened() -> None:
 
 
 def test_every_importer_is_listed_with_a_sentence() -> None:
-    found = members("importer")
-    assert set(found) == {*COUNTS, "mcap_joint_state"}
-    for entry in found.values():
+    recordings = members("importer")
+    assert set(recordings) == {*COUNTS, "mcap_joint_state"}
+    for entry in recordings.values():
         assert entry.doc.endswith(".")
         assert entry.schema.model_fields.keys() == entry.parameters.keys()
 

@@ -43,10 +43,10 @@ def settings_and_rig(*overrides: str) -> tuple[RecordSettings, simulate.Rig, lis
 
 def make(*overrides: str) -> list[Recording]:
     settings, rig, terms = settings_and_rig(*overrides)
-    found = simulate.play(
+    result = simulate.play(
         rig, plan.episodes(terms, settings), settings.sensors, settings.seed, lambda done, total: None
     )
-    return found
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +117,11 @@ def test_lost_samples_leave_gaps_and_no_trace() -> None:
 
 
 def test_a_hung_trunk_hangs_as_it_is_told() -> None:
-    found = make("excitation=[slow_ramps]", "seconds=1.0", "hang=[[0.0,0.0],[0.0,0.5],[0.3,0.0]]", "sensors.truth=true")
-    assert len({r.meta.episode for r in found}) == 3
-    for r, (roll, pitch) in zip(found, [(0.0, 0.0), (0.0, 0.5), (0.3, 0.0)], strict=True):
+    result = make(
+        "excitation=[slow_ramps]", "seconds=1.0", "hang=[[0.0,0.0],[0.0,0.5],[0.3,0.0]]", "sensors.truth=true"
+    )
+    assert len({r.meta.episode for r in result}) == 3
+    for r, (roll, pitch) in zip(result, [(0.0, 0.0), (0.0, 0.5), (0.3, 0.0)], strict=True):
         up = [-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)]
         acc = r.block("imu_acc_x", "imu_acc_y", "imu_acc_z").mean(0)
         np.testing.assert_allclose(acc, 9.81 * np.array(up), atol=0.05)
@@ -167,13 +169,13 @@ def test_drives_that_are_off_make_no_torque_and_come_back_gently() -> None:
 def test_all_recordings_of_a_set_are_of_one_robot_even_if_robots_differ() -> None:
     spread = "+effect.encoder_offset={offset: 0.0, spread: {offset: 0.05}}"
     still = ["excitation=[slow_ramps]", "seconds=0.4", "hang=[[0.0,0.0],[0.0,0.3]]", "repeats=1", *NOISELESS]
-    found = make(*still, spread)
+    result = make(*still, spread)
     plain = make(*still)
-    offsets = [np.mean(a.joint("q") - b.joint("q_target"), axis=0) for a, b in zip(found, plain, strict=True)]
+    offsets = [np.mean(a.joint("q") - b.joint("q_target"), axis=0) for a, b in zip(result, plain, strict=True)]
     # The drive closes on its own reading, so that what the readings of two poses share is not the offset alone.
     level = [offsets[0], offsets[2]]
     np.testing.assert_allclose(level[0], level[1], atol=1e-9)
-    torques = [r.joint("tau_est").mean(0) for r in (found[0], found[2])]
+    torques = [r.joint("tau_est").mean(0) for r in (result[0], result[2])]
     np.testing.assert_allclose(torques[0], torques[1], atol=1e-9)
     other = make(*still, spread, "seed=1")
     assert np.abs(other[0].joint("tau_est").mean(0) - torques[0]).max() > 0.01
@@ -196,18 +198,18 @@ def test_recordings_of_one_name_and_folders_that_cannot_be_written_are_refused(
 
 def test_a_hidden_effect_moves_the_robot_and_leaves_no_name_in_the_file(tmp_path: Path) -> None:
     arguments = ["record", "excitation=[slow_ramps]", "seconds=2.0", "physics_dt=0.001"]
-    for name, more in (
+    for name, extra in (
         ("with", ["effect=[coulomb,encoder_offset]", "effect.encoder_offset.offset=0.03"]),
         ("without", []),
     ):
-        sys.argv = ["go1exp", *arguments, *more, f"out={tmp_path / name}"]
+        sys.argv = ["go1exp", *arguments, *extra, f"out={tmp_path / name}"]
         assert main() == 0
     (file,) = (tmp_path / "with").iterdir()
     (hidden,), (plain,) = read_folder(tmp_path / "with"), read_folder(tmp_path / "without")
     assert np.abs(hidden.joint("q") - plain.joint("q")).max() > 0.01
     assert hidden.meta == plain.meta
-    for word in (b"coulomb", b"encoder_offset", b"effect"):
-        assert word not in file.read_bytes()
+    for secret in (b"coulomb", b"encoder_offset", b"effect"):
+        assert secret not in file.read_bytes()
 
 
 def test_a_tilt_that_nobody_knows_of_shows_in_the_attitude_that_the_imu_tells() -> None:
@@ -259,11 +261,11 @@ def test_a_policy_is_recorded_until_it_falls(make_task: Callable[..., Any]) -> N
 
 def test_a_hung_robot_can_tread_the_air_under_a_policy(make_task: Callable[..., Any]) -> None:
     settings, rig, _ = settings_and_rig()
-    seen: list[torch.Tensor] = []
+    observations: list[torch.Tensor] = []
 
     def policy(observation: torch.Tensor) -> torch.Tensor:
-        seen.append(observation.clone())
-        return torch.sin(torch.tensor(float(len(seen)))) * torch.ones(len(observation), 12)
+        observations.append(observation.clone())
+        return torch.sin(torch.tensor(float(len(observations)))) * torch.ones(len(observation), 12)
 
     walk = simulate.Walk(make_task("backend.threads=1", "experiment=ablation/no_noise"), policy, ["a"], 1.0, (0.0, 0.2))
     (r,) = simulate.play_policy(rig, walk, settings.sensors, 0, lambda done, total: None)
@@ -271,7 +273,7 @@ def test_a_hung_robot_can_tread_the_air_under_a_policy(make_task: Callable[..., 
     assert np.ptp(r.joint("q"), axis=0).min() > 0.05
     acc = r.block("imu_acc_x", "imu_acc_y", "imu_acc_z").mean(0)
     np.testing.assert_allclose(acc, 9.81 * np.array([-np.sin(0.2), 0.0, np.cos(0.2)]), atol=0.05)
-    for observation in seen:  # base velocity, angular velocity, gravity: those of a trunk that does not move
+    for observation in observations:  # base velocity, angular velocity, gravity: those of a trunk that does not move
         expected = [0.0] * 6 + [np.sin(0.2), 0.0, -np.cos(0.2)]
         np.testing.assert_allclose(observation[0, :9], expected, atol=1e-6)
 
@@ -309,9 +311,9 @@ def test_a_recording_can_be_audited_and_a_damaged_one_is_named(
     damaged.write_bytes(file.read_bytes()[:2000])
     sys.argv = ["go1exp", "record", "audit", str(tmp_path)]
     assert main() == 1
-    said = capsys.readouterr()
-    assert f"{damaged}: not a whole Parquet file" in said.err
-    assert file.name in said.out  # the other one is judged all the same
+    output = capsys.readouterr()
+    assert f"{damaged}: not a whole Parquet file" in output.err
+    assert file.name in output.out  # the other one is judged all the same
 
 
 def test_channels_without_noise_or_steps_are_left_as_they_are() -> None:
@@ -326,11 +328,11 @@ def test_channels_without_noise_or_steps_are_left_as_they_are() -> None:
     true |= {name: rng.normal(size=(rows, 3)) for name in ("gyro", "acc", "base_pos", "base_lin_vel", "base_ang_vel")}
     true |= {"quat": np.tile([1.0, 0, 0, 0], (rows, 1)), "base_quat": np.tile([1.0, 0, 0, 0], (rows, 1))}
     true |= {"foot_force": rng.uniform(size=(rows, 4)), "torque_enable": np.ones(rows, dtype=bool)}
-    found = log(true, config, rng)
-    np.testing.assert_array_equal(found["q_FL_calf"], true["q"][:, robot.JOINTS.index("FL_calf")])
-    np.testing.assert_array_equal(found["imu_acc_z"], true["acc"][:, 2])
-    np.testing.assert_array_equal(found["base_lin_vel_y_w"], true["base_lin_vel"][:, 1])
-    assert "torque_enable" not in found  # on throughout
+    result = log(true, config, rng)
+    np.testing.assert_array_equal(result["q_FL_calf"], true["q"][:, robot.JOINTS.index("FL_calf")])
+    np.testing.assert_array_equal(result["imu_acc_z"], true["acc"][:, 2])
+    np.testing.assert_array_equal(result["base_lin_vel_y_w"], true["base_lin_vel"][:, 1])
+    assert "torque_enable" not in result  # on throughout
     switched: dict[str, np.ndarray] = {**true, "torque_enable": np.arange(rows) < 5}
     assert log(switched, config, rng)["torque_enable"].sum() == 5
     assert not any(n.startswith("base_") for n in log(true, dataclasses.replace(config, truth=False), rng))

@@ -43,11 +43,11 @@ META = Meta(
 GO1 = replace(META, robot="go1", joints=JOINTS, kp=(20.0,) * 12, kd=None)
 
 
-def arm(**more: np.ndarray) -> Recording:
-    """A sound recording of 50 rows, with ``more`` columns."""
+def arm(**extra: np.ndarray) -> Recording:
+    """A sound recording of 50 rows, with ``extra`` columns."""
     t = np.arange(50) / 100
     waves = {f"{q}_{j}": np.sin(t + i) for i, q in enumerate(("q", "qd", "q_target")) for j in META.joints}
-    return Recording(META, {"t": t, **waves, **more})
+    return Recording(META, {"t": t, **waves, **extra})
 
 
 def without(recording: Recording, *names: str) -> Recording:
@@ -94,10 +94,10 @@ def test_a_recording_comes_back_bit_for_bit(path: Path) -> None:
     extra = {name: np.linspace(-1, 1, 50) for name in ("imu_gyro_x", "imu_gyro_y", "imu_gyro_z", "foot_force_tip")}
     written = arm(**extra, torque_enable=np.arange(50) % 3 > 0)
     rec.write(path, written)
-    found = rec.read(path)
-    assert same(found, written)
-    assert found.channels["torque_enable"].dtype == np.dtype(bool)
-    assert all(values.flags.writeable for values in found.channels.values())  # torch takes no others without a warning
+    result = rec.read(path)
+    assert same(result, written)
+    assert result.channels["torque_enable"].dtype == np.dtype(bool)
+    assert all(values.flags.writeable for values in result.channels.values())  # torch takes no others without a warning
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=True)
@@ -135,20 +135,20 @@ def test_awkward_numbers_keep_their_bits(path: Path) -> None:
 def test_metadata_is_one_json_object_that_any_reader_finds(path: Path) -> None:
     rec.write(path, arm())
     text = pq.read_schema(path).metadata[b"go1exp"]
-    found = json.loads(text)
-    assert found["joints"] == ["shoulder", "elbow"]
-    assert found["format"] == 1
-    assert found["tau_limit"] is None
-    assert set(found) == set(Meta.__dataclass_fields__)
+    result = json.loads(text)
+    assert result["joints"] == ["shoulder", "elbow"]
+    assert result["format"] == 1
+    assert result["tau_limit"] is None
+    assert set(result) == set(Meta.__dataclass_fields__)
 
 
 def test_a_joint_quantity_is_returned_in_the_order_of_the_metadata(path: Path) -> None:
     t = np.arange(5) / 100
     rec.write(path, Recording(GO1, {"t": t, **{f"q_{j}": np.full(5, float(JOINTS.index(j))) for j in sorted(JOINTS)}}))
-    found = rec.read(path)
-    assert list(found.channels)[1] == "q_FL_calf"  # the file's own order is another
-    assert np.array_equal(found.joint("q")[0], np.arange(12))
-    assert found.joint("q").shape == (5, 12)
+    result = rec.read(path)
+    assert list(result.channels)[1] == "q_FL_calf"  # the file's own order is another
+    assert np.array_equal(result.joint("q")[0], np.arange(12))
+    assert result.joint("q").shape == (5, 12)
 
 
 def test_an_absent_channel_is_named_and_never_zero() -> None:
@@ -199,16 +199,16 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(path: Path, monkeyp
 
 def test_the_old_file_stands_until_the_new_one_is_whole(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rec.write(path, arm())
-    seen = []
+    calls = []
     write_table = pq.write_table
 
     def watching(table: pa.Table, where: Path, **options: Any) -> None:
         write_table(table, where, **options)
-        seen.append("torque_enable" in rec.read(path).channels)
+        calls.append("torque_enable" in rec.read(path).channels)
 
     monkeypatch.setattr(pq, "write_table", watching)
     rec.write(path, arm(torque_enable=np.ones(50, bool)))
-    assert seen == [False]
+    assert calls == [False]
     assert "torque_enable" in rec.read(path).channels
     assert os.listdir(path.parent) == [path.name]
 

@@ -59,12 +59,12 @@ def stand(observation: Tensor) -> Tensor:
 
 def robot_pixels(camera: Camera, env: int = 0) -> np.ndarray:
     """(H, W) bool: where the picture differs from one without the robot."""
-    seen, model = camera.frame(env).astype(int), camera.stage.model
+    picture, model = camera.frame(env).astype(int), camera.stage.model
     groups = model.geom_group.copy()
     model.geom_group[model.geom_bodyid > 0] = 5  # not drawn
     empty = camera.frame(env).astype(int)
     model.geom_group[:] = groups
-    return np.abs(seen - empty).max(-1) > 20
+    return np.abs(picture - empty).max(-1) > 20
 
 
 def shift(core: Go1Core, env: int, x: float, seconds: float) -> None:
@@ -217,13 +217,13 @@ def test_the_second_library_is_taken_when_the_first_fails(monkeypatch: pytest.Mo
     assert choose_gl() == "osmesa"
 
 
-@pytest.mark.parametrize(("value", "said"), [("direct3d", "'direct3d' is no GL library"), ("osmesa", "with osmesa")])
+@pytest.mark.parametrize(("value", "message"), [("direct3d", "'direct3d' is no GL library"), ("osmesa", "with osmesa")])
 def test_a_wrong_choice_is_explained(
-    core: Go1Core, monkeypatch: pytest.MonkeyPatch, no_gl_chosen: None, value: str, said: str
+    core: Go1Core, monkeypatch: pytest.MonkeyPatch, no_gl_chosen: None, value: str, message: str
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", value)
     monkeypatch.setitem(sys.modules, "mujoco.osmesa", None)
-    with pytest.raises(RenderingUnavailable, match=said) as caught:
+    with pytest.raises(RenderingUnavailable, match=message) as caught:
         Camera(core)
     assert "libosmesa6" in str(caught.value)
 

@@ -1,4 +1,4 @@
-"""Is a recording fit to be compared with a simulation? Clock, sensors, order, signs and units, judged one by one."""
+"""Checks whether a recording can be compared with a simulation: clock, sensors, order, signs and units."""
 
 from go1exp.audit.checks import audit, audit_file
 from go1exp.audit.report import AuditReport, Channel, Finding, Verdict

@@ -1,7 +1,8 @@
-"""The audit of one recording: every check, put together."""
+"""The audit of one recording: runs every check and makes the report."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ import go1exp.audit.limits as limits
 import go1exp.audit.related as related
 import go1exp.audit.signals as signals
 import go1exp.audit.single as single
+from go1exp.audit.delay import Delay
 from go1exp.audit.log import Log, finding
 from go1exp.audit.report import ORDER, AuditReport, Channel, Finding, worst
 from go1exp.recording import Recording, problems, read
 
 SHORTEST = 20
-"""Rows below which nothing can be said."""
+"""Rows of a recording below which nothing is judged (chosen: a median step and its spread need about as many)."""
 
 
 def audit_file(path: Path) -> AuditReport:
@@ -29,59 +31,88 @@ def audit_file(path: Path) -> AuditReport:
 
 
 def audit(recording: Recording) -> AuditReport:
-    """Look for what is wrong with a recording; nothing is mended and nothing is raised.
+    """Look for what is wrong with a recording; nothing is corrected and nothing is raised.
 
-    A recording that breaks the format so that it cannot be computed with (no clock, not finite, a clock that runs
-    backward) gets only those findings.
+    A recording that cannot be computed with (no clock, values that are not finite, a clock that runs backward) gets
+    only the findings about its format.
     """
-    broken = [_as_finding(line) for line in problems(recording)]
+    format_findings = [_as_finding(line) for line in problems(recording)]
     if not _computable(recording):
-        return _report(recording, broken, ())
+        return _report(recording, format_findings, ())
     log = Log(recording)
-    found = list(single.clock(log))
-    repeats_found, repeats = single.stale(log)
-    noise_found, floors = single.noise(log, repeats)
-    delay_found, delay = commands.timing(log)
-    found += [*repeats_found, *single.resolution(log), *noise_found, *single.dead(log), *single.frozen(log)]
-    found += [
+    findings, measured = _run_checks(log)
+    off, still = _times(log, ~log.on), _times(log, log.still)
+    if off:
+        total = sum(b - a for a, b in off)
+        findings.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {len(off)} stretches"))
+    if (share := float(log.still.mean())) > limits.STILL_SHARE:
+        findings.append(
+            finding("still", "all", "suspect", share, "", "no joint moves: nothing can be learned from this")
+        )
+    # A format error is not repeated where a check has already called the same channel bad.
+    named = {f.channel for f in findings if f.verdict == "bad"}
+    findings += [f for f in format_findings if f.channel not in named]
+    return _report(recording, findings, _channel_table(log, findings, measured), off, still)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What the checks measured of each channel, by its name: share of repeats, noise floor, delay."""
+
+    repeats: dict[str, float]
+    floors: dict[str, float]
+    delays: dict[str, Delay]
+
+
+def _run_checks(log: Log) -> tuple[list[Finding], _Measured]:
+    """Run every check; findings come in the order in which the report prints those of equal verdict."""
+    stale_findings, repeats = single.stale(log)
+    noise_findings, floors = single.noise(log, repeats)
+    delay_findings, delays = commands.timing(log)
+    findings = [
+        *single.clock(log),
+        *stale_findings,
+        *single.resolution(log),
+        *noise_findings,
+        *single.dead(log),
+        *single.frozen(log),
         *single.saturation(log),
         *single.ranges(log),
         *related.attitude_length(log),
         *related.speed(log),
         *related.torque(log),
+        *related.rotation(log),
+        *related.gravity(log),
+        *commands.order_and_sign(log),
+        *delay_findings,
     ]
-    found += [*related.rotation(log), *related.gravity(log), *commands.order_and_sign(log), *delay_found]
-    off = _times(log, ~log.on)
-    still = _times(log, log.still)
-    if off:
-        total = sum(b - a for a, b in off)
-        found.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {len(off)} stretches"))
-    if (share := float(log.still.mean())) > limits.STILL_SHARE:
-        found.append(finding("still", "all", "suspect", share, "", "no joint moves: nothing can be learned from this"))
-    named = {f.channel for f in found if f.verdict == "bad"}
-    found += [f for f in broken if f.channel not in named]
+    return findings, _Measured(repeats, floors, delays)
+
+
+def _channel_table(log: Log, findings: list[Finding], measured: _Measured) -> tuple[Channel, ...]:
+    """One line for each column of the recording."""
     table = []
-    for name, values in recording.channels.items():
-        verdict = worst(f.verdict for f in found if _concerns(f, name, log))
-        d = delay.get(name)
+    for name, values in log.recording.channels.items():
+        delay = measured.delays.get(name)
         table.append(
             Channel(
                 name,
-                verdict,
+                worst(f.verdict for f in findings if _concerns(f, name, log)),
                 log.unit(name),
                 float(values.min()),
                 float(values.max()),
                 log.steps.get(name),
-                floors.get(name),
-                repeats.get(name),
-                None if d is None else d.time * 1e3,
-                None if d is None else d.error * 1e3,
+                measured.floors.get(name),
+                measured.repeats.get(name),
+                None if delay is None else delay.time * 1e3,
+                None if delay is None else delay.error * 1e3,
             )
         )
-    return _report(recording, found, tuple(table), off, still)
+    return tuple(table)
 
 
 def _as_finding(line: str) -> Finding:
+    """Turn a line of ``recording.problems`` (``channel: message``) into a finding."""
     channel, _, message = line.partition(": ")
     return Finding("format", channel, "bad", None, "", message)
 
@@ -106,7 +137,7 @@ def _times(log: Log, flags: np.ndarray) -> tuple[tuple[float, float], ...]:
 
 def _report(
     recording: Recording,
-    found: list[Finding],
+    findings: list[Finding],
     table: tuple[Channel, ...],
     off: tuple[tuple[float, float], ...] = (),
     still: tuple[tuple[float, float], ...] = (),
@@ -115,9 +146,9 @@ def _report(
     steps = np.diff(t) if t.ndim == 1 else np.empty(0)
     middle = float(np.median(steps)) if len(steps) else 0.0
     if t.ndim == 1 and len(t) < SHORTEST:
-        said = f"{len(t)} samples are too few to judge; at least {SHORTEST} are needed"
-        found = [*found, finding("length", "all", "suspect", len(t), "samples", said)]
-    ranked = sorted(found, key=lambda f: -ORDER.index(f.verdict))
+        message = f"{len(t)} samples are too few to judge; at least {SHORTEST} are needed"
+        findings = [*findings, finding("length", "all", "suspect", len(t), "samples", message)]
+    ranked = sorted(findings, key=lambda f: -ORDER.index(f.verdict))
     duration = float(t[-1] - t[0]) if t.ndim == 1 and len(t) else 0.0
     rate = 1 / middle if middle > 0 else 0.0
     return AuditReport(recording.meta.episode, len(t), duration, rate, table, tuple(ranked), off, still)

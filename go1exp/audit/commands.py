@@ -15,15 +15,15 @@ from go1exp.audit.report import Finding
 from go1exp.recording import joint_channel
 
 SMOOTH = 0.2
-"""s; order and sign are judged below some 3 Hz, where a joint follows its target whatever its gains."""
+"""s of smoothing: order and sign are judged below about 3 Hz, where a joint follows its target at any gains."""
 LONGEST_LAG = 0.12
-"""s by which a joint may trail its target."""
+"""s by which a joint may trail its target (chosen: longer than the response of any drive under position control)."""
 LONGEST_TRAIL = 0.3
 """s; the same for a soft position servo."""
 
 
 def order_and_sign(log: Log) -> Iterator[Finding]:
-    """Does each joint follow its own target better than another's, and forward?"""
+    """Check that each joint follows its own target better than that of another joint, and with the right sign."""
     if not (log.recording.has("q_target") and log.recording.has("q")) or not _enough(log):
         return
     target, q = _matches_inputs(log)
@@ -32,14 +32,14 @@ def order_and_sign(log: Log) -> Iterator[Finding]:
     for j, joint in enumerate(log.joints):
         if j in partner:
             other = log.joints[partner[j]]
-            said = f"moves with q_{other} (correlation {match[j, partner[j]]:.2f}), not with its own joint"
-            said += f" ({match[j, j]:.2f}): "
+            message = f"moves with q_{other} (correlation {match[j, partner[j]]:.2f}), not with its own joint"
+            message += f" ({match[j, j]:.2f}): "
             swap = partner[partner[j]] == j
-            said += f"{joint} and {other} are swapped" if swap else f"what is called {other} is the joint it drives"
-            yield finding("order", joint_channel("q_target", joint), "bad", match[j, partner[j]], "", said)
+            message += f"{joint} and {other} are swapped" if swap else f"what is called {other} is the joint it drives"
+            yield finding("order", joint_channel("q_target", joint), "bad", match[j, partner[j]], "", message)
         elif match[j, j] < -limits.CLEARLY:
-            said = f"goes against q_target_{joint} (correlation {match[j, j]:.2f}): a sign is flipped"
-            yield finding("sign", joint_channel("q", joint), "bad", match[j, j], "", said)
+            message = f"goes against q_target_{joint} (correlation {match[j, j]:.2f}): a sign is flipped"
+            yield finding("sign", joint_channel("q", joint), "bad", match[j, j], "", message)
 
 
 def _enough(log: Log) -> bool:
@@ -47,7 +47,10 @@ def _enough(log: Log) -> bool:
 
 
 def _matches_inputs(log: Log) -> tuple[np.ndarray, np.ndarray]:
-    """Targets and angles without their mean and without what is fast; while the drives are off, as they stood."""
+    """Return targets and angles (T, J), smoothed and without their mean.
+
+    While the drives are off, both keep their last values: a free joint does not follow its target.
+    """
     n = log.samples(SMOOTH)
     held = np.maximum.accumulate(np.where(log.on, np.arange(len(log.t)), 0))
     target, q = (uniform_filter1d(log.recording.joint(name)[held], n, axis=0) for name in ("q_target", "q"))
@@ -55,7 +58,10 @@ def _matches_inputs(log: Log) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lagged_correlation(log: Log, target: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Largest correlation (by size) of each target (rows) with each joint (columns) that trails it; 0 if one rests."""
+    """Return the correlation (J, J) of each target (rows) with each joint (columns), at the lag where it is largest.
+
+    "Largest" is by absolute value. A pair of which one does not move has 0.
+    """
     best = np.zeros((target.shape[1], q.shape[1]))
     live = np.outer(np.ptp(target, axis=0) > limits.STILL_ANGLE, np.ptp(q, axis=0) > limits.STILL_ANGLE)
     for lag in range(0, log.samples(LONGEST_LAG) + 1, log.samples(0.01)):
@@ -68,38 +74,39 @@ def _lagged_correlation(log: Log, target: np.ndarray, q: np.ndarray) -> np.ndarr
 
 
 def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
-    """Delay of each joint; return it by the name of the ``q`` column too."""
+    """Check the delay of each joint; return the delays, too, by the name of the ``q`` column."""
     if log.command is None or not log.recording.has("q") or not _enough(log):
         return [], {}
     q = log.recording.joint("q")
     estimates = delays(log.t, log.recording.joint(log.command), q, log.on)
     known = {j: d for j, d in zip(log.joints, estimates, strict=True) if d is not None}
-    found = []
+    findings = []
     middle = float(np.median([d.time for d in known.values()])) if known else 0.0
     threshold = limits.DELAY + log.dt
+    # An error of two standard deviations is allowed before a delay is reported.
     late = {j: d for j, d in known.items() if abs(d.time) - 2 * d.error > threshold}
     for joint, d in known.items():
         name = joint_channel("q", joint)
         shown = f"answers {log.command} after {d.time * 1e3:.1f} ± {d.error * 1e3:.1f} ms"
         apart = abs(d.time - middle) - 2 * d.error > limits.DELAY_SPREAD and len(known) > 2
         if joint in late and d.time > 0:
-            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", f"{shown}: delay or clock offset"))
+            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", f"{shown}: delay or clock offset"))
         elif joint in late:
-            said = f"{shown}, before it is given: a clock offset, or a command logged late"
-            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", said))
+            message = f"{shown}, before it is given: a clock offset, or a command logged late"
+            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", message))
         elif apart:
-            said = f"{shown}, the other joints after {middle * 1e3:.1f} ms: delay or clock offset of this one"
-            found.append(finding("delay", name, "suspect", d.time * 1e3, "ms", said))
-    if known and not found:
+            message = f"{shown}, the other joints after {middle * 1e3:.1f} ms: delay or clock offset of this one"
+            findings.append(finding("delay", name, "suspect", d.time * 1e3, "ms", message))
+    if known and not findings:
         low, high = (f(d.time for d in known.values()) * 1e3 for f in (min, max))
-        said = f"{len(known)} of {len(log.joints)} joints answer after {low:.1f} to {high:.1f} ms"
-        found.append(finding("delay", "q", "ok", middle * 1e3, "ms", said))
-    found += _trailing(log, [j for j in log.joints if j not in known])
-    return found, {joint_channel("q", joint): d for joint, d in known.items()}
+        message = f"{len(known)} of {len(log.joints)} joints answer after {low:.1f} to {high:.1f} ms"
+        findings.append(finding("delay", "q", "ok", middle * 1e3, "ms", message))
+    findings += _trailing(log, [j for j in log.joints if j not in known])
+    return findings, {joint_channel("q", joint): d for joint, d in known.items()}
 
 
 def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
-    """Tell by how much joints of unknown delay trail their targets: delay and response of the drive in one."""
+    """Report by how much joints of unknown delay trail their targets: delay and response of the drive together."""
     if log.command != "q_target" or not joints:
         return
     n, most = log.samples(0.05), log.samples(LONGEST_TRAIL)
@@ -107,6 +114,7 @@ def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
     for joint in joints:
         pair = (log.recording.channels[joint_channel(name, joint)] for name in ("q_target", "q"))
         a, b = (np.gradient(uniform_filter1d(x, n)) for x in pair)
+        # row k of the view: the joint k samples later than its target
         a, b = a[: len(a) - most], np.lib.stride_tricks.sliding_window_view(b, len(a) - most)
         spread = np.linalg.norm(a) * np.linalg.norm(b, axis=1)
         match = np.divide(b @ a, spread, out=np.zeros_like(spread), where=spread > 0)
@@ -114,5 +122,5 @@ def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
             trail[joint] = float(np.argmax(match)) * log.dt * 1e3
     if trail:
         low, high = min(trail.values()), max(trail.values())
-        said = f"{', '.join(trail)} trail their targets by {low:.3g} to {high:.3g} ms, delay and drive together; "
-        yield finding("trail", "q", "ok", high, "ms", said + "the motion does not tell them apart")
+        message = f"{', '.join(trail)} trail their targets by {low:.3g} to {high:.3g} ms, delay and drive together; "
+        yield finding("trail", "q", "ok", high, "ms", message + "the motion does not tell them apart")

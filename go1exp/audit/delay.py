@@ -1,4 +1,4 @@
-"""Time from a command to the joint's answer, without a model of the robot."""
+"""Delay between a command and the motion of the joint, estimated without a model of the robot."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import go1exp.audit.limits as limits
 from go1exp.audit.signals import stretches
 
 BLOCKS = 10
+"""Stretches of time for the jackknife."""
 FINE = 2
 """Points of the search grid to a sample."""
 MOST_ROWS = 1500
@@ -21,7 +22,7 @@ MOST_ROWS = 1500
 
 @dataclass(frozen=True)
 class Delay:
-    """Time from command to answer, s; its standard error, s; share of the acceleration that the command explains."""
+    """Delay, s; its standard error, s; share of the acceleration that the command explains."""
 
     time: float
     error: float
@@ -29,13 +30,14 @@ class Delay:
 
 
 def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray) -> list[Delay | None]:
-    """Return the delay of each joint, or None where the recording does not tell.
+    """Return the delay of each joint, or None where the recording does not show it.
 
-    Any joint under position or torque control obeys, near enough, q'' = a u(t - d) + b q + c q' + friction + gravity
+    Any joint under position or torque control obeys approximately q'' = a u(t - d) + b q + c q' + friction + gravity
     + coupling. All terms are smoothed by the same kernel (a Gaussian and its derivatives: the modulating function
-    method of Shinbrot, 1957), so no derivative of a noisy signal is taken; a, b, c, ... are free for each joint and d
-    is the delay that leaves least. Its error is a jackknife over ten stretches of time, enlarged, and part of a sample.
-    What is found is dead time and fast lag together: drive, bus, or an offset between the clocks of command and state.
+    method of Shinbrot, 1957), so no derivative of a noisy signal is taken; a, b, c, ... are fitted for each joint, and
+    d is the delay with the smallest residual. Its standard error comes from a jackknife over ten stretches of time, is
+    multiplied by ``limits.DELAY_FACTOR``, and has ``limits.DELAY_SAMPLES`` of a sample added in quadrature.
+    The result is dead time and fast lag together: drive, bus, or an offset between the clocks of command and state.
 
     Args:
         t: clock (T,), s.
@@ -43,18 +45,20 @@ def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray
         q: joint angles (T, J), rad.
         usable: (T,) bool; false where the drives are off.
     """
+    # Everything is computed on an even grid, finer than the samples, so that shifts are whole numbers of its points.
     dt = float(np.median(np.diff(t)))
     fine = dt / FINE
     grid = np.arange(t[0], t[-1], fine)
     held = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 1)
-    width = max(1.5 * dt, 6e-3)
-    reach = int(np.ceil(4 * width / fine))
+    width = max(1.5 * dt, 6e-3)  # s; standard deviation of the Gaussian: about 25 Hz pass at 6 ms
+    reach = int(np.ceil(4 * width / fine))  # points beyond which the kernel is negligible
     kernels = _kernels(width, fine, reach)
     angles = CubicSpline(t, q)(grid)
     smooth_q, speed, acceleration = (signal.fftconvolve(angles, k[:, None], mode="same", axes=0) for k in kernels)
     smooth_u = signal.fftconvolve(command[held] - command.mean(axis=0), kernels[0][:, None], mode="same", axes=0)
     first, last = (int(np.floor(d / fine)) for d in limits.DELAY_RANGE)
     good = usable[held] & (np.diff(t, append=t[-1] + dt)[held] < 3 * dt)
+    # A kernel or a shift must not reach into a gap, or into a time without drives.
     for a, b in stretches(~good):
         good[max(0, a - reach) : b + reach + last] = False
     good[: reach + last] = False
@@ -62,7 +66,7 @@ def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray
     rows = np.flatnonzero(good)
     rows = rows[:: max(FINE, -(-len(rows) // MOST_ROWS))]
     shifts = np.arange(first, last + 1)
-    found: list[Delay | None] = []
+    results: list[Delay | None] = []
     for joint in range(q.shape[1]):
         others = np.delete(acceleration, joint, axis=1)
         known = [smooth_q[:, joint], speed[:, joint], np.sin(angles[:, joint]), np.cos(angles[:, joint])]
@@ -70,12 +74,12 @@ def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray
         base = np.column_stack([np.stack(known, axis=1)[rows], others[rows]])
         # row i, column k: the command shifts[k] before rows[i]
         windows = sliding_window_view(smooth_u[:, joint], len(shifts))[rows - last][:, ::-1]
-        found.append(_best(acceleration[rows, joint], base, windows, shifts * fine))
-    return found
+        results.append(_best(acceleration[rows, joint], base, windows, shifts * fine))
+    return results
 
 
 def _kernels(width: float, step: float, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A Gaussian of standard deviation ``width`` and its two derivatives, for convolution on a grid of ``step`` s."""
+    """Return a Gaussian of standard deviation ``width`` and its first two derivatives, on a grid of ``step`` s."""
     x = np.arange(-reach, reach + 1) * step
     g = np.exp(-0.5 * (x / width) ** 2)
     g /= g.sum()
@@ -87,7 +91,7 @@ def _best(y: np.ndarray, base: np.ndarray, commands: np.ndarray, times: np.ndarr
     if len(y) < 2 * limits.ENOUGH or np.ptp(commands[:, 0]) < 1e-6 or np.ptp(y) == 0:
         return None
     q, r = np.linalg.qr(base / np.maximum(np.linalg.norm(base, axis=0), 1e-12))
-    q = q[:, np.abs(np.diag(r)) > 1e-8]
+    q = q[:, np.abs(np.diag(r)) > 1e-8]  # without columns that depend on earlier ones
     y = y - q @ (q.T @ y)
     commands = commands - q @ (q.T @ commands)
     parts = np.array_split(np.arange(len(y)), BLOCKS)
@@ -97,11 +101,11 @@ def _best(y: np.ndarray, base: np.ndarray, commands: np.ndarray, times: np.ndarr
 
     def minimum(keep: np.ndarray) -> tuple[float, float]:
         cross, power = keep @ uy, np.maximum(keep @ uu, 1e-12)
-        rest = keep @ yy - np.where(cross > 0, cross**2 / power, 0)  # a command pulls towards itself
+        rest = keep @ yy - np.where(cross > 0, cross**2 / power, 0)  # only a positive factor is physical
         k = int(np.argmin(rest))
         if k in (0, len(rest) - 1):
             return float("nan"), 0.0
-        a, b, c = rest[k - 1 : k + 2]
+        a, b, c = rest[k - 1 : k + 2]  # a parabola through three points gives the minimum between grid points
         vertex = 0.5 * (a - c) / (a - 2 * b + c) if a - 2 * b + c > 0 else 0.0
         return float(times[k] + vertex * (times[1] - times[0])), float(1 - b / (keep @ yy))
 

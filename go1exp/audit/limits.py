@@ -1,7 +1,7 @@
 """Every threshold of the audit, with its reason. Pairs are (suspect, bad).
 
-All were chosen so that noise-free simulated motion passes and the flaws of known public recordings do not; where a
-number comes from hardware, it says so.
+All were chosen so that simulated motion without noise passes and the flaws of known public recordings are found. Where
+a number comes from hardware, its comment says so.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ JITTER = (0.10, 0.50)
 GAP_STEPS = 1.8
 """A step longer than this many medians (and 6 robust deviations more than one) is a gap: a sample is missing."""
 GAPS = (0.0, 0.02)
-"""Share of missing samples: one is worth a word, 2 % spoil a derivative somewhere in every tenth of a second."""
+"""Share of missing samples: any is reported; with 2 %, every tenth of a second has a derivative that is wrong."""
 LONGEST_GAP = 0.1
 """s; longer ones are bad: half a stride is missing."""
 
@@ -26,22 +26,22 @@ LONGEST_GAP = 0.1
 REPEATS = (0.01, 0.20)
 """Share of samples that repeat the last value although the channel moves, beyond what its step explains."""
 ENOUGH = 50
-"""Samples that a share or a scale needs at least."""
+"""Fewest samples from which a share or a scale is computed."""
 SURE = 4.0
 """Standard deviations (of a count) by which stale samples must exceed chance."""
 ENOUGH_NOISE = 500
-"""Samples that a noise floor needs to be judged; shorter snippets (a second of walking) are mostly motion."""
+"""Fewest samples from which a noise floor is judged; shorter recordings (a second of walking) are mostly motion."""
 COARSE_ANGLE = 4e-3
 """rad; a coarser encoder than any known one (the coarsest, 2 pi / 4096, is 1.5e-3)."""
 NOISE = {"rad": (5e-3, 2e-2), "rad/s": (0.5, 2.0), "N m": (1.0, 5.0), "m/s2": (2.0, 10.0)}
-"""White noise by unit: some five times what drives of this class show (0.2 to 1 mrad, 0.05 rad/s, 0.15 N m)."""
+"""White noise by unit: about five times that of drives of this class (0.2 to 1 mrad, 0.05 rad/s, 0.15 N m)."""
 WHITE = (0.8, 1.25)
-"""Noise estimates by third and by fifth differences agree within this ratio if it is noise and not motion."""
+"""Estimates of noise by third and by fifth differences agree within this ratio if the signal is noise, not motion."""
 FROZEN_TIME, FROZEN_ANGLE = 1.0, 0.5
-"""s and rad: an angle that has not changed by a bit for so long, while its target moved so far, is not being read
+"""s and rad: an angle without any change for this time, while its target moved this far, is not being read
 (soft servos with coarse encoders stick for 0.7 s and 0.8 rad, and for 12 s and 0.2 rad)."""
 PLATEAU = 5
-"""Samples in a row at the extreme value, entered and left at speed, that count as clipped."""
+"""Consecutive samples at the extreme value, entered and left at speed, that count as clipped."""
 CLIPPED = (0.0, 0.05)
 """Share of clipped samples: any is suspect; a twentieth is bad."""
 CONTINUOUS = 2.0**-22
@@ -67,40 +67,41 @@ KNOWN = 2e-3
 SCALE = (0.05, 0.20)
 """Relative error of a scale (speed against the change of angle, gyroscope against attitude) beyond its uncertainty."""
 LAG_RANGE = 0.06
-"""s by which a speed is searched before and behind its angle."""
+"""s: largest lag, in either direction, at which a speed is compared with its angle."""
 LAG = 4e-3
 """s beyond one sample period: a speed that trails its angle by more was filtered, or read at another time."""
 LAG_GAIN = 1.5
-"""The unexplained part at no lag over that at the best lag: below it, the lag is chance."""
+"""Unexplained part at no lag over that at the best lag: below this ratio the lag may be chance."""
 MOTION = 5.0
-"""How many times its noise a change of angle, or an expected torque, must be to compare another channel with it."""
+"""A change of angle, or an expected torque, must exceed its noise this many times to be compared with a channel."""
 TORQUE_SCALE = (0.15, 0.50)
-"""The same of the reported torque against the PD law; motor strength and gains really are off by 5 to 15 %."""
+"""As ``SCALE``, for the reported torque against the PD law; strength and gains of real motors are off by 5 to 15 %."""
 TORQUE_LAG = 0.04
-"""s by which a torque is searched behind the control law; commands to a Go1 come up to 40 ms late."""
+"""s: largest lag of a torque behind the control law; commands to a Go1 arrive up to 40 ms late."""
 UNIT_SCALES = {"degrees instead of radians": 180 / math.pi, "milliseconds instead of seconds": 1e-3}
 """Scales that have a name, recognised within a tenth."""
 RELATED = 0.5
 """Correlation below which two channels that should follow one another do not."""
 CLEARLY = 0.7
-"""Correlation from which a sign is certain, and another joint may be called a better match."""
+"""Correlation above which a sign is certain, and another joint can be a better match."""
 BETTER = 0.25
-"""By how much the correlation with another joint must beat that with a joint's own."""
+"""The correlation with another joint must exceed that with the joint itself by this."""
 LEAST_TIME = 2.0
-"""s of motion below which order, sign and delay are not judged: any two slow curves of a second are alike."""
+"""s of motion below which order, sign and delay are not judged: any two slow curves of one second look alike."""
 DELAY = 8e-3
-"""s beyond one sample period: an intact bus and drive answer within it. A Go1 policy's 20 ms is worth knowing."""
+"""s beyond one sample period: an intact bus and drive respond within it. (A Go1 under a policy has 20 ms.)"""
 DELAY_SPREAD = 5e-3
 """s between joints, beyond their uncertainty: they were not sampled together."""
 DELAY_RANGE = (-0.05, 0.16)
 """s; delays that are searched. Longer ones are not delays of a drive."""
 DELAY_POWER = 0.6
-"""Share of what angle, speed and neighbours leave unexplained that the command must explain, to tell its timing."""
+"""Share of the acceleration left unexplained by angle, speed and neighbours that the command must explain: below it
+the delay is not given."""
 DELAY_FACTOR = 2.5
-"""Jackknife errors of a delay are enlarged by this: on simulated hung Go1s with no delay, chirps and slow ramps misled
-by up to five of them (forces of other joints), steps and sums of sines by about one."""
+"""Factor on the jackknife error of a delay. On simulated hung Go1s without delay, the estimate was wrong by up to five
+of these errors on chirps and slow ramps (forces of other joints), and by about one on steps and sums of sines."""
 DELAY_SAMPLES = 0.25
-"""Samples; error of a delay due to what happened between samples (measured: a fifth of one at 50 Hz)."""
+"""Samples; error of a delay because motion between samples is not known (measured: a fifth of a sample at 50 Hz)."""
 DELAY_ERROR = 4e-3
 """s; delays with a larger standard error are not given: the motion was too smooth to tell."""
 GRAVITY = 9.81
@@ -108,17 +109,17 @@ GRAVITY = 9.81
 GRAVITY_ERROR = (0.06, 0.15)
 """Relative error of the accelerometer at rest: 6 % is a poor calibration."""
 TILT = (10.0, 30.0)
-"""Degrees between the accelerometer's mean and the attitude's vertical: walking alone makes a few."""
+"""Degrees between the mean of the accelerometer and the vertical of the attitude: walking alone gives a few."""
 POSITION_MARGIN = (0.08, 0.3)
-"""rad beyond a hard stop: 5 degrees are play, a soft stop and zero offset, 17 are another unit, order or sign."""
+"""rad beyond a hard stop: 5 degrees can be play, a soft stop and a zero offset; 17 are a wrong unit, order or sign."""
 EXCEEDED = 1.25
-"""Torque and speed may exceed their limit by this factor: limits are nominal, and an ideal drive has none of speed."""
+"""Torque and speed may exceed their limit by this factor: limits are nominal, and an ideal drive has no speed limit."""
 
-# ---------------------------------------------------------------------- what the episode holds
+# ---------------------------------------------------------------------- motion in the episode
 
 STILL_TIME = 0.5
 """s; the shortest stretch that counts as still."""
 STILL_ANGLE = 5e-3
 """rad; joints that move less within that time stand still."""
 STILL_SHARE = 0.99
-"""A recording of a robot that rests for more than this share teaches nothing."""
+"""A recording in which the robot rests for more than this share cannot be used to identify anything."""

@@ -27,11 +27,11 @@ UNITS = {
     "foot_force": "N",
 }
 COMMANDS = ("q_target", "tau_cmd")
-"""Quantities that are held by design: no sensor stands behind them."""
+"""Quantities that are commanded, not measured: they are constant between commands by design."""
 
 
 def graded(size: float, pair: tuple[float, float]) -> Verdict:
-    """Judge ``size`` by its thresholds (suspect, bad)."""
+    """Grade ``size`` by a pair of thresholds (suspect, bad)."""
     return "bad" if size > pair[1] else "suspect" if size > pair[0] else "ok"
 
 
@@ -55,7 +55,7 @@ class Log:
 
     @cached_property
     def measured(self) -> list[str]:
-        """The columns behind which there is a sensor (or a simulated one)."""
+        """The columns that a sensor measured (or a simulated one)."""
         return [c for c, q in self.quantity.items() if q not in ("t", *COMMANDS)]
 
     @property
@@ -99,11 +99,11 @@ class Log:
         return sigma if white else 0.0
 
     def samples(self, seconds: float, least: int = 1) -> int:
-        """Return how many samples make ``seconds``, at least ``least``."""
+        """Return the number of samples in ``seconds``, at least ``least``."""
         return max(least, round(seconds / self.dt))
 
     def windows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return first and last samples (N,) of overlapping windows of 8 samples or 50 ms, those without gaps."""
+        """Return first and last sample (N,) of overlapping windows without gaps, of 50 ms or at least 8 samples."""
         width = self.samples(0.05, 8)
         first = np.arange(0, len(self.t) - width, max(1, width // 4))
         last = first + width
@@ -112,7 +112,7 @@ class Log:
 
     @cached_property
     def still(self) -> np.ndarray:
-        """(T,) bool: no joint moves for a while (False everywhere without joint angles)."""
+        """(T,) bool: no joint moves for ``limits.STILL_TIME``; False everywhere if there are no joint angles."""
         flags = np.zeros(len(self.t), dtype=bool)
         if self.recording.has("q"):
             q, n = self.recording.joint("q"), self.samples(limits.STILL_TIME)
@@ -124,5 +124,5 @@ class Log:
 
 
 def finding(check: str, channel: str, verdict: Verdict, size: float | None, unit: str, message: str) -> Finding:
-    """Make a finding with a plain float."""
+    """Make a finding; ``size`` becomes a plain float, as NumPy numbers cannot be written as JSON."""
     return Finding(check, channel, verdict, None if size is None else float(size), unit, message)

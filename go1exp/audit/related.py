@@ -17,7 +17,7 @@ from go1exp.recording import VECTORS, joint_channel
 def _scale_finding(
     check: str, name: str, against: str, s: signals.Scale, pair: tuple[float, float]
 ) -> Iterator[Finding]:
-    """Word a scale: sign first, then a factor with a name, then any other factor."""
+    """Report a scale: first a flipped sign, then a factor of another unit, then any other factor."""
     shown = f"{s.factor:.3f} ± {s.error:.3f} times"
     if s.correlation < -limits.RELATED:
         yield finding("sign", name, "bad", s.factor, "", f"goes against {against} ({shown}): its sign is flipped")
@@ -34,7 +34,7 @@ def _scale_finding(
 
 
 def speed(log: Log) -> Iterator[Finding]:
-    """Integrated speed against the change of the angle, over some 50 ms, at the lag that fits best."""
+    """Compare the integrated speed with the change of the angle over about 50 ms, at the lag that fits best."""
     if not (log.recording.has("q") and log.recording.has("qd")):
         return
     first, last = log.windows()
@@ -48,6 +48,7 @@ def speed(log: Log) -> Iterator[Finding]:
     lags = np.arange(-most, most + 1)
     whole = signals.antiderivative(log.t, qd)
     match = np.stack([_correlations(change, whole[last + lag] - whole[first + lag]) for lag in lags])
+    # (lags, J, J); a small cost on the lag decides between equal correlations
     best = np.argmax(np.abs(match) - 1e-4 * np.abs(lags)[:, None, None] / most, axis=0)
     peak = np.take_along_axis(match, best[None], axis=0)[0]
     partner = signals.mixed_up(peak.T)
@@ -58,41 +59,42 @@ def speed(log: Log) -> Iterator[Finding]:
             continue
         if j in partner:
             other = log.joints[partner[j]]
-            said = (
+            message = (
                 f"is the speed of q_{other} (correlation {peak[partner[j], j]:.2f}), not of {angle} ({peak[j, j]:.2f})"
             )
-            yield finding("order", name, "bad", peak[partner[j], j], "", f"{said}: the joints are in another order")
+            yield finding("order", name, "bad", peak[partner[j], j], "", f"{message}: the joints are in another order")
             continue
         lag = int(lags[best[j, j]])
         s = signals.scale(change[:, j], whole[last + lag, j] - whole[first + lag, j])
         if s is None:
             continue
         if abs(s.correlation) < limits.RELATED:
-            said = f"does not follow the change of {angle} (correlation {s.correlation:.2f})"
-            yield finding("scale", name, "suspect", s.correlation, "", said)
+            message = f"does not follow the change of {angle} (correlation {s.correlation:.2f})"
+            yield finding("scale", name, "suspect", s.correlation, "", message)
             continue
         yield from _scale_finding("scale", name, f"the change of {angle}", s, limits.SCALE)
         rest, rest_now = 1 - peak[j, j] ** 2, 1 - match[most, j, j] ** 2
         sharp = s.correlation > limits.CLEARLY and rest_now > limits.LAG_GAIN * rest + 1e-3
         if sharp and abs(lag) * log.dt > limits.LAG + log.dt:
-            word = "trails" if lag > 0 else "leads"
-            said = (
-                f"{word} the change of {angle} by {abs(lag) * log.dt * 1e3:.3g} ms: filtered, or read at another time"
+            verb = "trails" if lag > 0 else "leads"
+            message = (
+                f"{verb} the change of {angle} by {abs(lag) * log.dt * 1e3:.3g} ms: filtered, or read at another time"
             )
-            yield finding("lag", name, "suspect", lag * log.dt * 1e3, "ms", said)
+            yield finding("lag", name, "suspect", lag * log.dt * 1e3, "ms", message)
 
 
 def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Correlation of each column of ``a`` (N, J) with each of ``b``: (J, J); 0 where one is constant."""
+    """Return the correlation (J, J) of each column of ``a`` (N, J) with each of ``b``; 0 where one is constant."""
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     spread = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
     return np.divide(a.T @ b, spread, out=np.zeros_like(spread), where=spread > 0)
 
 
 def torque(log: Log) -> Iterator[Finding]:
-    """The reported torque against the commanded one, or against the joint controller's law, at the lag that fits best.
+    """Compare the reported torque with the commanded one, or with the law of the joint controller, at the best lag.
 
-    Either the command alone comes late (a delay before the controller) or the whole torque (behind it).
+    Two kinds of lag are tried: the command alone is late (a delay before the controller), or the whole torque is late
+    (a delay behind it).
     """
     r = log.recording
     if not r.has("tau_est"):
@@ -106,6 +108,7 @@ def torque(log: Log) -> Iterator[Finding]:
         what = "kp (q_target - q) - kd qd"
     else:
         return
+    # A torque near its limit is clipped, so that it says nothing about the scale.
     highest = np.full(len(log.joints), np.inf) if r.meta.tau_limit is None else 0.9 * np.array(r.meta.tau_limit)
     most = log.samples(limits.TORQUE_LAG)
     expected = []
@@ -127,14 +130,14 @@ def torque(log: Log) -> Iterator[Finding]:
 
 
 def _masked_correlation(a: np.ndarray, b: np.ndarray, use: np.ndarray) -> np.ndarray:
-    """Correlation about zero of the columns of ``a`` and ``b`` (T, J) where ``use`` is set: (J,)."""
+    """Return the correlation (J,), about zero, of the columns of ``a`` and ``b`` (T, J) where ``use`` is set."""
     a, b = np.where(use, a, 0.0), np.where(use, b, 0.0)
     spread = np.sqrt(np.sum(a * a, axis=0) * np.sum(b * b, axis=0))
     return np.divide(np.sum(a * b, axis=0), spread, out=np.zeros(a.shape[1]), where=spread > 0)
 
 
 def rotation(log: Log) -> Iterator[Finding]:
-    """Integrated rate of rotation against the attitude, axis by axis; for the IMU and for ground truth."""
+    """Compare the integrated rate of rotation with the attitude, axis by axis, for the IMU and for ground truth."""
     pairs = [("imu_quat", "imu_gyro"), ("base_quat", "base_ang_vel")]
     for attitude, rate in pairs:
         names = VECTORS[rate]
@@ -157,8 +160,10 @@ def rotation(log: Log) -> Iterator[Finding]:
             s = signals.scale(change[:, b], integral[:, b])
             if b in partner:
                 a = partner[b]
-                said = f"follows the {'xyz'[a]} axis of {attitude} ({match[a, b]:.2f}), not its own ({match[b, b]:.2f})"
-                yield finding("order", name, "bad", match[a, b], "", said)
+                message = (
+                    f"follows the {'xyz'[a]} axis of {attitude} ({match[a, b]:.2f}), not its own ({match[b, b]:.2f})"
+                )
+                yield finding("order", name, "bad", match[a, b], "", message)
             elif s and moves[b] and abs(s.correlation) >= limits.CLEARLY:
                 yield from _scale_finding("scale", name, f"the rotation of {attitude}", s, limits.SCALE)
 
@@ -168,17 +173,17 @@ def _attitude(log: Log, quantity: str) -> Rotation:
 
 
 def attitude_length(log: Log) -> Iterator[Finding]:
-    """Length of the quaternions."""
+    """Check that quaternions have length 1."""
     for quantity in ("imu_quat", "base_quat"):
         if set(VECTORS[quantity]) <= set(log.quantity):
             off = np.abs(np.linalg.norm(log.recording.block(*VECTORS[quantity]), axis=1) - 1)
             if off.max() > 1e-3:
-                said = f"its length differs from 1 by up to {off.max():.3g}; normalise, or look for a missing part"
-                yield finding("norm", quantity, "bad", off.max(), "", said)
+                message = f"its length differs from 1 by up to {off.max():.3g}; normalise, or look for a missing part"
+                yield finding("norm", quantity, "bad", off.max(), "", message)
 
 
 def gravity(log: Log) -> Iterator[Finding]:
-    """Length and direction of the accelerometer's reading while the robot rests, or on average."""
+    """Check length and direction of the measured gravity while the robot rests; on average if it never does."""
     names = VECTORS["imu_acc"]
     if not set(names) <= set(log.quantity):
         return
@@ -189,13 +194,13 @@ def gravity(log: Log) -> Iterator[Finding]:
     off = abs(reading / limits.GRAVITY - 1)
     channel = "imu_acc"
     if off > limits.GRAVITY_ERROR[0]:
-        said = f"reads {reading:.4g} {where}; gravity is {limits.GRAVITY} m/s2"
+        message = f"reads {reading:.4g} {where}; gravity is {limits.GRAVITY} m/s2"
         guess = "g instead of m/s2" if 0.9 < reading < 1.1 else "milli-g" if 900 < reading < 1100 else ""
         guess = guess or ("gravity taken out" if reading < 0.5 else "")
         if guess:
-            yield finding("units", channel, "bad", reading, "m/s2", f"{said}: it looks like {guess}")
+            yield finding("units", channel, "bad", reading, "m/s2", f"{message}: it looks like {guess}")
         elif rest is log.still or off > limits.GRAVITY_ERROR[1]:
-            yield finding("gravity", channel, graded(off, limits.GRAVITY_ERROR), reading, "m/s2", said)
+            yield finding("gravity", channel, graded(off, limits.GRAVITY_ERROR), reading, "m/s2", message)
     source = next((q for q in ("imu_quat", "base_quat") if set(VECTORS[q]) <= set(log.quantity)), None)
     if source is None or reading < 0.5 or np.linalg.norm(log.recording.block(*VECTORS[source]), axis=1).min() < 1e-3:
         return
@@ -204,5 +209,5 @@ def gravity(log: Log) -> Iterator[Finding]:
     verdict = graded(tilt, limits.TILT)
     if verdict != "ok":
         why = "its sign is flipped (at rest it must read +9.81 upwards)" if tilt > 150 else "axes or quaternion order"
-        said = f"gravity {where} is {tilt:.0f} degrees off the vertical of {source}: {why}"
-        yield finding("gravity", channel, verdict, tilt, "degrees", said)
+        message = f"gravity {where} is {tilt:.0f} degrees off the vertical of {source}: {why}"
+        yield finding("gravity", channel, verdict, tilt, "degrees", message)

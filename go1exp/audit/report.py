@@ -1,4 +1,4 @@
-"""What an audit says, and how it is printed."""
+"""The result of an audit, and how it is printed."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def worst(verdicts: Iterable[Verdict]) -> Verdict:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at and is worth a line.
+    """One result of one check.
 
     Attributes:
         check: ``rate``, ``repeats``, ``sign``, ``delay``, ...
         channel: column, or ``t``, or ``all`` where it concerns the whole recording.
-        verdict: ``ok`` for facts that are no flaws.
-        size: the number behind it, or None.
+        verdict: ``ok`` if it is information and not a flaw.
+        size: the number that was judged, or None.
         unit: of ``size``.
         message: a sentence.
     """
@@ -94,7 +94,7 @@ class AuditReport:
         """The worst verdict."""
         return worst(f.verdict for f in self.findings)
 
-    def of(self, check: str) -> list[Finding]:
+    def by_check(self, check: str) -> list[Finding]:
         """Return the findings of one check."""
         return [f for f in self.findings if f.check == check]
 
@@ -135,7 +135,7 @@ class AuditReport:
 
 
 def _grouped(findings: tuple[Finding, ...]) -> list[str]:
-    """One line for each finding, or for several channels of which the same is said."""
+    """One line for each finding; channels with the same message share a line."""
     same: dict[tuple[str, str, str], list[str]] = {}
     for f in findings:
         same.setdefault((f.verdict, f.check, f.message), []).append(f.channel)
@@ -156,5 +156,5 @@ def _row(c: Channel) -> tuple[str, ...]:
 
 def _stretches(stretches: tuple[tuple[float, float], ...]) -> str:
     shown = ", ".join(f"{a:.2f}-{b:.2f}" for a, b in stretches[:6])
-    more = f" and {len(stretches) - 6} more" if len(stretches) > 6 else ""
-    return f"{shown}{more} s ({sum(b - a for a, b in stretches):.1f} s)"
+    rest = f" and {len(stretches) - 6} more" if len(stretches) > 6 else ""
+    return f"{shown}{rest} s ({sum(b - a for a, b in stretches):.1f} s)"

@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 import go1exp.audit.limits as limits
 
 MOST_GAPS = 300
-"""Gaps that a step is sought in; of more, evenly ranked ones are taken."""
+"""Most gaps in which a step is searched; of more, a part is taken, evenly over their sorted order."""
 
 
 def stretches(flags: np.ndarray) -> list[tuple[int, int]]:
@@ -21,17 +21,19 @@ def stretches(flags: np.ndarray) -> list[tuple[int, int]]:
 
 
 def quantum(values: np.ndarray) -> float:
-    """Return the step that all ``values`` (T,) are a whole number of apart, or 0 if there is none.
+    """Return the quantisation step of ``values`` (T,): all differences are whole multiples of it; 0 if there is none.
 
-    Candidates are small gaps between neighbouring distinct values and their fractions; one is refined by regression on
-    ever larger gaps, and holds if the gaps are whole numbers of it (mean resultant of their phases above 0.9, which
-    forgives rounding to a tenth of a step, as in decimal text).
+    Candidates are small gaps between neighbouring distinct values, and fractions of them. A candidate is refined by
+    regression on larger and larger gaps. It is accepted if the gaps are whole multiples of it: the mean resultant of
+    their phases exceeds 0.9, which allows for rounding to a tenth of a step, as in decimal text.
     """
     distinct = np.unique(values)
     gaps = np.diff(distinct)
     largest = float(np.abs(distinct[[0, -1]]).max())
     gaps = np.sort(gaps[gaps > 1e-9 * largest])
-    if len(gaps) < (2 if len(values) > 20 * len(distinct) else 10):  # few values that come often are steps too
+    if len(gaps) < (
+        2 if len(values) > 20 * len(distinct) else 10
+    ):  # few distinct values that occur often are quantised too
         return 0.0
     gaps = gaps[:: -(-len(gaps) // MOST_GAPS)]
     guesses = {float(gaps[int(share * len(gaps))]) / m for share in (0, 0.02, 0.1, 0.5) for m in range(1, 7)}
@@ -53,10 +55,10 @@ def _refined(gaps: np.ndarray, step: float) -> float:
 
 
 def noise(values: np.ndarray) -> tuple[float, bool]:
-    """Return the standard deviation of white noise on a smooth signal (T,), and whether it looks white at all.
+    """Return the standard deviation of white noise on a smooth signal (T,), and whether it looks white.
 
-    Third differences remove what is smooth; their median is blind to rare events. Fifth differences give the same for
-    noise and another value for motion.
+    Third differences remove the smooth part; their median ignores rare events. Fifth differences give the same value
+    for white noise and another one for motion.
     """
     if len(values) < limits.ENOUGH:
         return float("nan"), False
@@ -64,6 +66,7 @@ def noise(values: np.ndarray) -> tuple[float, bool]:
     for order, gain in ((3, 20.0), (5, 252.0)):  # sums of the squared binomial coefficients
         d = np.diff(values, order)
         sigma.append(1.4826 * float(np.median(np.abs(d - np.median(d)))) / np.sqrt(gain))
+    # 1.4826 times the median absolute deviation is the standard deviation of a Gaussian.
     sigma = [s if s > 1e-9 * float(np.ptp(values)) else 0.0 for s in sigma]
     white = sigma[0] > 0 and limits.WHITE[0] < sigma[1] / sigma[0] < limits.WHITE[1]
     return sigma[0], white
@@ -71,7 +74,7 @@ def noise(values: np.ndarray) -> tuple[float, bool]:
 
 @dataclass(frozen=True)
 class Repeats:
-    """Which samples (T,) of a channel were moving, and which of those are stale; and how many too many are."""
+    """Samples (T,) at which a channel moved, the stale ones of them, and the share of stale ones beyond chance."""
 
     moving: np.ndarray
     stale: np.ndarray
@@ -79,10 +82,11 @@ class Repeats:
 
 
 def repeats(values: np.ndarray, step: float, reach: int) -> Repeats:
-    """Find samples that repeat the one before, although the ``reach`` samples before and after move the same way.
+    """Find samples that repeat the one before although the channel moves.
 
-    A channel moves where it changes by at least two steps a sample on both sides. A value may then repeat by chance,
-    but not more often than it changes by one step; only what exceeds that counts.
+    A channel moves at a sample if, over the ``reach`` samples before it and those after it, it changes in the same
+    direction and by at least two steps per sample. A value may then repeat by chance, but not more often than it
+    changes by one step; only the repeats beyond that count.
     """
     n = len(values)
     moving, same = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -102,9 +106,9 @@ def repeats(values: np.ndarray, step: float, reach: int) -> Repeats:
 
 
 def clipped(values: np.ndarray, step: float) -> tuple[float, list[float]]:
-    """Return the share of samples (T,) on flat tops or bottoms that are entered or left at speed, and their levels.
+    """Return the share of samples (T,) on flat maxima or minima that are entered or left at speed, and their levels.
 
-    The peak of a smooth signal has no speed where it begins; that of a clipped one has.
+    A smooth signal comes to its peak with zero speed; a clipped one does not.
     """
     span = float(np.ptp(values))
     share, levels = 0.0, []
@@ -131,7 +135,7 @@ class Scale:
 def scale(reference: np.ndarray, other: np.ndarray, blocks: int = 10) -> Scale | None:
     """Return how large ``other`` (N,) is against ``reference`` (N,), with a jackknife error over ``blocks`` in time.
 
-    Least squares: noise of ``other`` does no harm. None if there are too few samples or nothing varies.
+    Least squares: noise of ``other`` does not bias it. None if there are too few samples or nothing varies.
     """
     if len(reference) < limits.ENOUGH:
         return None
@@ -157,19 +161,19 @@ def antiderivative(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
 def mixed_up(match: np.ndarray) -> dict[int, int]:
     """Return which columns the rows of ``match`` (J, J; correlations) belong to, for those that are not in place.
 
-    The best assignment is taken apart into cycles (a swap is one of two); a cycle counts only if every member of it
-    matches its new partner clearly, and clearly better than its own. One odd joint mixes up nothing.
+    The best assignment is split into cycles (a swap is a cycle of two). A cycle counts only if every member of it
+    matches its new partner clearly, and clearly better than itself; a single joint that matches badly is not enough.
     """
     size = np.abs(match)
-    own = np.diag(size)
+    diagonal = np.diag(size)
     _, partner = linear_sum_assignment(-(size**2))
-    found: dict[int, int] = {}
+    partners: dict[int, int] = {}
     for start in range(len(partner)):
         cycle, k = [start], int(partner[start])
         while k != start:
             cycle.append(k)
             k = int(partner[k])
-        better = [size[j, partner[j]] > max(limits.CLEARLY, own[j] + limits.BETTER) for j in cycle]
+        better = [size[j, partner[j]] > max(limits.CLEARLY, diagonal[j] + limits.BETTER) for j in cycle]
         if len(cycle) > 1 and all(better):
-            found[start] = int(partner[start])
-    return found
+            partners[start] = int(partner[start])
+    return partners

@@ -1,4 +1,4 @@
-"""Checks of the clock, and of each channel by itself."""
+"""Checks of the clock, and of each channel alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
 
 
 def clock(log: Log) -> Iterator[Finding]:
-    """Rate against the metadata, jitter, gaps."""
+    """Compare the rate with the metadata; measure jitter and gaps."""
     steps = np.diff(log.t)
     nominal = 1 / log.recording.meta.rate_hz
     for factor, unit in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
@@ -24,37 +24,38 @@ def clock(log: Log) -> Iterator[Finding]:
             return
     off = log.dt / nominal - 1
     verdict = graded(abs(off), limits.RATE)
-    said = f"{1 / log.dt:.5g} Hz (median step {log.dt * 1e3:.4g} ms)"
+    message = f"{1 / log.dt:.5g} Hz (median step {log.dt * 1e3:.4g} ms)"
     if verdict == "ok":
-        yield finding("rate", "t", "ok", 1 / log.dt, "Hz", said)
+        yield finding("rate", "t", "ok", 1 / log.dt, "Hz", message)
     else:
-        yield finding("rate", "t", verdict, 1 / log.dt, "Hz", f"{said}, but rate_hz = {1 / nominal:g}")
+        yield finding("rate", "t", verdict, 1 / log.dt, "Hz", f"{message}, but rate_hz = {1 / nominal:g}")
+    # Robust: the median of the deviations, as a standard deviation, so that the gaps themselves do not count.
     usual = 1.4826 * float(np.median(np.abs(steps - log.dt)))
     long = steps > max(limits.GAP_STEPS * log.dt, log.dt + 6 * usual)
     jitter = float(np.std(steps[~long]))
     worst = float(np.abs(steps[~long] - log.dt).max())
-    said = (
+    message = (
         f"steps vary by {jitter * 1e3:.3g} ms (standard deviation; {jitter / log.dt:.1%}), at most {worst * 1e3:.3g} ms"
     )
     if jitter < 1e-6 * log.dt and log.recording.meta.source == "measured":
-        said += "; a clock this even was counted, not read, so its true jitter is unknown"
-    yield finding("jitter", "t", graded(jitter / log.dt, limits.JITTER), jitter * 1e3, "ms", said)
+        message += "; a clock this even was counted, not read, so its true jitter is unknown"
+    yield finding("jitter", "t", graded(jitter / log.dt, limits.JITTER), jitter * 1e3, "ms", message)
     if long.any():
         missing = int(np.sum(np.round(steps[long] / log.dt) - 1))
         longest = float(steps.max())
         share = missing / (len(log.t) + missing)
         verdict = "bad" if longest > limits.LONGEST_GAP else graded(share, limits.GAPS)
         at = float(log.t[int(np.argmax(steps))])
-        said = (
+        message = (
             f"{missing} samples are missing ({share:.2%}) in {int(long.sum())} gaps, the longest {longest * 1e3:.4g} ms"
         )
-        yield finding("gaps", "t", verdict, missing, "samples", f"{said} at {at:.3f} s")
+        yield finding("gaps", "t", verdict, missing, "samples", f"{message} at {at:.3f} s")
 
 
 def stale(log: Log) -> tuple[list[Finding], dict[str, float]]:
-    """Rows and channels that repeat although they move; return the share by channel too."""
+    """Find rows and channels that repeat although they move; return the share of repeats by channel, too."""
     reach = log.samples(0.02, 3)
-    found: list[Finding] = []
+    findings: list[Finding] = []
     each = {c: signals.repeats(log.recording.channels[c], log.steps[c], reach) for c in log.measured}
     moving = np.any([r.moving for r in each.values()], axis=0) if each else np.zeros(len(log.t), dtype=bool)
     rows = log.recording.block(*log.measured) if each else np.zeros((len(log.t), 0))
@@ -62,36 +63,40 @@ def stale(log: Log) -> tuple[list[Finding], dict[str, float]]:
     share = float(twice.sum() / max(1, moving.sum()))
     if len(each) > 1 and moving.sum() >= limits.ENOUGH and share > limits.REPEATS[0] / 2:
         verdict = graded(share, (limits.REPEATS[0] / 2, limits.REPEATS[1]))
-        said = f"{share:.1%} of the rows are exact copies of the row before ({int(twice.sum())}, while joints move)"
-        found.append(finding("duplicates", "all", verdict, share, "", said))
+        message = f"{share:.1%} of the rows are exact copies of the row before ({int(twice.sum())}, while joints move)"
+        findings.append(finding("duplicates", "all", verdict, share, "", message))
     shares = {}
     for name, r in each.items():
         shares[name] = max(0.0, r.share - (float((twice & r.stale).sum()) / max(1, int(r.moving.sum()))))
         verdict = graded(shares[name], limits.REPEATS)
         if verdict != "ok":
             rate = (1 - shares[name]) / log.dt
-            said = f"repeats its last value in {shares[name]:.1%} of its moving samples, as if read at {rate:.2g} Hz"
-            found.append(finding("repeats", name, verdict, shares[name], "", said))
-    return found, shares
+            message = f"repeats its last value in {shares[name]:.1%} of its moving samples, as if read at {rate:.2g} Hz"
+            findings.append(finding("repeats", name, verdict, shares[name], "", message))
+    return findings, shares
 
 
 def resolution(log: Log) -> Iterator[Finding]:
-    """Quantisation step, by the name of a known encoder where it is one."""
+    """Report the quantisation step of each channel, with the name of the encoder where it is a known one."""
     for name, step in log.steps.items():
         if step == 0:
             continue
         unit = log.unit(name)
         known = next((k for k, s in limits.KNOWN_STEPS.items() if abs(step / s - 1) < limits.KNOWN), None)
-        said = f"steps of {step:.3g} {unit}".rstrip() + (f": {known}" if known else "")
+        message = f"steps of {step:.3g} {unit}".rstrip() + (f": {known}" if known else "")
         coarse = unit == "rad" and step > limits.COARSE_ANGLE
         if coarse:
-            said += f"; coarser than any known encoder ({limits.COARSE_ANGLE:g} rad)"
-        yield finding("resolution", name, "suspect" if coarse else "ok", step, unit, said)
+            message += f"; coarser than any known encoder ({limits.COARSE_ANGLE:g} rad)"
+        yield finding("resolution", name, "suspect" if coarse else "ok", step, unit, message)
 
 
 def noise(log: Log, repeats: dict[str, float]) -> tuple[list[Finding], dict[str, float]]:
-    """Noise floor of each channel; judged where it looks like noise and neither stale samples nor motion make it."""
-    found, floors = [], {}
+    """Measure the noise floor of each channel.
+
+    It is judged only if it looks white and the channel has few stale samples, since both stale samples and motion look
+    like noise otherwise.
+    """
+    findings, floors = [], {}
     for name, (sigma, white) in log.floors.items():
         if not np.isfinite(sigma):
             continue
@@ -101,13 +106,15 @@ def noise(log: Log, repeats: dict[str, float]) -> tuple[list[Finding], dict[str,
             continue
         if white and unit in limits.NOISE and (verdict := graded(sigma, limits.NOISE[unit])) != "ok":
             usual = limits.NOISE[unit][0]
-            said = f"white noise of {sigma:.3g} {unit} (standard deviation); drives of this class stay below {usual:g}"
-            found.append(finding("noise", name, verdict, sigma, unit, said))
-    return found, floors
+            message = (
+                f"white noise of {sigma:.3g} {unit} (standard deviation); drives of this class stay below {usual:g}"
+            )
+            findings.append(finding("noise", name, verdict, sigma, unit, message))
+    return findings, floors
 
 
 def dead(log: Log) -> Iterator[Finding]:
-    """Channels that never change although what they measure does."""
+    """Find channels that never change although the robot moves."""
     meta = log.recording.meta
     moved = {}
     if log.recording.has("q"):
@@ -118,7 +125,7 @@ def dead(log: Log) -> Iterator[Finding]:
         if np.ptp(values) > 0 or len(values) < limits.ENOUGH:
             continue
         quantity = log.quantity[name]
-        said = f"is {values[0]:g} throughout"
+        message = f"is {values[0]:g} throughout"
         if quantity in ("qd", "tau_est"):
             joint = name.removeprefix(f"{quantity}_")
             verdict, why = (
@@ -138,11 +145,14 @@ def dead(log: Log) -> Iterator[Finding]:
         else:
             live = any(moved.values()) and quantity in ("imu_gyro", "imu_acc", "imu_quat", "base_quat", "base_pos")
             verdict, why = ("bad", "while the robot moves") if live else ("suspect", "")
-        yield finding("dead", name, verdict, float(values[0]), log.unit(name), f"{said} {why}".rstrip())  # type: ignore[arg-type]
+        yield finding("dead", name, verdict, float(values[0]), log.unit(name), f"{message} {why}".rstrip())  # type: ignore[arg-type]
 
 
 def frozen(log: Log) -> Iterator[Finding]:
-    """Joint angles that stop changing although their target goes on; one at the end of its range may lean on a stop."""
+    """Find joint angles that stop changing although their target still moves.
+
+    An angle at the end of its range is left out: the joint may be pressed against a stop.
+    """
     if not (log.recording.has("q") and log.recording.has("q_target")):
         return
     q, target = log.recording.joint("q"), log.recording.joint("q_target")
@@ -159,17 +169,19 @@ def frozen(log: Log) -> Iterator[Finding]:
         if caught:
             first, last = max(caught, key=lambda run: log.t[run[1]] - log.t[run[0]])
             time = float(log.t[last] - log.t[first])
-            said = f"is {q[first, j]:.6g} rad without a change for {time:.2g} s from {log.t[first]:.3f} s, while its "
-            said += f"target moves by {np.ptp(target[first : last + 1, j]):.2g} rad"
-            yield finding("frozen", joint_channel("q", joint), "bad", time, "s", said)
+            message = (
+                f"is {q[first, j]:.6g} rad without a change for {time:.2g} s from {log.t[first]:.3f} s, while its "
+            )
+            message += f"target moves by {np.ptp(target[first : last + 1, j]):.2g} rad"
+            yield finding("frozen", joint_channel("q", joint), "bad", time, "s", message)
 
 
 def saturation(log: Log) -> Iterator[Finding]:
-    """Values that stick at an extreme."""
+    """Find values that are clipped at their largest or smallest."""
     for name in log.measured:
         quantity = log.quantity[name]
         if quantity in ("q", "base_pos", "imu_quat", "base_quat", "foot_force"):
-            continue  # an angle may well rest where it is largest, a force at zero
+            continue  # an angle may rest where it is largest, and a force at zero, without being clipped
         values = log.recording.channels[name]
         use = log.on if quantity == "tau_est" else np.ones(len(values), dtype=bool)
         if use.sum() < limits.ENOUGH or np.ptp(values[use]) == 0:
@@ -179,16 +191,18 @@ def saturation(log: Log) -> Iterator[Finding]:
         if not levels:
             continue
         at = " and ".join(f"{v:.4g}" for v in levels)
-        said = f"sticks at {at} {log.unit(name)} in {share:.1%} of the samples"
+        message = f"sticks at {at} {log.unit(name)} in {share:.1%} of the samples"
         verdict = graded(share, limits.CLIPPED)
         if quantity == "tau_est":
             limit = _torque_limit(log, name.removeprefix("tau_est_"))
             if limit is None or all(abs(abs(v) / limit - 1) < 0.02 for v in levels):
                 verdict = "ok"
-                said += ": the drive's limit" if limit else ": perhaps the drive's limit, which the file does not give"
+                message += (
+                    ": the drive's limit" if limit else ": perhaps the drive's limit, which the file does not give"
+                )
             else:
-                said += f", but the limit is {limit:.4g} N m"
-        yield finding("saturation", name, verdict, share, "", said)
+                message += f", but the limit is {limit:.4g} N m"
+        yield finding("saturation", name, verdict, share, "", message)
 
 
 def _torque_limit(log: Log, joint: str) -> float | None:
@@ -201,7 +215,7 @@ def _torque_limit(log: Log, joint: str) -> float | None:
 
 
 def ranges(log: Log) -> Iterator[Finding]:
-    """Angles beyond the stops, torques and speeds beyond their limits (Go1), angles in degrees (any robot)."""
+    """Check angles against stops, torques and speeds against limits (Go1), and for degrees (any robot)."""
     go1 = log.recording.meta.robot == "go1"
     for name, quantity in log.quantity.items():
         values = log.recording.channels[name]
@@ -216,17 +230,17 @@ def ranges(log: Log) -> Iterator[Finding]:
                 over = float(max(values.max() - high, low - values.min()))
                 degrees = over > limits.POSITION_MARGIN[1] and inside > 0.99 and float(np.abs(values).max()) > 2 * np.pi
             if degrees:
-                said = f"reaches {np.abs(values).max():.4g}: it looks like degrees, not radians"
-                yield finding("units", name, "bad", float(np.abs(values).max()), "rad", said)
+                message = f"reaches {np.abs(values).max():.4g}: it looks like degrees, not radians"
+                yield finding("units", name, "bad", float(np.abs(values).max()), "rad", message)
             elif quantity == "q" and over > limits.POSITION_MARGIN[0]:
-                said = f"goes {over:.3g} rad beyond the joint's stops, {low:g} to {high:g} rad"
-                yield finding("limits", name, graded(over, limits.POSITION_MARGIN), over, "rad", said)
+                message = f"goes {over:.3g} rad beyond the joint's stops, {low:g} to {high:g} rad"
+                yield finding("limits", name, graded(over, limits.POSITION_MARGIN), over, "rad", message)
         elif quantity in ("qd", "tau_est"):
             limit = _torque_limit(log, joint) if quantity == "tau_est" else None
             if quantity == "qd" and known:
                 limit = VELOCITY_LIMIT[JOINTS.index(joint) % 3]
             worst = float(np.abs(values).max())
             if limit is not None and worst > limits.EXCEEDED * limit:
-                said = f"reaches {worst:.4g} {log.unit(name)}; the limit is {limit:.4g}"
+                message = f"reaches {worst:.4g} {log.unit(name)}; the limit is {limit:.4g}"
                 verdict = graded(worst / limit, (limits.EXCEEDED, 2.0))
-                yield finding("limits", name, verdict, worst, log.unit(name), said)
+                yield finding("limits", name, verdict, worst, log.unit(name), message)

@@ -1,1 +1,1 @@
-"""Speed, as ratios measured in one run: absolute figures depend on the machine, ratios far less."""
+"""Speed, as ratios measured in one run: absolute figures depend on the machine, ratios much less."""

@@ -71,11 +71,11 @@ def run(
             "net": core_subject(dataclasses.replace(task, actuator=net), num_envs),
             "effects": core_subject(dataclasses.replace(task, effect=effects), num_envs),
         }
-        found = rates(subjects, rounds, seconds, on_round)
+        measured = rates(subjects, rounds, seconds, on_round)
         recorded = record_seconds(rig, sensors, folder)
     return {
-        **{f"{key}_steps_per_s": float(np.median(values)) for key, values in found.items()},
-        "net_over_pd": ratio(found, "net", "pd"),
-        "effects_over_none": ratio(found, "effects", "pd"),
+        **{f"{key}_steps_per_s": float(np.median(values)) for key, values in measured.items()},
+        "net_over_pd": ratio(measured, "net", "pd"),
+        "effects_over_none": ratio(measured, "effects", "pd"),
         "record_s": recorded,
     }

@@ -1,7 +1,7 @@
-"""``suite=deploy``: what the runtime costs on this machine, beside what the machine's timer alone does.
+"""``suite=deploy``: timing of the runtime on this machine, and of an empty loop for comparison.
 
-The runtime is the light one, ``python -m go1exp.deploy``, in a process of its own as on the robot's computer, with a
-network of the size of training, against the simulated robot in another. The policy is hardly trained: it stands.
+The runtime is ``python -m go1exp.deploy`` in a process of its own, as on the robot's computer, with a network of the
+size of training, against the simulated robot in another process. The policy is hardly trained: it stands.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RATE = 400.0
 CALLS = 500
 
 LITTLE = {"num_envs": 4, "steps": 4, "minibatches": 2, "epochs": 1, "iterations": 1}
-"""Of a training that is over at once."""
+"""Settings of a training that takes a moment."""
 
 
 def run(
@@ -42,7 +42,7 @@ def run(
 ) -> dict[str, float]:
     """Measure; return the medians over the rounds by name. ``container`` is a training's configuration."""
     little = container | {"ppo": container["ppo"] | LITTLE}
-    found: list[dict[str, float]] = []
+    results: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory(prefix="go1exp-") as folder:
         place = Path(folder)
         run_folder.write(place / "run", little)
@@ -53,13 +53,13 @@ def run(
         bundle = loads(data, str(file))
         for k in range(rounds):
             idle = loop(lambda now: True, RATE, seconds)
-            found.append(_walk(file, seconds, place / str(k)) | {"policy_us": _policy(bundle)} | _jitter(idle))
+            results.append(_walk(file, seconds, place / str(k)) | {"policy_us": _policy(bundle)} | _jitter(idle))
             on_round(k + 1, rounds)
-    return {name: float(np.median([one[name] for one in found])) for name in found[0]}
+    return {name: float(np.median([one[name] for one in results])) for name in results[0]}
 
 
 def _jitter(idle: Timing) -> dict[str, float]:
-    """Return what the timer does to a loop without work."""
+    """Return the timing of a loop without work."""
     return {"idle_missed_400hz": 100.0 * idle.missed_share, "idle_period_p99_ms": 1e3 * idle.period_p99}
 
 
@@ -75,15 +75,15 @@ def _policy(bundle: Bundle) -> float:
 
 
 def _walk(file: Path, seconds: float, out: Path) -> dict[str, float]:
-    """Walk once; return the runtime's own account."""
-    words = [str(file), "--rate", str(RATE), "--seconds", str(seconds), "--stand-up", "0.2", "--brake", "0.1"]
+    """Walk once; return figures from the runtime's report."""
+    arguments = [str(file), "--rate", str(RATE), "--seconds", str(seconds), "--stand-up", "0.2", "--brake", "0.1"]
     with SimulatedRobot(str(file), {}, {}) as robot:
         done = subprocess.run(
             [
                 sys.executable,
                 "-m",
                 "go1exp.deploy",
-                *words,
+                *arguments,
                 "--robot",
                 str(robot.port),
                 "--stale",

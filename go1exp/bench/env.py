@@ -1,4 +1,4 @@
-"""``suite=env``: how much of bare MuJoCo's speed the environment keeps, and what it costs in memory."""
+"""``suite=env``: speed of the environment relative to bare MuJoCo, and memory per environment."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from go1exp.schema.joint_values import spread
 from go1exp.terrain import build_terrain
 
 ACTION_SCALE = 0.5
-"""Standard deviation of the random actions, policy units: robots step about and few fall."""
+"""Standard deviation of the random actions, policy units (chosen: robots move their feet and few fall)."""
 
 
 def core_subject(task: TaskConfig, num_envs: int) -> Subject:
@@ -137,14 +137,14 @@ def run(
     subproc, close = subproc_subject(task)
     subjects = {"env": core_subject(task, num_envs), "bare": bare_subject(task, num_envs), "subproc": subproc}
     try:
-        found = rates(subjects, rounds, seconds, on_round)
+        measured = rates(subjects, rounds, seconds, on_round)
     finally:
         close()
     return {
-        "env_steps_per_s": float(np.median(found["env"])),
-        "bare_steps_per_s": float(np.median(found["bare"])),
-        "subproc_steps_per_s": float(np.median(found["subproc"])),
-        "env_over_bare": ratio(found, "env", "bare"),
-        "env_over_subproc": ratio(found, "env", "subproc"),
+        "env_steps_per_s": float(np.median(measured["env"])),
+        "bare_steps_per_s": float(np.median(measured["bare"])),
+        "subproc_steps_per_s": float(np.median(measured["subproc"])),
+        "env_over_bare": ratio(measured, "env", "bare"),
+        "env_over_subproc": ratio(measured, "env", "subproc"),
         "memory_per_env_kb": memory_per_env_kb(overrides),
     }

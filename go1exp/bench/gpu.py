@@ -1,4 +1,4 @@
-"""``suite=gpu``: what is left of MuJoCo Warp's speed in an environment step and in training, on the GPU at hand."""
+"""``suite=gpu``: speed of the environment step and of training relative to bare MuJoCo Warp, on this GPU."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from go1exp.train import trainer
 from go1exp.train.ppo import AdaptivePPO
 
 STEPS = 24
-"""Policy steps between two looks at the clock, which wait for the device."""
+"""Policy steps between two readings of the clock; each reading waits for the device."""
 
 PAPER_STEPS = 4096 * 24 * 5000
-"""What the paper's policy learnt from (section III-A)."""
+"""Policy steps in the training of the paper (section III-A)."""
 
 
 def gpu() -> str:
@@ -113,7 +113,7 @@ def train_subject(config: TrainConfig) -> Subject:
 
 
 def border_subject(config: TrainConfig) -> Subject:
-    """The same through SB3's own loop and buffer, every step in numpy."""
+    """Training through SB3's own loop and buffer, with every step in numpy."""
     core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=True)
     ppo = AdaptivePPO(config.ppo, Go1VecEnv(core), config.process.seed, "cuda")
     size = config.ppo.num_envs * config.ppo.steps
@@ -170,16 +170,16 @@ def run(
         actuator = Term("net", members("actuator")["net"], {"file": str(net), "period": "exact"})
         subjects["net"] = env_subject(dataclasses.replace(config.task, actuator=actuator), num_envs)
     subjects |= {"train": train_subject(config), "numpy": border_subject(config)}
-    found = rates(subjects, rounds, seconds, on_round)
+    measured = rates(subjects, rounds, seconds, on_round)
     cold, warm = first_update_seconds([*overrides, f"ppo.num_envs={num_envs}"])
-    speed = {f"{name}_steps_per_s": float(np.median(values)) for name, values in found.items()}
-    with_net = {"gpu_net_over_bare": ratio(found, "net", "bare")} if net is not None else {}
+    speed = {f"{name}_steps_per_s": float(np.median(values)) for name, values in measured.items()}
+    with_net = {"gpu_net_over_bare": ratio(measured, "net", "bare")} if net is not None else {}
     return {
         **speed,
-        "gpu_env_over_bare": ratio(found, "env", "bare"),
+        "gpu_env_over_bare": ratio(measured, "env", "bare"),
         **with_net,
-        "gpu_train_over_env": ratio(found, "train", "env"),
-        "gpu_train_over_numpy": ratio(found, "train", "numpy"),
+        "gpu_train_over_env": ratio(measured, "train", "env"),
+        "gpu_train_over_numpy": ratio(measured, "train", "numpy"),
         "paper_minutes": PAPER_STEPS / speed["train_steps_per_s"] / 60.0,
         "first_update_cold_s": cold,
         "first_update_warm_s": warm,

@@ -1,4 +1,4 @@
-"""Timing that survives a busy machine: subjects take turns, and the median of the rounds counts."""
+"""Timing that is robust on a busy machine: subjects run in turns, and the median of the rounds counts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import torch
 
 @dataclass(frozen=True)
 class Subject:
-    """Something to measure: ``work()`` does one unit and returns how many environment steps that was."""
+    """A piece of work to measure: ``work()`` does one unit and returns its number of environment steps."""
 
     label: str
     work: Callable[[], int]
@@ -28,15 +28,15 @@ def rates(
     """Return the steps per second of each subject in each round; a warm-up unit of each does not count."""
     for subject in subjects.values():
         subject.work()
-    found: dict[str, list[float]] = {name: [] for name in subjects}
+    measured: dict[str, list[float]] = {name: [] for name in subjects}
     for k in range(rounds):
         for name, subject in subjects.items():
             steps, start = 0, time.perf_counter()
             while (elapsed := time.perf_counter() - start) < seconds:
                 steps += subject.work()
-            found[name].append(steps / elapsed)
+            measured[name].append(steps / elapsed)
         on_round(k + 1, rounds)
-    return found
+    return measured
 
 
 def ratio(rates: Mapping[str, list[float]], over: str, under: str) -> float:

@@ -1,4 +1,4 @@
-"""``suite=train``: how much of the environment's speed is left when a policy learns from it."""
+"""``suite=train``: speed of training relative to the environment alone."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def run(
     """Measure; return the figures by name."""
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=num_envs))
     subjects = {"train": train_subject(config), "env": core_subject(config.task, num_envs)}
-    found = rates(subjects, rounds, seconds, on_round)
+    measured = rates(subjects, rounds, seconds, on_round)
     return {
-        "train_steps_per_s": float(np.median(found["train"])),
-        "env_steps_per_s": float(np.median(found["env"])),
-        "train_over_env": ratio(found, "train", "env"),
+        "train_steps_per_s": float(np.median(measured["train"])),
+        "env_steps_per_s": float(np.median(measured["env"])),
+        "train_over_env": ratio(measured, "train", "env"),
     }

@@ -28,7 +28,7 @@ def _task(container: dict[str, Any]) -> None:
 
     of_run, policy, about = load_run(run, checkpoint)
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
-    config = EvalConfig.of(settings, commands=commands)
+    config = EvalConfig.from_settings(settings, commands=commands)
     task = other_robot.replaced(of_run.task, other)
     report = {
         "policy": about,

@@ -26,7 +26,7 @@ def _task(container: dict[str, Any]) -> None:
 
     of_run, policy, _ = load_run(run, checkpoint)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
-    shown = EvalConfig.of(settings, commands=(settings.velocity,), **whole)
+    shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), **whole)
     task = other_robot.replaced(of_run.task, other)
     core = Go1Core(evaluation_task(task, shown), 1, settings.seed, noise=settings.noise)
     if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):

@@ -9,7 +9,12 @@ from go1exp.cli.app import App, spinner
 from go1exp.schema.registry import ConfigError, Term, bind
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from go1exp.cli.settings import RecordSettings
+    from go1exp.record.plan import Episode
+    from go1exp.record.simulate import Rig
+    from go1exp.recording import Recording
 
 RIG = ("robot", "actuator", "effect", "terrain", "backend")
 """Groups of the configuration that describe the robot to be recorded."""
@@ -68,29 +73,49 @@ def _task(container: dict[str, Any]) -> None:
         raise ConfigError(problems)
     walk = trained(settings.run, settings.policy, "", "")[0] if settings.run or settings.policy else None
 
-    from go1exp import recording
     from go1exp.cli.logs import writable
-    from go1exp.record import plan, simulate
+    from go1exp.record import plan
+    from go1exp.record.simulate import Rig
 
-    rig = simulate.Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
+    rig = Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
     driven = [m for m in motions if m.entry.name != POLICY]
-    recordings = []
-    episodes = plan.episodes(driven, settings)
+    episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
     out = writable(settings.out)
-    if there := sorted(p.name for p in out.glob("*.parquet")):
-        print(f"note: {out} holds {len(there)} recordings already; they stay, those of the same name are replaced")
-    if episodes:
-        show = spinner(1, f"recording {len(episodes)} episodes")
-        recordings += simulate.play(rig, episodes, settings.sensors, settings.seed, show)
+    if present := sorted(p.name for p in out.glob("*.parquet")):
+        print(f"note: {out} holds {len(present)} recordings already; they stay, those of the same name are replaced")
+    recordings = _record_motions(rig, episodes, settings)
     if walk and len(driven) < len(motions):
-        from go1exp.evaluate.policy import load_run
+        recordings += _record_policy(rig, walk, settings)
+    _write(out, recordings)
 
-        of_run, policy, _ = load_run(walk)
-        names = [f"policy_{settings.seed}_{k}" for k in range(settings.episodes)]
-        hang = settings.hang[0] if settings.support == "hung" else None
-        taught = simulate.Walk(of_run.task, policy, names, settings.seconds, hang)
-        show = spinner(1, "recording a policy")
-        recordings += simulate.play_policy(rig, taught, settings.sensors, settings.seed, show)
+
+def _record_motions(rig: Rig, episodes: list[Episode], settings: RecordSettings) -> list[Recording]:
+    """Drive simulated robots through the motions; return a recording of each episode."""
+    from go1exp.record import simulate
+
+    if not episodes:
+        return []
+    show = spinner(1, f"recording {len(episodes)} episodes")
+    return simulate.play(rig, episodes, settings.sensors, settings.seed, show)
+
+
+def _record_policy(rig: Rig, run: Path, settings: RecordSettings) -> list[Recording]:
+    """Let the policy of a run move simulated robots; return a recording of each."""
+    from go1exp.evaluate.policy import load_run
+    from go1exp.record import simulate
+
+    config, policy, _ = load_run(run)
+    names = [f"policy_{settings.seed}_{k}" for k in range(settings.episodes)]
+    hang = settings.hang[0] if settings.support == "hung" else None
+    walk = simulate.Walk(config.task, policy, names, settings.seconds, hang)
+    show = spinner(1, "recording a policy")
+    return simulate.play_policy(rig, walk, settings.sensors, settings.seed, show)
+
+
+def _write(out: Path, recordings: list[Recording]) -> None:
+    """Write the recordings and print what to do with them."""
+    from go1exp import recording
+
     for r in recordings:
         recording.write(out / f"{r.meta.episode}.parquet", r)
     total = sum(float(r.t[-1] - r.t[0]) for r in recordings)

@@ -1,1 +1,1 @@
-"""What runs on the robot: NumPy, onnxruntime and the standard library; no torch, no engine, no Hydra, no pydantic."""
+"""The runtime on the robot. It imports NumPy, onnxruntime and the standard library; no torch, engine or Hydra."""

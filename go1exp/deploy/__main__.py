@@ -61,27 +61,27 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
 
 def main(given: Sequence[str]) -> int:
     """Walk as the command line says; return the exit status."""
-    found = arguments(given)
+    options = arguments(given)
     from go1exp.deploy.commands import Wish, parsed
     from go1exp.deploy.job import Job, do
     from go1exp.deploy.walk import Plan
 
     try:
-        amplitude = tuple(float(part) for part in found.amplitude.split(","))
-        wish = Wish(parsed(found.command), amplitude, found.period)
+        amplitude = tuple(float(part) for part in options.amplitude.split(","))
+        wish = Wish(parsed(options.command), amplitude, options.period)
         plan = Plan(
-            rate=found.rate,
-            seconds=found.seconds,
+            rate=options.rate,
+            seconds=options.seconds,
             wish=wish,
-            stand_up=found.stand_up,
-            lie_down=found.lie_down,
-            brake=found.brake,
-            keep=found.keep,
-            stale=found.stale,
-            spin=found.spin,
+            stand_up=options.stand_up,
+            lie_down=options.lie_down,
+            brake=options.brake,
+            keep=options.keep,
+            stale=options.stale,
+            spin=options.spin,
         )
-        sim = {name: getattr(found, name) for name in ("start", "noise", "delay", "loss", "seed")}
-        job = Job(found.bundle, found.robot, plan, found.out, sim, truth=found.truth)
+        sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "loss", "seed")}
+        job = Job(options.bundle, options.robot, plan, options.out, sim, truth=options.truth)
         return do(job, lambda line: print(line, flush=True))
     except (Expected, OSError, ValueError) as error:
         print(f"go1exp.deploy: {error}", file=sys.stderr)

@@ -1,8 +1,8 @@
-"""A sealed archive: a zip whose bytes depend on its content alone, and a list in it of every member's hash.
+"""A sealed archive: a zip whose bytes depend only on its content, with a list of the hashes of its members.
 
-Members are stored as they are, in a fixed order, dated 1980. ``manifest.json`` comes first and names each of the
-others with its SHA-256. It is not signed: whoever rewrites a member and the list makes another archive, whose own hash
-(``seal``) is another one.
+Members are stored uncompressed, in a fixed order, dated 1980. ``manifest.json`` comes first and lists each of the
+others with its SHA-256. This is not a signature: a changed member with a changed list makes another valid archive, but
+its own hash (``seal``) is different.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FORMAT = 1
 
 
 class BundleError(Expected):
-    """A bundle that is refused; the message names the file, the member and what is wrong with it."""
+    """A bundle that is refused; the message names the file, the member and the problem."""
 
 
 def seal(data: bytes) -> str:
@@ -57,28 +57,28 @@ def unpack(data: bytes, members: tuple[str, ...], source: str) -> dict[str, byte
     Args:
         data: the archive.
         members: what must be in it, in order; nothing else may.
-        source: what to call it in messages.
+        source: name of it in messages.
 
     Raises:
-        BundleError: if it is no such archive, or anything in it is not what was packed.
+        BundleError: if it is not such an archive, or its content is not what was packed.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             infos = archive.infolist()
-            # Python's reader finds an archive anywhere in a file: nothing may stand before or after it.
+            # Python's reader accepts an archive with other bytes before or after it; these are refused here.
             if infos[0].header_offset or archive.comment or data[-22:-18] != b"PK\5\6":
                 raise BundleError(f"{source}: not a bundle, or damaged (bytes before or after the archive)")
             _check_names([info.filename for info in infos], members, source)
-            found = {info.filename: _member(archive, info, source) for info in infos}
+            contents = {info.filename: _member(archive, info, source) for info in infos}
     except (zipfile.BadZipFile, IndexError, OSError, struct.error, NotImplementedError, RuntimeError) as error:
         if isinstance(error, BundleError):
             raise
         raise BundleError(f"{source}: not a bundle, or damaged ({error})") from None
-    hashes = _hashes(found.pop(MANIFEST), members, source)
-    for name, content in found.items():
+    hashes = _hashes(contents.pop(MANIFEST), members, source)
+    for name, content in contents.items():
         if seal(content) != hashes[name]:
             raise BundleError(f"{source}: {name}: its SHA-256 is {seal(content)}, {MANIFEST} says {hashes[name]}")
-    return found
+    return contents
 
 
 def _check_names(names: list[str], members: tuple[str, ...], source: str) -> None:
@@ -106,7 +106,7 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, source: str) -> byt
 
 
 def _hashes(manifest: bytes, members: tuple[str, ...], source: str) -> dict[str, str]:
-    """Return what the manifest says, which must be that and no more."""
+    """Return the hashes of the manifest, which must have these and nothing else."""
     try:
         content = json.loads(manifest)
     except ValueError as error:

@@ -1,7 +1,8 @@
-"""The bundle: everything that the robot's computer needs of a training run, in one sealed file.
+"""The bundle: everything of a training run that the robot's computer needs, in one sealed file.
 
 ``metadata.json`` (``metadata.py``), ``config.json`` (the run's own resolved configuration), ``versions.json``,
-``policy.onnx`` and ``trace.npz``: what sensors, policy and drives exchanged in simulation. Loading replays that.
+``policy.onnx`` and ``trace.npz``: inputs and outputs of the policy in simulation. Loading replays
+it.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ TOLERANCE = 1e-5
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle that has been read, and whose policy does what it did in simulation.
+    """A bundle that has been read, and whose policy gives the same outputs as in simulation.
 
     Attributes:
         source: the file.
         seal: SHA-256 of the whole file.
         sizes: bytes by member.
-        metadata: what the policy is.
+        metadata: description of the policy.
         config: the run's own resolved configuration.
-        versions: of what trained and exported it.
+        versions: versions of the packages that trained and exported it.
         policy: sensor readings in, joint targets out.
         trace: ``input.NAME`` and ``output.NAME`` (rows, size) float32, and ``time`` (rows,) float64, s.
         differences: largest difference of each output in the replay, by name.
@@ -63,24 +64,24 @@ def write(
     """Return the bundle's bytes: the same for the same content.
 
     Raises:
-        ValueError: if the data hold what JSON cannot say.
+        ValueError: if the data hold values that JSON does not have.
     """
-    said = {METADATA: metadata.as_dict(), CONFIG: config, VERSIONS: versions}
-    return pack({**{name: as_json(content) for name, content in said.items()}, POLICY: policy, TRACE: _npz(trace)})
+    documents = {METADATA: metadata.as_dict(), CONFIG: config, VERSIONS: versions}
+    return pack({**{name: as_json(content) for name, content in documents.items()}, POLICY: policy, TRACE: _npz(trace)})
 
 
 def load(path: str | Path) -> Bundle:
     """Read a bundle and replay its trace.
 
     Raises:
-        BundleError: if it is no bundle, a member is not what was packed, or the policy does something else here.
+        BundleError: if it is not a bundle, a member is not what was packed, or the policy gives other outputs here.
         OSError: if the file cannot be read.
     """
     return loads(Path(path).read_bytes(), str(path))
 
 
 def loads(data: bytes, source: str) -> Bundle:
-    """Read a bundle from its bytes; ``source`` is what messages call it. Errors as ``load``'s."""
+    """Read a bundle from its bytes; ``source`` is its name in messages. Errors as ``load``'s."""
     members = unpack(data, MEMBERS, source)
     metadata = _metadata(members[METADATA], source)
     try:
@@ -103,7 +104,7 @@ def loads(data: bytes, source: str) -> Bundle:
 
 
 def replay(policy: OnnxPolicy, trace: Mapping[str, np.ndarray], source: str) -> dict[str, float]:
-    """Give the policy the recorded readings, row by row as on the robot; return each output's largest difference.
+    """Run the policy on the recorded readings, row by row as on the robot; return the largest difference per output.
 
     Raises:
         BundleError: if one exceeds ``TOLERANCE`` or is not a number.
@@ -111,24 +112,24 @@ def replay(policy: OnnxPolicy, trace: Mapping[str, np.ndarray], source: str) -> 
     rows = len(trace["time"])
     inputs = {port.name: trace[f"input.{port.name}"] for port in policy.inputs}
     steps = [policy({name: values[k : k + 1] for name, values in inputs.items()}) for k in range(rows)]
-    found = {}
+    differences = {}
     for port in policy.outputs:
         got = np.concatenate([step[port.name] for step in steps])
         off = np.abs(got.astype(np.float64) - trace[f"output.{port.name}"])
         worst = float(np.max(off))  # NaN if anything is
         if not worst <= TOLERANCE:
             at = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
-            here, then = got[at], trace[f"output.{port.name}"][at]
+            replayed, then = got[at], trace[f"output.{port.name}"][at]
             raise BundleError(
-                f"{source}: {TRACE}: {port.name}[{at[1]}] at {trace['time'][at[0]]:.2f} s is {here:.6g} here and "
+                f"{source}: {TRACE}: {port.name}[{at[1]}] at {trace['time'][at[0]]:.2f} s is {replayed:.6g} here and "
                 f"{then:.6g} in the trace; they may differ by {TOLERANCE:g}"
             )
-        found[port.name] = worst
-    return found
+        differences[port.name] = worst
+    return differences
 
 
 def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: str) -> None:
-    """Refuse metadata under which the recorded actions do not mean the recorded targets."""
+    """Refuse metadata by which the recorded actions do not give the recorded targets."""
     action, target = (trace[f"output.{name}"].astype(np.float64) for name in ("action", "joint_target"))
     meant = np.asarray(metadata.nominal_stance) + metadata.action_scale * action
     if not float(np.max(np.abs(meant - target))) <= TOLERANCE:
@@ -139,19 +140,19 @@ def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: s
 
 def _metadata(content: bytes, source: str) -> Metadata:
     try:
-        return Metadata.of(_json(content, f"{source}: {METADATA}"))
+        return Metadata.from_dict(_json(content, f"{source}: {METADATA}"))
     except ValueError as error:
         raise BundleError(f"{source}: {METADATA}: {error}") from None
 
 
 def _json(content: bytes, where: str) -> dict[str, Any]:
     try:
-        found = json.loads(content)
+        document = json.loads(content)
     except ValueError as error:
         raise BundleError(f"{where}: no JSON ({error})") from None
-    if not isinstance(found, dict):
+    if not isinstance(document, dict):
         raise BundleError(f"{where}: must be a mapping")
-    return found
+    return document
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -172,10 +173,10 @@ def _trace(content: bytes, metadata: Metadata, source: str) -> dict[str, np.ndar
     except Exception as error:  # damage of a zip and of the arrays in it has many forms
         raise BundleError(f"{source}: {TRACE}: not NumPy's arrays ({error})") from None
 
-    def ports(prefix: str, found: tuple[Port, ...]) -> dict[str, int]:
-        return {f"{prefix}.{port.name}": port.size for port in found}
+    def port_sizes(prefix: str, ports: tuple[Port, ...]) -> dict[str, int]:
+        return {f"{prefix}.{port.name}": port.size for port in ports}
 
-    sizes = {**ports("input", metadata.inputs), **ports("output", metadata.outputs)}
+    sizes = {**port_sizes("input", metadata.inputs), **port_sizes("output", metadata.outputs)}
     if arrays.keys() != {"time", *sizes}:
         odd = ", ".join(sorted(arrays.keys() ^ {"time", *sizes}))
         raise BundleError(f"{source}: {TRACE}: arrays missing or too many: {odd}")

@@ -1,7 +1,7 @@
-"""Where commanded velocities come from: numbers, a file, a sine, keys, a gamepad; all within the bundle's ranges.
+"""Sources of commanded velocities: numbers, a file, a sine, keys, a gamepad; all within the bundle's ranges.
 
 A source is called with the time since walking began, s, and returns the velocity (3,): x and y in m/s, yaw in rad/s,
-in the trunk's frame. ``poll`` is called in every cycle, before walking too; ``close`` gives back what was taken.
+in the trunk's frame. ``poll`` is called in every cycle, also before walking; ``close`` releases what was taken.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """Names of the ranges in a bundle's metadata, in the order of a command."""
 
 Stop = Callable[[str], None]
-"""``Safety.stop``: told who wants the end."""
+"""``Safety.stop``: called with the name of who asks for the end."""
 
 
 class CommandError(Expected):
-    """A source of commands that cannot be had; the message says why and what would help."""
+    """A source of commands is not available; the message says why and what would help."""
 
 
 class Source(Protocol):
@@ -40,14 +40,14 @@ class Source(Protocol):
         """Return the velocity (3,) at ``t`` s since walking began."""
 
     def poll(self) -> None:
-        """Look whether somebody wants something, without waiting."""
+        """Read keys, sticks and buttons without waiting."""
 
     def close(self) -> None:
-        """Give back what was taken."""
+        """Release the terminal or the gamepad."""
 
 
 class Constant:
-    """The same velocity for all time."""
+    """One constant velocity."""
 
     def __init__(self, velocity: Sequence[float]) -> None:
         """Keep the velocity (3,).
@@ -60,7 +60,7 @@ class Constant:
             raise CommandError(f"command {list(velocity)}: must be three finite numbers: x m/s, y m/s, yaw rad/s")
 
     def __call__(self, t: float) -> np.ndarray:
-        """Return it."""
+        """Return the velocity (3,)."""
         return self._velocity
 
     def poll(self) -> None:
@@ -108,13 +108,13 @@ class Table(Constant):
 
 
 class Sinusoid(Constant):
-    """All three velocities on sines of one period, as in the paper's velocity experiment."""
+    """Sines of one period for all three velocities, as in the paper's velocity experiment."""
 
     def __init__(self, amplitude: Sequence[float], period: float) -> None:
         """Keep amplitudes (3,), m/s, m/s and rad/s, and the period, s.
 
         Raises:
-            CommandError: if they are no finite numbers, or the period is not positive.
+            CommandError: if they are not finite numbers, or the period is not positive.
         """
         super().__init__(amplitude)
         if not (period > 0 and math.isfinite(period)):
@@ -122,7 +122,7 @@ class Sinusoid(Constant):
         self._rate = 2.0 * math.pi / period
 
     def __call__(self, t: float) -> np.ndarray:
-        """Return their values."""
+        """Return the velocity (3,)."""
         return self._velocity * math.sin(self._rate * t)
 
 
@@ -134,10 +134,10 @@ STEPS = {
     **dict.fromkeys(("\x1b[D", "\x1bOD"), (0.0, 0.0, 0.2)),
     **dict.fromkeys(("\x1b[C", "\x1bOC"), (0.0, 0.0, -0.2)),
 }
-"""What a key adds: m/s, m/s, rad/s."""
+"""Key -> change of the velocity: m/s, m/s, rad/s. Arrow keys arrive as three characters."""
 
 ENDS = {"\x1b": "the Esc key", "q": "the q key", "Q": "the q key"}
-"""Keys that stop the robot; Q, which turns in many a game, is one of them, since in a terminal it means the end."""
+"""Keys that end the walk. Q is one of them: in many games it turns, but in a terminal it means the end."""
 
 KEYS = "W S or up down: forward, back; A D: left, right; left right: turn; space: zero; Esc or q: end (twice: brake)"
 
@@ -152,7 +152,7 @@ class Keyboard(Constant):
         descriptor: int | None = None,
         end: Stop | None = None,
     ) -> None:
-        """Take the terminal's keys one by one; ``limit`` keeps what they add up to within the ranges.
+        """Read the terminal's keys one by one; ``limit`` keeps the resulting velocity within the ranges.
 
         Raises:
             CommandError: if there is no terminal.
@@ -171,13 +171,13 @@ class Keyboard(Constant):
         self._open = True
 
     def poll(self) -> None:
-        """Read the keys that were pressed."""
+        """Read all keys pressed since the last call."""
         while self._open and select.select([self._keys], [], [], 0)[0]:
             data = os.read(self._keys, 64)
             if not data:
                 self._stop("the end of the terminal")
                 return
-            for key in keys_of(data.decode(errors="replace")):
+            for key in split_keys(data.decode(errors="replace")):
                 self._press(key)
 
     def _press(self, key: str) -> None:
@@ -189,7 +189,7 @@ class Keyboard(Constant):
             self._velocity = self._limit(np.round(self._velocity + STEPS[key], 6))
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal's settings."""
         if self._open:
             import termios
 
@@ -197,25 +197,25 @@ class Keyboard(Constant):
             termios.tcsetattr(self._keys, termios.TCSADRAIN, self._before)
 
 
-def keys_of(text: str) -> list[str]:
-    """Cut what a terminal sent into keys: an arrow is three characters, Esc alone is one."""
-    found, place = [], 0
+def split_keys(text: str) -> list[str]:
+    """Split the characters that a terminal sent into keys: an arrow is three characters, Esc alone is one."""
+    keys, place = [], 0
     while place < len(text):
         size = 3 if text[place] == "\x1b" and text[place + 1 : place + 2] in ("[", "O") else 1
-        found.append(text[place : place + size])
+        keys.append(text[place : place + size])
         place += size
-    return found
+    return keys
 
 
 DEAD = 0.1
-"""Share of a stick's way about its middle that counts as nothing."""
+"""Dead zone of a stick about its middle, as a share of its range."""
 
 
 class Gamepad(Constant):
     """Sticks of a gamepad: left for x and y, right for yaw; any of the first two buttons stops the robot."""
 
     def __init__(self, stop: Stop, ranges: np.ndarray) -> None:
-        """Take the first gamepad; a stick's full way is the range's end.
+        """Open the first gamepad; a stick at its end gives the end of the range.
 
         Raises:
             CommandError: if pygame is not installed, or there is no gamepad.
@@ -247,18 +247,18 @@ class Gamepad(Constant):
         self._velocity = stretched(sticks, self._ranges)
 
     def close(self) -> None:
-        """Let it go."""
+        """Release the gamepad."""
         self._pygame.quit()
 
 
 def stretched(sticks: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    """Return the velocity (3,) of sticks (3,) from -1 to 1: the middle is zero, the ends are those of ranges (3, 2)."""
+    """Return the velocity (3,) for sticks (3,) from -1 to 1: 0 is zero, the ends are those of ``ranges`` (3, 2)."""
     moved = np.where(np.abs(sticks) < DEAD, 0.0, sticks)
     return np.where(moved < 0, -moved * np.minimum(ranges[:, 0], 0.0), moved * np.maximum(ranges[:, 1], 0.0))
 
 
 class Limited:
-    """A source within ranges.
+    """A source whose commands are limited to ranges.
 
     Attributes:
         cut: cycles in which each axis was cut, (3,).
@@ -270,14 +270,14 @@ class Limited:
         self.cut = np.zeros(3, dtype=np.int64)
 
     def __call__(self, t: float) -> np.ndarray:
-        """Return the command, cut; what is no number stays none, which the controller treats as a fault."""
+        """Return the command, cut to the ranges; NaN stays NaN, which the controller treats as a fault."""
         asked = self._source(t)
         given = np.clip(asked, self._ranges[:, 0], self._ranges[:, 1])
         self.cut += asked != given
         return given
 
     def poll(self) -> None:
-        """Ask the source to look."""
+        """Poll the source."""
         self._source.poll()
 
     def close(self) -> None:
@@ -285,17 +285,17 @@ class Limited:
         self._source.close()
 
 
-def ranges_of(given: Mapping[str, tuple[float, float]]) -> np.ndarray:
+def range_array(given: Mapping[str, tuple[float, float]]) -> np.ndarray:
     """Return lowest and highest command (3, 2) of a bundle's metadata.
 
-    An axis that the bundle says nothing of is not limited, since nobody knows what was trained.
+    An axis without a range in the bundle is not limited, because the trained range is not known.
     """
     return np.array([given.get(name, (-math.inf, math.inf)) for name in AXES], dtype=float)
 
 
 @dataclass(frozen=True)
 class Wish:
-    """Which source: three numbers, a file's name, ``sinusoid``, ``keyboard`` or ``gamepad``; and the sine's numbers."""
+    """The wanted source: three numbers, a file, ``sinusoid``, ``keyboard`` or ``gamepad``; and the sine's values."""
 
     command: tuple[float, ...] | str
     amplitude: tuple[float, ...] = (1.0, 0.3, 0.8)
@@ -303,12 +303,13 @@ class Wish:
 
 
 def make(wish: Wish, ranges: np.ndarray, stop: Stop, end: Stop | None = None) -> Limited:
-    """Return the source that is wished for, within ``ranges`` (3, 2).
+    """Return the wanted source, limited to ``ranges`` (3, 2).
 
-    ``stop`` is told of what makes the drives brake at once, ``end`` of who wants an orderly end, if there is one.
+    ``stop`` is called if the drives must brake at once, ``end`` (if given) if an orderly end is asked for; both with
+    the name of what asked.
 
     Raises:
-        CommandError: if it cannot be had.
+        CommandError: if the source is not available.
         OSError: if its file cannot be read.
     """
     source: Source
@@ -332,7 +333,7 @@ def make(wish: Wish, ranges: np.ndarray, stop: Stop, end: Stop | None = None) ->
 
 
 def parsed(text: str) -> tuple[float, ...] | str:
-    """Read a command from a word of the command line: ``0.5,0,0`` is three numbers, anything else a name."""
+    """Parse a command-line argument: ``0.5,0,0`` is three numbers, anything else a name."""
     with contextlib.suppress(ValueError):
         return tuple(float(part) for part in text.strip("[]()").split(","))
     return text

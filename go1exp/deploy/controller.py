@@ -1,7 +1,6 @@
 """One cycle of the runtime: newest state, estimate, policy, safety, command.
 
-Which robot is at the other end of the link, where commands come from and how velocity is estimated, the controller does
-not know.
+The controller does not know which robot the link leads to, where commands come from, or how velocity is estimated.
 """
 
 from __future__ import annotations
@@ -18,19 +17,19 @@ from go1exp.deploy.past import PastActions
 from go1exp.deploy.safety import Safety
 
 PHASES = ("waiting", "standing_up", "walking", "lying_down", "damping")
-"""Before the first state; on the way to the nominal stance; under the policy; on the way to the ground at a walk's
-orderly end; braking, for good."""
+"""Before the first state; moving to the nominal stance; under the policy; lying down at an orderly end; braking until
+the end."""
 
 LYING = (0.0, 1.3, -2.65)
-"""Hip, thigh, calf of a Go1 that lies on its belly, rad; of every leg."""
+"""Hip, thigh and calf angle of every leg of a Go1 that lies on its belly, rad."""
 
 HALTED, STOOD = 0.4, 0.6
-"""Shares of the time for lying down: up to the first a policy that walks is commanded to stand still, at the second the
-robot has reached the nominal stance. Straight out of a gait it tips over its legs (chosen on a shipped policy)."""
+"""Shares of the time for lying down. Until the first, a walking policy is commanded to stand still; at the second, the
+robot has reached the nominal stance. Directly from a gait it would tip over (chosen on a shipped policy)."""
 
 
 class Estimator(Protocol):
-    """Finds the trunk's velocity from what the robot measures."""
+    """Estimates the trunk's velocity from the robot's sensors."""
 
     def update(self, state: LowState) -> np.ndarray:
         """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame."""
@@ -42,17 +41,17 @@ CommandSource = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Cycle:
-    """What happened in a cycle, for the log.
+    """Everything about one cycle, for the log.
 
     Attributes:
         t: the runtime's clock, s.
         phase: one of ``PHASES``.
         state: the newest state; None before the first.
-        command: what was sent; None if nothing was.
-        velocity: (3,) the command as the policy saw it.
+        command: the command that was sent; None if none was.
+        velocity: (3,) the commanded velocity as the policy saw it.
         base_lin_vel: (3,) the estimate; NaN before the first.
-        observation: (O,) what the network saw; None unless walking.
-        fresh: the states that came since the last cycle, oldest first.
+        observation: (O,) input of the network; None unless walking.
+        fresh: the states received since the last cycle, oldest first.
     """
 
     t: float
@@ -70,8 +69,8 @@ class Controller:
 
     Attributes:
         phase: one of ``PHASES``.
-        safety: judges every command before it goes out.
-        finished: the walk came to its orderly end, and what happens to the braking robot after that is not its end.
+        safety: checks every command before it is sent.
+        finished: whether the walk came to its orderly end; a fault of the braking robot after that does not count.
     """
 
     def __init__(
@@ -94,19 +93,19 @@ class Controller:
         """Join the parts.
 
         Args:
-            bundle: the policy and what goes with it.
-            link: the way to the robot.
-            commands: asked in every cycle.
-            estimator: given every new state.
-            safety: with the robot's limits.
-            rate: of the cycles, Hz; that of training if None.
+            bundle: the policy and its metadata.
+            link: connection to the robot.
+            commands: called in every cycle.
+            estimator: gets every new state.
+            safety: has the robot's limits.
+            rate: cycles per second, Hz; that of training if None.
             stand_up: time from the first pose to the nominal stance, s.
             lie_down: time that ``finish`` gives the robot to lie down, s; with 0 the drives brake at once.
-            brake: time for which the drives are told to brake after a fault before ``cycle`` returns False, s.
+            brake: time for which the drives brake after a fault before ``cycle`` returns False, s.
             patience: time to wait for the robot's first state, s.
             kp: (J,) N m/rad; those of the bundle if None.
             kd: (J,) N m s/rad.
-            on_cycle: told what happened.
+            on_cycle: called after every cycle.
 
         Raises:
             ValueError: if neither the bundle nor the caller gives gains.
@@ -133,9 +132,9 @@ class Controller:
         self.phase, self.finished = "waiting", False
 
     def cycle(self, now: float) -> bool:
-        """Do one cycle; return whether there should be another. ``now`` is the clock's time, s.
+        """Run one cycle; return whether there should be another. ``now`` is the clock's time, s.
 
-        Whatever goes wrong in it, the drives are told to brake: nothing is raised but by the link and ``on_cycle``.
+        If anything fails in it, the drives are commanded to brake; only the link and ``on_cycle`` can raise.
         """
         self._begin = now if self._begin is None else self._begin
         fresh = self._link.receive()
@@ -146,11 +145,11 @@ class Controller:
         self._observation = None
         try:
             wanted = self._wanted(now, fresh)
-        except Exception as error:  # a robot that goes on with its last command is worse than any bug
+        except Exception as error:  # without a new command the robot would go on with its last one
             self.safety.fail("runtime", f"{type(error).__name__}: {error}", now)
             wanted = None
         sent = self.safety.review(self._state, wanted, now)
-        if self.safety.fault is not None and self.phase != "damping":  # lying down is no shelter
+        if self.safety.fault is not None and self.phase != "damping":  # also while lying down
             self.phase, self._since = "damping", now
         heard = self._state is not None or self.phase == "damping"
         if heard:
@@ -172,17 +171,17 @@ class Controller:
             self.phase, self._since, self.finished = "damping", now, True
 
     def rehearse(self) -> None:
-        """Do what a cycle of the walk does most, for nothing: nothing is kept, nothing goes out."""
+        """Run the costly parts of a cycle so that caches are warm; nothing is kept and nothing is sent."""
         if self._state is not None and self.phase == "walking":
             self._policy(self._readings)
             self.safety.rehearse(self._state, LowCmd(self._target, self._kp, self._kd))
 
     def walked(self, now: float) -> float:
-        """Return the time since walking began, s; 0 unless it is going on."""
+        """Return the time since walking began, s; 0 unless the robot walks now."""
         return now - self._since if self.phase == "walking" else 0.0
 
     def _wanted(self, now: float, fresh: Sequence[LowState]) -> LowCmd | None:
-        """Return what the present phase asks for; None if it asks for nothing."""
+        """Return the command of the present phase; None if it has none."""
         state = self._state
         if state is None or self.phase == "damping":
             return None
@@ -200,7 +199,7 @@ class Controller:
         return self._walk(state, now)
 
     def _lie(self, state: LowState, now: float) -> LowCmd | None:
-        """Halt under the policy if it walked, go to the nominal stance, lie down; None when that is done."""
+        """Stand still under the policy if it walked, move to the nominal stance, lie down; None when that is done."""
         share = (now - self._since) / self._lie_down
         if share < HALTED and self._halting:
             self._origin = self._target
@@ -215,7 +214,7 @@ class Controller:
         return None
 
     def _walk(self, state: LowState, now: float) -> LowCmd | None:
-        """Ask the policy; None, and a fault, if the estimate or the command is no number."""
+        """Return the policy's command; None, and a fault, if the estimate or the commanded velocity is not finite."""
         asked = self._commands(now - self._since) if self.phase == "walking" else np.zeros(3)
         self._velocity = np.asarray(asked, dtype=float)
         given = {

@@ -13,16 +13,16 @@ from go1exp.deploy.messages import LowState
 from go1exp.estimation import FilterConfig, Status, from_json, go1, make_filter, sample
 
 FASTEST = 10.0
-"""No Go1 is so fast, m/s: an estimate beyond it has diverged (its joints' top speed gives some 6 m/s)."""
+"""Speed above which an estimate has diverged, m/s: the top speed of a Go1's joints gives about 6 m/s."""
 
 BLIND_S = 0.1
-"""Time for which the filter may refuse all samples before its last estimate is too old, s."""
+"""Longest time for which the filter may refuse all samples, s; after that its last estimate is too old."""
 
 TORQUE = {"contact_source": "torque", "contact_low": 10.0, "contact_high": 40.0}
 """Contact from the joints' torques, for a robot whose foot sensors are not calibrated (``docs/estimation.md``)."""
 
 Fail = Callable[[str, str, float], None]
-"""``Safety.fail``: name of the fault, what was wrong, the runtime's clock."""
+"""``Safety.fail``: name of the fault, message, the runtime's clock."""
 
 
 def settings(given: Mapping[str, Any], **changes: Any) -> FilterConfig:
@@ -40,12 +40,12 @@ class KalmanEstimator:
     """Velocity of the trunk from every state of the robot.
 
     Attributes:
-        refused: samples that the filter left out, by its word for it.
-        restarts: times that it learnt the speed anew after a gap.
+        refused: number of samples that the filter left out, by ``Status``.
+        restarts: number of times that it initialised the speed again after a gap.
     """
 
     def __init__(self, config: FilterConfig, fail: Fail) -> None:
-        """Build the filter; ``fail`` is told when it cannot be believed any more.
+        """Build the filter; ``fail`` is called when its estimate is no longer valid.
 
         Raises:
             go1exp.estimation.EstimatorError: if the compiled filter is missing.
@@ -59,8 +59,8 @@ class KalmanEstimator:
     def update(self, state: LowState) -> np.ndarray:
         """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame.
 
-        It is NaN before the first good state. A sample that is no sample leaves the last estimate in force for
-        ``BLIND_S``: the reading itself is the safety's matter.
+        It is NaN before the first valid state. After a refused sample the last estimate stays in force for ``BLIND_S``;
+        whether the reading itself is a fault is decided by ``Safety``.
         """
         clock = state.t if math.isnan(state.clock) else state.clock
         row = sample(
@@ -93,7 +93,7 @@ class KalmanEstimator:
 
 
 class NoEstimator:
-    """For a policy that does not ask for the velocity: nothing is estimated."""
+    """For a policy that does not use the velocity: nothing is estimated."""
 
     def update(self, state: LowState) -> np.ndarray:
         """Return NaN."""

@@ -24,24 +24,24 @@ NOTICE = "note: robot=go1 has never been run on a robot; hang it up first, and k
 
 LOW_LEVEL, LOCAL_PORT, ROBOT, ROBOT_PORT = 0xFF, 8080, "192.168.123.10", 8007
 SERVO = 0x0A
-"""A motor's mode in which it obeys gains and targets."""
+"""Mode of a motor in which it follows gains and targets."""
 
 POWER_LEVEL = 5
-"""Of the SDK's own PowerProtect, out of 10: 500 W, as in ``SafetyConfig.power``."""
+"""Level of the SDK's PowerProtect, of 1 to 10: 500 W, as in ``SafetyConfig.power``."""
 
 PERIOD = 0.002
-"""Of the exchange with the robot, s."""
+"""Period of the exchange with the robot, s."""
 
 SILENCE = 0.05
-"""The drives are told to brake when the runtime has not commanded anything for so long, s."""
+"""The drives are commanded to brake when the runtime has sent no command for this time, s."""
 
 JOINTS = 12
 
 
 class SdkLink:
-    """Exchanges states and commands every 2 ms in a thread of its own, whatever the runtime's rate.
+    """Exchanges states and commands every 2 ms in a thread of its own, at any rate of the runtime.
 
-    The SDK is spoken to by that thread alone. If the runtime stops commanding, the drives brake.
+    Only that thread calls the SDK. If the runtime stops sending commands, the drives brake.
     """
 
     def __init__(self, sdk: Any = None) -> None:
@@ -71,10 +71,10 @@ class SdkLink:
         """
         if self._failure is not None:
             raise RobotError(f"the SDK failed: {type(self._failure).__name__}: {self._failure}")
-        found = []
+        states = []
         while self._arrived:
-            found.append(self._arrived.popleft())
-        return found
+            states.append(self._arrived.popleft())
+        return states
 
     def send(self, command: LowCmd) -> None:
         """Hand over a command; it goes out within 2 ms, and again every 2 ms."""

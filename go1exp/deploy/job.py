@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy import bundle as bundles
-from go1exp.deploy.commands import KEYS, make, ranges_of
+from go1exp.deploy.commands import KEYS, make, range_array
 from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
@@ -99,7 +99,7 @@ def do(job: Job, say: Say) -> int:
     if about.kp is None or about.kd is None:
         raise RobotError(f"{job.bundle}: knows no gains of its drives (those of an actuator net that says none)")
     make(
-        plan.wish, ranges_of(about.command_ranges), lambda who: None, lambda who: None
+        plan.wish, range_array(about.command_ranges), lambda who: None, lambda who: None
     ).close()  # before anything is started
     if not about.command_ranges:
         say("note: the bundle knows no range of commands, so none is cut")
@@ -172,8 +172,8 @@ def _writable(folder: Path) -> None:
 
 def _free(folder: Path, name: str) -> str:
     """Return ``name``, with a number behind it if there is such a log already."""
-    found, number = name, 1
-    while list(folder.glob(f"{found}.*")):
+    free, number = name, 1
+    while list(folder.glob(f"{free}.*")):
         number += 1
-        found = f"{name}_{number}"
-    return found
+        free = f"{name}_{number}"
+    return free

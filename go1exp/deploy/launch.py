@@ -1,4 +1,4 @@
-"""Starts the simulated robot's process and ends it; the runtime itself stays free of what that needs."""
+"""Starts and ends the process of the simulated robot, so that the runtime does not import torch or the engine."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ import numpy as np
 from go1exp.errors import Expected
 
 PATIENCE = 120.0
-"""Time for the robot's process to come up, s: a busy machine needs a while for torch."""
+"""Longest time for the robot's process to start, s: importing torch is slow on a busy machine."""
 
 
 class RobotError(Expected):
-    """The robot cannot be had; the message says why."""
+    """The robot is not available; the message says why."""
 
 
 class RefusedError(RobotError):
-    """The simulated robot was set up wrongly.
+    """The settings of the simulated robot are wrong.
 
     Attributes:
-        problems: a line on each.
+        problems: one line for each problem.
     """
 
     def __init__(self, problems: list[str]) -> None:
@@ -40,11 +40,11 @@ class RefusedError(RobotError):
 
 
 class SimulatedRobot:
-    """A simulated Go1 in a process of its own, that listens at a port of this machine.
+    """A simulated Go1 in a process of its own that listens at a port of this machine.
 
     Attributes:
         port: where it listens.
-        report: its account of the walk, after ``close``: datagrams, and how it kept real time.
+        report: its report of the walk, after ``close``: datagrams, and how it kept real time.
         truth: the trunk's true motion by column, with ``clock``, after ``close``; empty for a robot that hangs.
     """
 
@@ -68,7 +68,7 @@ class SimulatedRobot:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
-            start_new_session=True,  # a key in the terminal is for the runtime alone
+            start_new_session=True,  # Ctrl-C in the terminal must reach the runtime only
         )
         self.report: dict[str, Any] = {}
         self.truth: dict[str, np.ndarray] = {}
@@ -81,7 +81,7 @@ class SimulatedRobot:
         except OSError:
             answer = {}
         except BaseException:
-            self._process.kill()  # it does not listen yet, so there is nothing to wait for
+            self._process.kill()  # it does not read its input yet, so closing that would not end it
             self.close()
             raise
         if answer.get("what") != "listening":
@@ -93,7 +93,7 @@ class SimulatedRobot:
         self.pid = self._process.pid
 
     def _answer(self, patience: float) -> dict[str, Any]:
-        """Return the next line that it says; empty if there is none in time."""
+        """Return the next line of the process as JSON; empty if there is none in time."""
         assert self._process.stdout is not None
         until, text = time.monotonic() + patience, b""
         while not text.endswith(b"\n"):
@@ -104,17 +104,17 @@ class SimulatedRobot:
             if not part:
                 return {}
             text += part
-        found: dict[str, Any] = json.loads(text)
-        return found
+        answer: dict[str, Any] = json.loads(text)
+        return answer
 
     def close(self) -> None:
-        """End it and take its account."""
+        """End the process and read its report."""
         if self._process.returncode is not None:
             return
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:
-            self._process.stdin.close()  # which is what it waits for
+            self._process.stdin.close()  # the process ends when its input ends
             self.report = self._answer(10.0)
             self._process.wait(10.0)
         except (OSError, subprocess.TimeoutExpired):

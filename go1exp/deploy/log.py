@@ -1,4 +1,4 @@
-"""Everything that happened on a walk, kept in arrays that exist before it begins, and written when it is over."""
+"""The log of a walk: kept in arrays that are allocated before the walk begins, and written after its end."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ STATE = (
     *(("imu_quat", 4), ("imu_gyro", 3), ("imu_acc", 3), ("foot_force", 4)),
 )
 CYCLE = (("t", 1), ("phase", 1), ("number", 1), ("damping", 1), ("q_target", 12), ("command", 3), ("estimate", 3))
-"""What a row holds: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0."""
+"""Parts of a row: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0."""
 
 
 class Ring:
     """The newest rows of numbers, in an array of fixed size."""
 
     def __init__(self, parts: tuple[tuple[str, int], ...], size: int) -> None:
-        """Make room for ``size`` rows of ``parts``; every page of it is touched now."""
+        """Allocate ``size`` rows of ``parts``; filling them with NaN now avoids page faults during the walk."""
         self._rows = np.full((size, sum(width for _, width in parts)), np.nan)
         self.columns, place = {}, 0
         for name, width in parts:
@@ -42,14 +42,14 @@ class Ring:
         self.count = 0
 
     def next(self) -> np.ndarray:
-        """Return the row to be filled next; the oldest, once all are full."""
+        """Return the row to be filled next: the oldest, once all are full."""
         row: np.ndarray = self._rows[self.count % len(self._rows)]
         self.count += 1
         return row
 
     @property
     def overwritten(self) -> int:
-        """Rows that had to make room."""
+        """Number of rows that were overwritten."""
         return max(self.count - len(self._rows), 0)
 
     def rows(self) -> np.ndarray:
@@ -60,13 +60,13 @@ class Ring:
 
     def part(self, name: str) -> np.ndarray:
         """Return a part of all rows that are kept, (T, width), or (T,) if its width is 1."""
-        found = self.rows()[:, self.columns[name]]
-        return found[:, 0] if found.shape[1] == 1 else found
+        values = self.rows()[:, self.columns[name]]
+        return values[:, 0] if values.shape[1] == 1 else values
 
 
 @dataclass(frozen=True)
 class About:
-    """What a log says of where it comes from.
+    """Origin of a log.
 
     Attributes:
         metadata: of the bundle.
@@ -75,7 +75,7 @@ class About:
         simulated: not measured on hardware.
         newton: the feet's readings are in newtons; if not, they are left out of the recording.
         episode: the recording's name.
-        notes: whatever a reader must know.
+        notes: anything else that a reader must know.
     """
 
     metadata: Metadata
@@ -88,17 +88,17 @@ class About:
 
 
 class Log:
-    """Told of every cycle; writes nothing until it is asked.
+    """Keeps every cycle in memory; writes nothing during the walk.
 
     Attributes:
-        states: every state that came.
+        states: every received state.
         cycles: every cycle.
         phases: when each phase began, s of the runtime's clock.
-        first_command: when the first command went out, s; None before.
+        first_command: when the first command was sent, s; None before.
     """
 
     def __init__(self, rate: float, keep: float) -> None:
-        """Make room for ``keep`` s at ``rate`` cycles per second; of a longer walk the newest are kept."""
+        """Allocate ``keep`` s at ``rate`` cycles per second; of a longer walk the newest are kept."""
         self.states = Ring(STATE, math.ceil(keep * STATES_PER_S) + 1)
         self.cycles = Ring(CYCLE, math.ceil(keep * rate) + 1)
         self.phases: dict[str, float] = {}
@@ -106,7 +106,7 @@ class Log:
         self._sent = 0
 
     def note(self, cycle: Cycle) -> None:
-        """Keep a cycle and the states that came in it."""
+        """Keep a cycle and the states received in it."""
         for state in cycle.fresh:
             row = self.states.next()
             row[0], row[1], row[2] = state.t, state.clock, state.in_force
@@ -129,7 +129,7 @@ class Log:
         """Return the walk from the first command in force to the first that brakes; None if there was none.
 
         Args:
-            about: where it comes from.
+            about: its origin.
             truth: columns of the format by name, with ``clock``, s; rows are joined where the clocks are the same.
         """
         from go1exp.recording import FOOT_FORCE, VECTORS, Meta, Recording, joint_channels
@@ -183,20 +183,20 @@ class Log:
         return Recording(meta, {name: np.ascontiguousarray(values[good]) for name, values in channels.items()})
 
     def _in_force(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return which states fall under a command of standing up or walking (T,), and its target, row by row."""
+        """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""
         sent = self.cycles.part("number") > 0
         if not sent.any() or not self.states.count:
             return None
         number, at = self.cycles.part("number")[sent], self.cycles.part("t")[sent]
         damping, target = self.cycles.part("damping")[sent] > 0, self.cycles.part("q_target")[sent]
         known = self.states.part("in_force")
-        # Where the robot does not tell what it obeys, it is taken to be the newest that was sent.
+        # If the robot does not report the command in force, the newest one sent by then is taken.
         by_number, by_time = np.searchsorted(number, known), np.searchsorted(at, self.states.part("t"), "right") - 1
         k = np.where(known >= 0, by_number, by_time)
-        there = (k >= 0) & (k < len(number)) & (known != 0) & ((known < 0) | (known >= number[0]))
+        in_force = (k >= 0) & (k < len(number)) & (known != 0) & ((known < 0) | (known >= number[0]))
         place = np.clip(k, 0, len(number) - 1)
-        there &= ~damping[place]
-        return (there, target[place[there]]) if there.any() else None
+        in_force &= ~damping[place]
+        return (in_force, target[place[in_force]]) if in_force.any() else None
 
 
 UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell what it obeys, and the way takes time"
@@ -204,9 +204,9 @@ UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell w
 
 def _joined(truth: Mapping[str, np.ndarray], clock: np.ndarray) -> dict[str, np.ndarray]:
     """Return the true columns at the times of a clock; NaN where they are unknown."""
-    found = np.clip(np.searchsorted(truth["clock"], clock - 1e-6), 0, len(truth["clock"]) - 1)
-    same = np.abs(truth["clock"][found] - clock) < 1e-6
-    return {name: np.where(same, values[found], np.nan) for name, values in truth.items() if name != "clock"}
+    nearest = np.clip(np.searchsorted(truth["clock"], clock - 1e-6), 0, len(truth["clock"]) - 1)
+    same = np.abs(truth["clock"][nearest] - clock) < 1e-6
+    return {name: np.where(same, values[nearest], np.nan) for name, values in truth.items() if name != "clock"}
 
 
 def write_cycles(path: Path, log: Log) -> None:

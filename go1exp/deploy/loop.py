@@ -1,8 +1,8 @@
-"""A loop at a fixed rate that accounts for every deadline.
+"""A loop at a fixed rate that counts every deadline.
 
-Cycle k is due at start + k periods; its work has to be done by the time that cycle k + 1 is due. A cycle that took too
-long is followed at once by the one whose time it then is, so that a little lateness costs little; those whose time is
-over are left out and count as missed. Nothing is made up for in a burst, and the phase stays.
+Cycle k is due at start + k periods; its work must be done when cycle k + 1 is due. After a cycle that took too long,
+the cycle that is due by then follows at once, so that a small delay costs little. Cycles whose time is over are left
+out and count as missed: they are not made up for, and the phase of the loop stays.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from typing import Protocol
 import numpy as np
 
 KEPT = 200_000
-"""Cycles whose periods and durations are kept for the percentiles: 500 s at 400 Hz."""
+"""Newest cycles that are kept for the percentiles: 500 s at 400 Hz."""
 
 
 class Clock(Protocol):
-    """Where time comes from."""
+    """A clock."""
 
     def now(self) -> float:
-        """Return the time, s, which never goes back."""
+        """Return the time, s; it never decreases."""
 
     def sleep_until(self, when: float) -> None:
         """Return at ``when`` or a little later; at once if that has passed."""
@@ -34,9 +34,9 @@ class MonotonicClock:
     """The system's monotonic clock.
 
     Args:
-        spin: for this long before the time the core is kept busy instead of asleep, s; 0 leaves it to the system.
-        meanwhile: called once at the beginning of that, such as a rehearsal of the work: what comes first after a sleep
-            finds cold caches and takes two to three times as long.
+        spin: time before each instant for which the core is kept busy instead of asleep, s; 0: not at all.
+        meanwhile: called once at the beginning of that, for example a rehearsal of the work: after a sleep the caches
+            are cold, and the first work takes two to three times as long.
     """
 
     def __init__(self, spin: float = 0.0, meanwhile: Callable[[], None] = lambda: None) -> None:
@@ -47,7 +47,7 @@ class MonotonicClock:
         return time.perf_counter()
 
     def sleep_until(self, when: float) -> None:
-        """Sleep, and then watch the clock for the last ``spin`` s."""
+        """Sleep, then poll the clock for the last ``spin`` s."""
         left = when - time.perf_counter() - self._spin
         if left > 0:
             time.sleep(left)
@@ -59,10 +59,10 @@ class MonotonicClock:
 
 @dataclass(frozen=True)
 class Timing:
-    """How a loop kept its time; percentiles are over the newest ``KEPT`` cycles, the rest over all.
+    """Timing of a loop; percentiles are over the newest ``KEPT`` cycles, everything else over all.
 
     Attributes:
-        cycles: that ran.
+        cycles: number of cycles that ran.
         period_p50: time from one cycle's start to the next one's, median, s.
         period_p99: s.
         period_worst: s.
@@ -70,7 +70,7 @@ class Timing:
         work_p99: s.
         work_worst: s.
         late_worst: latest start after the time that was due, s.
-        missed: deadlines: of cycles that were not done when the next was due, and of those that were left out.
+        missed: missed deadlines: cycles that were not done when the next was due, and cycles that were left out.
         left_out: cycles that never ran.
     """
 
@@ -101,10 +101,10 @@ class Timing:
 
 
 class Deadlines:
-    """Counts what a loop did; allocates nothing once it is built."""
+    """Counts cycles and deadlines of a loop; allocates memory only when it is built."""
 
     def __init__(self, period: float, kept: int = KEPT) -> None:
-        """Account for cycles of ``period`` s."""
+        """Start counting cycles of ``period`` s."""
         self._period = period
         self._periods, self._work = np.zeros(kept), np.zeros(kept)
         self.cycles = self.missed = self.left_out = 0
@@ -112,7 +112,7 @@ class Deadlines:
         self._period_worst = self._work_worst = self._late_worst = 0.0
 
     def note(self, due: float, start: float, end: float, left_out: int) -> None:
-        """Note a cycle.
+        """Count a cycle.
 
         Args:
             due: when it should have started, s.
@@ -134,7 +134,7 @@ class Deadlines:
         self.missed += left_out + (end > due + self._period)
 
     def timing(self) -> Timing:
-        """Return the account so far."""
+        """Return the timing so far."""
         periods = self._periods[: min(max(self.cycles - 1, 0), len(self._periods))]
         work = self._work[: min(self.cycles, len(self._work))]
         p50, p99 = np.percentile(periods, [50, 99]) if len(periods) else (0.0, 0.0)
@@ -161,17 +161,17 @@ def run(
     on_report: Callable[[Timing], None] | None = None,
     report_every: float = 1.0,
 ) -> Timing:
-    """Call ``work(now)`` at a fixed rate until it returns False or the time is up; return how the time was kept.
+    """Call ``work(now)`` at a fixed rate until it returns False or the time is up; return the timing.
 
-    Python's garbage collector is off meanwhile: a collection takes milliseconds, and ``work`` should leave nothing that
-    only a collector could find.
+    Python's garbage collector is off meanwhile, because a collection takes milliseconds; ``work`` should not create
+    reference cycles.
 
     Args:
         work: one cycle; gets the clock's time at its start, s.
         rate: cycles per second.
         seconds: how long; None for as long as ``work`` wants.
         clock: the system's monotonic one if None.
-        on_report: told the account every ``report_every`` s, after a cycle's work.
+        on_report: called with the timing every ``report_every`` s, after the work of a cycle.
         report_every: s.
     """
     clock = clock or MonotonicClock()

@@ -1,4 +1,4 @@
-"""What goes between robot and runtime, whatever carries it: joints and legs in the bundle's order, SI units."""
+"""Messages between robot and runtime, for any link: joints and legs in the bundle's order, SI units."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class LowState:
-    """What the robot's sensors say at one moment.
+    """Readings of the robot's sensors at one instant.
 
     Attributes:
         t: when it arrived, on the runtime's own clock, s.
@@ -23,9 +23,9 @@ class LowState:
         imu_gyro: (3,) rad/s, trunk frame.
         imu_acc: (3,) specific force, m/s2, trunk frame.
         foot_force: (4,) in the sensor's own unit, not calibrated.
-        clock: the robot's own clock when it was measured, s; NaN if the robot tells none.
-        in_force: number of the newest command that the drives had then, counted from 1 by the link as it sends; 0 for
-            none yet, -1 if the robot does not tell.
+        clock: the robot's clock at the measurement, s; NaN if the robot does not report it.
+        in_force: number of the command in force at the measurement, counted from 1 by the link as it sends; 0 for none
+            yet, -1 if the robot does not report it.
     """
 
     t: float
@@ -42,13 +42,13 @@ class LowState:
 
 @dataclass(frozen=True)
 class LowCmd:
-    """What the drives are to do: torque = kp (joint_target - joint_pos) - kd joint_vel.
+    """Command for the drives: torque = kp (joint_target - joint_pos) - kd joint_vel.
 
     Attributes:
         joint_target: (J,) rad.
         kp: (J,) N m/rad.
         kd: (J,) N m s/rad.
-        damping: let the drives brake: kp is zero, and a link may use its drives' own damping mode.
+        damping: the drives brake: kp is zero, and a link may use the damping mode of its drives.
     """
 
     joint_target: np.ndarray
@@ -58,7 +58,7 @@ class LowCmd:
 
 
 class Link(Protocol):
-    """The way to a robot, real or simulated."""
+    """The connection to a robot, real or simulated."""
 
     def receive(self) -> Sequence[LowState]:
         """Return the states that have arrived since the last call, oldest first, without waiting."""
@@ -67,4 +67,4 @@ class Link(Protocol):
         """Send a command, without waiting."""
 
     def close(self) -> None:
-        """Give the way back."""
+        """Close the connection."""

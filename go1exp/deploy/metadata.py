@@ -1,4 +1,4 @@
-"""What a bundle says of its policy: one schema, filled by the export and read by the runtime."""
+"""The metadata of a bundle: one schema, written by the export and read by the runtime."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Trained:
-    """Where the policy comes from: the checkpoint's name and SHA-256, learner iterations and robot steps."""
+    """Origin of the policy: name and SHA-256 of the checkpoint, learner iterations and robot steps."""
 
     checkpoint: str
     sha256: str
@@ -51,14 +51,14 @@ class Metadata:
     Attributes:
         robot: its name.
         joints: the J driven joints; every joint quantity has this order.
-        legs: order of whatever there is one of per leg.
-        inputs: of the graph.
-        outputs: of the graph.
+        legs: order of quantities per leg.
+        inputs: inputs of the graph.
+        outputs: outputs of the graph.
         observation: the terms in the flat observation.
         nominal_stance: (J,) rad, about which actions act.
         action_scale: rad per unit of action.
-        action_clip: where actions are cut.
-        kp: (J,) N m/rad, position gains of the drives that were trained with; None if those have none.
+        action_clip: largest absolute value of an action; larger ones are clipped.
+        kp: (J,) N m/rad, position gains of the drives in training; None if those have none.
         kd: (J,) N m s/rad.
         joint_limits: (J, 2) rad, the hard stops.
         torque_limit: (J,) N m.
@@ -93,7 +93,7 @@ class Metadata:
     trained: Trained
 
     def __post_init__(self) -> None:
-        """Check what concerns two values; raise ValueError with the name of one."""
+        """Check relations between values; raise ValueError with the name of one of them."""
         per_joint = ("nominal_stance", "kp", "kd", "joint_limits", "torque_limit", "velocity_limit")
         for name in per_joint:
             values = getattr(self, name)
@@ -116,8 +116,8 @@ class Metadata:
         return dataclasses.asdict(self)
 
     @classmethod
-    def of(cls, content: Any) -> Metadata:
-        """Build from plain data, such as JSON gives; raise ValueError that starts with the key that is wrong."""
+    def from_dict(cls, content: Any) -> Metadata:
+        """Build from plain data, as read from JSON; raise ValueError that starts with the wrong key."""
         return _built(cls, content, "")
 
 

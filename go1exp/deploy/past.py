@@ -1,7 +1,8 @@
 """The previous action at another rate than that of training.
 
-A policy has learnt what an action does within one training period. Run at 400 Hz and told 1.0 m/s sideways, the shipped
-one, trained at 50 Hz, walked at 0.33 m/s when it saw its action of 2.5 ms ago, at 1.01 m/s with that of 20 ms ago.
+A policy has learnt the effect of an action over one training period. The shipped policy, trained at 50 Hz, run at
+400 Hz and commanded 1.0 m/s sideways, walked at 0.33 m/s with its action of 2.5 ms ago, and at 1.01 m/s with that of
+20 ms ago.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ class PastActions(Generic[A]):
 
     Args:
         trained: period of the policy in training, s.
-        period: of the policy now, s.
+        period: present period of the policy, s.
 
     Attributes:
-        cycles: of the policy in a training period, at least 1.
+        cycles: policy cycles in one training period, at least 1.
     """
 
     def __init__(self, trained: float, period: float) -> None:

@@ -1,4 +1,4 @@
-"""A link over UDP on this machine: the way to the simulated robot."""
+"""A link over UDP on this machine, to the simulated robot."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from go1exp.deploy.messages import LowCmd, LowState
 
 HOST = "127.0.0.1"
 AT_ONCE = 1024
-"""Datagrams that one call reads at most: a flood delays a cycle, but does not stop it."""
+"""Most datagrams that one call reads: a flood of them delays a cycle but does not stop it."""
 
 GREETING_S = 0.1
-"""The robot is greeted so often until it answers, s: a greeting may get lost."""
+"""Period at which a hello is sent until the robot answers, s: a hello can be lost."""
 
 _STAMP = 35
-"""SO_TIMESTAMPNS of Linux, which Python has no name for: the kernel notes when a datagram arrived."""
+"""SO_TIMESTAMPNS of Linux, for which Python has no name: the kernel stamps datagrams with their time of arrival."""
 _TIMESPEC = struct.Struct("@qq")
 
 
 @dataclass
 class Traffic:
-    """What went over a link.
+    """Counts of the datagrams over a link.
 
     Attributes:
-        received: states that were taken.
+        received: states that were accepted.
         sent: commands.
-        foreign: datagrams that were no state of this version.
-        late: states that were older than one that had come before, or came twice; they are left out.
-        lost: states that the robot counted and that never came (a late one counts here too).
-        refused: times that nobody listened at the other end.
+        foreign: datagrams that were not a state of this version.
+        late: states older than one received before, or received twice; they are left out.
+        lost: states missing in the robot's count (a late one counts here too).
+        refused: times that the port at the other end was closed.
     """
 
     received: int = 0
@@ -46,22 +46,22 @@ class Traffic:
 
 
 class UdpLink:
-    """A link to the robot that listens at a port of this machine; nothing is waited for.
+    """A link to the robot that listens at a port of this machine; no call waits.
 
     Attributes:
-        traffic: what went over it.
+        traffic: counts of its datagrams.
     """
 
     def __init__(self, port: int, host: str = HOST) -> None:
         """Open it.
 
         Raises:
-            OSError: if there can be no such socket.
+            OSError: if the socket cannot be opened.
         """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
-            self._socket.connect((host, port))  # from now on the kernel drops what comes from elsewhere
+            self._socket.connect((host, port))  # the kernel then drops datagrams of other senders
             _ask_for_stamps(self._socket)
         except OSError:
             self._socket.close()
@@ -72,7 +72,7 @@ class UdpLink:
 
     def receive(self) -> Sequence[LowState]:
         """Return the states that have arrived since the last call, oldest first, without waiting."""
-        found = []
+        states = []
         for _ in range(AT_ONCE):
             try:
                 data, extra, _, _ = self._socket.recvmsg(wire.STATE_SIZE + 1, 64)
@@ -83,13 +83,13 @@ class UdpLink:
                 continue
             state = self._taken(data, extra)
             if state is not None:
-                found.append(state)
+                states.append(state)
         if self._last is None:
             self._greet()
-        return found
+        return states
 
     def _taken(self, data: bytes, extra: list[tuple[int, int, bytes]]) -> LowState | None:
-        """Return the state of a datagram, or None and a count."""
+        """Return the state of a datagram; None, and a count, if it is not accepted."""
         about = wire.head(data)
         if about is None or about.kind != wire.STATE:
             self.traffic.foreign += 1
@@ -118,25 +118,25 @@ class UdpLink:
         try:
             self._socket.send(data)
         except BlockingIOError:
-            pass  # as good as lost on the way
+            pass  # counts as lost
         except ConnectionRefusedError:
-            self.traffic.refused += 1  # of an earlier one; a robot that is gone is found by its silence
+            self.traffic.refused += 1  # reports an earlier datagram; a robot that is gone is noticed by missing states
 
     def close(self) -> None:
-        """Give the socket back."""
+        """Close the socket."""
         self._socket.close()
 
 
 def _ask_for_stamps(opened: socket.socket) -> None:
-    """Ask the kernel for times of arrival, which not every system gives."""
+    """Ask the kernel for times of arrival; not every system has them."""
     with contextlib.suppress(OSError):
         opened.setsockopt(socket.SOL_SOCKET, _STAMP, 1)
 
 
 def _age(extra: list[tuple[int, int, bytes]]) -> float:
-    """Return how long ago a datagram arrived, s; 0 where the kernel does not tell.
+    """Return how long ago a datagram arrived, s; 0 if the kernel gives no stamp.
 
-    Its stamp is of the wall clock, which somebody may set meanwhile: more than a second is not believed.
+    The stamp is by the wall clock, which can be changed meanwhile; ages of more than a second are ignored.
     """
     for level, kind, content in extra:
         if level == socket.SOL_SOCKET and kind == _STAMP and len(content) == _TIMESPEC.size:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy.bundle import Bundle
-from go1exp.deploy.commands import Limited, Wish, make, ranges_of
+from go1exp.deploy.commands import Limited, Wish, make, range_array
 from go1exp.deploy.controller import Controller, Cycle, Estimator
 from go1exp.deploy.estimate import KalmanEstimator, NoEstimator, settings
 from go1exp.deploy.log import About, Log, write_cycles
@@ -144,7 +144,7 @@ def go(
         room = min(room, plan.seconds + plan.stand_up + plan.lie_down + plan.brake + plan.patience + 1.0)
     log = Log(rate, room)
     asked: list[str] = []
-    commands = make(plan.wish, ranges_of(about.command_ranges), safety.stop, asked.append)
+    commands = make(plan.wish, range_array(about.command_ranges), safety.stop, asked.append)
     try:
         return _go(bundle, link, plan, rate, safety, estimator, log, commands, asked, on_second)
     finally:

@@ -1,7 +1,7 @@
-"""States and commands as datagrams of fixed size: what runs between the runtime and the simulated robot.
+"""States and commands as datagrams of fixed size, between the runtime and the simulated robot.
 
-Little-endian, no padding. A head (magic, version, kind, number, clock) and then plain numbers. Whatever is not exactly
-that is no message: a datagram of another size, magic, version or kind is refused, and the one who reads counts it.
+Little-endian, no padding. A head (magic, version, kind, number, clock), then plain numbers. A datagram of another size,
+magic, version or kind is refused, and the reader counts it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from go1exp.deploy.messages import LowCmd, LowState
 
 MAGIC, VERSION = b"G1XP", 1
 STATE, COMMAND, HELLO = 1, 2, 3
-"""Kinds. A hello tells the robot where to send its states to."""
+"""Kinds. A hello tells the robot the address to which it sends its states."""
 
 HEAD = struct.Struct("<4sBBHId")
 """Magic, version, kind, flags, number, sender's clock in s."""
@@ -44,12 +44,12 @@ DAMPING = 1
 """Flag of a command."""
 
 NUMBERS = 2**32
-"""Numbers of datagrams begin anew after so many: 99 days at 500 Hz."""
+"""Numbers of datagrams wrap around here: after 99 days at 500 Hz."""
 
 
 @dataclass(frozen=True)
 class Head:
-    """What a datagram says of itself: its kind, its sender's count and clock (s), and flags."""
+    """Head of a datagram: its kind, its sender's count and clock (s), and flags."""
 
     kind: int
     number: int
@@ -58,7 +58,7 @@ class Head:
 
 
 def head(data: bytes) -> Head | None:
-    """Read a datagram's head; None if this is no message of this version, or not as long as its kind is."""
+    """Read a datagram's head; None if it is not a message of this version, or has a wrong length."""
     if len(data) < HEAD.size:
         return None
     magic, version, kind, flags, number, clock = HEAD.unpack_from(data)
@@ -76,7 +76,7 @@ def pack_state(state: LowState, number: int) -> bytes:
     """Return a state's datagram; ``state.clock`` is the sender's, ``state.t`` is left out.
 
     Raises:
-        ValueError: if a part has another size than a Go1's.
+        ValueError: if a part does not have the size of a Go1's.
     """
     begin = HEAD.pack(MAGIC, VERSION, STATE, 0, number % NUMBERS, state.clock)
     return begin + _IN_FORCE.pack(state.in_force) + _packed(state, STATE_PARTS)
@@ -114,13 +114,13 @@ def _packed(message: LowState | LowCmd, parts: tuple[tuple[str, int], ...]) -> b
 
 def _unpacked(data: bytes, start: int, parts: tuple[tuple[str, int], ...]) -> dict[str, np.ndarray]:
     numbers = np.frombuffer(data, dtype="<f8", offset=start)  # read only, and no copy
-    found, place = {}, 0
+    arrays, place = {}, 0
     for name, size in parts:
-        found[name] = numbers[place : place + size]
+        arrays[name] = numbers[place : place + size]
         place += size
-    return found
+    return arrays
 
 
 def newer(number: int, than: int) -> int:
-    """Return by how much a datagram's number is ahead of another's; negative if it is older, across a new beginning."""
+    """Return by how much a datagram's number is ahead of another's; negative if it is older. Wrap-around is handled."""
     return (number - than + NUMBERS // 2) % NUMBERS - NUMBERS // 2

@@ -1,7 +1,7 @@
-"""Velocity and place of a legged robot's trunk from its IMU, joints and contacts: a Kalman filter in C++.
+"""Velocity and position of a legged robot's trunk from its IMU, joints and contacts: a Kalman filter in C++.
 
-``make_filter(go1())`` gives the compiled filter; ``sample`` builds its input. The layer below the runtime on the robot:
-NumPy and pydantic are all that it imports.
+``make_filter(go1())`` gives the compiled filter; ``sample`` builds its input. The runtime on the robot uses this
+package, so it imports nothing but NumPy and pydantic.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SOURCES = ("force", "torque", "height")
 
 
 class EstimatorError(Expected):
-    """The compiled filter is missing or cannot be loaded; the message says what to do."""
+    """The compiled filter is missing or cannot be loaded; the message says how to build it."""
 
 
 def compiled() -> ModuleType:
@@ -52,9 +52,15 @@ def compiled() -> ModuleType:
     try:
         return importlib.import_module("go1exp.estimation._kalman")
     except ImportError as error:
-        here = Path(__file__).parent
-        there = [file.name for file in sorted(here.glob("_kalman.*")) if file.suffix in (".so", ".pyd", ".dylib")]
-        why = f"{', '.join(there)} does not load: {error}" if there else f"no _kalman extension in {here.name}/"
+        folder = Path(__file__).parent
+        extensions = [
+            file.name for file in sorted(folder.glob("_kalman.*")) if file.suffix in (".so", ".pyd", ".dylib")
+        ]
+        why = (
+            f"{', '.join(extensions)} does not load: {error}"
+            if extensions
+            else f"no _kalman extension in {folder.name}/"
+        )
         raise EstimatorError(
             f"the Kalman filter is not built for this Python ({why}). Install a C++17 compiler (Debian: g++ and "
             "python3-dev), then `make setup`, or `pip install -e .` in the checkout; its build brings pybind11 and "
@@ -72,12 +78,12 @@ def make_filter(config: FilterConfig) -> _kalman.Filter:
     settings = module.Settings()
     for name in FilterConfig.__dataclass_fields__:
         setattr(settings, name, _plain(module, name, getattr(config, name)))
-    found: _kalman.Filter = module.Filter(settings)
-    return found
+    compiled_filter: _kalman.Filter = module.Filter(settings)
+    return compiled_filter
 
 
 def _plain(module: ModuleType, name: str, value: object) -> object:
-    """Turn a setting into what the extension takes."""
+    """Convert a setting to the type that the extension takes."""
     if name == "legs":
         assert isinstance(value, tuple)
         return [

@@ -1,4 +1,4 @@
-"""What the filter must know about a robot and its sensors. Plain data: it comes from JSON, and a bundle carries it."""
+"""Settings of the filter for one robot and its sensors. Plain data, read from JSON; a bundle contains it."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Vector = tuple[float, float, float]
 PositiveVector = tuple[Positive, Positive, Positive]
 
 POLYNOMIAL_TERMS = 35
-"""Monomials u0^i u1^j u2^k with i + j + k <= 4; i slowest, k fastest."""
+"""Number of monomials u0^i u1^j u2^k with i + j + k <= 4; ordered with i slowest, k fastest."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class ChainLeg:
-    """A leg whose hip turns about x, and thigh and calf about y; it hangs straight down at zero angles.
+    """A leg whose hip turns about x, and thigh and calf about y; at zero angles it points straight down.
 
     Attributes:
-        hip: where the hip's axis meets the thigh's plane at no abduction offset, trunk frame, m.
-        lengths: from the hip's axis sideways to the thigh (left is positive), thigh, calf, m.
+        hip: point on the hip's axis from which the abduction offset is counted, trunk frame, m.
+        lengths: abduction offset (left is positive), thigh, calf, m.
     """
 
     hip: Vector
@@ -36,14 +36,14 @@ class ChainLeg:
 
 @dataclass(frozen=True, config=STRICT)
 class PolynomialLeg:
-    """A leg of any mechanism, calibrated: foot position as a polynomial of degree four in the three joint angles.
+    """A calibrated leg of any mechanism: the foot position is a polynomial of degree four in the three joint angles.
 
     Attributes:
         centre: angles about which it is written, rad.
         scale: u = (q - centre) / scale, rad.
-        x: coefficients of the foot's x in the trunk's frame, m.
-        y: of its y.
-        z: of its z.
+        x: coefficients of the x coordinate of the foot in the trunk's frame, m.
+        y: coefficients of y.
+        z: coefficients of z.
     """
 
     centre: Vector
@@ -59,43 +59,43 @@ LegConfig = Annotated[ChainLeg | PolynomialLeg, Field(discriminator="kind")]
 
 @dataclass(frozen=True, config=STRICT)
 class FilterConfig:
-    """The filter's settings; ``docs/estimation.md`` has the equations they stand in.
+    """Settings of the filter; ``docs/estimation.md`` has the equations in which they occur.
 
-    Noises are standard deviations per sample, but for those "per root second", which grow with the time between
-    samples. ``kinematics`` below means the foot's position that the joint angles give.
+    Noises are standard deviations per sample, except those "per root second", which grow with the time between
+    samples. Below, ``kinematics`` is the position of a foot computed from the joint angles.
 
     Attributes:
         legs: four legs; their order is that of every array.
-        imu_position: of the accelerometer in the trunk's frame, m. IMU axes are the trunk's.
-        foot_radius: of a foot that rolls, m; 0 for a point. Rolling needs ``ChainLeg`` and joint velocities.
-        contact_source: ``force`` (foot sensors, N), ``torque`` (the vertical force that the joint torques balance, N)
-            or ``height`` (minus the height of a foot above the mean of the two lowest, trunk frame, m: for robots that
-            feel nothing, on flat ground).
-        contact_low: source's value at which a foot carries nothing.
-        contact_high: value from which on it is trusted in full; contact grows linearly between the two.
-        contact_least: contact below which a foot is in the air, above 0.
-        settle: time after touch-down for which a foot is not yet trusted, s (impact gating).
-        acceleration_noise: of the accelerometer and of what attitude errors make of gravity, m/s2 per root hertz.
+        imu_position: position of the accelerometer in the trunk's frame, m. The IMU has the axes of the trunk.
+        foot_radius: radius of a foot that rolls, m; 0 for a point. Rolling needs ``ChainLeg`` and joint velocities.
+        contact_source: ``force`` (foot sensors, N), ``torque`` (vertical force that balances the joint torques, N) or
+            ``height`` (minus the height of a foot above the mean of the two lowest, trunk frame, m: for robots
+            without force sensors, on flat ground).
+        contact_low: value of the source below which contact is 0: the foot carries no load.
+        contact_high: value above which contact is 1; between the two it grows linearly.
+        contact_least: contact below which a foot counts as in the air, above 0.
+        settle: time after touch-down during which a foot is not used, s (impact gating).
+        acceleration_noise: noise of the accelerometer, and of gravity by attitude errors, m/s2 per root hertz.
         impact_acceleration: excess of the measured acceleration over gravity that doubles its noise, m/s2.
-        bias_walk: of the accelerometer's offset, m/s2 per root second.
-        attitude_time: time within which the attitude, turned by the gyro, is drawn to the reported one, s; 0 takes it
-            as it is reported.
+        bias_walk: random walk of the accelerometer's offset, m/s2 per root second.
+        attitude_time: time constant with which the attitude, integrated from the gyro, follows the reported one, s; 0
+            takes the reported one.
         attitude_noise: error of the attitude, rad.
         gyro_noise: rad/s.
-        joint_noise: of a joint angle, rad.
-        joint_speed_noise: of a joint velocity, rad/s.
-        leg_noise: of the kinematics beside the angles' error: flexing, m.
-        foot_drift: of a foot on the ground, horizontally, m per root second; slip that is too slow to see.
-        foot_speed_noise: of a foot on the ground, horizontally, m/s; 0 leaves joint velocities out of the correction.
-        sinking: how many times more a foot moves vertically than the two above: ground and sole give way at each step.
-        level_noise: difference in height of a foot just set down from the ground so far, m; 0 for no such rule.
-        ground_walk: how the ground's height under the robot departs from its slope, m per root second.
-        slope_walk: how the slope changes, per root second (and its standard deviation at the start).
-        initial_speed: of the trunk at the start and after a gap, m/s.
-        initial_bias: of the accelerometer's offset, m/s2.
+        joint_noise: noise of a joint angle, rad.
+        joint_speed_noise: noise of a joint velocity, rad/s.
+        leg_noise: error of the kinematics besides that of the angles, such as flexing, m.
+        foot_drift: horizontal drift of a foot on the ground, m per root second: slip too slow to detect.
+        foot_speed_noise: horizontal speed of a foot on the ground, m/s; 0: joint velocities are not used.
+        sinking: factor by which vertical drift and speed exceed the two above: ground and sole give way at each step.
+        level_noise: difference in height between a foot just set down and the ground before, m; 0 turns the rule off.
+        ground_walk: random walk of the ground's height under the robot about its slope, m per root second.
+        slope_walk: random walk of the slope, per root second (also its standard deviation at the start).
+        initial_speed: standard deviation of the trunk's speed at the start and after a gap, m/s.
+        initial_bias: standard deviation of the accelerometer's offset at the start, m/s2.
         gate: squared Mahalanobis distance (3 degrees of freedom) beyond which a foot slips (16.3: one in a thousand).
-        longest_gap: time without samples beyond which speed and feet are learnt anew, s.
-        lost_after: time for which every foot on the ground contradicts the filter before it gives way, s.
+        longest_gap: time without samples after which speed and feet are initialised again, s.
+        lost_after: time for which all feet on the ground contradict the filter until its speed is made uncertain, s.
     """
 
     legs: tuple[LegConfig, LegConfig, LegConfig, LegConfig]
@@ -150,9 +150,9 @@ def go1_legs() -> tuple[ChainLeg, ChainLeg, ChainLeg, ChainLeg]:
 def go1(**changes: Any) -> FilterConfig:
     """Return the settings of the Go1; keyword arguments replace some.
 
-    Kinematics and the IMU's place are the vendor's; joint, gyro and attitude noise are the standard deviations of the
-    paper's Table II (uniform 0.05 rad, 0.1 rad/s, 0.01 rad/s and 0.05). The rest was chosen on simulated walks, see
-    ``docs/estimation.md``.
+    Kinematics and the position of the IMU are the vendor's; joint, gyro and attitude noise are the standard deviations
+    of the paper's Table II (uniform 0.05 rad, 0.1 rad/s, 0.01 rad/s and 0.05). The rest was chosen on simulated walks,
+    see ``docs/estimation.md``.
     """
     usual: dict[str, Any] = {
         "legs": go1_legs(),
@@ -214,5 +214,5 @@ def load(path: Path) -> FilterConfig:
 
 
 def to_json(config: FilterConfig) -> str:
-    """Write settings as JSON, for a bundle or a file of one's own."""
+    """Return settings as JSON, for a bundle or a file."""
     return _CONFIG.dump_json(config, indent=1).decode()

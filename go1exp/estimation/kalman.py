@@ -1,4 +1,4 @@
-"""The filter in NumPy: short, slow, and the oracle of the C++ one in the tests. docs/estimation.md derives it."""
+"""The filter in NumPy: short and slow; the tests compare the C++ one with it. docs/estimation.md has the equations."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class NumpyFilter:
         self.P = F @ self.P @ F.T + Q
 
     def _correct(self, dt: float) -> None:
-        c, any_foot, seen = self.c, False, False
+        c, any_foot, any_accepted = self.c, False, False
         self.age = np.where(self.contact >= c.contact_least, self.age + dt, 0.0)
         for leg in range(4):
             if self.age[leg] <= c.settle:
@@ -154,8 +154,8 @@ class NumpyFilter:
                 holds = self._apply(H, self.place_noise[leg], self.arm[leg] - H @ self.x, robust=False)
             if not holds:
                 self._anchor(leg)
-            any_foot, seen = True, seen or holds
-        self.unseen = self.unseen + dt if any_foot and not seen else 0.0
+            any_foot, any_accepted = True, any_accepted or holds
+        self.unseen = self.unseen + dt if any_foot and not any_accepted else 0.0
         if self.unseen > c.lost_after:
             self._widen_speed()
 

@@ -1,4 +1,4 @@
-"""The legs' kinematics in NumPy: the twin of ``cpp/legs.hpp``."""
+"""Kinematics of the legs in NumPy, equal to ``cpp/legs.hpp``."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def foot(leg: ChainLeg | PolynomialLeg, q: np.ndarray) -> tuple[np.ndarray, np.n
     """Return a foot in the trunk's frame for joint angles ``q`` (3,), rad.
 
     Returns:
-        Its position (3,), m; the Jacobian (3, 3) of it, m/rad; and ``turning`` (3, 3), which makes the angular
-        velocity of the foot's link against the trunk from joint velocities (zero where that is not known).
+        Its position (3,), m; the Jacobian (3, 3) of the position, m/rad; and ``turning`` (3, 3), which maps joint
+        velocities to the angular velocity of the foot's link relative to the trunk (zero if that is not known).
     """
     if isinstance(leg, PolynomialLeg):
         u = (q - np.array(leg.centre)) / leg.scale
@@ -34,7 +34,7 @@ def foot(leg: ChainLeg | PolynomialLeg, q: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _slope(u: np.ndarray, axis: int) -> np.ndarray:
-    """Derivative (35,) of the terms by one of their variables."""
+    """Return the derivative (35,) of the terms by one of their variables."""
     lower = EXPONENTS.copy()
     lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
     return EXPONENTS[:, axis] * (u**lower).prod(axis=1)

@@ -1,4 +1,4 @@
-"""The filter beside plain leg odometry on SCALER's walks under motion capture (``scaler_walk_mocap``)."""
+"""Compares the filter and plain leg odometry with motion capture, on walks of SCALER (``scaler_walk_mocap``)."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ GRID = 0.01
 """Step at which motion capture is differentiated and compared, s."""
 
 WINDOW = 15
-"""Samples over which a cubic is fitted to its positions (Savitzky-Golay): 0.15 s, a third of a stride."""
+"""Samples over which a cubic is fitted to the positions (Savitzky-Golay): 0.15 s, a third of a stride."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """One run.
+    """Errors of filter and odometry on one run.
 
     Attributes:
-        run: its name.
-        truth_distance: between start and end by motion capture, m.
-        filter_rmse: of the forward velocity, m/s, over the whole run.
+        run: name of the run.
+        truth_distance: distance between start and end by motion capture, m.
+        filter_rmse: RMSE of the forward velocity over the whole run, m/s.
         filter_distance: (distance by the filter) / truth - 1.
-        odometry_rmse: the same two of leg odometry.
-        odometry_distance: ...
-        clock_shift: by which motion capture was moved beside the source's own match, s (see the importer).
+        odometry_rmse: as ``filter_rmse``, of leg odometry.
+        odometry_distance: as ``filter_distance``, of leg odometry.
+        clock_shift: correction of motion capture's clock in addition to the source's own, s (see the importer).
     """
 
     run: str
@@ -52,7 +52,7 @@ class Judgement:
 def truth(capture: Mocap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times (T,), s, positions (T, 3), m, and forward speed (T,), m/s, by motion capture.
 
-    Forward is the trunk's x axis without its slope. Lost samples are bridged by straight lines.
+    Forward is the horizontal direction of the trunk's x axis. Lost samples are interpolated linearly.
     """
     heading = np.unwrap(_heading(capture.attitude.as_matrix()))
     grid = np.arange(capture.t[0], capture.t[-1], GRID)
@@ -72,11 +72,11 @@ def _forward(velocity_w: np.ndarray, heading: np.ndarray) -> np.ndarray:
 
 
 def odometry(rows: np.ndarray, config: FilterConfig) -> np.ndarray:
-    """Return the trunk's velocity (T, 3) in the world by legs alone: the mean of what the two lowest feet say.
+    """Return the trunk's velocity (T, 3) in the world by legs alone: the mean over the two lowest feet.
 
     Args:
         rows: samples (T, 51).
-        config: for its legs.
+        config: gives the legs.
     """
     t, q = rows[:, column.T], rows[:, column.Q].reshape(-1, 4, 3)
     feet = np.array([[foot(leg, angles)[0] for leg, angles in zip(config.legs, row, strict=True)] for row in q])
@@ -97,26 +97,26 @@ def judge(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Judgement:
     """
     (recording,) = import_recordings("scaler_walk_mocap", path, {})
     capture = motion_capture(load_npz(path), recording.t, recording.block(*VECTORS["imu_gyro"]))
-    found, rows = estimate(recording, config, log), samples(recording, log)
-    rotation = Rotation.from_quat(found.quat, scalar_first=True)
+    result, rows = estimate(recording, config, log), samples(recording, log)
+    rotation = Rotation.from_quat(result.quat, scalar_first=True)
     heading = _heading(rotation.as_matrix())
     leg_velocity = odometry(rows, config)
-    leg_place = np.cumsum(leg_velocity * np.gradient(found.t)[:, None], axis=0)
+    leg_place = np.cumsum(leg_velocity * np.gradient(result.t)[:, None], axis=0)
     grid, place, speed = truth(capture)
-    within = (grid >= found.t[0] + 0.05) & (grid <= found.t[-1])
+    within = (grid >= result.t[0] + 0.05) & (grid <= result.t[-1])
     if within.sum() < WINDOW:
         raise RecordingError(f"{path}: motion capture and the robot's log have less than {WINDOW * GRID:g} s in common")
     grid, place, speed = grid[within], place[within], speed[within]
     distance = _distance(place)
 
     def errors(velocity_w: np.ndarray, position_w: np.ndarray) -> tuple[float, float]:
-        error = np.interp(grid, found.t, _forward(velocity_w, heading)) - speed
-        return float(np.sqrt(np.mean(error**2))), _distance(interp1d(found.t, position_w, axis=0)(grid)) / distance - 1
+        error = np.interp(grid, result.t, _forward(velocity_w, heading)) - speed
+        return float(np.sqrt(np.mean(error**2))), _distance(interp1d(result.t, position_w, axis=0)(grid)) / distance - 1
 
-    filtered = errors(rotation.apply(found.velocity_b), found.position_w)
+    filtered = errors(rotation.apply(result.velocity_b), result.position_w)
     return Judgement(path.stem, distance, *filtered, *errors(leg_velocity, leg_place), capture.shift)
 
 
 def _distance(place: np.ndarray) -> float:
-    """From first to last, in the plane."""
+    """Return the horizontal distance between first and last position, m."""
     return float(np.linalg.norm(place[-1, :2] - place[0, :2]))

@@ -1,4 +1,4 @@
-"""One reading of all sensors as a row of numbers: the filter's only input, in one order everywhere."""
+"""One sample of all sensors as a row of numbers, the only input of the filter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TAU = slice(35, 47)
 FOOT_FORCE = slice(47, 51)
 WIDTH = 51
 """Columns of a sample: time s, attitude w-x-y-z (trunk to world), gyro rad/s, specific force m/s2 (both in the trunk's
-axes), joint angles rad, velocities rad/s and torques N m, foot forces N. What the settings do not use may be NaN."""
+axes), joint angles rad, velocities rad/s and torques N m, foot forces N. Columns that are not used may be NaN."""
 
 
 class Status(IntEnum):
@@ -24,13 +24,13 @@ class Status(IntEnum):
 
     OK = 0
     STARTED = 1
-    """The first good sample: speed is taken as zero within ``initial_speed``, the place as the origin."""
+    """The first valid sample: speed is zero within ``initial_speed``, position is the origin."""
     RESTARTED = 2
-    """It came after a gap longer than ``longest_gap``: the place is kept, speed and feet are learnt anew."""
+    """It came after a gap longer than ``longest_gap``: the position is kept, speed and feet are initialised again."""
     LATE = 3
-    """Not newer than the last one; it was left out. The tenth in a row restarts: then the clock had jumped."""
+    """Not newer than the last one; it was left out. The tenth in a row restarts the filter: the clock has jumped."""
     INVALID = 4
-    """Not finite, beyond any sensor's range, or no rotation; it was left out."""
+    """Not finite, beyond the range of any sensor, or not a unit quaternion; it was left out."""
 
 
 def sample(
@@ -43,7 +43,7 @@ def sample(
     tau: np.ndarray | None = None,
     foot_force: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return one sample ``(51,)``; what is left out is NaN."""
+    """Return one sample ``(51,)``; arguments that are not given become NaN."""
     row = np.full(WIDTH, np.nan)
     row[T], row[QUAT], row[GYRO], row[ACC], row[Q] = t, quat, gyro, acc, q
     for place, values in ((QD, qd), (TAU, tau), (FOOT_FORCE, foot_force)):

@@ -1,4 +1,4 @@
-"""The filter on a recording: what a robot would have known at each sample, from the log alone."""
+"""The filter run over a recording: the estimate at each sample, from the log alone."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ JOINTS = 12
 
 @dataclass(frozen=True)
 class Log:
-    """What a robot needs beside the filter's settings to be followed from its log.
+    """Properties of a robot's log that are not among the filter's settings.
 
     Attributes:
-        leg_delay_s: legs and soles are soft: what the joints say reaches the trunk that much later, s. It is no
-            difference of clocks.
-        levelling_s: see ``attitude.levelled``, used where the log has no ``imu_quat``, s.
+        leg_delay_s: legs and soles are soft: the trunk follows the motion of the joints later by this, s. It is not a
+            difference between clocks.
+        levelling_s: time constant for ``attitude.levelled``, used if the log has no ``imu_quat``, s.
     """
 
     leg_delay_s: float = 0.0
@@ -29,21 +29,22 @@ class Log:
 
 
 SCALER_LOG = Log(leg_delay_s=0.085, levelling_s=2.0)
-"""SCALER's forward speed swings 94 to 106 ms (eight runs) after the one that its standing legs say, at 4 Hz.
-Vertically it moves with them, 3.3 times as far: the delay is for forward velocity only."""
+"""The forward speed of SCALER oscillates at 4 Hz, 94 to 106 ms (eight runs) after that computed from its standing legs.
+Vertically there is no delay, but 3.3 times the motion: the delay is right for forward velocity only."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the filter made of a log; rows as in the recording.
+    """The filter's output for a log; rows as in the recording.
 
     Attributes:
         t: s (T,).
-        position_w: of the trunk's origin, m (T, 3); the world begins below the first sample, heading as the IMU says.
-        velocity_b: of the trunk's origin in its own axes, m/s (T, 3).
+        position_w: position of the trunk's origin, m (T, 3). The origin of the world is below the first sample; heading
+            is that of the IMU.
+        velocity_b: velocity of the trunk's origin in the trunk frame, m/s (T, 3).
         quat: attitude that was used, w-x-y-z (T, 4).
-        contact: of each foot, 0 to 1 (T, 4).
-        status: what became of each sample, ``Status`` (T,).
+        contact: contact of each foot, 0 to 1 (T, 4).
+        status: ``Status`` of each sample (T,).
     """
 
     t: np.ndarray
@@ -55,10 +56,10 @@ class Estimate:
 
 
 def samples(recording: Recording, log: Log | None = None) -> np.ndarray:
-    """Return the log as the filter's input, ``(T, 51)``; what it lacks is NaN.
+    """Return the log as input of the filter, ``(T, 51)``; quantities that it lacks are NaN.
 
     Raises:
-        RecordingError: if the robot has not twelve joints, or the IMU or the joint angles are missing.
+        RecordingError: if the robot does not have twelve joints, or the IMU or the joint angles are missing.
     """
     log = log or Log()
     joints = recording.meta.joints
@@ -93,5 +94,7 @@ def estimate(recording: Recording, config: FilterConfig, log: Log | None = None)
         EstimatorError: if the filter is not built.
     """
     rows = samples(recording, log)
-    found = make_filter(config).run(rows)
-    return Estimate(rows[:, column.T], found[:, :3], found[:, 3:6], rows[:, column.QUAT], found[:, 6:10], found[:, 10])
+    states = make_filter(config).run(rows)
+    return Estimate(
+        rows[:, column.T], states[:, :3], states[:, 3:6], rows[:, column.QUAT], states[:, 6:10], states[:, 10]
+    )

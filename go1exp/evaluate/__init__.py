@@ -1,1 +1,1 @@
-"""Judging a policy: command grids, tables, pictures."""
+"""Evaluation of a policy: command grids, tables, pictures."""

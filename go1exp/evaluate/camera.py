@@ -2,7 +2,7 @@
 
 MuJoCo binds ``mujoco.Renderer`` to one GL library when ``mujoco`` is first imported, from MUJOCO_GL, and takes one that
 needs a display if that is unset. Pictures are wanted long after that import and mostly without a display, so the
-library is chosen here and the context is made directly.
+library is chosen here and the context is made directly, without ``mujoco.Renderer``.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ Picture = NDArray[np.uint8]
 """(H, W, 3), RGB."""
 
 COMMAND_RGB, MEASURED_RGB = (0.25, 0.6, 1.0), (0.35, 0.9, 0.4)
-"""Colours of what was wanted and of what happened."""
+"""Colours of the commanded and of the measured velocity."""
 
 GL_LIBRARIES = ("egl", "osmesa")
-"""What draws without a display, the faster one first."""
+"""GL libraries that draw without a display, the faster one first."""
 
 GL_HELP = (
     "On Debian and Ubuntu install the packages libegl1 libopengl0 libgl1-mesa-dri (for egl) or libosmesa6 (for "
@@ -44,10 +44,11 @@ GL_HELP = (
 )
 
 GROUND_RANGE = 10.0
-"""How far a height field is drawn around the robot, m: drawn in software, a whole one takes a second a picture."""
+"""Distance up to which a height field is drawn around the robot, m: in software, a whole one takes 1 s a picture."""
 
 GROUND_PACE = 2.0
-"""That window moves by whole multiples of this, m: two squares of MuJoCo's checker, so that a pattern stands still."""
+"""The drawn part moves by whole multiples of this, m: two squares of MuJoCo's checker, so that the pattern does not
+move."""
 
 AZIMUTH, ELEVATION, DISTANCE = 128.0, -16.0, 1.5
 """Line of sight against the robot's first heading, deg, and against the horizon, deg; its length, m."""
@@ -62,7 +63,8 @@ LEAST_DRAWN, ARROW_SCALE = 0.15, 0.35
 """Speed below which there is no arrow, m/s; length of an arrow per speed, m / (m/s)."""
 
 REACH, FASTEST = 1.0, 5.0
-"""A robot that is further from where it was than this, m, and than this speed explains, m/s, was put there."""
+"""A robot whose distance from its last position exceeds this, m, plus this speed, m/s, times the time, was reset: the
+camera then jumps to it."""
 
 _PROBE = """
 import os, mujoco
@@ -75,7 +77,7 @@ os._exit(0)
 
 
 class RenderingUnavailable(Expected):
-    """Nothing to draw with; the message says what to install or set."""
+    """There is no GL library to draw with; the message says what to install or set."""
 
 
 @functools.cache
@@ -130,7 +132,7 @@ def _contexts(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujo
 class Stage:
     """The scene with its decorative shapes, and the robot of one environment in it.
 
-    Of a height field it holds only a window round the robot.
+    Of a height field it has only the part around the robot.
     """
 
     def __init__(self, core: Go1Core, decoration: bool = True) -> None:
@@ -142,7 +144,10 @@ class Stage:
         self.model = self._build()
         self.data = mujoco.MjData(self.model)
         self.model.vis.headlight.ambient[:] = 0.25
-        self.model.vis.map.fogstart, self.model.vis.map.fogend = 2.5, 4.9  # in extents of 2 m: hides the window's edge
+        self.model.vis.map.fogstart, self.model.vis.map.fogend = (
+            2.5,
+            4.9,
+        )  # in extents of 2 m: hides the edge of the drawn ground
         self.model.vis.rgba.fog[:] = self.model.vis.rgba.haze
         self.model.vis.quality.shadowsize = (
             2048  # half of the default: 12 ms a picture less in software, and looks the same
@@ -207,7 +212,7 @@ class Camera:
         core: the environments; any may be drawn at any time.
         width: of the picture, pixels.
         height: of the picture, pixels.
-        decoration: draw the robot as it looks, not as it touches.
+        decoration: draw the visual shapes of the robot, not its collision shapes.
 
     Raises:
         RenderingUnavailable: if there is no GL library to draw with.
@@ -219,7 +224,7 @@ class Camera:
         model = self.stage.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._gl, self._context = _contexts(model, width, height)
-        # Left to the interpreter's end, the context would outlive its library and say so on stderr.
+        # Without this the context would be freed after its library at the end, with a message on stderr.
         self._at_exit = functools.partial(_close, weakref.ref(self))
         atexit.register(self._at_exit)
         self._rect = mujoco.MjrRect(0, 0, width, height)
@@ -242,7 +247,7 @@ class Camera:
             mujoco.mjr_uploadHField(model, self._context, 0)
         self._follow(env)
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        for _ in range(2):  # the second time, an endless plane is laid about this camera and not about the last one
+        for _ in range(2):  # the first call places the infinite plane around the previous camera position
             mujoco.mjv_updateScene(model, data, self._option, None, self._view, everything, self._scene)
         draw_velocities(self._scene, self.stage, self.stage.core.command.value[env], self._velocity)
         mujoco.mjr_render(self._rect, self._scene, self._context)
@@ -260,7 +265,7 @@ class Camera:
             self._context = None
 
     def __del__(self) -> None:
-        self.close()  # while its own context is current: else MuJoCo would release the objects of another camera
+        self.close()  # makes its own context current first; otherwise MuJoCo would free the objects of another camera
 
     def _follow(self, env: int) -> None:
         """Move the camera, and the velocity to be drawn, on by the time since the last picture."""

@@ -1,4 +1,4 @@
-"""The trunk's velocity as the robot would know it: from its sensors through the Kalman filter, not from the truth."""
+"""The trunk's velocity as the robot knows it: estimated from its sensors by the Kalman filter."""
 
 from __future__ import annotations
 
@@ -18,45 +18,49 @@ TERM = "base_linear_velocity"
 
 
 class EstimatedVelocity:
-    """A filter for each robot of an environment, given its sensors in every physics step."""
+    """One filter for each robot of an environment, updated with its sensors in every physics step."""
 
     def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
-        """Listen to the plant of ``core``, which must have been built with ``imu=True``, from its next step on.
+        """Observe the plant of ``core``, which must have been built with ``imu=True``, from its next step on.
 
         Args:
             core: the environment.
             noise: give the sensors the noise of the paper's Table II, and accelerometer and feet that of a logger.
-            seed: of it.
+            seed: seed of the noise.
 
         Raises:
-            ConfigError: if the policy does not see the velocity.
+            ConfigError: if the policy does not observe the velocity.
             go1exp.estimation.EstimatorError: if the filter is not built.
         """
-        found = columns(core.task, TERM)
-        if found is None:
+        velocity_columns = columns(core.task, TERM)
+        if velocity_columns is None:
             raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
-        self._columns = found
+        self._columns = velocity_columns
         self._filters = [make_filter(go1()) for _ in range(core.num_envs)]
         self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
         self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])
         core.plant.observer = self._listen
 
     def put(self, observation: Tensor) -> Tensor:
-        """Return the observation (N, O) with the estimated velocity in the place of the true one."""
-        found = np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])
+        """Return the observation (N, O) with the estimated velocity in place of the true one."""
+        velocities = np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])
         changed = observation.clone()
-        changed[:, self._columns] = torch.as_tensor(found, dtype=observation.dtype)
+        changed[:, self._columns] = torch.as_tensor(velocities, dtype=observation.dtype)
         return changed
 
     def _listen(self, target: Tensor) -> None:
-        """Give every filter a sample, before a step."""
+        """Update every filter with a sample, before a step."""
         true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}
-        seen = noisy(true, self._noise, self._rng)
+        readings = noisy(true, self._noise, self._rng)
         rows = np.full((len(self._filters), WIDTH), np.nan)
         rows[:, column.T] = self._steps * self._dt
-        rows[:, column.QUAT], rows[:, column.GYRO], rows[:, column.ACC] = seen["quat"], seen["gyro"], seen["acc"]
-        rows[:, column.Q], rows[:, column.QD] = seen["q"], seen["qd"]
-        rows[:, column.FOOT_FORCE] = seen["foot_force"]
+        rows[:, column.QUAT], rows[:, column.GYRO], rows[:, column.ACC] = (
+            readings["quat"],
+            readings["gyro"],
+            readings["acc"],
+        )
+        rows[:, column.Q], rows[:, column.QD] = readings["q"], readings["qd"]
+        rows[:, column.FOOT_FORCE] = readings["foot_force"]
         for one, row in zip(self._filters, rows, strict=True):
             one.update(row)
         self._steps += 1

@@ -1,4 +1,4 @@
-"""Where the terms of an observation stand."""
+"""Columns of the terms in an observation."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from go1exp.config import TaskConfig
 
 
 def columns(task: TaskConfig, term: str) -> slice | None:
-    """Return the columns of a term in the observation; None if the policy does not see it."""
+    """Return the columns of a term in the observation; None if the policy does not observe it."""
     start = 0
     for t in task.observation:
         size = int(t.entry.traits["size"])

@@ -21,10 +21,10 @@ Policy = Callable[[Tensor], Tensor]
 
 
 def load_run(run: Path, which: Path | None = None) -> tuple[TrainConfig, Policy, dict[str, Any]]:
-    """Load a run by its own configuration: that, its policy, and what ``load_policy`` tells of it.
+    """Load a run by its own configuration; return that, its policy, and the description that ``load_policy`` returns.
 
     Raises:
-        FileNotFoundError: if ``run`` is no run folder or holds no checkpoint.
+        FileNotFoundError: if ``run`` is not a run folder or has no checkpoint.
         go1exp.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
     config = parse_train(run_folder.read_config(run))
@@ -48,11 +48,11 @@ def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tup
 
     Args:
         run: run folder.
-        config: the run's own learner settings (they hold the network's shape).
+        config: the run's own learner settings, which give the shape of the network.
         which: a checkpoint file; the newest if None.
 
     Returns:
-        The network, and of the checkpoint ``iteration``, ``file`` and ``num_timesteps``, earlier stages included.
+        The network; and ``iteration``, ``file`` and ``num_timesteps`` (earlier stages included) of the checkpoint.
 
     Raises:
         FileNotFoundError: if there is no checkpoint.

@@ -1,4 +1,4 @@
-"""How well a policy follows commands: a grid of constant commands, many episodes of each, all at once."""
+"""How well a policy follows commands: a grid of constant commands, several episodes of each, as one batch."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ AXES = ("x", "y", "yaw")
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """What to run a policy through.
+    """Settings of an evaluation.
 
     Attributes:
         commands: the grid.
@@ -37,13 +37,13 @@ class EvalConfig:
         duration_s: length of an episode, s.
         settle_s: time at its start that counts for falls but not for tracking, s.
         noise: add the observation noise of training.
-        randomize: randomise robots and starts as in training; else the nominal robot.
+        randomize: randomise robots and starts as in training; if not, the nominal robot.
         push: push as in training.
-        train_ground: the ground of training; else flat.
+        train_ground: use the ground of training; if not, flat ground.
         policy_dt: another period of the policy, s, or None for that of training.
-        seed: of everything random.
-        physics_dt: another step of the physics, s, or None for that of training.
-        trunk_velocity: what the policy sees of it: ``exact``, or ``estimated`` by the filter from the robot's sensors.
+        seed: seed of everything random.
+        physics_dt: another physics step, s, or None for that of training.
+        trunk_velocity: velocity that the policy observes: ``exact``, or ``estimated`` from the sensors by the filter.
     """
 
     commands: tuple[Command, ...]
@@ -60,17 +60,17 @@ class EvalConfig:
     trunk_velocity: Literal["exact", "estimated"] = "exact"
 
     @classmethod
-    def of(cls, settings: Any, **changes: Any) -> EvalConfig:
-        """Take what ``settings`` (of a verb) has of these attributes; ``changes`` give the rest."""
+    def from_settings(cls, settings: Any, **changes: Any) -> EvalConfig:
+        """Build from those attributes that ``settings`` (of a verb) has; ``changes`` give the others."""
         shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(cls) if hasattr(settings, f.name)}
         return cls(**{**shared, **changes})
 
 
 def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
-    """Return the task in which a policy trained on ``task`` is judged: on the CPU, wherever it was trained.
+    """Return the task in which a policy trained on ``task`` is evaluated; always on the CPU.
 
     Raises:
-        ConfigError: if the times do not divide each other.
+        ConfigError: if physics step and policy period do not fit each other.
     """
     period = config.policy_dt or task.sim.policy_dt
     beyond = (math.ceil(config.duration_s / period) + 1) * period  # no time limit within the evaluation
@@ -98,70 +98,92 @@ def evaluate(
     """Run the grid and return a report of plain data.
 
     A robot counts until it falls. Tracking figures of a command are over all its robots and the time after
-    ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is told the progress in steps.
+    ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
     """
     count = len(config.commands) * config.episodes
     estimated = config.trunk_velocity == "estimated"
     core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=estimated)
-    seen = EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
+    see = EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
+    # A policy that runs faster than it was trained sees its action of one training period ago.
     past = PastActions[torch.Tensor](task.sim.policy_dt, core.task.sim.policy_dt)
-    held = columns(core.task, "previous_action") if past.cycles > 1 else None
+    past_columns = columns(core.task, "previous_action") if past.cycles > 1 else None
     assert isinstance(core.command, FixedVelocity)
+    # Robot i has command i // episodes: the robots of one command are neighbours.
     commands = torch.tensor(config.commands, dtype=torch.float32)
     core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
     observation = core.reset()
     dt = core.task.sim.policy_dt
     steps, settle = round(config.duration_s / dt), round(config.settle_s / dt)
-
-    alive = torch.ones(count, dtype=torch.bool)
-    fell = torch.zeros(count, dtype=torch.bool)
-    survived = torch.zeros(count)
-    samples = torch.zeros(count)
-    velocity_sum = torch.zeros(count, 3, dtype=torch.float64)
-    square_sum = torch.zeros(count, 3, dtype=torch.float64)
+    tally = _Tally(count)
     for step in range(steps):
-        result = core.step(policy(seen(observation)))
+        result = core.step(policy(see(observation)))
         core.check(result)
         observation = result.observation
-        if held is not None:
+        if past_columns is not None:
             observation = observation.clone()
-            observation[:, held] = past.after(core.action.clone())
-        fell |= alive & result.terminated
-        alive &= ~(result.terminated | result.truncated)
-        survived += alive * dt
+            observation[:, past_columns] = past.after(core.action.clone())
+        tally.add_step(result.terminated, result.truncated, dt)
         if step >= settle:
-            s = core.snapshot()
-            assert s.base_lin_vel_b is not None
-            velocity = torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1).double()
-            counted = alive.unsqueeze(1)
-            velocity_sum += velocity * counted
-            square_sum += (velocity - core.command.value).square() * counted
-            samples += alive
+            tally.add_velocity(_planar_velocity(core), core.command.value)
         on_step(step + 1, steps)
+    return tally.report(config)
 
-    rows = []
-    for k, command in enumerate(config.commands):
-        mine = slice(k * config.episodes, (k + 1) * config.episodes)
-        n = float(samples[mine].sum())
-        rows.append(
-            {
-                "command": list(command),
-                "mean": _per_axis(velocity_sum[mine].sum(0) / n) if n else None,
-                "rmse": _per_axis((square_sum[mine].sum(0) / n).sqrt()) if n else None,
-                "falls": int(fell[mine].sum()),
-                "episodes": config.episodes,
-                "mean_time_s": float(survived[mine].mean()),
-            }
-        )
-    total = float(samples.sum())
-    overall = (square_sum.sum(0) / total).sqrt() if total else None
-    return {
-        "commands": rows,
-        "rmse": _per_axis(overall) if overall is not None else None,
-        "falls": int(fell.sum()),
-        "episodes": count,
-        "settings": {k: v for k, v in dataclasses.asdict(config).items() if k != "commands"},
-    }
+
+def _planar_velocity(core: Go1Core) -> torch.Tensor:
+    """Velocity of the trunk in its own frame (N, 3), float64: x and y in m/s, yaw rate in rad/s."""
+    s = core.snapshot()
+    assert s.base_lin_vel_b is not None
+    return torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], dim=1).double()
+
+
+class _Tally:
+    """Running sums over the steps of an evaluation, one row for each robot."""
+
+    def __init__(self, count: int) -> None:
+        self.alive = torch.ones(count, dtype=torch.bool)
+        self.fell = torch.zeros(count, dtype=torch.bool)
+        self.survived = torch.zeros(count)  # s
+        self.samples = torch.zeros(count)
+        # float64: sums over thousands of steps
+        self.velocity_sum = torch.zeros(count, 3, dtype=torch.float64)
+        self.square_sum = torch.zeros(count, 3, dtype=torch.float64)
+
+    def add_step(self, terminated: torch.Tensor, truncated: torch.Tensor, dt: float) -> None:
+        """Count falls and time; a robot that has fallen starts again but does not count any more."""
+        self.fell |= self.alive & terminated
+        self.alive &= ~(terminated | truncated)
+        self.survived += self.alive * dt
+
+    def add_velocity(self, velocity: torch.Tensor, command: torch.Tensor) -> None:
+        """Add the velocities (N, 3) of the robots that have not fallen, and their squared errors."""
+        counted = self.alive.unsqueeze(1)
+        self.velocity_sum += velocity * counted
+        self.square_sum += (velocity - command).square() * counted
+        self.samples += self.alive
+
+    def report(self, config: EvalConfig) -> dict[str, Any]:
+        """Return the report: one row for each command, and the totals."""
+        total = float(self.samples.sum())
+        overall = (self.square_sum.sum(0) / total).sqrt() if total else None
+        return {
+            "commands": [self._row(k, command, config.episodes) for k, command in enumerate(config.commands)],
+            "rmse": _per_axis(overall) if overall is not None else None,
+            "falls": int(self.fell.sum()),
+            "episodes": len(self.fell),
+            "settings": {k: v for k, v in dataclasses.asdict(config).items() if k != "commands"},
+        }
+
+    def _row(self, k: int, command: Command, episodes: int) -> dict[str, Any]:
+        robots = slice(k * episodes, (k + 1) * episodes)
+        n = float(self.samples[robots].sum())
+        return {
+            "command": list(command),
+            "mean": _per_axis(self.velocity_sum[robots].sum(0) / n) if n else None,
+            "rmse": _per_axis((self.square_sum[robots].sum(0) / n).sqrt()) if n else None,
+            "falls": int(self.fell[robots].sum()),
+            "episodes": episodes,
+            "mean_time_s": float(self.survived[robots].mean()),
+        }
 
 
 def grid(x: Sequence[float], y: Sequence[float], yaw: Sequence[float], cross: bool) -> tuple[Command, ...]:

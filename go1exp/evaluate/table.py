@@ -15,12 +15,12 @@ def _triple(values: Any) -> str:
 
 def rows(report: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return one row of text per command of a report of ``rollout.evaluate``."""
-    found: list[tuple[str, ...]] = []
+    lines: list[tuple[str, ...]] = []
     for c in report["commands"]:
         mean = _triple(c["mean"][a] for a in AXES) if c["mean"] else "-"
         rmse = ", ".join(f"{c['rmse'][a]:.2f}" for a in AXES) if c["rmse"] else "-"
-        found.append((_triple(c["command"]), mean, rmse, f"{c['falls']}/{c['episodes']}", f"{c['mean_time_s']:.1f}"))
-    return found
+        lines.append((_triple(c["command"]), mean, rmse, f"{c['falls']}/{c['episodes']}", f"{c['mean_time_s']:.1f}"))
+    return lines
 
 
 def _summary(report: dict[str, Any]) -> str:
@@ -35,7 +35,7 @@ def _summary(report: dict[str, Any]) -> str:
 
 
 def text(report: dict[str, Any]) -> str:
-    """Lay the report out for a terminal; m/s and rad/s."""
+    """Return the report as text for a terminal; m/s and rad/s."""
     lines = [HEADER, *rows(report)]
     widths = [max(len(line[k]) for line in lines) for k in range(len(HEADER))]
     laid = ["  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)) for line in lines]
@@ -43,6 +43,6 @@ def text(report: dict[str, Any]) -> str:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """Lay the report out for a document."""
+    """Return the report as a Markdown table."""
     lines = [f"| {' | '.join(line)} |" for line in [HEADER, ("---",) * len(HEADER), *rows(report)]]
     return "\n".join([*lines, "", _summary(report)])

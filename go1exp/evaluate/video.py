@@ -1,4 +1,4 @@
-"""Films of a policy: recorded to a file or to pictures for a page, or live in a window."""
+"""Videos of a policy: recorded to a file or as pictures for a page, or live in a window."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ AVERAGE_TIME = 0.5
 """Time over which the velocity in the caption is averaged, s: about a gait cycle."""
 
 GIF_COLOURS = 128
-"""Of the 256 that a GIF may have; fewer compress better."""
+"""Colours of a GIF, of at most 256; fewer compress better."""
 
 
 def record(
@@ -60,11 +60,11 @@ def record(
 
     Args:
         core: the environments; all of them run.
-        policy: what acts.
-        seconds: simulated time to film; an episode that ends in it is followed by the next.
-        env: which to film.
+        policy: gives the actions.
+        seconds: simulated time to film, s; if an episode ends within it, the next one follows.
+        env: index of the environment to film.
         fps: pictures per simulated second.
-        on_frame: told the progress: pictures done, pictures in all.
+        on_frame: called with the progress: pictures done, pictures in all.
         caption: write time, command and velocity (mean over 0.5 s) on the picture.
         width: of the picture, pixels.
         height: of the picture, pixels.
@@ -73,7 +73,7 @@ def record(
         RenderingUnavailable: at once, if there is nothing to draw with.
         NumericalFault: while iterating, when a value is not finite.
     """
-    camera = Camera(core, width, height)  # here, not in the generator: what cannot be drawn is known before it starts
+    camera = Camera(core, width, height)  # here, not in the generator, so that errors are raised before it starts
     return _frames(camera, policy, seconds, env, fps, on_frame or (lambda done, total: None), caption)
 
 
@@ -172,7 +172,7 @@ def write_gif(path: Path, frames: Iterable[Picture], fps: float = 12, width: int
 
 @contextmanager
 def _complete(path: Path) -> Iterator[Path]:
-    """Give a file beside ``path`` to write, and rename it when it is complete."""
+    """Yield a temporary file beside ``path`` to write, and rename it when it is complete."""
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -196,7 +196,7 @@ def _velocity(core: Go1Core, env: int) -> list[float]:
 
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Figures of one width, so that running numbers stand still."""
+    """Return a font with digits of one width, so that changing numbers do not move."""
     return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSansMono.ttf")), size)
 
 
@@ -246,7 +246,7 @@ def steer(command: list[float], key: int) -> None:
 
 
 def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
-    """Show one environment in a window in real time until it is closed; the keyboard gives all the command.
+    """Show one environment in a window in real time until it is closed; the keyboard sets the command.
 
     Raises:
         RenderingUnavailable: if there is no display.
@@ -281,9 +281,9 @@ def live(core: Go1Core, policy: Policy, env: int = 0) -> None:
 
 @contextmanager
 def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
-    """Open MuJoCo's window on a stage and close it in the end; ``on_key`` is told GLFW's key codes."""
+    """Open MuJoCo's window on a stage and close it at the end; ``on_key`` is called with GLFW's key codes."""
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if not display:  # MuJoCo would wait for ever for a window that never comes
+    if not display:  # without a display MuJoCo would wait without end
         raise RenderingUnavailable(
             "cannot open a window: there is no display (DISPLAY and WAYLAND_DISPLAY are unset); record a film instead"
         )
@@ -302,6 +302,6 @@ def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
             stage.model, stage.data, key_callback=on_key, show_left_ui=False, show_right_ui=False
         ) as window:
             yield window
-    finally:  # an interpreter that ended before the window has gone would hang
+    finally:  # the interpreter would hang if it ended before the threads of the window
         for thread in set(threading.enumerate()) - others:
             thread.join(5.0)

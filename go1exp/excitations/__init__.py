@@ -1,4 +1,4 @@
-"""Motions that a robot is driven through so that what its model lacks becomes visible.
+"""Motions for identification: they make errors of the robot's model visible in the recordings.
 
 Importing the package registers every excitation, from this explicit list.
 """

@@ -1,4 +1,4 @@
-"""Motions on the ground: they load the joints with the robot's weight and try the contact."""
+"""Motions on the ground: they load the joints with the weight of the robot and excite the contacts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from go1exp.excitations.motion import ExcitationError, Motion, always_on, check,
 from go1exp.schema.registry import Annotated, Field, PositiveRange, excitation
 
 Depth = Annotated[float, Field(gt=0, le=0.6)]
-"""Share of the standing height; a leg folds no farther than some 0.6."""
+"""Share of the standing height; a leg cannot fold by more than about 0.6."""
 
 
 @excitation("squat", smooth=True)
@@ -42,7 +42,9 @@ def squat(
     duration = check(t, centre, limits)
     shares = np.linspace(0, depth, 201)
     bent = np.stack([_lowered(centre, limits, share) for share in shares])
-    angles = centre + (bent - bent[0] + np.pi) % (2 * np.pi) - np.pi  # the change alone: exactly none at share 0
+    angles = (
+        centre + (bent - bent[0] + np.pi) % (2 * np.pi) - np.pi
+    )  # as a change from bent[0], so that share 0 is exactly the stance
     inside = np.all((angles >= limits[:, 0] - 1e-9) & (angles <= limits[:, 1] + 1e-9), axis=1)
     deepest = depth if inside.all() else shares[np.argmin(inside) - 1]
     times, levels = [0.0], [0.0]
@@ -59,7 +61,10 @@ def squat(
 
 
 def _lowered(centre: np.ndarray, limits: np.ndarray, share: float) -> np.ndarray:
-    """Joint angles (J,) with every hip ``share`` of its height lower over the same footholds; lengths in links."""
+    """Return joint angles (J,) with every hip lower by ``share`` of its height, the feet where they were.
+
+    Two links of length 1: x and z are the foot under the hip, in link lengths.
+    """
     if len(centre) % 3:
         toward = np.where(limits[:, 1] - centre > centre - limits[:, 0], limits[:, 1], limits[:, 0])
         return centre + share * (toward - centre)
@@ -67,6 +72,7 @@ def _lowered(centre: np.ndarray, limits: np.ndarray, share: float) -> np.ndarray
     thigh, calf = angles[:, 1], angles[:, 2]
     x = np.sin(thigh) + np.sin(thigh + calf)
     z = (np.cos(thigh) + np.cos(thigh + calf)) * (1 - share)
+    # law of cosines with two links of equal length; the knee keeps its side
     bend = np.where(calf > 0, 1.0, -1.0) * 2 * np.arccos(np.clip(np.hypot(x, z) / 2, 0, 1))
     angles[:, 1], angles[:, 2] = np.arctan2(x, z) - bend / 2, bend
     return angles.reshape(-1)
@@ -100,4 +106,4 @@ def drop(
 
 
 HIGHEST_DROP = 0.2
-"""m (chosen): a stiff leg of a Go1 meets its torque limit well below it."""
+"""m (chosen): a stiff leg of a Go1 reaches its torque limit at much lower falls."""

@@ -1,6 +1,6 @@
-"""Smooth motions that sweep frequencies and speeds. All but the gait want the robot hung up, its feet in the air.
+"""Smooth motions over a range of frequencies and speeds. All except the gait need a hung robot, its feet in the air.
 
-Joints move by different phases, frequencies and levels, so that what one does to another shows.
+Joints differ in phase, frequency and level, so that forces between joints can be told from forces of the joint itself.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def chirp(
     speed: Positive = 8.0,
     fade: Positive = 1.0,
 ) -> Motion:
-    """Sweep the frequency up, logarithmically: inertia, damping, delay and lag each own a part of the band.
+    """Sweep the frequency up, logarithmically: inertia, damping, delay and lag each act in a part of the band.
 
     0.1 to 10 Hz over 20 s at low gains is the sweep of PACE (arXiv 2509.06342). Joints differ in phase and a
     little in frequency.
@@ -35,7 +35,7 @@ def chirp(
         t: when commands are sent (T,), s.
         centre: angles to swing about (J,), rad.
         limits: lowest and highest target (J, 2), rad.
-        rng: gives the phases and each joint's own ends of the sweep.
+        rng: gives the phases, and first and last frequency of each joint.
         band: first and last frequency, Hz.
         amplitude: swing to each side at low frequency, rad, per kind of joint.
         speed: highest target speed, rad/s; the amplitude falls as the frequency grows, to stay below it.
@@ -62,7 +62,7 @@ def chirp(
 
 
 SWEEP_SPREAD = 0.04
-"""Sweeps begin and end up to this share of the (logarithmic) band inside it, so that joints drift apart in phase."""
+"""Sweeps begin and end up to this share of the (logarithmic) band inside it, so that phases between joints change."""
 
 
 @excitation("multisine", smooth=True)
@@ -78,10 +78,10 @@ def multisine(
     amplitude: PerKind = (0.3, 0.4, 0.4),
     fade: Positive = 1.0,
 ) -> Motion:
-    """Add sines of many frequencies at once: the whole band in every window, and each joint has lines of its own.
+    """Add sines of many frequencies at once: the whole band in every window; each joint has different lines.
 
-    No line is near 2 to 5 times another of the same joint, so what friction and saturation add at multiples does not
-    hide under a line. Phases are the best of some random draws (Schroeder's rule needs evenly spaced lines).
+    No line is near 2 to 5 times another of the same joint, so that the harmonics of friction and saturation do not
+    coincide with a line. Phases are the best of eight random draws (Schroeder's rule needs evenly spaced lines).
 
     Args:
         t: when commands are sent (T,), s.
@@ -90,7 +90,7 @@ def multisine(
         rng: gives frequencies and phases.
         band: lowest and highest frequency, Hz.
         lines: number of sines per joint.
-        corner: frequency above which a line's speed, not its angle, is the same as its neighbours', Hz.
+        corner: lines above this frequency have equal amplitude of speed, those below equal amplitude of angle, Hz.
         amplitude: largest swing to each side, rad, per kind of joint.
         fade: time over which the swing grows from nothing, s.
 
@@ -105,6 +105,7 @@ def multisine(
         sines = 2 * np.pi * np.outer(t - t[0], frequency)
         draws = [(sines + rng.uniform(0, 2 * np.pi, lines)) for _ in range(8)]
         sums = [np.sin(angle) @ weight for angle in draws]
+        # the lowest crest factor: the most energy within a given range of angles
         best = min(sums, key=lambda x: float(np.max(np.abs(x))))
         wave[:, joint] = best / np.max(np.abs(best))
     return always_on(swing(t, wave, amplitude, centre, limits, fade), "hung")

@@ -1,6 +1,6 @@
-"""What an excitation returns, and the few shapes all of them are made of.
+"""What an excitation returns, and the shapes that all excitations are made of.
 
-Every shape is a function of continuous time: drawn numbers do not depend on the command rate, so the same seed gives
+Every shape is a function of continuous time: random draws do not depend on the command rate, so the same seed gives
 the same motion at 50 Hz and at 500 Hz.
 """
 
@@ -19,22 +19,22 @@ PerKind = Annotated[tuple[Positive, ...], Field(min_length=1)]
 
 
 class ExcitationError(Expected):
-    """An excitation that cannot be made for this robot or command rate; the message names what would be right."""
+    """An excitation that cannot be made for this robot or command rate; the message says what would be right."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What to command, and from where.
+    """A motion to command.
 
     Attributes:
         target: joint angles (T, J), rad; row i is in force from ``t[i]`` to ``t[i + 1]``.
         torque_enable: (T,) bool; false while the drives are off.
         start: joint angles (J,) at t = 0, rad.
-        support: whether the robot is ``hung`` up, stands on the ``ground``, or ``either``.
-        height: how far above its standing height the base starts, m; for drops.
-        soft_start: time over which, each time the drives come back on, the player should blend from the measured
-            angles to ``target``, s. Where it does not, the joints are pulled back at once: ``target`` then rests at
-            the centre, and what was in force differs from it only while blending.
+        support: ``hung``, on the ``ground``, or ``either``.
+        height: height of the base above its standing height at the start, m; for drops.
+        soft_start: each time the drives come back on, the player should blend from the measured angles to ``target``
+            within this time, s. Without that the joints are pulled back at once. ``target`` rests at the centre
+            meanwhile; the command in force differs from it only during the blend.
     """
 
     target: np.ndarray
@@ -46,7 +46,7 @@ class Motion:
 
 
 def always_on(target: np.ndarray, support: Literal["hung", "ground", "either"], height: float = 0.0) -> Motion:
-    """Return the motion with drives on throughout, which starts at its first target."""
+    """Return a motion with drives on throughout that starts at its first target."""
     return Motion(target, np.ones(len(target), dtype=bool), target[0].copy(), support, height)
 
 
@@ -79,7 +79,7 @@ def room(
     """Fit swings of ±``amplitude`` between the limits.
 
     Returns:
-        middle (J,) of the swing, which leaves ``centre`` only where a limit is near, and the half swing (J,), rad.
+        middle (J,) of the swing, which differs from ``centre`` only near a limit, and half the swing (J,), rad.
     """
     half = np.minimum(np.resize(amplitude, len(centre)), (limits[:, 1] - limits[:, 0]) / 2)
     return np.clip(centre, limits[:, 0] + half, limits[:, 1] - half), half
@@ -107,7 +107,7 @@ def swing(
     limits: np.ndarray,
     fade: float,
 ) -> np.ndarray:
-    """Turn ``wave`` (T, J), within ±1, into joint angles that grow out of ``centre`` over the first ``fade`` s."""
+    """Scale ``wave`` (T, J), within ±1, to joint angles; the swing grows from ``centre`` over the first ``fade`` s."""
     middle, half = room(amplitude, centre, limits)
     grow = ease((t - t[0]) / fade)[:, None]
     return np.clip(centre + grow * (middle - centre + half * wave), limits[:, 0], limits[:, 1])

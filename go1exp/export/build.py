@@ -1,4 +1,4 @@
-"""A run folder's policy, joined with everything that the robot's computer needs to know of it."""
+"""Builds the bundle of a run: its policy, with everything that the robot's computer needs to run it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from go1exp.train import run_folder
 PACKAGES = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy", "mujoco-core")
 
 AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
-"""Parameters of a command term that say which velocities it gives."""
+"""Parameters of a command term that give the ranges of its velocities."""
 
 CONVENTIONS = {
     "units": "SI: m, rad, s, N m",
@@ -61,15 +61,15 @@ def build(
     Args:
         run: run folder; its own configuration counts.
         checkpoint: a checkpoint's file; the newest if None.
-        seconds: length of the trace.
-        seed: of everything random in it.
-        on_step: told the progress of the trace, in steps.
+        seconds: length of the trace, s.
+        seed: seed of everything random in the trace.
+        on_step: called with the progress of the trace, in steps.
 
     Raises:
         ExportError: if an observation term reads what the robot does not measure or has no form in ONNX, a package is
             missing, or the robot falls before the trace has a row.
         go1exp.deploy.archive.BundleError: if ONNX, torch and the environment do not agree.
-        FileNotFoundError: if ``run`` is no run folder or holds no checkpoint.
+        FileNotFoundError: if ``run`` is not a run folder or has no checkpoint.
         go1exp.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
     config = parse_train(run_folder.read_config(run))
@@ -93,7 +93,7 @@ def build(
 
 
 def metadata(task: TaskConfig, module: DeployedPolicy, about: dict[str, Any]) -> Metadata:
-    """Describe the policy of a task; ``about`` is what ``load_network`` tells of its checkpoint."""
+    """Return the metadata of a task's policy; ``about`` describes its checkpoint, as ``load_network`` returns it."""
     file = Path(about["file"])
     config: RobotConfig = task.robot
     return Metadata(
@@ -126,12 +126,12 @@ def metadata(task: TaskConfig, module: DeployedPolicy, about: dict[str, Any]) ->
 
 
 def gains(actuator: Term, name: str) -> tuple[float, ...] | None:
-    """Return ``kp`` or ``kd`` of an actuator, or of the drives that its net is of, per joint; None: unknown."""
+    """Return ``kp`` or ``kd`` of an actuator, or of the drives its net was fitted to, per joint; None if unknown."""
     for term, _ in drives(actuator):
         if name in term.parameters:
             return tuple(spread(term.parameters[name], robot.JOINTS).tolist())
         if "file" in term.parameters:
-            from go1exp.fit.net import load  # what fits nets takes seconds to import
+            from go1exp.fit.net import load  # this package takes seconds to import
 
             info = load(find(term.parameters["file"])).info
             values = getattr(info, name)
@@ -140,14 +140,14 @@ def gains(actuator: Term, name: str) -> tuple[float, ...] | None:
 
 
 def command_ranges(command: Term) -> dict[str, tuple[float, float]]:
-    """Return lowest and highest commanded velocity by name, as far as the command's parameters say."""
+    """Return lowest and highest commanded velocity by name, for the axes that the command's parameters give."""
     given = {name: command.parameters[name] for name in AXES if name in command.parameters}
     pairs = {name: value if isinstance(value, tuple | list) else (value, value) for name, value in given.items()}
     return {name: (float(pair[0]), float(pair[1])) for name, pair in pairs.items()}
 
 
 def _versions(run: Path) -> dict[str, Any]:
-    """Return what exports, and what the run says of what trained it."""
+    """Return the versions of the exporting packages, and those that the run recorded when it was trained."""
     packages = {}
     for name in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):

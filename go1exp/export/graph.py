@@ -1,7 +1,7 @@
 """Observation terms and policy as one graph: sensor readings in, joint targets out.
 
-The terms in the graph are the very functions of ``go1exp.mdp.observations``, traced by torch, as are the network, the
-cut of the actions and the targets: there is no second version of any of them to drift away.
+The terms in the graph are the functions of ``go1exp.mdp.observations``, traced by torch; so are the network, the
+clipping of the actions and the targets. There is no second implementation that could differ.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ J = robot.NUM_JOINTS
 
 
 class ExportError(Expected):
-    """Something of a run cannot be put into a bundle; the message names it."""
+    """A part of a run that cannot be put into a bundle; the message names it."""
 
 
 def _same(reading: Tensor) -> Tensor:
@@ -43,7 +43,7 @@ def _same(reading: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Source:
-    """Where a field of the Snapshot comes from on the robot: the name of a reading, and the law between the two."""
+    """Source of a field of the Snapshot on the robot: the name of a reading, and the function of it."""
 
     reading: str
     law: Callable[[Tensor], Tensor] = _same
@@ -60,7 +60,7 @@ READINGS = (
     Port("command", 3, "m/s, m/s, rad/s", "trunk", "commanded velocity: x, y and yaw rate"),
     Port("previous_action", J, "1", "joint", "the output `action` of one training period before; zero until then"),
 )
-"""What the robot's computer can tell a policy. A graph has those as inputs that its terms read, in this order."""
+"""Inputs that the robot's computer can provide. A graph has those that its terms read, in this order."""
 
 SOURCES = {
     "base_lin_vel_b": Source("base_lin_vel_b"),
@@ -74,7 +74,7 @@ SOURCES = {
     "command": Source("command"),
     "action": Source("previous_action"),
 }
-"""Field of the Snapshot -> its source. What is not here the robot does not measure."""
+"""Field of the Snapshot -> its source. The robot does not measure the other fields."""
 
 OUTPUTS = (
     Port("joint_target", J, "rad", "joint", "position targets for the drives"),
@@ -85,22 +85,22 @@ OUTPUTS = (
 
 
 class Sensed:
-    """Looks like a Snapshot to a term, and knows only what the robot measures.
+    """Stands in for a Snapshot, with only those fields that the robot measures.
 
     Attributes:
-        read: names of the readings that were asked for.
+        read: names of the readings that were used.
 
     Raises:
         ExportError: where a term reads another field.
     """
 
     def __init__(self, readings: Mapping[str, Tensor], term: str = "observation") -> None:
-        """Take readings (N, size) by name; ``term`` is named in complaints."""
+        """Take readings (N, size) by name; ``term`` is named in errors."""
         self._readings, self._term = readings, term
         self.read: set[str] = set()
 
     def __getattr__(self, name: str) -> Tensor:
-        """Return a field as the robot knows it."""
+        """Return a field, computed from the readings."""
         if name not in {f.name for f in dataclasses.fields(Snapshot)}:
             raise AttributeError(f"a Snapshot has no {name!r}")
         source = SOURCES.get(name)
@@ -115,15 +115,15 @@ class Sensed:
 
 def blocks(terms: Sequence[Term]) -> tuple[Block, ...]:
     """Return the terms with their place in the flat observation."""
-    found, start = [], 0
+    placed, start = [], 0
     for term in terms:
         size = int(term.entry.traits["size"])
-        found.append(Block(term.key, term.entry.name, start, size, float(term.slots.get("noise", 0.0))))
+        placed.append(Block(term.key, term.entry.name, start, size, float(term.slots.get("noise", 0.0))))
         start += size
-    return tuple(found)
+    return tuple(placed)
 
 
-def inputs_of(terms: Sequence[Term]) -> tuple[Port, ...]:
+def required_inputs(terms: Sequence[Term]) -> tuple[Port, ...]:
     """Return the readings that the terms need, in the order of ``READINGS``.
 
     Raises:
@@ -148,13 +148,13 @@ class DeployedPolicy(nn.Module):
     nominal: Tensor
 
     def __init__(self, network: GaussianPolicy, terms: Sequence[Term], action: ActionConfig) -> None:
-        """Join a trained network with the terms and the action's meaning of its task.
+        """Join a trained network with the observation terms and the action settings of its task.
 
         Raises:
             ExportError: if a term reads what the robot does not measure.
         """
         super().__init__()
-        self.inputs = inputs_of(terms)
+        self.inputs = required_inputs(terms)
         size = sum(block.size for block in blocks(terms))
         self.outputs = tuple(dataclasses.replace(p, size=p.size or size) for p in OUTPUTS)
         self._terms, self._action = tuple(terms), action
@@ -174,7 +174,7 @@ def to_onnx(module: DeployedPolicy) -> bytes:
     """Return the module as an ONNX model: float32, any number of rows, the same bytes for the same module.
 
     Raises:
-        ExportError: if onnxscript is not installed, or a term does what has no form in ONNX; names the term.
+        ExportError: if onnxscript is missing, or a term uses an operation that ONNX does not have; names the term.
     """
     try:
         import onnx
@@ -190,7 +190,7 @@ def to_onnx(module: DeployedPolicy) -> bytes:
 
 
 def _exported(module: nn.Module, inputs: Sequence[Port], outputs: Sequence[str]) -> Any:
-    """Return the model without what depends on the place and time of the export."""
+    """Export the module, and remove everything that depends on where and when it was exported."""
     example = tuple(torch.zeros(2, port.size) for port in inputs)
     rows = torch.export.Dim("rows", min=1)
     with _quiet(), torch.no_grad():
@@ -218,7 +218,7 @@ def _exported(module: nn.Module, inputs: Sequence[Port], outputs: Sequence[str])
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep torch's exporter from telling of itself: of torchvision, of its own deprecated calls, of its progress."""
+    """Suppress messages of torch's exporter: about torchvision, its own deprecated calls, and its progress."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -231,7 +231,7 @@ def _quiet() -> Iterator[None]:
 
 
 class _OneTerm(nn.Module):
-    """A term alone, to find out which one cannot be exported."""
+    """One term alone, to find out whether it can be exported."""
 
     def __init__(self, term: Term, inputs: Sequence[Port]) -> None:
         super().__init__()
@@ -245,7 +245,7 @@ class _OneTerm(nn.Module):
 def _culprit(module: DeployedPolicy) -> str:
     """Return ``.key`` of the first term that cannot be exported alone, or nothing."""
     for term in module._terms:
-        inputs = inputs_of([term])
+        inputs = required_inputs([term])
         try:
             _exported(_OneTerm(term, inputs), inputs, [term.key])
         except torch.onnx.errors.OnnxExporterError:
@@ -254,7 +254,7 @@ def _culprit(module: DeployedPolicy) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """Return the innermost complaint, its first line."""
+    """Return the first line of the innermost error."""
     inner: BaseException = error
     while inner.__cause__ is not None:
         inner = inner.__cause__

@@ -1,4 +1,4 @@
-"""Some seconds of the environment under a policy: what its sensors said, and what the environment made of it."""
+"""The trace: some seconds of the environment under a policy, inputs and outputs of each step."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from go1exp.schema.backends import CpuBackend
 
 
 def readings(core: Go1Core) -> dict[str, Tensor]:
-    """Return what the robots' sensors and computers know at this moment, (N, size) by name, without noise."""
+    """Return the present readings of the robots' sensors and computers, (N, size) by name, without noise."""
     s = core.snapshot()
     assert s.base_lin_vel_b is not None
-    seen = Measured(s.joint_pos, s.joint_vel, gyro=s.base_ang_vel_b, quat=s.base_quat_w)
+    measured = Measured(s.joint_pos, s.joint_vel, gyro=s.base_ang_vel_b, quat=s.base_quat_w)
     effects = core.plant.effects
     if effects.senses:
-        seen = effects.measure(dataclasses.replace(seen, joint_pos=core.plant.q, joint_vel=core.plant.qd))
-    assert seen.gyro is not None
-    assert seen.quat is not None
-    found = {
-        "joint_pos": seen.joint_pos,
-        "joint_vel": seen.joint_vel,
-        "imu_gyro": seen.gyro,
-        "imu_quat": seen.quat,
+        measured = effects.measure(dataclasses.replace(measured, joint_pos=core.plant.q, joint_vel=core.plant.qd))
+    assert measured.gyro is not None
+    assert measured.quat is not None
+    current = {
+        "joint_pos": measured.joint_pos,
+        "joint_vel": measured.joint_vel,
+        "imu_gyro": measured.gyro,
+        "imu_quat": measured.quat,
         "base_lin_vel_b": s.base_lin_vel_b,
         "joint_torque": s.joint_torque,
         "joint_target": s.joint_target,
         "command": s.command,
         "previous_action": s.action,
     }
-    return {name: values.float().clone() for name, values in found.items()}
+    return {name: values.float().clone() for name, values in current.items()}
 
 
 def traced_task(task: TaskConfig, seconds: float) -> TaskConfig:
-    """Return the task in which a trace is recorded: that of training, in one piece, on the CPU and on one thread."""
+    """Return the task in which a trace is recorded: that of training, as one episode, on the CPU with one thread."""
     period = task.sim.policy_dt
     sim = dataclasses.replace(task.sim, episode_s=(round(seconds / period) + 2) * period, spread_starts=False)
     return dataclasses.replace(task, sim=sim, backend=CpuBackend("cpu", threads=1), curriculum=())
@@ -56,16 +56,16 @@ def record(
 ) -> dict[str, np.ndarray]:
     """Run one robot and return ``time``, ``input.NAME`` and ``output.NAME``, a row per policy step.
 
-    Observations, actions and targets are the environment's own. The step that ends an episode is left out, since the
-    environment begins the next one before it can be asked.
+    Observations, actions and targets are those of the environment. The step that ends an episode is left out, because
+    the environment starts the next episode within that step.
 
     Args:
-        task: of the training; its robot, ground, commands and pushes are drawn as in training, without noise.
+        task: task of the training; its robot, ground, commands and pushes are drawn as in training, without noise.
         policy: observations (N, O) -> actions (N, 12).
         inputs: the readings to keep.
-        seconds: length.
-        seed: of everything random.
-        on_step: told the progress in steps.
+        seconds: length, s.
+        seed: seed of everything random.
+        on_step: called with the progress in steps.
     """
     core = Go1Core(traced_task(task, seconds), 1, seed, noise=False)
     observation = core.reset()
@@ -73,12 +73,12 @@ def record(
     rows: list[dict[str, np.ndarray]] = []
     for step in range(steps):
         before = readings(core)
-        seen = observation.clone()
+        policy_input = observation.clone()
         result = core.step(policy(observation))
         core.check(result)
         if not bool(result.terminated | result.truncated):
             row = {f"input.{port.name}": before[port.name] for port in inputs}
-            made = {"joint_target": core.target, "observation": seen, "action": core.action}
+            made = {"joint_target": core.target, "observation": policy_input, "action": core.action}
             row |= {f"output.{name}": values for name, values in made.items()}
             rows.append({"time": np.array([step * period]), **{k: v.numpy().copy() for k, v in row.items()}})
         observation = result.observation

@@ -1,8 +1,8 @@
 """Recordings -> rows of (history window, torque), split by episode and never by sample.
 
-A row stands at a sample of the recording, whose torque is its target as it was logged. Its taps lie ``period`` apart,
-back from that moment on the recording's own clock, irregular as it may be: measured channels are interpolated
-linearly between the two samples around a tap, commands are those in force at it (zero-order hold).
+Each row belongs to one sample of the recording; its target is the torque of that sample. Its taps go back from the time
+of that sample in steps of ``period``, on the recording's own clock, which may be irregular: measured channels are
+interpolated linearly between the two samples around a tap, commands are those in force at it (zero-order hold).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ JointTorque = Callable[[Recording], np.ndarray]
 """Recording -> torque at its joints ``(T, J)``, N m, in the order of ``meta.joints``; NaN where it is not known."""
 
 GAP = 5.0
-"""A window that spans a step of the clock longer than this many periods (of taps or samples, the longer) is left out
-(chosen: what happened in between is not in the recording)."""
+"""A window is left out if it spans a step of the clock longer than this many periods (of taps or of samples, whichever
+is longer; chosen: the motion within such a gap is not in the recording)."""
 
 EDGE = 1e-6
-"""s; a command logged this much after a tap counts as in force at it, so that rounding of the clock decides nothing."""
+"""s; a command logged this much after a tap counts as in force at it, so that rounding of the clock has no effect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +81,12 @@ def windows(
 ) -> Rows:
     """Cut recordings into rows; see the module for how.
 
-    With ``smoothing`` (s) the inputs' angle and speed come from ``smooth_motion`` over that window. A simulation shows
-    a net motion without noise: one that was trained on noisy speeds has learnt to trust them less, and blurs friction.
+    With ``smoothing`` (s) angle and speed of the inputs come from ``smooth_motion`` over that window. In simulation a
+    net gets motion without noise; a net that was trained on noisy speeds has learnt small weights for them, which blurs
+    friction.
 
-    Left out are rows whose window reaches before the recording's start, over a gap of its clock or to where
-    ``torque_enable`` is false, and rows without a finite target.
+    Rows are left out if their window reaches before the start of the recording, over a gap of its clock, or into a time
+    in which ``torque_enable`` is false, or if their target is not finite.
 
     Raises:
         RecordingError: if a recording lacks a channel; names it.
@@ -144,7 +145,7 @@ def _episode(
 def _signal(
     recording: Recording, measured: Mapping[str, np.ndarray], name: InputName, taps: np.ndarray, held: np.ndarray
 ) -> np.ndarray:
-    """One input at every tap, (T, H, J)."""
+    """Return one input at every tap, (T, H, J)."""
     if name == "tau_cmd":
         return recording.joint("tau_cmd")[held]
     quantity = {"velocity": "qd", "position": "q", "position_error": "q"}[name]
@@ -154,7 +155,7 @@ def _signal(
 
 
 def _whole(recording: Recording, oldest: np.ndarray, period: float) -> np.ndarray:
-    """Which rows have all of their window in the recording, on a clock without gaps and with drives on, (T,) bool."""
+    """Return which rows (T,) have their whole window in the recording, without a gap and with drives on."""
     t = recording.t
     first = np.searchsorted(t, oldest + EDGE, side="right") - 1  # last sample at or before the oldest tap
     inside = oldest >= t[0] - EDGE
@@ -167,7 +168,7 @@ def _whole(recording: Recording, oldest: np.ndarray, period: float) -> np.ndarra
 
 
 def _since_reversal(t: np.ndarray, qd: np.ndarray) -> np.ndarray:
-    """Time between each sample and the nearest sign change of qd, (T,) s; at exactly zero the last sign stays."""
+    """Return the time (T,), s, between each sample and the nearest sign change of qd; a zero keeps the last sign."""
     sign = np.sign(qd)
     moving = np.flatnonzero(sign != 0)
     if len(moving) == 0 or not np.isfinite(qd).all():
@@ -180,7 +181,7 @@ def _since_reversal(t: np.ndarray, qd: np.ndarray) -> np.ndarray:
 
 
 def _references(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """The command as a torque and the PD law, (T, J) each; NaN where unknown."""
+    """Return the command as a torque, and the PD law, (T, J) each; NaN where unknown."""
     meta = recording.meta
     unknown = np.full((len(recording.t), len(meta.joints)), np.nan)
     command, pd = unknown, unknown
@@ -196,7 +197,7 @@ def _references(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Split:
-    """Names of the episodes that train, that decide when to stop, and that nobody meets before the report."""
+    """Names of the episodes for training, for deciding when to stop, and held out for the report."""
 
     train: tuple[str, ...]
     validation: tuple[str, ...]
@@ -209,10 +210,10 @@ def split(
     validation: float | tuple[str, ...],
     seed: int,
 ) -> Split:
-    """Share whole episodes out; an episode and its repeats (``repeat_of``) always go together.
+    """Divide whole episodes among the three parts; an episode and its repeats (``repeat_of``) stay together.
 
-    A part (0.2) takes that part of the clusters of repeats, at least one, in an order drawn with ``seed``; held-out
-    episodes are drawn before those for validation. Names take their repeats with them.
+    A number (0.2) takes this share of the clusters of repeats, at least one, in an order drawn with ``seed``; held-out
+    episodes are drawn before those for validation. A named episode takes its repeats with it.
 
     Raises:
         FitError: if a name is unknown or occurs twice, or nothing is left to train on.
@@ -225,7 +226,7 @@ def split(
     order = np.random.default_rng(seed).permutation(len(clusters))
     shuffled = [clusters[i] for i in order]
     chosen: dict[str, set[str]] = {"holdout": set(), "validation": set()}
-    # Names first: a part is then drawn from what they leave.
+    # Names first: a share is drawn from the episodes that are not named.
     requests: list[tuple[str, float | tuple[str, ...]]] = [("holdout", holdout), ("validation", validation)]
     for key, wish in sorted(requests, key=lambda request: isinstance(request[1], float)):
         taken = set().union(*chosen.values())
@@ -254,7 +255,7 @@ def split(
 
 
 def _clusters(recordings: Sequence[Recording]) -> list[set[str]]:
-    """Sets of episodes that repeat each other, in the order of their first; the original need not be there."""
+    """Return sets of episodes that repeat each other, in the order of their first; the original may be missing."""
     order = {r.meta.episode: i for i, r in enumerate(recordings)}
     merged: list[set[str]] = []
     for r in recordings:
@@ -265,7 +266,7 @@ def _clusters(recordings: Sequence[Recording]) -> list[set[str]]:
 
 
 def fingerprint(recording: Recording) -> str:
-    """Return the SHA-256 of a recording's content: its metadata as JSON, then its columns by name, as float64 bytes."""
+    """Return the SHA-256 of a recording: its metadata as JSON, then its columns by name, as float64 bytes."""
     digest = hashlib.sha256(TypeAdapter(Meta).dump_json(Meta(**asdict(recording.meta))))
     for name in sorted(recording.channels):
         digest.update(name.encode() + b"\0")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -11,7 +11,7 @@ from importlib.metadata import version
 import numpy as np
 
 from go1exp import __version__
-from go1exp.fit.dataset import JointTorque, Rows, fingerprint, split, windows
+from go1exp.fit.dataset import JointTorque, Rows, Split, fingerprint, split, windows
 from go1exp.fit.net import ActuatorNet, NetInfo, Provenance, group_names
 from go1exp.fit.references import Reference, command, linear, pd
 from go1exp.fit.regimes import thresholds
@@ -24,19 +24,19 @@ OnProgress = Callable[[str, int, int, float, float], None]
 """``on_progress(what, done, total, train, validation)``: ``net hip`` or ``half net hip``, epochs, RMSE in N m."""
 
 SLACK = 0.9
-"""Taps may lie this part of a sampling period apart: a nominal 500 Hz clock that runs at 498 Hz still takes 2 ms."""
+"""Smallest distance of taps in sampling periods: a nominal 500 Hz clock that runs at 498 Hz still allows 2 ms."""
 
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """What a fit found.
+    """The result of a fit.
 
     Attributes:
         net: the network.
-        report: its errors, and the references', on the held-out episodes.
+        report: errors of the network and of the references on the held-out episodes.
         rows: the held-out rows; ``rows.episode`` indexes ``episodes``.
         episodes: names of all episodes.
-        torque: model -> torque at ``rows`` ``(R,)``, N m: ``net`` and the references that there are.
+        torque: model -> torque at ``rows`` ``(R,)``, N m: ``net`` and the available references.
         curves: group -> (epochs, 2) root mean square errors of training and validation, N m.
     """
 
@@ -58,8 +58,8 @@ def fit(
 
     Args:
         recordings: of one robot, one episode each.
-        settings: how.
-        on_progress: told of every epoch.
+        settings: how to fit.
+        on_progress: called after every epoch.
         joint_torque: torque at the joints of a recording, for ``settings.target = "joint_torque"``.
 
     Raises:
@@ -67,17 +67,62 @@ def fit(
         RecordingError: if one lacks a channel that the inputs or the target need.
     """
     robot, joints, period = _common(recordings, settings)
-    kp, kd = _gains(recordings, settings)
     parts = split(recordings, settings.holdout, settings.validation, settings.seed)
     episodes = tuple(r.meta.episode for r in recordings)
     rows = windows(
         recordings, settings.inputs, settings.history, period, settings.target, joint_torque, settings.smoothing
     )
-    picked = {
-        part: rows.take(np.isin(rows.episode, [episodes.index(name) for name in getattr(parts, part)]))
-        for part in ("train", "validation", "held_out")
-    }
-    groups = group_names(joints, settings.share)
+    info = _describe(recordings, settings, parts, robot, joints, period)
+    shares = _share_out(rows, parts, episodes, np.array(info.group_of))
+    held_out = shares["held_out"]
+    if len(held_out.rows) == 0:
+        raise FitError("no rows to report on: the held-out episodes are shorter than the history, or drives are off")
+    trained = _train_groups("net", info.groups, shares, settings, settings.hidden, on_progress)
+    net = _assemble(info, trained, shares["train"])
+    torque = _predict(net, held_out)
+    references = _references(info, shares, settings, on_progress)
+    held_out_report = report(
+        held_out.rows, torque, references, thresholds(rows, joints), episodes, parts, settings.target
+    )
+    # The net's file says how good it is; that is known only now.
+    provenance = replace(info.provenance, held_out_rmse=rmse(torque - held_out.rows.y))
+    net = replace(net, info=replace(info, provenance=provenance))
+    torques = {"net": torque} | {r.name: r.torque for r in references if r.torque is not None}
+    curves = {name: one.curve for name, one in zip(info.groups, trained, strict=True)}
+    return FitResult(net, held_out_report, held_out.rows, episodes, torques, curves)
+
+
+@dataclass(frozen=True, eq=False)
+class _Share:
+    """The rows of one part of the episodes, and for each row the index ``(R,)`` of the net of its joint."""
+
+    rows: Rows
+    group: np.ndarray
+
+    def of_group(self, k: int) -> Rows:
+        """Return the rows of the joints of net ``k``."""
+        return self.rows.take(self.group == k)
+
+
+def _share_out(rows: Rows, parts: Split, episodes: tuple[str, ...], group_index: np.ndarray) -> dict[str, _Share]:
+    """Split rows by episode; ``group_index`` (J,) is the net of each joint."""
+    shares = {}
+    for part in ("train", "validation", "held_out"):
+        picked = rows.take(np.isin(rows.episode, [episodes.index(name) for name in getattr(parts, part)]))
+        shares[part] = _Share(picked, group_index[picked.joint])
+    return shares
+
+
+def _describe(
+    recordings: Sequence[Recording],
+    settings: FitSettings,
+    parts: Split,
+    robot: str,
+    joints: tuple[str, ...],
+    period: float,
+) -> NetInfo:
+    """Return what the net's file says about the net, with a held-out error of 0 until that is known."""
+    kp, kd = _gains(recordings, settings)
     provenance = Provenance(
         recordings={r.meta.episode: fingerprint(r) for r in recordings},
         **asdict(parts),
@@ -86,11 +131,11 @@ def fit(
         settings=json.dumps(asdict(settings)),
         versions={"go1exp": __version__} | {name: version(name) for name in ("torch", "numpy")},
     )
-    info = NetInfo(
+    return NetInfo(
         robot=robot,
         joints=joints,
         share=settings.share,
-        groups=groups,
+        groups=group_names(joints, settings.share),
         inputs=settings.inputs,
         history=settings.history,
         period=period,
@@ -100,52 +145,54 @@ def fit(
         kd=kd,
         provenance=provenance,
     )
-    group_of = np.array(info.group_of)
-    in_group = {part: group_of[rows.joint] for part, rows in picked.items()}
-    if len(picked["held_out"]) == 0:
-        raise FitError("no rows to report on: the held-out episodes are shorter than the history, or drives are off")
 
-    def networks(what: str, hidden: tuple[int, ...]) -> list[Trained]:
-        found = []
-        for k, group in enumerate(groups):
-            rows, check = (picked[part].take(in_group[part] == k) for part in ("train", "validation"))
-            tell = None if on_progress is None else partial(on_progress, f"{what} {group}")
-            found.append(train(rows, check, settings, hidden, tell))
-        return found
 
-    trained = networks("net", settings.hidden)
-    held_out, group = picked["held_out"], in_group["held_out"]
-    net = _assemble(info, trained, picked["train"], in_group["train"])
-    torque = _predict(net, held_out, group)
-    others = [
-        command(held_out),
-        pd(held_out),
-        linear(picked["train"], in_group["train"], held_out, group),
-        Reference("half_net", None, "half_net is off"),
+def _train_groups(
+    what: str,
+    groups: tuple[str, ...],
+    shares: Mapping[str, _Share],
+    settings: FitSettings,
+    hidden: tuple[int, ...],
+    on_progress: OnProgress | None,
+) -> list[Trained]:
+    """Train one network for each group of joints, with hidden layers of the widths ``hidden``."""
+    nets = []
+    for k, group in enumerate(groups):
+        on_epoch = None if on_progress is None else partial(on_progress, f"{what} {group}")
+        nets.append(train(shares["train"].of_group(k), shares["validation"].of_group(k), settings, hidden, on_epoch))
+    return nets
+
+
+def _references(
+    info: NetInfo, shares: Mapping[str, _Share], settings: FitSettings, on_progress: OnProgress | None
+) -> list[Reference]:
+    """Return what the net is compared with, on the held-out rows."""
+    training, held_out = shares["train"], shares["held_out"]
+    references = [
+        command(held_out.rows),
+        pd(held_out.rows),
+        linear(training.rows, training.group, held_out.rows, held_out.group),
     ]
-    if settings.half_net:
-        hidden = tuple(max(1, width // 2) for width in settings.hidden)
-        half = _assemble(replace(info, hidden=hidden), networks("half net", hidden), picked["train"], in_group["train"])
-        others[-1] = Reference("half_net", _predict(half, held_out, group))
-    found = report(held_out, torque, others, thresholds(rows, joints), episodes, parts, settings.target)
-    provenance = replace(provenance, held_out_rmse=rmse(torque - held_out.y))
-    net = replace(net, info=replace(info, provenance=provenance))
-    torques = {"net": torque} | {r.name: r.torque for r in others if r.torque is not None}
-    curves = {name: one.curve for name, one in zip(groups, trained, strict=True)}
-    return FitResult(net, found, held_out, episodes, torques, curves)
+    if not settings.half_net:
+        return [*references, Reference("half_net", None, "half_net is off")]
+    hidden = tuple(max(1, width // 2) for width in settings.hidden)
+    trained = _train_groups("half net", info.groups, shares, settings, hidden, on_progress)
+    half = _assemble(replace(info, hidden=hidden), trained, training)
+    return [*references, Reference("half_net", _predict(half, held_out))]
 
 
-def _predict(net: ActuatorNet, rows: Rows, group: np.ndarray) -> np.ndarray:
-    torque = np.empty(len(rows))
-    for k in np.unique(group):
-        torque[group == k] = net.torque(rows.x[group == k], int(k))
+def _predict(net: ActuatorNet, share: _Share) -> np.ndarray:
+    """Return the net's torque at every row (R,), N m."""
+    torque = np.empty(len(share.rows))
+    for k in np.unique(share.group):
+        torque[share.group == k] = net.torque(share.of_group(k).x, int(k))
     return torque
 
 
-def _assemble(info: NetInfo, trained: list[Trained], rows: Rows, group: np.ndarray) -> ActuatorNet:
+def _assemble(info: NetInfo, trained: list[Trained], training: _Share) -> ActuatorNet:
     """Put the groups' networks side by side; the ranges of the inputs are those of the training rows."""
-    per_input = rows.x.reshape(len(rows), len(info.inputs), info.history)
-    seen = [per_input[group == k] for k in range(len(info.groups))]
+    per_input = training.rows.x.reshape(len(training.rows), len(info.inputs), info.history)
+    inputs = [per_input[training.group == k] for k in range(len(info.groups))]
     return ActuatorNet(
         info,
         tuple(np.stack(layer) for layer in zip(*(one.weights for one in trained), strict=True)),
@@ -155,8 +202,8 @@ def _assemble(info: NetInfo, trained: list[Trained], rows: Rows, group: np.ndarr
         input_std=np.stack([one.input_std for one in trained]),
         output_mean=np.array([one.output_mean for one in trained]),
         output_std=np.array([one.output_std for one in trained]),
-        input_low=np.stack([values.min(axis=(0, 2)) for values in seen]),
-        input_high=np.stack([values.max(axis=(0, 2)) for values in seen]),
+        input_low=np.stack([values.min(axis=(0, 2)) for values in inputs]),
+        input_high=np.stack([values.max(axis=(0, 2)) for values in inputs]),
     )
 
 
@@ -193,13 +240,13 @@ def _common(recordings: Sequence[Recording], settings: FitSettings) -> tuple[str
 def _gains(
     recordings: Sequence[Recording], settings: FitSettings
 ) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
-    """Return the gains that all recordings share, None where they differ and the net does not see the target."""
-    found = []
+    """Return the gains that all recordings share; None where they differ and the net does not use the target."""
+    gains = []
     for key in ("kp", "kd"):
         values = {getattr(r.meta, key) for r in recordings}
         if len(values) > 1 and "position_error" in settings.inputs:
             raise FitError(
                 f"{key}: differs between the recordings; a net of position errors holds for one set of gains"
             )
-        found.append(values.pop() if len(values) == 1 else None)
-    return found[0], found[1]
+        gains.append(values.pop() if len(values) == 1 else None)
+    return gains[0], gains[1]

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from onnx import NodeProto, TensorProto
+
 OPSET = 20
 IR_VERSION = 10
-"""The IR of that opset, which every runtime that knows the opset reads."""
+"""Version of the intermediate representation that belongs to this opset."""
 
 
 def write_onnx(
@@ -28,14 +32,39 @@ def write_onnx(
         weights: layer by layer (K, in, out), normalisation folded in.
         biases: layer by layer (K, out).
         skip: linear map beside them, (K, F, 1); left out where it is zero.
-        about: the model's metadata, for whoever feeds it.
+        about: metadata of the model: what a program must know to compute its inputs.
     """
     import onnx
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import TensorProto, helper
 
     nets, features, _ = skip.shape
-    single = nets == 1
-    nodes, constants = [], []
+    leading: list[int | str] = ["rows"] if nets == 1 else [nets, "rows"]
+    nodes, constants = _layers(weights, biases, skip)
+    graph = helper.make_graph(
+        nodes,
+        "actuator_net",
+        [helper.make_tensor_value_info("features", TensorProto.FLOAT, [*leading, features])],
+        [helper.make_tensor_value_info("torque", TensorProto.FLOAT, leading)],
+        constants,
+    )
+    model = helper.make_model(
+        graph, producer_name="go1exp", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
+    )
+    helper.set_model_props(model, dict(about))
+    onnx.checker.check_model(model, full_check=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(model.SerializeToString())
+
+
+def _layers(
+    weights: Sequence[np.ndarray], biases: Sequence[np.ndarray], skip: np.ndarray
+) -> tuple[list[NodeProto], list[TensorProto]]:
+    """Return the graph's nodes in order, and its constants."""
+    from onnx import helper, numpy_helper
+
+    single = skip.shape[0] == 1
+    nodes: list[NodeProto] = []
+    constants: list[TensorProto] = []
 
     def constant(name: str, values: np.ndarray) -> str:
         constants.append(numpy_helper.from_array(np.ascontiguousarray(values, dtype=np.float32), name))
@@ -47,7 +76,7 @@ def write_onnx(
 
     value = "features"
     for i, (w, b) in enumerate(zip(weights, biases, strict=True)):
-        w, b = (w[0], b[0]) if single else (w, b[:, None, :])
+        w, b = (w[0], b[0]) if single else (w, b[:, None, :])  # (in, out), (out,) or (K, in, out), (K, 1, out)
         value = node("MatMul", [value, constant(f"weight_{i}", w)], f"product_{i}")
         value = node("Add", [value, constant(f"bias_{i}", b)], f"sum_{i}")
         if i < len(weights) - 1:
@@ -57,19 +86,4 @@ def write_onnx(
         value = node("Add", [value, linear], "sum")
     constants.append(numpy_helper.from_array(np.array([-1], dtype=np.int64), "last_axis"))
     node("Squeeze", [value, "last_axis"], "torque")
-
-    lead: list[int | str] = ["rows"] if single else [nets, "rows"]
-    graph = helper.make_graph(
-        nodes,
-        "actuator_net",
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, [*lead, features])],
-        [helper.make_tensor_value_info("torque", TensorProto.FLOAT, lead)],
-        constants,
-    )
-    model = helper.make_model(
-        graph, producer_name="go1exp", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
-    )
-    helper.set_model_props(model, dict(about))
-    onnx.checker.check_model(model, full_check=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(model.SerializeToString())
+    return nodes, constants

@@ -1,4 +1,4 @@
-"""Overlays of measured and predicted torque: where the net is at its worst, and where it is as good as usual."""
+"""Plots of measured and predicted torque: where the net is worst, and where its error is the median."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STRETCH = 1.0
-"""s shown (chosen: a few strides, and fast transients still have width)."""
+"""s shown (chosen: a few strides, while fast transients are still visible)."""
 
 COLOURS = {"measured": "0.35", "net": "#c2410c", "reference": "#1d4ed8"}
 
@@ -23,8 +23,8 @@ COLOURS = {"measured": "0.35", "net": "#c2410c", "reference": "#1d4ed8"}
 def plot(result: FitResult, folder: Path) -> list[Path]:
     """Draw one page per joint, ``actuator_net_<joint>.png``, from the held-out rows; return the files.
 
-    A page shows the stretch of one second with the largest error of the net, and the one with the median error: above
-    the torque that was measured, the net's and that of the best reference that is no net, below the two errors.
+    A page shows the second with the largest error of the net, and the one with the median error. The upper plot has the
+    torque as measured, of the net, and of the best reference that is not a net; the lower plot has the two errors.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -33,11 +33,11 @@ def plot(result: FitResult, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     files = []
     for j, joint in enumerate(result.net.info.joints):
-        mine = np.flatnonzero(result.rows.joint == j)
-        if not len(mine):
+        index = np.flatnonzero(result.rows.joint == j)
+        if not len(index):
             continue
-        rows = result.rows.take(mine)
-        torque = {name: values[mine] for name, values in result.torque.items()}
+        rows = result.rows.take(index)
+        torque = {name: values[index] for name, values in result.torque.items()}
         best = min(torque, key=lambda n: (n in ("net", "half_net"), rmse(torque[n] - rows.y)))
         figure = Figure(figsize=(12, 9), layout="constrained")
         FigureCanvasAgg(figure)
@@ -58,9 +58,9 @@ def _stretches(rows: Rows, net: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Cut the rows into stretches of one second; return the worst and the median by the net's error."""
     pieces = []
     for index in np.unique(rows.episode):
-        mine = np.flatnonzero(rows.episode == index)
-        number = ((rows.t[mine] - rows.t[mine[0]]) / STRETCH).astype(int)
-        pieces += [mine[number == n] for n in np.unique(number)]
+        in_episode = np.flatnonzero(rows.episode == index)
+        number = ((rows.t[in_episode] - rows.t[in_episode[0]]) / STRETCH).astype(int)
+        pieces += [in_episode[number == n] for n in np.unique(number)]
     longest = max(len(piece) for piece in pieces)
     whole = [piece for piece in pieces if len(piece) > longest / 2]
     order = sorted(whole, key=lambda piece: rmse(net[piece] - rows.y[piece]))
@@ -69,6 +69,7 @@ def _stretches(rows: Rows, net: np.ndarray) -> list[tuple[str, np.ndarray]]:
 
 def _stretch(pair: list[Axes], rows: Rows, net: np.ndarray, reference: np.ndarray, name: str) -> None:
     above, below = pair
+    # NaN breaks the line where rows are missing
     t = np.where(np.concatenate([[False], np.diff(rows.t) > 10 * np.median(np.diff(rows.t))]), np.nan, rows.t)
     above.plot(t, rows.y, color=COLOURS["measured"], lw=2.2, alpha=0.6, label="measured")
     above.plot(t, reference, color=COLOURS["reference"], lw=1.0, label=f"{name}, {rmse(reference - rows.y):.4f}")

@@ -1,4 +1,4 @@
-"""What a net must beat on the same rows: the command, the PD law, a linear map of its inputs, a net half as wide."""
+"""Simple models that a net is compared with: the command, the PD law, a linear map of its inputs, a smaller net."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMES = {
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """One reference's prediction of the held-out rows ``(R,)``, N m; or None, and why."""
+    """Torque of a reference at the held-out rows ``(R,)``, N m; or None, and the reason."""
 
     name: str
     torque: np.ndarray | None
@@ -27,14 +27,14 @@ class Reference:
 
 
 def command(rows: Rows) -> Reference:
-    """Take the commanded torque as it is; kp e where the drives were given targets."""
+    """Predict the commanded torque; kp e if targets were commanded."""
     if np.isnan(rows.command).any():
         return Reference("command", None, "no tau_cmd, and no q_target with known kp")
     return Reference("command", rows.command)
 
 
 def pd(rows: Rows) -> Reference:
-    """Take the firmware's law at its word."""
+    """Predict the torque of the firmware's PD law."""
     if np.isnan(rows.pd).any():
         return Reference("pd", None, "kp and kd, or q_target and qd, are not in all recordings")
     return Reference("pd", rows.pd)
@@ -45,15 +45,15 @@ def linear(train: Rows, train_group: np.ndarray, rows: Rows, group: np.ndarray) 
 
     Args:
         train: training rows.
-        train_group: index of the net of each of them ``(R,)``.
+        train_group: index of the net for each training row ``(R,)``.
         rows: held-out rows.
-        group: index of the net of each of those.
+        group: index of the net for each held-out row.
     """
     torque = np.full(len(rows), np.nan)
     for k in np.unique(group):
-        mine, theirs = train.take(train_group == k), group == k
-        mean, std = mine.x.mean(axis=0), mine.x.std(axis=0)
+        train_rows, predicted = train.take(train_group == k), group == k
+        mean, std = train_rows.x.mean(axis=0), train_rows.x.std(axis=0)
         std = np.where(std > 0, std, 1.0)
-        weights = ridge((mine.x - mean) / std, mine.y - mine.y.mean())
-        torque[theirs] = mine.y.mean() + (rows.x[theirs] - mean) / std @ weights
+        weights = ridge((train_rows.x - mean) / std, train_rows.y - train_rows.y.mean())
+        torque[predicted] = train_rows.y.mean() + (rows.x[predicted] - mean) / std @ weights
     return Reference("linear", torque)

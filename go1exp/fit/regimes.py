@@ -1,4 +1,4 @@
-"""Kinds of motion that an actuator model can be good or bad at, told apart by each joint's own speed and torque."""
+"""Kinds of motion for which the errors of an actuator model are reported, by speed and torque of each joint."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 from go1exp.fit.dataset import Rows
 
 STILL, FAST, HIGH = 0.05, 0.5, 0.7
-"""Parts of a joint's speed scale below which it is still, above which fast; part of its torque scale that is high."""
+"""Share of a joint's speed scale below which it is still; above which it is fast; share of its torque scale that is
+high."""
 
 QUANTILE = 0.99
-"""The scales are this quantile of |speed| and |torque| over all recordings: a rare spike sets no scale."""
+"""The scales are this quantile of |speed| and |torque| over all recordings, so that rare spikes have no effect."""
 
 REVERSAL = 0.02
 """s; rows this close to a change of the velocity's sign count as reversal."""
@@ -22,7 +23,7 @@ REGIMES = ("all", "still", "slow", "fast", "reversal", "high torque")
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Limits of the regimes of one joint: speeds rad/s, torque N m, time s; None where there is no velocity."""
+    """Limits of the regimes of one joint: speeds rad/s, torque N m, time s; None if there is no velocity."""
 
     joint: str
     still_below: float | None
@@ -32,16 +33,16 @@ class Thresholds:
 
 
 def thresholds(rows: Rows, joints: tuple[str, ...]) -> list[Thresholds]:
-    """Derive each joint's limits from ``rows``, which should be those of all recordings."""
-    found = []
+    """Compute the limits of each joint from ``rows``, which should be those of all recordings."""
+    limits = []
     for j, joint in enumerate(joints):
-        mine = rows.take(rows.joint == j)
-        known = len(mine) > 0 and bool(np.isfinite(mine.speed).all())
-        speed = float(np.quantile(np.abs(mine.speed), QUANTILE)) if known else None
-        torque = float(np.quantile(np.abs(mine.y), QUANTILE)) if len(mine) else 0.0
+        joint_rows = rows.take(rows.joint == j)
+        known = len(joint_rows) > 0 and bool(np.isfinite(joint_rows.speed).all())
+        speed = float(np.quantile(np.abs(joint_rows.speed), QUANTILE)) if known else None
+        torque = float(np.quantile(np.abs(joint_rows.y), QUANTILE)) if len(joint_rows) else 0.0
         slow, fast = (None, None) if speed is None else (STILL * speed, FAST * speed)
-        found.append(Thresholds(joint, slow, fast, REVERSAL, HIGH * torque))
-    return found
+        limits.append(Thresholds(joint, slow, fast, REVERSAL, HIGH * torque))
+    return limits
 
 
 def masks(rows: Rows, limits: list[Thresholds]) -> dict[str, np.ndarray]:
@@ -62,16 +63,16 @@ def masks(rows: Rows, limits: list[Thresholds]) -> dict[str, np.ndarray]:
     }
 
 
-def as_words(limits: list[Thresholds]) -> list[str]:
-    """Say the limits in one line per joint."""
+def as_text(limits: list[Thresholds]) -> list[str]:
+    """Return one line per joint with its limits."""
     lines = []
     for x in limits:
         values = asdict(x)
-        words = "speed unknown: no still, slow, fast or reversal"
+        description = "speed unknown: no still, slow, fast or reversal"
         if x.still_below is not None:
-            words = (
+            description = (
                 "still below {still_below:.3g} rad/s, fast from {fast_above:.3g} rad/s, "
                 "reversal within {reversal_within:g} s of a sign change"
             ).format(**values)
-        lines.append(f"{x.joint}: {words}; high torque above {x.high_torque_above:.3g} N m")
+        lines.append(f"{x.joint}: {description}; high torque above {x.high_torque_above:.3g} N m")
     return lines

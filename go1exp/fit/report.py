@@ -1,4 +1,4 @@
-"""How good a net is on episodes it never met: errors per joint and regime, beside the references, as text and JSON."""
+"""Errors of a net on held-out episodes, per joint and regime, with those of the references; as text and JSON."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from go1exp.fit.dataset import Rows, Split
 from go1exp.fit.references import NAMES, Reference
-from go1exp.fit.regimes import REGIMES, Thresholds, as_words, masks
+from go1exp.fit.regimes import REGIMES, Thresholds, as_text, masks
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Cell:
         episode: its name.
         rows: how many.
         rms: root mean square of the target itself, N m.
-        rmse: model -> root mean square error, N m; ``net`` and the references that there are.
+        rmse: model -> root mean square error, N m; ``net`` and the available references.
     """
 
     joint: str
@@ -39,11 +39,11 @@ class Report:
 
     Attributes:
         target: what was predicted: ``tau_est`` or ``joint_torque``.
-        split: which episodes did what.
-        cells: of each joint and of all, in each regime that occurs, over all held-out episodes.
-        episodes: of each joint and held-out episode, in the regime ``all``.
+        split: which episodes trained, validated and were held out.
+        cells: one for each joint and for all, in each regime that occurs, over all held-out episodes.
+        episodes: one for each joint and held-out episode, in the regime ``all``.
         missing: reference -> why there is none.
-        thresholds: of the regimes.
+        thresholds: limits of the regimes.
     """
 
     target: str
@@ -84,10 +84,10 @@ def report(
     Args:
         rows: the held-out rows.
         net: the net's torque for each ``(R,)``, N m.
-        references: theirs.
-        limits: of the regimes.
+        references: torques of the references.
+        limits: limits of the regimes.
         episodes: names that ``rows.episode`` points to.
-        split: which episodes did what.
+        split: which episodes trained, validated and were held out.
         target: ``tau_est`` or ``joint_torque``.
     """
     torques = {"net": net} | {r.name: r.torque for r in references if r.torque is not None}
@@ -100,12 +100,12 @@ def report(
         return Cell(joint, regime, episode, int(which.sum()), rmse(rows.y[which]), errors)
 
     cells, by_episode = [], []
-    for joint, mine in joints.items():
+    for joint, joint_rows in joints.items():
         for regime in REGIMES:
-            if (mine & regimes[regime]).any():
-                cells.append(cell(joint, regime, "all", mine & regimes[regime]))
+            if (joint_rows & regimes[regime]).any():
+                cells.append(cell(joint, regime, "all", joint_rows & regimes[regime]))
         for index in np.unique(rows.episode):
-            which = mine & (rows.episode == index)
+            which = joint_rows & (rows.episode == index)
             if which.any():
                 by_episode.append(cell(joint, "all", episodes[index], which))
     missing = {r.name: r.reason for r in references if r.torque is None}
@@ -113,7 +113,7 @@ def report(
 
 
 def text(report: Report) -> str:
-    """Lay a report out for a terminal; errors in N m, the smallest of each line marked with a star."""
+    """Return a report as text for a terminal; errors in N m, the smallest of each line marked with a star."""
     parts = [
         f"{report.target}: RMSE in N m on episodes that the net never met: {', '.join(report.split.held_out)}",
         f"trained on {', '.join(report.split.train)}; stopped by {', '.join(report.split.validation)}",
@@ -124,7 +124,7 @@ def text(report: Report) -> str:
         "",
         *(f"{name}: {NAMES[name]}" for name in NAMES if name in report.cells[0].rmse),
         *(f"{name}: none ({reason})" for name, reason in report.missing.items()),
-        *as_words(list(report.thresholds)),
+        *as_text(list(report.thresholds)),
     ]
     return "\n".join(parts)
 
@@ -139,6 +139,6 @@ def _table(cells: tuple[Cell, ...], key: str) -> str:
     widths = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
     laid = []
     for line in lines:
-        words = [line[k].ljust(widths[k]) if k < 2 else line[k].rjust(widths[k]) for k in range(len(line))]
-        laid.append("  ".join(words).rstrip())
+        padded = [line[k].ljust(widths[k]) if k < 2 else line[k].rjust(widths[k]) for k in range(len(line))]
+        laid.append("  ".join(padded).rstrip())
     return "\n".join(laid)

@@ -11,10 +11,10 @@ from go1exp.fit.settings import FitError
 from go1exp.recording import Recording
 
 ORDER = 3
-"""Of the polynomial: the lowest whose second derivative may change within the window."""
+"""Order of the polynomial: the lowest whose second derivative may change within the window."""
 
 WINDOW = 0.06
-"""s; passes motion to about 20 Hz (half amplitude at 1.2 / window for this order), takes the noise above (chosen)."""
+"""s; passes motion to about 20 Hz (half amplitude at 1.2 / window for this order) and removes noise above (chosen)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ def smooth_motion(recording: Recording, window: float = WINDOW) -> SmoothMotion:
     """Differentiate the measured angles with a Savitzky-Golay filter (third order, symmetric: no lag).
 
     The angles are resampled linearly to the median step of the clock, filtered, and read off at the recording's own
-    time stamps. Only ``q`` is used: a drive's ``qd`` has a filter of its own.
+    time stamps. Only ``q`` is used: the ``qd`` of a drive has already been filtered.
 
     Args:
         recording: any with ``q``.
@@ -54,11 +54,11 @@ def smooth_motion(recording: Recording, window: float = WINDOW) -> SmoothMotion:
         )
     even = np.stack([np.interp(grid, t, column) for column in q.T], axis=1)
     half = length // 2 * step
-    edge = half - step / 1000  # so that rounding of the clock takes no sample
+    edge = half - step / 1000  # so that rounding of the clock removes no sample
     inner = (t >= grid[0] + edge) & (t <= grid[-1] - edge)
-    found = []
+    derivatives = []
     for order in range(3):
         smooth = savgol_filter(even, length, ORDER, deriv=order, delta=step, axis=0)
         back = np.stack([np.interp(t, grid, column) for column in smooth.T], axis=1)
-        found.append(np.where(inner[:, None], back, np.nan))
-    return SmoothMotion(*found)
+        derivatives.append(np.where(inner[:, None], back, np.nan))
+    return SmoothMotion(*derivatives)

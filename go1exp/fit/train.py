@@ -1,4 +1,4 @@
-"""Training one network on rows: least squares, then Adam on what that leaves, stopped by the validation episodes."""
+"""Training of one network: least squares, then Adam on the residual, stopped by the validation episodes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ OnEpoch = Callable[[int, int, float, float], None]
 """``on_epoch(done, total, train, validation)``: epochs, and root mean square errors in N m."""
 
 RIDGE = 1e-3
-"""Penalty of the linear map in units of the normalised inputs' variance (chosen: taps 2 ms apart are nearly equal, and
-without it their weights grow large and opposite, which a noisier command than the training's then shows)."""
+"""Penalty of the linear map in units of the variance of the normalised inputs (chosen: taps 2 ms apart are nearly
+equal; without a penalty their weights become large and opposite, and amplify noise of a command)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """One trained network, in the terms of ``ActuatorNet``, without its leading axis K.
+    """One trained network: the arrays of ``ActuatorNet`` without the leading axis K.
 
     Attributes:
         weights: layer by layer (in, out).
@@ -62,7 +62,7 @@ def train(
         if len(part) == 0:
             raise FitError(f"no rows for {name}: its episodes are shorter than the history, or their drives are off")
     mean, std = rows.x.mean(axis=0), rows.x.std(axis=0)
-    std = np.where(std > 0, std, 1.0)  # an input that never moves tells nothing, and is not blown up
+    std = np.where(std > 0, std, 1.0)  # an input that never changes must not be divided by zero
     output_mean = float(rows.y.mean())
     z = (rows.x - mean) / std
     skip = ridge(z, rows.y - output_mean) if settings.skip else np.zeros(rows.x.shape[1])

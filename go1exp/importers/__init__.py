@@ -1,8 +1,8 @@
-"""Recordings of other tools and robots, turned into the format of ``go1exp.recording``: one file, one source.
+"""Recordings of other tools and robots, converted to the format of ``go1exp.recording``; one module for each source.
 
 An importer is ``f(path, *, options) -> list[Recording]``; ``path`` is a file of its source, or a folder of them. It
-maps what the source measured, keeps the source's known flaws in ``notes``, and never makes up a channel. Importing
-the package registers every importer, from this explicit list.
+converts what the source measured, writes the known flaws of the source into ``notes``, and never invents a channel.
+Importing the package registers every importer, from this explicit list.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list
     Args:
         name: a registered importer.
         path: a file of that source, or a folder that holds some.
-        options: what the importer lets you choose; the rest keeps its defaults.
+        options: values of the importer's options; the others keep their defaults.
 
     Raises:
         ConfigError: if there is no such importer, or it has no such option or value.
-        RecordingError: if a file is missing, damaged or lacks something.
+        RecordingError: if a file is missing or damaged, or lacks data.
     """
     entry = members("importer").get(name)
     if entry is None:
@@ -53,5 +53,5 @@ def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list
     values, problems = entry.check(options, f"importer.{name}")
     if problems:
         raise ConfigError(problems)
-    found: list[Recording] = entry.target(Path(path), **values)
-    return found
+    recordings: list[Recording] = entry.target(Path(path), **values)
+    return recordings

@@ -30,11 +30,11 @@ def ak80_double_pendulum(path: Path, *, design: Literal["A", "C"] | None = None)
     """Shoulder and elbow turned by two AK80-6 quasi-direct drives, from the .npz of one run.
 
     ``tau_con`` becomes ``tau_cmd``, ``tau_meas`` ``tau_est``, and ``pos_des`` ``q_target`` where the source has one.
-    Filtered positions and velocities equal the measured ones there and are left out.
+    The source's filtered positions and velocities equal the measured ones and are left out.
 
     Args:
         path: a ``.npz``, or a folder with ``design_A*/*.npz`` and ``design_C*/*.npz`` in it.
-        design: links of 0.3 and 0.2 m (A) or 0.2 and 0.3 m (C); by default told from the name of the file's folder.
+        design: links of 0.3 and 0.2 m (A) or 0.2 and 0.3 m (C); by default taken from the name of the file's folder.
 
     Raises:
         RecordingError: if an array is missing, the design is unknown or time does not increase strictly.

@@ -18,7 +18,7 @@ KP = 20.0
 KD = 0.5
 """Velocity gain the source states, N m s/rad."""
 TORQUE_TOLERANCE = 1e-3
-"""How far the source's own PD torque may be from these gains, N m (it is float32 rounding)."""
+"""Largest difference between the source's PD torque and that of these gains, N m (float32 rounding)."""
 
 NOTES = (
     "t is the step count times 0.02 s, not a clock. imu_quat is the IMU's roll, pitch and yaw written as a quaternion. "
@@ -32,7 +32,7 @@ NOTES = (
 def go1_walk_snippet(path: Path) -> list[Recording]:
     """Real Go1 walking under a learned policy at 50 Hz, from .npz.
 
-    ``tau_pd_computed`` is no measurement: it only serves to check the gains. Joints are brought into our order.
+    ``tau_pd_computed`` is not measured: it is used only to check the gains. Joints are put into our order.
 
     Args:
         path: a ``.npz``, or a folder of them.
@@ -74,12 +74,13 @@ def _one(path: Path) -> Recording:
 
 
 def _check_gains(data: Arrays) -> None:
-    """The gains are not in the file, but the torques that its logger worked out with them are."""
+    """Check the assumed gains: the file does not have them, but has torques that its logger computed with them."""
     q, qd, target, target_qd, torque = (
         data.numbers(key, len(JOINTS)) for key in ("q", "dq", "q_target", "dq_target", "tau_pd_computed")
     )
     if len({len(values) for values in (q, qd, target, target_qd, torque)}) > 1:
         raise RecordingError(f"{data.path}: q, dq, q_target, dq_target and tau_pd_computed must be of one length")
+    # The logger computed a row's torque from the state of the row before.
     again = KP * (target[1:] - q[:-1]) + KD * (target_qd[1:] - qd[:-1])
     if not np.allclose(again, torque[1:], rtol=0, atol=TORQUE_TOLERANCE):
         raise RecordingError(f"{data.path}: tau_pd_computed: does not belong to kp = {KP:g}, kd = {KD:g}")

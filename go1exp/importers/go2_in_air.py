@@ -26,7 +26,7 @@ NOTES = (
 def go2_in_air(path: Path, *, rate_hz: Positive = 200.0, base_quat: Quaternion = LEVEL) -> list[Recording]:
     """Legs of a Unitree Go2 that a walking policy moves in the air, from CSV without a clock.
 
-    The Go2 has the joints of the Go1, named and ordered like those here; ``robot`` is ``go2``.
+    The Go2 has the same joints as the Go1; they get our names and order. ``robot`` is ``go2``.
 
     Args:
         path: a ``.csv``, or a folder of them.
@@ -34,7 +34,7 @@ def go2_in_air(path: Path, *, rate_hz: Positive = 200.0, base_quat: Quaternion =
         base_quat: attitude in which the trunk was held, w-x-y-z.
 
     Raises:
-        RecordingError: if a column is missing, a number is not one, or the gains change.
+        RecordingError: if a column is missing, a value is not a number, or the gains change.
     """
     return [_one(file, rate_hz, base_quat) for file in files(path, "*.csv")]
 

@@ -66,12 +66,12 @@ def mcap_joint_state(
     tau_limit: tuple[Positive, ...] | None = None,
     excitation: str | None = None,
 ) -> list[Recording]:
-    """Joint states, and commands where there are some, from the MCAP log of any ROS 2 robot.
+    """Joint states, and commands if there are any, from the MCAP log of any ROS 2 robot.
 
     State ``position``, ``velocity``, ``effort`` become ``q``, ``qd``, ``tau_est``; command ``position`` and ``effort``
     become ``q_target`` and ``tau_cmd``, held from one command to the next; rows before the first command are left out.
-    A velocity or effort that is zero or NaN throughout was never filled in and has no column. Messages may be CDR or
-    JSON.
+    A velocity or effort that is zero or NaN throughout is taken as not measured and has no column. Messages may be CDR
+    or JSON.
 
     Args:
         path: a ``.mcap``, or a folder of them.
@@ -90,13 +90,13 @@ def mcap_joint_state(
         RecordingError: if the extra is not installed, the log is damaged, or a topic or joint is missing.
     """
     topics = [state_topic] if command_topic is None else [state_topic, command_topic]
-    found = []
+    recordings = []
     for file in files(path, "*.mcap"):
         messages = _read(file, topics)
         names = joints or messages[state_topic][0].state.name
         names = JOINTS if joints is None and set(names) == set(JOINTS) else names
         channels, notes = _channels(file, state_topic, command_topic, messages, names)
-        found.append(
+        recordings.append(
             recording(
                 file,
                 "mcap_joint_state",
@@ -114,7 +114,7 @@ def mcap_joint_state(
                 notes=" ".join(notes),
             )
         )
-    return found
+    return recordings
 
 
 def _channels(
@@ -124,7 +124,7 @@ def _channels(
     messages: dict[str, list[_Message]],
     joints: tuple[str, ...],
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Columns in the order of ``joints``, and the notes."""
+    """Return the columns, in the order of ``joints``, and the notes."""
     everything = [m for topic in messages.values() for m in topic]
     stamped = all(m.stamp_ns > 0 for m in everything)
     clock = {k: np.array([m.stamp_ns if stamped else m.log_ns for m in v], np.int64) for k, v in messages.items()}
@@ -142,6 +142,7 @@ def _channels(
         return channels, notes
     if (np.diff(clock[command_topic]) < 0).any():
         raise RecordingError(f"{path}: {command_topic}: time runs backwards")
+    # index of the command in force at each state; -1 before the first
     held = np.searchsorted(clock[command_topic], now, side="right") - 1
     kept = held >= 0
     if not kept.any():
@@ -164,7 +165,7 @@ def _quantity(
     key: Fields,
     notes: list[str],
 ) -> dict[str, np.ndarray]:
-    """Columns of one field, by joint name; none if the field is empty in every message or was never filled in."""
+    """Return the columns of one field by name; none if the field is empty, or zero or NaN, in every message."""
     if not any(getattr(m.state, key) for m in messages):
         return {}
     rows, orders = [], {}
@@ -195,28 +196,30 @@ def _read(path: Path, topics: list[str]) -> dict[str, list[_Message]]:
         from mcap_ros2.decoder import DecoderFactory
     except ImportError as error:
         raise RecordingError(f'{path}: to read MCAP, pip install "go1exp[logs]" ({error})') from error
-    found: dict[str, list[_Message]] = {topic: [] for topic in topics}
-    there: set[str] = set()
+    messages: dict[str, list[_Message]] = {topic: [] for topic in topics}
+    topics_in_file: set[str] = set()
     factory = DecoderFactory()
     try:
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
             summary = reader.get_summary()
-            there = {channel.topic for channel in summary.channels.values()} if summary else set()
+            topics_in_file = {channel.topic for channel in summary.channels.values()} if summary else set()
             for schema, channel, message in reader.iter_messages(topics=topics):
                 where = f"{path}: {channel.topic}"
                 decode = _decoder(where, factory, schema, channel.message_encoding)
-                state = _checked(f"{where}: message {len(found[channel.topic])}", decode(message.data))
+                state = _checked(f"{where}: message {len(messages[channel.topic])}", decode(message.data))
                 stamp = state.header.stamp.sec * 10**9 + state.header.stamp.nanosec if state.header else 0
-                found[channel.topic].append(_Message(message.log_time, stamp, state))
+                messages[channel.topic].append(_Message(message.log_time, stamp, state))
     except RecordingError:
         raise
     except Exception as error:  # the reader and its decompressors share no base class of errors
         raise RecordingError(f"{path}: not a whole MCAP file ({error or type(error).__name__})") from error
     for topic in topics:
-        if not found[topic]:
-            raise RecordingError(f"{path}: no message on topic {topic!r}; it has {', '.join(sorted(there)) or 'none'}")
-    return found
+        if not messages[topic]:
+            raise RecordingError(
+                f"{path}: no message on topic {topic!r}; it has {', '.join(sorted(topics_in_file)) or 'none'}"
+            )
+    return messages
 
 
 def _decoder(where: str, factory: Any, schema: Any, encoding: str) -> Callable[[bytes], Any]:

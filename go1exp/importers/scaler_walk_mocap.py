@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 LEGS = ("FL", "FR", "RR", "RL")
-"""The source's legs 1 to 4; its joints have numbers only."""
+"""Legs 1 to 4 of the source; its joints have numbers and no names."""
 JOINTS = tuple(f"{leg}_{number}" for leg in LEGS for number in (1, 2, 3))
 
 WILD_FORCE = 200.0
-"""N; more than twice the robot's weight (8.8 kg) on one foot is a fault of the sensor (chosen)."""
+"""N; more than twice the weight of the robot (8.8 kg) on one foot is an error of the sensor (chosen)."""
 
 NOTES = (
     "The source's joint velocity is 1.5 to 1.7 times the derivative of q and is left out: differentiate q. "
@@ -41,14 +41,15 @@ TURNED = (
 AS_LOGGED = "imu_acc is no specific force: all of it but gravity has its sign turned (reversed_acceleration: false)."
 
 MOVING_GYRO, MOVING_BODY = 0.3, 0.1
-"""rad/s and m/s above which gyro and motion capture see the robot move; at rest they read 0.005 and 0.02."""
+"""rad/s and m/s above which the robot moves, by gyro and by motion capture; at rest they read 0.005 and 0.02."""
 
 STOPS_LATER = 0.05
-"""s by which the body comes to rest by ``MOVING_BODY`` after the gyro by ``MOVING_GYRO`` (seven runs: 0.04 to 0.06)."""
+"""s between the last motion by ``MOVING_GYRO`` and the last by ``MOVING_BODY``, which is later (seven runs: 0.04 to
+0.06)."""
 
 CLOCK_SURE = 0.2
-"""s; a difference of the clocks below is not looked for: the source's match of rotation rates is better than that,
-where it found the right stride (chosen; a stride lasts 0.51 s)."""
+"""s; smaller differences of the clocks are not corrected: the source's match of rotation rates is better than that if
+it has the right stride (chosen; a stride lasts 0.51 s)."""
 
 
 @importer("scaler_walk_mocap")
@@ -62,25 +63,25 @@ def scaler_walk_mocap(
 ) -> list[Recording]:
     """Walk of the 8.8 kg quadruped SCALER with motion-capture truth, from .npz.
 
-    Joints are ``FL_1`` ... ``RL_3`` in the source's order FL FR RR RL; ``foot_force_FL`` ... are magnitudes, as the
-    sensor's axes are not the body's. A leg whose sensor gave nothing, or was broken all along, has no column. Rows
-    whose joints or IMU are not finite, or whose time does not advance, are left out.
+    Joints are ``FL_1`` ... ``RL_3`` in the source's order FL FR RR RL. ``foot_force_FL`` ... are magnitudes: the
+    axes of the sensor are not those of the body. A leg whose sensor gave nothing, or was broken throughout, has no
+    column. Rows whose joints or IMU are not finite, or whose time does not advance, are left out.
 
-    Motion capture ran on a clock of its own, which the source shifted onto the robot's by matching rotation rates; in
-    run 14 it took the wrong stride. Each row takes the nearest valid sample, never one worked out between two;
-    ``base_pos`` is the marker body's origin and ``base_quat`` the body's attitude through the source's fixed rotation,
-    good to a few degrees. If any row has no valid sample within the tolerance, the recording has neither.
+    Motion capture had its own clock, which the source shifted onto that of the robot by matching rotation rates; in
+    run 14 it chose the wrong stride. Each row takes the nearest valid sample; samples are not interpolated.
+    ``base_pos`` is the origin of the marker body, and ``base_quat`` the attitude of the body by the source's fixed
+    rotation, accurate to a few degrees. If any row has no valid sample within the tolerance, both are left out.
 
     Args:
         path: a ``.npz``, or a folder of them.
         mocap_tolerance_s: largest time between a row and its motion-capture sample, s (default: half of the
             capture's longest period).
-        resync: whether motion capture is shifted by whole strides where it and the gyro see the robot stop at
-            different times.
-        reversed_acceleration: whether the source's accelerometer has the sign of all but gravity turned, as it has in
-            the eight runs; it is then turned back.
-        levelling_s: time in which the vertical for that follows the accelerometer, s (default: four strides; of 1 to
-            10 s it agreed best with motion capture: 1 to 2 degrees while walking, 0.5 at rest).
+        resync: whether motion capture is shifted by whole strides if the robot stops at different times by motion
+            capture and by the gyro.
+        reversed_acceleration: whether the source's accelerometer has the wrong sign on everything except gravity, as in
+            all eight runs; the sign is then corrected.
+        levelling_s: time constant with which the vertical used for that follows the accelerometer, s (default: four
+            strides; of 1 to 10 s it agreed best with motion capture: 1 to 2 degrees while walking, 0.5 at rest).
 
     Raises:
         RecordingError: if an array is missing or of another shape.
@@ -115,10 +116,10 @@ def _one(path: Path, tolerance: float, resync: bool, levelling: float | None) ->
 
 
 def open_run(path: Path) -> tuple[Arrays, np.ndarray, list[str]]:
-    """Open a run; return its arrays, which rows of the robot's log are sound, and a note if some are not.
+    """Open a run; return its arrays, the valid rows of the robot's log, and a note if others were left out.
 
     Raises:
-        RecordingError: if an array of the robot's log is missing, or fewer than two rows are sound.
+        RecordingError: if an array of the robot's log is missing, or fewer than two rows are valid.
     """
     data = load_npz(path)
     t = data.numbers("t")
@@ -128,6 +129,7 @@ def open_run(path: Path) -> tuple[Arrays, np.ndarray, list[str]]:
     sound = np.isfinite(t)
     for part in parts:
         sound &= np.isfinite(part.reshape(len(t), -1)).all(axis=1)
+    # A row counts only if its time is later than that of every valid row before it.
     ahead = np.maximum.accumulate(np.where(sound, t, -np.inf))
     sound[1:] &= t[1:] > ahead[:-1]
     if sound.sum() < 2:
@@ -137,21 +139,21 @@ def open_run(path: Path) -> tuple[Arrays, np.ndarray, list[str]]:
 
 
 def specific_force(t: np.ndarray, gyro: np.ndarray, reported: np.ndarray, seconds: float) -> np.ndarray:
-    """Turn back the sign of all but gravity in what the source reports, ``(T, 3)`` m/s2 (see ``TURNED``)."""
+    """Correct the sign of everything except gravity in the reported acceleration, ``(T, 3)`` m/s2 (see ``TURNED``)."""
     from go1exp.estimation.attitude import GRAVITY, levelled, vertical
 
     return 2 * GRAVITY * vertical(levelled(t, gyro, reported, seconds=seconds)) - reported
 
 
 def _foot_forces(data: Arrays, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Magnitude of each foot's force, and what is wrong with it."""
+    """Return the magnitude of the force on each foot, and notes on flaws of the sensors."""
     if "foot_wrench_raw" not in data:
         return {}, ["There are no foot forces."]
     wrench = data.numbers("foot_wrench_raw", 4, 6)
     if len(wrench) <= rows[-1]:
         raise RecordingError(f"{data.path}: foot_wrench_raw: must have as many rows as t")
     force = np.linalg.norm(wrench[rows, :, :3], axis=2)
-    found, notes = {}, []
+    forces, notes = {}, []
     for leg, values in zip(LEGS, force.T, strict=True):
         wild = int((values > WILD_FORCE).sum())
         if not np.isfinite(values).all():
@@ -161,12 +163,12 @@ def _foot_forces(data: Arrays, rows: np.ndarray) -> tuple[dict[str, np.ndarray],
         elif wild > len(values) / 2:
             notes.append(f"The force sensor of {leg} was broken: {wild} of {len(values)} values exceed 200 N.")
         else:
-            found[FOOT_FORCE + leg] = np.ascontiguousarray(values)
+            forces[FOOT_FORCE + leg] = np.ascontiguousarray(values)
             if wild:
                 notes.append(f"foot_force_{leg} has {wild} wild values above 200 N.")
-    if found:
+    if forces:
         notes.append("Foot forces drift; they are magnitudes in the sensor's frame.")
-    return found, notes
+    return forces, notes
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +179,7 @@ class Mocap:
         t: s (M,).
         position: of the marker body, world, m (M, 3).
         attitude: of the robot's body (M,).
-        shift: by which the source's clock was moved, s; 0 where it was left alone.
+        shift: by which the source's clock was corrected, s; 0 if it was not.
     """
 
     t: np.ndarray
@@ -217,9 +219,10 @@ def motion_capture(data: Arrays, t: np.ndarray, gyro: np.ndarray, resync: bool =
 
 
 def _unflipped(attitude: Rotation) -> Rotation:
-    """Turn back what motion capture saw back to front: half a turn about the body's z from one sample to the next.
+    """Correct samples in which motion capture has the body back to front: half a turn about its z axis.
 
-    The longest stretch without such a step is right. (Run 14 has a short one at its start, 179.5 degrees off.)
+    Such an error begins and ends between two samples. The longest stretch without a jump is taken to be right. (Run 14
+    has a short wrong one at its start, 179.5 degrees off.)
     """
     from scipy.spatial.transform import Rotation
 
@@ -235,10 +238,10 @@ def _unflipped(attitude: Rotation) -> Rotation:
 
 
 def _clock_error(t: np.ndarray, gyro: np.ndarray, clock: np.ndarray, position: np.ndarray, attitude: Rotation) -> float:
-    """By how much motion capture is early, s: by the instant of the stop, then by rotation rates around it.
+    """Return by how much motion capture is early, s: from the time of the stop, then from rotation rates around it.
 
-    Steady walking repeats itself every stride, so that rotation rates match almost as well a stride off (0.82 and 0.83
-    in run 14); the stop does not. 0 where the robot does not come to rest in both, or the two agree.
+    Steady walking repeats every stride, so rotation rates match almost as well when shifted by one stride (0.82 and
+    0.83 in run 14); the stop happens only once. 0 if the robot does not come to rest in both, or if the two agree.
     """
     grid = np.arange(clock[0], clock[-1], 0.01)
     if len(grid) < 100:
@@ -255,8 +258,8 @@ def _clock_error(t: np.ndarray, gyro: np.ndarray, clock: np.ndarray, position: n
     rate = (attitude[:-4].inv() * attitude[4:]).as_rotvec() / (clock[4:] - clock[:-4])[:, None]
 
     def match(shift: float) -> float:
-        seen = np.stack([np.interp(t, clock[2:-2] + shift, one) for one in np.clip(rate, -3.0, 3.0).T], axis=1)
-        return float((seen * (gyro - still)).sum() / np.sqrt((seen**2).sum() + 1e-12))
+        mocap_rate = np.stack([np.interp(t, clock[2:-2] + shift, one) for one in np.clip(rate, -3.0, 3.0).T], axis=1)
+        return float((mocap_rate * (gyro - still)).sum() / np.sqrt((mocap_rate**2).sum() + 1e-12))
 
     return float(max(rough + np.arange(-0.15, 0.151, 0.01), key=match))
 
@@ -264,7 +267,7 @@ def _clock_error(t: np.ndarray, gyro: np.ndarray, clock: np.ndarray, position: n
 def _truth(
     data: Arrays, t: np.ndarray, gyro: np.ndarray, tolerance: float, resync: bool
 ) -> tuple[dict[str, np.ndarray], str]:
-    """Position and attitude of the base by the nearest motion-capture sample, if every row has one."""
+    """Return position and attitude of the base from the nearest motion-capture sample, if every row has one."""
     if "mocap_t" not in data:
         return {}, "No ground truth: there is no motion capture."
     capture = motion_capture(data, t, gyro, resync)

@@ -12,7 +12,7 @@ from go1exp.recording import Recording, RecordingError
 from go1exp.schema.registry import explain, importer
 
 MOST_LINES = 3
-"""How many of a file's problems are told: a missing key is missing in every row."""
+"""Most problems of a file that are reported: a missing key is missing in every row."""
 
 JOINT = "pendulum"
 
@@ -52,14 +52,14 @@ class _Log(BaseModel):
 def servo_pendulum_xl330(path: Path) -> list[Recording]:
     """Pendulum on an XL330 servo, from the JSON of one motion at one firmware gain.
 
-    ``goal_position`` becomes ``q_target``; while ``torque_enable`` is false the mass falls free and the target acts on
-    nothing. The gain stays in ``notes``, as it has no unit of the format.
+    ``goal_position`` becomes ``q_target``; while ``torque_enable`` is false the mass falls freely and the target has
+    no effect. The gain is given in ``notes`` only, as its unit is not that of the format.
 
     Args:
         path: a ``.json``, or a folder of them.
 
     Raises:
-        RecordingError: if a file is no such log, or lacks a key.
+        RecordingError: if a file is not such a log, or lacks a key.
     """
     return [_one(file) for file in files(path, "*.json")]
 
@@ -69,8 +69,8 @@ def _one(path: Path) -> Recording:
         log = _Log.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         lines = explain(error, "", ()) if isinstance(error, ValidationError) else [str(error)]
-        more = [f"and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else []
-        raise RecordingError("\n".join(f"{path}: {line}" for line in lines[:MOST_LINES] + more)) from error
+        omitted = [f"and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else []
+        raise RecordingError("\n".join(f"{path}: {line}" for line in lines[:MOST_LINES] + omitted)) from error
     if not log.entries:
         raise RecordingError(f"{path}: entries: must not be empty")
     table = {key: np.array([getattr(row, key) for row in log.entries]) for key in _Row.model_fields}

@@ -1,4 +1,4 @@
-"""What the importers share: finding and opening foreign files, and putting a checked recording together."""
+"""What all importers use: finding and opening source files, and building a checked recording."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def files(path: Path, pattern: str) -> list[Path]:
         return [path]
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
-    found = sorted(path.rglob(pattern))
-    if not found:
+    matches = sorted(path.rglob(pattern))
+    if not matches:
         raise RecordingError(f"{path}: no {pattern} in this folder")
-    return found
+    return matches
 
 
 @dataclass(frozen=True)
 class Arrays:
-    """The arrays of one ``.npz``, asked for by key; everything wrong names the file and the key."""
+    """The arrays of one ``.npz`` by key; every error names the file and the key."""
 
     path: Path
     values: Mapping[str, np.ndarray]
@@ -62,7 +62,7 @@ class Arrays:
         return values.astype(np.float64)
 
     def names(self, key: str) -> tuple[str, ...]:
-        """Return the array of words ``key``."""
+        """Return the array of strings ``key``."""
         values = self._get(key)
         if values.dtype.kind != "U" or values.ndim != 1:
             raise RecordingError(f"{self.path}: {key}: must be a list of words, not {values.dtype} {values.shape}")
@@ -81,18 +81,20 @@ def load_npz(path: Path) -> Arrays:
         RecordingError: if it is truncated, damaged, of another kind, or holds objects.
     """
     try:
-        with path.open("rb") as file:  # opened here, as NumPy leaves a damaged one open
+        with path.open("rb") as file:  # opened here, because NumPy does not close a damaged file
             archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("one bare array")
             return Arrays(path, {key: archive[key] for key in archive.files})
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        reason = "no zip archive of them" if "pickle" in str(error) else error  # NumPy advises to unpickle it
+        reason = (
+            "no zip archive of them" if "pickle" in str(error) else error
+        )  # NumPy's message advises to allow pickles
         raise RecordingError(f"{path}: not a whole .npz of plain arrays ({reason})") from error
 
 
 def rate(path: Path, t: np.ndarray) -> float:
-    """Sampling rate, Hz: the inverse of the median step of ``t``.
+    """Return the sampling rate, Hz: the inverse of the median step of ``t``.
 
     Raises:
         RecordingError: if there are fewer than two time stamps, or they do not advance.
@@ -114,13 +116,13 @@ def joint_columns(quantity: str, joints: Iterable[str], values: np.ndarray) -> d
 
 
 def reorder(theirs: Iterable[str], ours: Iterable[str]) -> list[int]:
-    """Index that brings a source's joints into our order, by name."""
+    """Return the index that puts the joints of a source into our order, by name."""
     place = {name: i for i, name in enumerate(theirs)}
     return [place[name] for name in ours]
 
 
 def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **about: Any) -> Recording:
-    """Put a recording together and check it; ``about`` are fields of ``Meta``; those not known are left out.
+    """Build a recording and check it; ``about`` are fields of ``Meta``; unknown ones are left out.
 
     Raises:
         RecordingError: naming ``path``, if anything breaks the format.
@@ -133,8 +135,8 @@ def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **abou
     except ValidationError as error:
         lines = explain(error, "metadata", Meta.__dataclass_fields__)
         raise RecordingError("\n".join(f"{path}: {line}" for line in lines)) from error
-    found = Recording(meta, channels)
-    wrong = problems(found)
+    result = Recording(meta, channels)
+    wrong = problems(result)
     if wrong:
         raise RecordingError("\n".join(f"{path}: {line}" for line in wrong))
-    return found
+    return result

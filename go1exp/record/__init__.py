@@ -1,1 +1,1 @@
-"""The simulated robot in the laboratory: driven through a motion while a logger like a real one's listens."""
+"""Recordings of simulated robots: a robot follows a motion or a policy, and a logger with realistic errors records."""

@@ -1,4 +1,4 @@
-"""From what a user wants recorded to the list of episodes."""
+"""Makes the list of episodes to record from the user's settings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Episode:
         kd: speed gain, N m s/rad.
         hang: roll and pitch at which a held trunk hangs, rad; None on the ground.
         repeat_of: name of the episode that this one repeats.
-        seed: of the logger's noise.
+        seed: seed of the logger's noise.
     """
 
     name: str
@@ -71,12 +71,14 @@ def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion
 
 
 def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
-    """Return every motion x seed x base x gain set, and the repetitions.
+    """Return an episode for each combination of motion, seed, base and gain set, and then the repetitions.
+
+    The first episode of each gain set is repeated.
 
     Raises:
-        ConfigError: if a motion cannot be made on the base that is wanted.
+        ConfigError: if a motion cannot be made on the wanted base, or two episodes would have one name.
     """
-    found: list[Episode] = []
+    planned: list[Episode] = []
     for term in terms:
         for seed in wishes.seeds:
             motion = make_motion(term, wishes.seconds, wishes.sensors.rate_hz, seed)
@@ -88,20 +90,22 @@ def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
                     name = f"{term.key}_kp{kp:g}_kd{kd:g}_{seed}"
                     if base is not None and len(wishes.hang) > 1:
                         name += f"_roll{base[0]:g}_pitch{base[1]:g}"
-                    found.append(Episode(name, term.entry.name, motion, kp, kd, base, None, _seed(wishes, len(found))))
-    twice = sorted({e.name for e in found if [f.name for f in found].count(e.name) > 1})
+                    planned.append(
+                        Episode(name, term.entry.name, motion, kp, kd, base, None, _seed(wishes, len(planned)))
+                    )
+    twice = sorted({e.name for e in planned if [f.name for f in planned].count(e.name) > 1})
     if twice:
         raise ConfigError(
             [f"{name}: two recordings of this name; leave out one, or record them into two folders" for name in twice]
         )
-    sets = dict.fromkeys((e.kp, e.kd) for e in found)
-    firsts = [next(e for e in found if (e.kp, e.kd) == gains) for gains in sets]
+    sets = dict.fromkeys((e.kp, e.kd) for e in planned)
+    firsts = [next(e for e in planned if (e.kp, e.kd) == gains) for gains in sets]
     for e in firsts:
         for k in range(wishes.repeats):
             name = f"{e.name}_repeat{k + 1}"
-            again = Episode(name, e.excitation, e.motion, e.kp, e.kd, e.hang, e.name, _seed(wishes, len(found)))
-            found.append(again)
-    return found
+            again = Episode(name, e.excitation, e.motion, e.kp, e.kd, e.hang, e.name, _seed(wishes, len(planned)))
+            planned.append(again)
+    return planned
 
 
 def _seed(wishes: Wishes, index: int) -> int:

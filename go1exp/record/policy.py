@@ -1,4 +1,4 @@
-"""The excitation that is not a motion but a policy."""
+"""The excitation ``policy``: not a fixed motion, but a policy in closed loop."""
 
 from __future__ import annotations
 

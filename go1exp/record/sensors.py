@@ -1,4 +1,4 @@
-"""What a Go1's logger makes of the truth: rates, steps, noise, an uneven clock, and only what the robot measures."""
+"""The simulated logger of a Go1: sampling rate, quantisation, noise, an uneven clock; only what the robot measures."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class SensorConfig:
 
     Attributes:
         rate_hz: samples per second (the vendor's SDK: 500).
-        jitter: standard deviation of the lateness of a time stamp, s.
-        dropped: share of the samples that get lost.
+        jitter: scale of the delay of a time stamp, s: the absolute value of a Gaussian with this standard deviation.
+        dropped: share of the samples that are lost.
         q: joint angle, rad.
         qd: joint speed, rad/s.
         tau_est: torque that the drive reports, N m.
@@ -39,7 +39,7 @@ class SensorConfig:
         acc: m/s2.
         attitude: error of the reported attitude as a small rotation, rad (its ``step`` is of the quaternion).
         foot_force: N.
-        truth: also write the base's true position and velocity, as motion capture would.
+        truth: also write the true position and velocity of the base, as motion capture measures them.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -57,11 +57,11 @@ class SensorConfig:
     truth: bool
 
 
-def _spoil(true: np.ndarray, channel: Channel, rng: np.random.Generator) -> np.ndarray:
-    return _stepped(true + channel.noise * rng.standard_normal(true.shape), channel)
+def _with_errors(true: np.ndarray, channel: Channel, rng: np.random.Generator) -> np.ndarray:
+    return _quantised(true + channel.noise * rng.standard_normal(true.shape), channel)
 
 
-def _stepped(values: np.ndarray, channel: Channel) -> np.ndarray:
+def _quantised(values: np.ndarray, channel: Channel) -> np.ndarray:
     return np.round(values / channel.step) * channel.step if channel.step else values
 
 
@@ -79,27 +79,29 @@ def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Gen
 
     rows = len(true["q"])
     dt = 1.0 / config.rate_hz
-    # A stamp is late by the bus, never early, and a late sample does not overtake the next.
+    # The bus delays a stamp and never advances it; a delayed sample stays before the next one.
     late = np.minimum(np.abs(config.jitter * rng.standard_normal(rows)), 0.9 * dt)
-    found: dict[str, np.ndarray] = {"t": np.arange(rows) * dt + late}
+    channels: dict[str, np.ndarray] = {"t": np.arange(rows) * dt + late}
     for name in ("q", "qd", "tau_est"):
-        spoilt = _spoil(true[name], getattr(config, name), rng)
-        found |= dict(zip(joint_channels(name, robot.JOINTS), spoilt.T, strict=True))
-    found |= dict(zip(joint_channels("q_target", robot.JOINTS), true["q_target"].T, strict=True))
+        measured = _with_errors(true[name], getattr(config, name), rng)
+        channels |= dict(zip(joint_channels(name, robot.JOINTS), measured.T, strict=True))
+    channels |= dict(zip(joint_channels("q_target", robot.JOINTS), true["q_target"].T, strict=True))
     for name in ("gyro", "acc"):
-        found |= dict(zip(VECTORS[f"imu_{name}"], _spoil(true[name], getattr(config, name), rng).T, strict=True))
+        channels |= dict(
+            zip(VECTORS[f"imu_{name}"], _with_errors(true[name], getattr(config, name), rng).T, strict=True)
+        )
     error = Rotation.from_rotvec(config.attitude.noise * rng.standard_normal((rows, 3)))
     attitude = Rotation.from_quat(true["quat"], scalar_first=True) * error
-    quat = _stepped(attitude.as_quat(canonical=True, scalar_first=True), config.attitude)
-    found |= dict(zip(VECTORS["imu_quat"], quat.T, strict=True))
-    forces = np.maximum(_spoil(true["foot_force"], config.foot_force, rng), 0.0)
-    found |= {f"foot_force_{leg}": forces[:, k] for k, leg in enumerate(robot.LEGS)}
+    quat = _quantised(attitude.as_quat(canonical=True, scalar_first=True), config.attitude)
+    channels |= dict(zip(VECTORS["imu_quat"], quat.T, strict=True))
+    forces = np.maximum(_with_errors(true["foot_force"], config.foot_force, rng), 0.0)
+    channels |= {f"foot_force_{leg}": forces[:, k] for k, leg in enumerate(robot.LEGS)}
     if not true["torque_enable"].all():
-        found["torque_enable"] = true["torque_enable"].astype(bool)
+        channels["torque_enable"] = true["torque_enable"].astype(bool)
     if config.truth:
         for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel"):
             if name in true:
-                found |= dict(zip(VECTORS[name], true[name].T, strict=True))
+                channels |= dict(zip(VECTORS[name], true[name].T, strict=True))
     kept = rng.random(rows) >= config.dropped
     kept[0] = True
-    return {name: np.ascontiguousarray(values[kept]) for name, values in found.items()}
+    return {name: np.ascontiguousarray(values[kept]) for name, values in channels.items()}

@@ -1,4 +1,4 @@
-"""Drive simulated robots through motions and return what their loggers wrote."""
+"""Moves simulated robots and returns their recordings."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Rig:
-    """The robots of a recording: what they are, how they are driven, and the step at which they are simulated, s."""
+    """The robots of a recording: model, drives, effects, ground, engine, and the physics step, s."""
 
     robot: RobotConfig
     actuator: Term
@@ -50,7 +50,7 @@ class Rig:
 
 
 def held_quat(hang: tuple[float, float]) -> tuple[float, float, float, float]:
-    """Return the attitude w-x-y-z of a trunk that hangs with this roll and pitch, rad (about x, then about y)."""
+    """Return the attitude w-x-y-z of a trunk held at this roll and pitch, rad (about x, then about y)."""
     w, x, y, z = Rotation.from_euler("xyz", [*hang, 0.0]).as_quat(scalar_first=True)
     return float(w), float(x), float(y), float(z)
 
@@ -58,9 +58,10 @@ def held_quat(hang: tuple[float, float]) -> tuple[float, float, float, float]:
 def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
     """Simulate episodes side by side and return their recordings, in the same order.
 
-    All must last equally long. Those that hang alike, or stand, share a batch. ``on_step`` is told the progress.
+    All must be of equal length. Episodes with the same base (held at the same attitude, standing, or dropped) are
+    simulated as one batch. ``on_step`` is called with the progress.
     """
-    found: dict[str, Recording] = {}
+    recordings: dict[str, Recording] = {}
     places = list(dict.fromkeys((e.hang, e.motion.height > 0) for e in episodes))
     for k, place in enumerate(places):
         group = [e for e in episodes if (e.hang, e.motion.height > 0) == place]
@@ -68,14 +69,25 @@ def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int
         def part(done: int, total: int, k: int = k) -> None:
             on_step(k * total + done, len(places) * total)
 
-        found |= {r.meta.episode: r for r in _play_alike(rig, group, sensors, seed, part)}
-    return [found[e.name] for e in episodes]
+        recordings |= {r.meta.episode: r for r in _play_alike(rig, group, sensors, seed, part)}
+    return [recordings[e.name] for e in episodes]
 
 
 def _play_alike(
     rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress
 ) -> list[Recording]:
     """Simulate episodes that share a base."""
+    plant = _build_plant(rig, episodes, seed)
+    _put_down(plant, episodes, rig.physics_dt)
+    per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
+    tape = Tape(plant, per_sample, len(episodes[0].motion.target))
+    _follow_motions(plant, tape, episodes, sensors.rate_hz, per_sample, on_step)
+    tape.stop()
+    return [_recording(rig, sensors, e, tape.true(k)) for k, e in enumerate(episodes)]
+
+
+def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
+    """Build one robot for each episode, with the gains of that episode."""
     n, hang = len(episodes), episodes[0].hang
     model, blocks = build_model(
         rig.robot,
@@ -88,35 +100,49 @@ def _play_alike(
     random = EnvRandom(seed, n, device=backend.qpos.device, alike=True)  # one robot, in all its recordings
     plant = Plant(backend, drive_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
     if has_gains(rig.actuator):
+        # (n, 1) each, then the same gain for all joints: (n, 12)
         kp, kd = (torch.tensor([[getattr(e, g)] for e in episodes], dtype=plant.q.dtype) for g in ("kp", "kd"))
         plant.set_gains(kp.expand_as(plant.q), kd.expand_as(plant.q))
     plant.startup()
+    return plant
 
-    targets = torch.as_tensor(np.stack([e.motion.target for e in episodes], axis=1), dtype=plant.q.dtype)
-    enabled = torch.as_tensor(np.stack([e.motion.torque_enable for e in episodes], axis=1))
-    everyone = torch.ones(n, dtype=torch.bool)
+
+def _put_down(plant: Plant, episodes: Sequence[Episode], physics_dt: float) -> None:
+    """Reset every robot to the first angles of its motion and, unless it is to fall, let it settle there."""
+    backend = plant.backend
+    everyone = torch.ones(len(episodes), dtype=torch.bool)
     qpos, qvel = torch.zeros_like(backend.qpos), torch.zeros_like(backend.qvel)
     qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(np.stack([e.motion.start for e in episodes]))
-    if hang is None:
+    if episodes[0].hang is None:  # a free trunk has seven coordinates before the joints: position, then quaternion
         qpos[:, 2] = robot.NOMINAL_HEIGHT + torch.tensor([e.motion.height for e in episodes])
         qpos[:, 3] = 1.0
     backend.reset(everyone, qpos, qvel)
     start = qpos[:, -robot.NUM_JOINTS :].clone()
     plant.reset(everyone, start)
-    per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
     if episodes[0].motion.height == 0:
-        for _ in range(round(SETTLE_S / rig.physics_dt)):
+        for _ in range(round(SETTLE_S / physics_dt)):
             plant.step(start)
-        plant.effects.reset(everyone)  # what drifts within an episode begins with it
+        plant.effects.reset(everyone)  # an effect that drifts within an episode starts with the recording
 
+
+def _follow_motions(
+    plant: Plant, tape: Tape, episodes: Sequence[Episode], rate_hz: float, per_sample: int, on_step: Progress
+) -> None:
+    """Send every robot the targets of its motion, one each ``per_sample`` physics steps, while ``tape`` records.
+
+    When drives come back on, the target moves from the measured angle to the commanded one within ``soft_start``: a
+    sudden pull would hit the joint's torque limit.
+    """
+    targets = torch.as_tensor(np.stack([e.motion.target for e in episodes], axis=1), dtype=plant.q.dtype)  # (T, n, 12)
+    enabled = torch.as_tensor(np.stack([e.motion.torque_enable for e in episodes], axis=1))  # (T, n)
     rows = len(targets)
     soft = torch.tensor([[e.motion.soft_start] for e in episodes], dtype=plant.q.dtype)
-    since, origin = torch.full_like(soft, torch.inf), start.clone()
-    tape = Tape(plant, per_sample, rows)
+    # s since the drives came back on; infinite at the start, where nothing is blended
+    since, origin = torch.full_like(soft, torch.inf), targets[0].clone()
     plant.enabled = enabled[0]
     for row in range(rows):
         back_on = (enabled[row] & ~plant.enabled).unsqueeze(1)
-        since = torch.where(back_on, 0.0, since + 1.0 / sensors.rate_hz)
+        since = torch.where(back_on, 0.0, since + 1.0 / rate_hz)
         origin = torch.where(back_on, plant.q, origin)
         share = (since / soft.clamp(min=1e-9)).clamp(max=1.0)
         target = torch.lerp(origin, targets[row], share)
@@ -125,12 +151,10 @@ def _play_alike(
             plant.step(target)
         if row % 100 == 99 or row + 1 == rows:
             on_step(row + 1, rows)
-    tape.stop()
-    return [_recording(rig, sensors, e, tape.true(k)) for k, e in enumerate(episodes)]
 
 
 def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[str, np.ndarray]) -> Recording:
-    """Write one robot's log."""
+    """Return the recording of one robot."""
     return Recording(
         meta(
             rig.robot,
@@ -148,7 +172,7 @@ def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[
 
 
 def meta(config: RobotConfig, sensors: SensorConfig, **changes: Any) -> Meta:
-    """Describe a recording of a simulated Go1; nothing in it tells which effects it has."""
+    """Return the metadata of a simulated Go1's recording; they do not reveal which effects the robot has."""
     limit = tuple(float(v) for v in robot.per_joint(config.effort_limit))
     usual: dict[str, Any] = {"robot": "go1", "joints": robot.JOINTS, "rate_hz": sensors.rate_hz, "tau_limit": limit}
     about: dict[str, Any] = {"source": "simulated", "tool": "go1exp record", "notes": ""}
@@ -179,9 +203,9 @@ class Walk:
     Attributes:
         trained: the task that it was trained in.
         policy: observations (N, O) -> actions (N, 12).
-        names: of the episodes, one robot each.
-        seconds: length of each.
-        hang: roll and pitch of a held trunk, rad, for a policy that treads the air; None on the ground.
+        names: names of the episodes, one robot each.
+        seconds: length of each, s.
+        hang: roll and pitch of a held trunk, rad, if the feet are to be in the air; None on the ground.
     """
 
     trained: TaskConfig
@@ -192,7 +216,7 @@ class Walk:
 
 
 def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
-    """Let a policy move robots under random commands and return the recordings.
+    """Move robots by a policy under random commands and return the recordings.
 
     A robot that falls is recorded up to its fall.
     """
@@ -218,7 +242,7 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
         walking &= ~fell
         on_step(step + 1, steps)
     tape.stop()
-    found = []
+    recordings = []
     for k, name in enumerate(walk.names):
         true = {key: values[: rows[k]] for key, values in tape.true(k).items()}
         about = meta(
@@ -232,11 +256,11 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
             episode=name,
             repeat_of=None,
         )
-        found.append(Recording(about, log(true, sensors, np.random.default_rng([seed, k]))))
-    return found
+        recordings.append(Recording(about, log(true, sensors, np.random.default_rng([seed, k]))))
+    return recordings
 
 
 def _configured(actuator: Term, gain: str) -> tuple[float, ...] | None:
-    """Return a gain as it is configured (not as effects make it), per joint; None if the actuator has none."""
+    """Return a gain as configured, per joint, without the effects on it; None if the actuator has no gains."""
     value = next((term.parameters[gain] for term, _ in drives(actuator) if gain in term.parameters), None)
     return None if value is None else tuple(float(v) for v in spread(value, robot.JOINTS))

@@ -1,4 +1,4 @@
-"""The truth about N robots at the logger's rate, taken from a plant while something drives it."""
+"""Samples of N simulated robots at the logger's rate, taken from the plant while it is stepped."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from go1exp.env.plant import Plant
 
 
 class Tape:
-    """Listens to a plant, and keeps every so-manieth of its steps.
+    """Observes a plant and keeps one of every ``every`` steps.
 
-    Samples are what the sensors would say without their noise: effects that change readings are in them.
+    Samples are the readings of the sensors without noise; effects that change readings are included.
     """
 
     def __init__(self, plant: Plant, every: int, rows: int) -> None:
-        """Start listening: keep ``rows`` samples, one each ``every`` steps, from the next step on."""
+        """Start to observe: keep ``rows`` samples, one for each ``every`` steps, from the next step on."""
         self._plant, self._every, self._rows, self._step = plant, every, rows, 0
         self._kept: dict[str, np.ndarray] = {}
         self.enabled = torch.ones(len(plant.q), dtype=torch.bool)
@@ -26,11 +26,11 @@ class Tape:
 
     @property
     def full(self) -> bool:
-        """Whether all rows are there."""
+        """Whether all rows have been taken."""
         return self._step >= self._every * self._rows
 
     def stop(self) -> None:
-        """Stop listening."""
+        """Stop observing."""
         self._plant.observer = None
 
     def true(self, env: int) -> dict[str, np.ndarray]:
@@ -38,7 +38,7 @@ class Tape:
         return {name: values[:, env] for name, values in self._kept.items()}
 
     def _listen(self, target: Tensor) -> None:
-        """Take a sample before a step, with the target that takes force now."""
+        """Take a sample before a step; ``target`` is in force from this step on."""
         if self._step % self._every == 0 and not self.full:
             row = self._step // self._every
             for name, value in (sample(self._plant, target) | {"torque_enable": self.enabled}).items():
@@ -50,35 +50,36 @@ class Tape:
 
 
 def sample(plant: Plant, target: Tensor) -> dict[str, Tensor]:
-    """Return what the sensors of N robots would say at this moment without their noise, and the truth; (N, ...) each.
+    """Return the present readings of N robots' sensors without noise, and the truth; (N, ...) each.
 
-    ``target`` (N, J) is the one that takes force now. A free trunk's pose and velocity are ``base_...``.
+    ``target`` (N, J) is in force from now on. Pose and velocity of a free trunk are ``base_...``.
     """
     blocks, readings = plant.backend.sensors, plant.backend.sensordata
     quat = readings[:, blocks.imu_quat]
-    seen = plant.effects.measure(
+    measured = plant.effects.measure(
         Measured(plant.q, plant.speed(), gyro=readings[:, blocks.imu_gyro], acc=readings[:, blocks.imu_acc], quat=quat)
     )
-    assert seen.gyro is not None
-    assert seen.acc is not None
-    assert seen.quat is not None
+    assert measured.gyro is not None
+    assert measured.acc is not None
+    assert measured.quat is not None
+    # Of the four values of a contact sensor the first is the number of contacts, the others are the force.
     contact = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))
-    found = {
-        "q": seen.joint_pos,
-        "qd": seen.joint_vel,
+    values = {
+        "q": measured.joint_pos,
+        "qd": measured.joint_vel,
         "q_target": target,
         "tau_est": plant.torque,
-        "gyro": seen.gyro,
-        "acc": seen.acc,
-        "quat": seen.quat,
+        "gyro": measured.gyro,
+        "acc": measured.acc,
+        "quat": measured.quat,
         "foot_force": contact[..., 1:].norm(dim=-1),
     }
     qpos, qvel = plant.backend.qpos, plant.backend.qvel
     if qpos.shape[1] > robot.NUM_JOINTS:
-        found |= {
+        values |= {
             "base_pos": qpos[:, :3],
             "base_quat": qpos[:, 3:7],
             "base_lin_vel": qvel[:, :3],
             "base_ang_vel": qvel[:, 3:6],
         }
-    return found
+    return values

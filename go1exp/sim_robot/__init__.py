@@ -1,1 +1,1 @@
-"""A simulated Go1 that runs in real time as a process of its own, and is spoken to as the real one is."""
+"""A simulated Go1 that runs in real time as a process of its own; the runtime talks to it as to a real robot."""

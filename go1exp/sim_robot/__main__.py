@@ -1,7 +1,7 @@
 """The simulated robot's process: ``python -m go1exp.sim_robot``, which ``go1exp deploy`` starts.
 
-Its settings come as a line of JSON on standard input, and the end of that input is its own end, so that no robot
-outlives whoever started it. It answers with a line of JSON when it listens, and with its account at the end.
+Its settings come as one line of JSON on standard input. It ends when that input ends, so that it never runs longer than
+the process that started it. It writes one line of JSON when it listens, and one with its report at the end.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from go1exp.sim_robot.server import TRUTH, Server
 from go1exp.sim_robot.settings import SimConfig
 
 
-def task_of(bundle: str, other: dict[str, Any]) -> TaskConfig:
+def bundle_task(bundle: str, other: dict[str, Any]) -> TaskConfig:
     """Return the task that a bundle's policy was trained in, with other choices of actuator and effects if given.
 
     Raises:
@@ -61,7 +61,7 @@ def sim_config(given: dict[str, Any]) -> SimConfig:
 
 
 def _line(descriptor: int) -> bytes:
-    """Read a line byte by byte, so that nothing behind it waits in a buffer where ``select`` would not see it."""
+    """Read a line byte by byte: a buffered reader could take more than the line, which ``select`` would not see."""
     text = b""
     while not text.endswith(b"\n") and (part := os.read(descriptor, 1)):
         text += part
@@ -75,14 +75,14 @@ def _say(what: str, **content: Any) -> None:
 
 def main() -> int:
     """Serve until standard input ends or SIGTERM comes; return the exit status."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a key in the terminal is for the runtime, which then ends this
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the runtime, which then ends this process
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: ended.append(number))
     torch.set_num_threads(1)
     given = json.loads(_line(sys.stdin.fileno()))
     try:
         config = sim_config(given.get("sim", {}))
-        task = task_of(given["bundle"], given.get("robot", {}))
+        task = bundle_task(given["bundle"], given.get("robot", {}))
         server = Server(Robot(task, config), config, given.get("port", 0))
     except (ConfigError, Expected, OSError) as error:
         lines = error.problems if isinstance(error, ConfigError) else []

@@ -26,34 +26,34 @@ TICK = 0.002
 """Period of the drives and of the states that the robot sends, s: the vendor's SDK has 500 Hz."""
 
 SILENCE = 0.05
-"""The drives brake when no command has come for so long, s."""
+"""The drives brake when no command has come for this time, s."""
 
 NOISE = {"joint_pos": 0.05, "joint_vel": 0.1, "imu_gyro": 0.01, "attitude": 0.05}
 """Half-widths of the paper's Table II: rad, rad/s, rad/s, and of projected gravity, taken as a rotation in rad."""
 
 OWN_NOISE = {"imu_acc": 0.1, "foot_force": 2.0}
-"""Standard deviations of what Table II does not have, m/s2 and N, as in ``conf/record.yaml``."""
+"""Standard deviations of noises that Table II does not list, m/s2 and N, as in ``conf/record.yaml``."""
 
 LYING_HEIGHT = 0.12
-"""Of its trunk when it is put down, m."""
+"""Height of the trunk when a lying robot is put down, m."""
 
 SETTLE_S = 1.0
-"""Time that it is given to come to rest before anybody may speak to it, s of its own clock."""
+"""Simulated time in which the robot comes to rest before it takes commands, s."""
 
 
 class Robot:
     """One Go1 with its sensors.
 
     Attributes:
-        clock: its own time, s.
-        braking: its drives only brake, because nobody has commanded them for too long or because they were told to.
+        clock: time of the robot, s.
+        braking: whether its drives only brake: no command for too long, or a damping command.
     """
 
     def __init__(self, task: TaskConfig, config: SimConfig) -> None:
         """Put the task's robot, with its drives and effects, where ``config.start`` says, at rest.
 
         Raises:
-            ConfigError: if its drives have no gains, which commands set.
+            ConfigError: if its drives have no gains, since commands set gains.
         """
         if not has_gains(task.actuator):
             raise ConfigError([f"actuator: {task.actuator.entry.name!r} has no kp and kd to command; use actuator=pd"])
@@ -64,15 +64,15 @@ class Robot:
         random = EnvRandom(config.seed, 1, device=backend.qpos.device)
         self._plant = Plant(backend, drive_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
         self._plant.startup()
-        own = self._plant.actuator
-        self._own_gains = tuple(getattr(own, name).numpy().ravel().copy() for name in ("kp", "kd"))
+        actuator = self._plant.actuator
+        self._default_gains = tuple(getattr(actuator, name).numpy().ravel().copy() for name in ("kp", "kd"))
         self.clock, self.braking = 0.0, False
         self._commanded, self._in_force = -np.inf, 0
         self._measured = self.clock, self._in_force
         self._place()
 
     def _place(self) -> None:
-        """Set the first state down and let it come to rest; the robot holds it with its own gains until it is told."""
+        """Put the robot into its first state and let it come to rest; default gains hold it until a command comes."""
         plant, start = self._plant, self._config.start
         joints = np.tile(LYING, robot.NUM_LEGS) if start == "lying" else robot.NOMINAL_STANCE
         qpos, qvel = torch.zeros_like(plant.backend.qpos), torch.zeros_like(plant.backend.qvel)
@@ -84,31 +84,31 @@ class Robot:
         plant.backend.reset(everyone, qpos, qvel)
         self._target = qpos[:, -robot.NUM_JOINTS :].clone()
         plant.reset(everyone, self._target)
-        self._gains = self._own_gains
-        self._set_gains(*((np.zeros(robot.NUM_JOINTS), self._braking_kd) if start == "lying" else self._own_gains))
+        self._gains = self._default_gains
+        self._set_gains(*((np.zeros(robot.NUM_JOINTS), self._braking_kd) if start == "lying" else self._default_gains))
         for _ in range(round(SETTLE_S / TICK)):
             self._advance()
-        plant.effects.reset(everyone)  # what drifts begins now
+        plant.effects.reset(everyone)  # an effect that drifts starts now
 
     _braking_kd = np.full(robot.NUM_JOINTS, DEFAULT_KD)
 
     def _set_gains(self, kp: np.ndarray, kd: np.ndarray) -> None:
-        """Give the drives gains, if they have others."""
-        if all(np.array_equal(own, new) for own, new in zip(self._gains, (kp, kd), strict=True)):
+        """Set the gains of the drives, unless they already have these."""
+        if all(np.array_equal(present, new) for present, new in zip(self._gains, (kp, kd), strict=True)):
             return
         self._gains = (np.array(kp), np.array(kd))
         rows = (torch.as_tensor(values).unsqueeze(0) for values in self._gains)
         self._plant.set_gains(*(row.to(self._plant.q.dtype) for row in rows))
 
     def obey(self, command: LowCmd, number: int) -> None:
-        """Take a command into force, whose number its sender gave it."""
+        """Put a command into force; ``number`` is the sender's count."""
         self._commanded, self._in_force = self.clock, number
         self.braking = command.damping
         self._target = torch.tensor(command.joint_target, dtype=self._plant.q.dtype).unsqueeze(0)
         self._set_gains(command.kp, command.kd)
 
     def step(self) -> None:
-        """Advance by a tick; drives that nobody has commanded for ``SILENCE`` brake."""
+        """Advance by a tick; drives without a command for ``SILENCE`` brake."""
         if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE + 1e-9:
             self.braking = True
             self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
@@ -117,17 +117,17 @@ class Robot:
         self.clock = round(self.clock / TICK + 1) * TICK
 
     def _advance(self) -> None:
-        """Make a step, and note what is true at the instant where it begins.
+        """Make a step, and keep the readings of the instant at which it begins.
 
-        The engine tells forces and the IMU's readings while it makes the step that begins there, and speeds half a step
-        before and after: asked before the step, it would tell them one to three milliseconds late.
+        The engine computes forces and IMU readings of that instant during the step, and has speeds half a step before
+        and after it. Read before the step, they would be one to three milliseconds old.
         """
         plant, backend = self._plant, self._plant.backend
         joints = plant.effects.measure(Measured(plant.q, plant.speed()))
         pose, q, qd = backend.qpos.clone(), joints.joint_pos.clone(), joints.joint_vel.clone()
         half = backend.qvel.clone()
         blocks, readings = backend.sensors, backend.sensordata
-        # Feet tell a tick late: the estimator's wait after a touch-down was chosen with such feet.
+        # Foot forces are one tick old: the estimator's ``settle`` was chosen with such readings.
         feet = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))[..., 1:].norm(dim=-1)
         plant.step(self._target)
         speed = 0.5 * (half + backend.qvel)
@@ -135,37 +135,37 @@ class Robot:
         rate = speed[:, 3:6] if floats else readings[:, blocks.imu_gyro]
         about = {"acc": readings[:, blocks.imu_acc], "quat": readings[:, blocks.imu_quat]}
         imu = plant.effects.measure(Measured(plant.q, plant.speed(), gyro=rate, **about))
-        told = {"q": q, "qd": qd, "tau_est": plant.torque, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
-        told["foot_force"] = feet
-        self._now = {name: values[0].numpy().copy() for name, values in told.items() if values is not None}
+        readings_now = {"q": q, "qd": qd, "tau_est": plant.torque, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
+        readings_now["foot_force"] = feet
+        self._now = {name: values[0].numpy().copy() for name, values in readings_now.items() if values is not None}
         trunk = torch.cat([pose[:, :7], speed[:, :6]], dim=1)[0].numpy() if floats else np.full(13, np.nan)
         self._true = np.array(trunk)
 
     def sense(self) -> tuple[LowState, np.ndarray]:
-        """Return what the sensors say of the instant where the last step began, and the truth (13,) then.
+        """Return the sensors' readings of the instant at which the last step began, and the truth (13,) then.
 
-        The truth is the trunk's place, attitude and velocities, in the columns of ``TRUTH``; NaN for a robot that
+        The truth is position, attitude and velocities of the trunk, in the columns of ``TRUTH``; NaN for a robot that
         hangs.
         """
-        seen = noisy(self._now, self._config.noise, self._rng)
+        readings = noisy(self._now, self._config.noise, self._rng)
         clock, in_force = self._measured
         state = LowState(
             t=clock,
             clock=clock,
             in_force=in_force,
-            joint_pos=seen["q"],
-            joint_vel=seen["qd"],
+            joint_pos=readings["q"],
+            joint_vel=readings["qd"],
             joint_torque=self._now["tau_est"],
-            imu_quat=seen["quat"],
-            imu_gyro=seen["gyro"],
-            imu_acc=seen["acc"],
-            foot_force=seen["foot_force"],
+            imu_quat=readings["quat"],
+            imu_gyro=readings["gyro"],
+            imu_acc=readings["acc"],
+            foot_force=readings["foot_force"],
         )
         return state, self._true
 
 
 def noisy(true: Mapping[str, np.ndarray], share: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Return what sensors read of the truth, values (..., size) by name, with a share of the noises above."""
+    """Return the truth, values (..., size) by name, with ``share`` times the noises above."""
 
     def even(name: str, like: np.ndarray) -> np.ndarray:
         return rng.uniform(-1.0, 1.0, like.shape) * share * NOISE[name]
@@ -184,7 +184,7 @@ def noisy(true: Mapping[str, np.ndarray], share: float, rng: np.random.Generator
 
 
 def turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """Return attitudes (..., 4), w-x-y-z, turned by small rotation vectors (..., 3), rad, in their own axes."""
+    """Return attitudes (..., 4), w-x-y-z, rotated by small rotation vectors (..., 3), rad, in the body's axes."""
     w, x, y, z = np.moveaxis(quat, -1, 0)
     a, b, c = np.moveaxis(0.5 * by, -1, 0)
     parts = (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)

@@ -1,4 +1,4 @@
-"""The simulated robot behind a UDP socket, in real time, over a network that may delay and lose."""
+"""The simulated robot behind a UDP socket, in real time, over a network that can delay and lose datagrams."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from go1exp.sim_robot.machine import TICK, Robot
 from go1exp.sim_robot.settings import SimConfig
 
 MOST_AT_ONCE = 10
-"""Ticks that are made up for at once after a delay; beyond that the robot's time stands still (its clock tells)."""
+"""Most ticks that are simulated at once after a delay; for a longer one the robot's clock falls behind for good."""
 
 TRUTH = (
     *("base_pos_x_w", "base_pos_y_w", "base_pos_z_w", "base_quat_w", "base_quat_x", "base_quat_y", "base_quat_z"),
@@ -29,11 +29,11 @@ TRUTH = (
 
 CHUNK = 5000
 ASK_EVERY = 20
-"""Calls between two questions whether to go on."""
+"""Calls between two checks whether to continue."""
 
 
 class Network:
-    """Delays and loses datagrams: each of them by itself, with the same odds both ways."""
+    """Delays datagrams, and loses each of them with the same probability, independently."""
 
     def __init__(self, delay: float, loss: float, rng: np.random.Generator) -> None:
         """Delay by ``delay`` s and lose a share ``loss``."""
@@ -43,7 +43,7 @@ class Network:
         self.lost = 0
 
     def put(self, now: float, data: bytes) -> None:
-        """Hand a datagram over at ``now``, s."""
+        """Send a datagram at ``now``, s."""
         if self._loss and self._rng.random() < self._loss:
             self.lost += 1
             return
@@ -51,15 +51,15 @@ class Network:
         heapq.heappush(self._way, (now + self._delay, self._count, data))
 
     def take(self, now: float) -> list[bytes]:
-        """Return the datagrams that are there by ``now``, in the order in which they arrive."""
-        found = []
+        """Return the datagrams that have arrived by ``now``, in the order of arrival."""
+        arrived = []
         while self._way and self._way[0][0] <= now + 1e-9:
-            found.append(heapq.heappop(self._way)[2])
-        return found
+            arrived.append(heapq.heappop(self._way)[2])
+        return arrived
 
 
 class Truth:
-    """The trunk's true motion by the robot's clock, kept in pieces so that nothing is ever moved."""
+    """The trunk's true motion by the robot's clock, kept in blocks so that no array is ever copied to grow."""
 
     def __init__(self) -> None:
         self._pieces = [np.zeros((CHUNK, 1 + len(TRUTH)))]
@@ -81,16 +81,16 @@ class Truth:
 
 @dataclass
 class Counts:
-    """What happened at the robot's end; datagrams by what became of them, and how real time was kept.
+    """Counts at the robot's end: datagrams by what happened to them, and how real time was kept.
 
     Attributes:
-        commands: taken into force.
+        commands: commands put into force.
         old: commands that came after a newer one.
-        foreign: datagrams that were no message, or came from somebody else.
-        states: sent.
+        foreign: datagrams that were not a valid message, or came from another sender.
+        states: states sent.
         lost: datagrams that the simulated network lost.
         slipped: time by which the robot's clock fell behind for good, s.
-        ticks: of 2 ms, that were simulated.
+        ticks: simulated ticks of 2 ms.
     """
 
     commands: int = 0
@@ -120,7 +120,7 @@ class Server:
         """
         self._robot = robot
         rng = np.random.default_rng([config.seed, 1])
-        self._here, self._back = (Network(config.delay, config.loss, rng) for _ in range(2))
+        self._uplink, self._downlink = (Network(config.delay, config.loss, rng) for _ in range(2))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
@@ -153,21 +153,21 @@ class Server:
 
         timing = run(work, 1.0 / TICK, seconds, clock)
         self.counts.timing = asdict(timing)
-        self.counts.lost = self._here.lost + self._back.lost
+        self.counts.lost = self._uplink.lost + self._downlink.lost
         return timing
 
     def tick(self) -> None:
-        """Listen, obey the newest command, move on by a tick, and send what the sensors said at its beginning."""
+        """Receive, obey the newest command, simulate one tick, and send the readings of its beginning."""
         robot, now = self._robot, self._robot.clock
         self._listen(now)
-        for data in self._here.take(now):
+        for data in self._uplink.take(now):
             self._obey(data)
         robot.step()
         state, true = robot.sense()
         self.truth.add(now, true)
         if self._peer is not None:
-            self._back.put(now, wire.pack_state(state, self.counts.ticks))
-            for data in self._back.take(now):
+            self._downlink.put(now, wire.pack_state(state, self.counts.ticks))
+            for data in self._downlink.take(now):
                 self._send(data)
         self.counts.ticks += 1
 
@@ -178,18 +178,18 @@ class Server:
             except BlockingIOError:
                 return
             except ConnectionRefusedError:
-                continue  # an earlier state found nobody
+                continue  # an earlier state was sent to a port that is closed
             about = wire.head(data)
             if about is None or about.kind == wire.STATE or self._peer not in (None, sender):
                 self.counts.foreign += 1
                 continue
-            self._peer = sender  # whoever speaks first
+            self._peer = sender  # the first sender; others are ignored
             if about.kind == wire.COMMAND:
-                self._here.put(now, data)
+                self._uplink.put(now, data)
 
     def _obey(self, data: bytes) -> None:
         about = wire.head(data)
-        assert about is not None  # it was looked at when it came
+        assert about is not None  # checked when it was received
         if wire.newer(about.number, self._last) <= 0:
             self.counts.old += 1
             return
