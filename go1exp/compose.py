@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
-from hydra.core.config_store import ConfigStore
+from hydra import initialize
 from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from go1exp import data_root
+from go1exp.choices import choice_files, config_folder, groups_of
+from go1exp.config_source import seen_by
+from go1exp.schema.registry import ConfigError, nearest, unknown_name
 
-
-def config_folder() -> str:
-    """Return the absolute path of ``conf/``."""
-    return str(data_root() / "conf")
-
-
-def register_groups() -> None:
-    """Make the files of ``conf/randomization`` the group ``rand``: Hydra takes a group's name from its folder."""
-    for file in sorted((data_root() / "conf/randomization").glob("*.yaml")):
-        ConfigStore.instance().store(group="rand", name=file.stem, node=OmegaConf.load(file), provider=str(file))
+GRAMMAR = "See https://hydra.cc/docs/1.2/advanced/override_grammar/basic for details"
+"""What Hydra ends its remarks on a value with."""
 
 
 def as_container(config: DictConfig) -> dict[str, Any]:
@@ -32,24 +30,83 @@ def as_container(config: DictConfig) -> dict[str, Any]:
     return {str(k): v for k, v in container.items()}
 
 
-def compose(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Compose ``conf/<name>.yaml`` with command-line overrides outside a Hydra application."""
-    register_groups()
+@contextmanager
+def hydra_for(name: str, folders: Sequence[Path] = ()) -> Iterator[None]:
+    """Set Hydra up for what ``conf/<name>.yaml`` may choose from, with a user's ``folders`` of further choices."""
     GlobalHydra.instance().clear()
-    with initialize_config_dir(config_folder(), version_base="1.3"):
+    with seen_by(name, folders), initialize(config_path=None, version_base="1.3"):
+        yield
+
+
+def compose(name: str, overrides: Sequence[str] = (), folders: Sequence[Path] = ()) -> dict[str, Any]:
+    """Compose ``conf/<name>.yaml`` with command-line overrides outside a Hydra application."""
+    with hydra_for(name, folders):
         return as_container(hydra_compose(name, list(overrides)))
+
+
+def compose_checked(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Compose as ``compose`` does, with the command line's words for what is wrong.
+
+    Raises:
+        ConfigError: if an override does not fit.
+    """
+    try:
+        return compose(name, overrides)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        problem = composition_problem(error, name, overrides)
+        if problem is None:
+            raise
+        raise ConfigError([problem]) from None
+
+
+def composition_problem(
+    error: Exception, name: str, overrides: Sequence[str], folders: Sequence[Path] = ()
+) -> str | None:
+    """Return in words why Hydra refused ``overrides`` of ``conf/<name>.yaml``; None if that is not what happened."""
+    if isinstance(error, MissingConfigException):
+        group, _, choice = (error.missing_cfg_file or "").partition("/")
+        known = choice_files(group, [config_folder(), *folders])
+        if choice and known:
+            return unknown_name(f"{group}={choice}", choice, known, f"choice of {group}")
+        return str(error).split("\n")[0]
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        return _refused_override(error, name, overrides, folders)
+    if isinstance(error, ValueError) and "override must be a string" in str(error):
+        files = {group: choice_files(group, [config_folder(), *folders]) for group in groups_of(name)}
+        pairs = ((override, *override.partition("=")[::2]) for override in overrides)
+        bad = next((text for text, group, choice in pairs if group in files and choice not in files[group]), "a group")
+        return f"{bad}: a group takes the name of one of its files, such as reward=paper"
+    return None
+
+
+def _refused_override(error: Exception, name: str, overrides: Sequence[str], folders: Sequence[Path]) -> str:
+    """Name the key that Hydra refused, the value, and the nearest keys that exist."""
+    match = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([^']+)'", str(error))
+    if not match:
+        cause = str(error.__cause__ or error).replace(GRAMMAR, "")
+        return " ".join(line.strip() for line in cause.splitlines() if line.strip())
+    key = match.group(1)
+    given = next((o for o in overrides if o.lstrip("+~").split("=")[0].split("@")[0] == key), key)
+    groups = [o for o in overrides if re.match(r"[a-z_]+=[a-z]", o) and o != given]
+    try:
+        known = [k for k in flat_keys(name, groups, folders) if k != key]
+    except Exception:  # one of the others is wrong too
+        known = [k for k in flat_keys(name) if k != key]
+    close = nearest(key, known) or nearest(key.rsplit(".", 1)[-1], known)
+    hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else "see --help"
+    return f"{given}: no such key {key!r}; {hint}"
 
 
 def key_values(container: Any, path: str = "") -> dict[str, Any]:
     """Flatten nested mappings: every key path, with its value (a mapping's own path is there too, with None)."""
     if not isinstance(container, dict):
         return {path: container}
-    found: dict[str, Any] = {path: None} if path else {}
+    flat: dict[str, Any] = {path: None} if path else {}
     for key, value in container.items():
-        found |= key_values(value, f"{path}.{key}" if path else str(key))
-    return found
+        flat |= key_values(value, f"{path}.{key}" if path else str(key))
+    return flat
 
 
-def flat_keys(name: str, overrides: Sequence[str] = ()) -> list[str]:
+def flat_keys(name: str, overrides: Sequence[str] = (), folders: Sequence[Path] = ()) -> list[str]:
     """Return every key path of ``conf/<name>.yaml`` composed with ``overrides``, groups included."""
-    return list(key_values(compose(name, overrides)))
+    return list(key_values(compose(name, overrides, folders)))

@@ -41,7 +41,14 @@ CountOrZero = Annotated[int, Field(ge=0)]
 
 @dataclass(frozen=True)
 class SimConfig:
-    """Time: the physics step and the policy's period, s; the episode length, s; where in an episode robots begin."""
+    """Time.
+
+    Attributes:
+        physics_dt: physics step, s.
+        policy_dt: period of the policy, s.
+        episode_s: length of an episode, s.
+        spread_starts: first episodes begin at random times, so that not all end together.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
@@ -63,7 +70,12 @@ class SimConfig:
 
 @dataclass(frozen=True)
 class ActionConfig:
-    """Action to joint target: target = nominal stance + ``scale`` (rad) x action cut at +-``clip``."""
+    """Action to joint target: target = nominal stance + ``scale`` x action cut at +-``clip``.
+
+    Attributes:
+        scale: rad per unit of action.
+        clip: bound of the policy's output.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
@@ -101,23 +113,23 @@ class PPOConfig:
         steps: policy steps per environment and iteration.
         epochs: passes over a rollout.
         minibatches: gradient steps per pass; must divide num_envs x steps.
-        learning_rate: of Adam; the first value unless the schedule is fixed.
+        learning_rate: step size of Adam; the first value unless the schedule is fixed.
         schedule: ``adaptive`` steers the rate by the KL divergence (rsl_rl's rule), ``fixed`` keeps it, ``linear``
             lowers it to the least of ``learning_rate_range`` over the iterations.
         desired_kl: the divergence per update that ``adaptive`` aims at.
-        learning_rate_range: its bounds.
+        learning_rate_range: bounds of the learning rate.
         gamma: discount factor.
-        gae_lambda: of the advantage estimator.
-        clip_range: of the probability ratio.
-        value_clip: of the value function's change, null for none.
+        gae_lambda: decay of the advantage estimator (GAE).
+        clip_range: how far the probability ratio may move from 1.
+        value_clip: bound of the value function's change; null for none.
         entropy: weight of the entropy bonus.
         value_coef: weight of the value loss.
         max_grad_norm: gradient clip, norm over actor and critic together.
-        normalize_advantage: over each minibatch, as SB3 does.
+        normalize_advantage: normalise advantages over each minibatch, as SB3 does.
         init_std: initial standard deviation of the actions.
         orthogonal_init: SB3's initial weights (gain sqrt(2), last layer of the actor 0.01); else PyTorch's, as rsl_rl.
         hidden: layers of actor and critic each.
-        activation: between them.
+        activation: nonlinearity between the layers.
         matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16.
     """
 
@@ -149,7 +161,14 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class WandbConfig:
-    """Weights & Biases: project, ``offline`` / ``online``, and an optional group and entity."""
+    """Weights & Biases.
+
+    Attributes:
+        project: name of the project.
+        mode: offline, or online, which needs an account.
+        group: name under which runs are shown together, or null.
+        entity: team or user, or null for the account's default.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
@@ -161,7 +180,13 @@ class WandbConfig:
 
 @dataclass(frozen=True)
 class LoggerConfig:
-    """Where metrics go besides the progress bar."""
+    """Where metrics go besides the progress bar.
+
+    Attributes:
+        csv: write metrics.csv in the run folder.
+        tensorboard: write TensorBoard's event files in the run folder.
+        wandb: Weights & Biases, or null for none.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
@@ -172,7 +197,12 @@ class LoggerConfig:
 
 @dataclass(frozen=True)
 class CheckpointConfig:
-    """A checkpoint ``every`` so many iterations; the newest ``keep`` stay."""
+    """When checkpoints are written.
+
+    Attributes:
+        every: iterations from checkpoint to checkpoint.
+        keep: newest checkpoints that stay.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
@@ -185,11 +215,11 @@ class ProcessConfig:
     """Settings at the top level of the YAML.
 
     Attributes:
-        seed: of everything random.
+        seed: seed of everything random.
         device: torch device of policy and update, ``auto`` for that of the environment, which is its backend's.
         torch_threads: threads of torch, 0 for its own choice.
-        resume: run folder to continue, or null.
-        start_from: run folder, or name of a shipped policy, whose weights a new run begins with, or null.
+        resume: run folder to continue; nothing but iterations, checkpoints, threads, device and backend may change.
+        start_from: run folder, or name of a shipped policy, whose weights a new run begins with.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -213,28 +243,44 @@ class TrainConfig:
 
 
 class RewardSlots(BaseModel):
-    """What a reward group reads beside the term's own parameters: the weight, per second."""
+    """What a reward group reads beside the term's own parameters.
+
+    Attributes:
+        weight: factor of the term in the reward, per second.
+    """
 
     model_config = STRICT
     weight: float
 
 
 class ObservationSlots(BaseModel):
-    """Half-width of the uniform noise added to the term."""
+    """What an observation group reads beside the term's own parameters.
+
+    Attributes:
+        noise: half-width of the uniform noise added to the term.
+    """
 
     model_config = STRICT
     noise: NonNegative = 0.0
 
 
 class RandomizationSlots(BaseModel):
-    """When a model term draws: once per environment, or at each of its resets."""
+    """What a randomisation group reads beside the term's own parameters.
+
+    Attributes:
+        when: startup draws once per environment, reset at each of its resets.
+    """
 
     model_config = STRICT
     when: Literal["startup", "reset"] = "reset"
 
 
 class EffectSlots(BaseModel):
-    """Half-widths of the uniform distributions from which each environment's parameters are drawn, once."""
+    """What an effect group reads beside the term's own parameters.
+
+    Attributes:
+        spread: half-widths of the uniform distributions from which each environment draws its parameters, once.
+    """
 
     model_config = STRICT
     spread: dict[str, NonNegative] = {}

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
@@ -25,10 +24,9 @@ from go1exp.cli import listing, settings
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.record import RIG
 from go1exp.cli.record import _motions as motions
-from go1exp.compose import compose, config_folder
+from go1exp.compose import compose, hydra_for
 from go1exp.config import TrainConfig, parse_parts, parse_train
 from go1exp.env.core import Go1Core
-from go1exp.fit import FitSettings
 from go1exp.gap.models import parse_model
 from go1exp.mdp import rewards
 from go1exp.schema import registry
@@ -335,28 +333,14 @@ COMMANDS = [
     for line in block.splitlines()
     if re.match(r"go1exp [\w-]+( |$)", line) and " --" not in line
 ]
-VERBS: dict[str, type] = {
-    "eval": settings.EvalSettings,
-    "play": settings.PlaySettings,
-    "record": settings.RecordSettings,
-    "record_audit": settings.AuditSettings,
-    "record_import": settings.ImportSettings,
-    "gap": settings.GapVerb,
-    "export": settings.ExportSettings,
-    "export_check": settings.ExportCheckSettings,
-    "deploy": settings.DeploySettings,
-    "fit-actuator": settings.FitActuatorSettings,
-    "list": settings.ListSettings,
-    "bench": settings.BenchSettings,
-}
-"""Verbs besides ``train``, and the schema of each."""
+VERBS = settings.SETTINGS
 COMPLAINTS = [block for block in fences("console") if block.startswith("$ go1exp train ")]
 
 
 def jobs(overrides: list[str]) -> list[list[str]]:
     """The overrides of each job of a multirun."""
     runs: list[list[str]] = [[]]
-    with initialize_config_dir(config_folder(), version_base="1.3"):
+    with hydra_for("train"):
         parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
         for override in parser.parse_overrides(overrides):
             if override.is_sweep_override():
@@ -387,9 +371,7 @@ def parse(verb: str, container: dict[str, Any]) -> None:
     if "model" in others:
         parse_model(container["model"])
     if "excitation" in others:
-        problems += motions(container["excitation"])[1]
-    if verb == "fit-actuator":
-        FitSettings(**{f.name: getattr(checked, f.name) for f in fields(FitSettings)})
+        motions(container["excitation"])
     if verb == "record_import":
         assert checked.source in registry.members("importer")
     if verb == "list":
@@ -424,7 +406,7 @@ def test_commands_in_the_documentation_compose_and_parse(command: str, beside: C
     verb, *overrides = shlex.split(command, comments=True)[1:]
     if overrides[:1] and overrides[0] in cli.SUBVERBS.get(verb, ()):
         verb, overrides = f"{verb}_{overrides[0]}", overrides[1:]
-    runs = [choices_from_files(cli._by_name(verb, overrides))]
+    runs = [choices_from_files(cli._by_name(verb, overrides), verb)]
     if overrides[:1] == ["-m"]:
         runs = jobs(overrides[1:])
         assert len(runs) > 1

@@ -30,8 +30,6 @@ import pyarrow.parquet as parquet
 import pytest
 import torch
 from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from mujoco.batch import Batch
 from omegaconf import OmegaConf
 
@@ -39,7 +37,7 @@ from go1exp import data_root
 from go1exp.cli import settings
 from go1exp.cli.app import App
 from go1exp.cli.record import RIG
-from go1exp.compose import config_folder, register_groups
+from go1exp.compose import hydra_for
 from go1exp.config import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
 from go1exp.deploy.bundle import loads
 from go1exp.deploy.walk import STATUS
@@ -167,6 +165,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "record_import:path": lambda walk: [str(walk.logs(1))],
     "record_import:options": lambda walk: [{"rate_hz": 100.0}],
     "fit-actuator:recordings": lambda walk: [str(walk.recorded("noisy", {**FIVE, "sensors.qd.noise": 0.3}))],
+    "fit-actuator:gains": lambda walk: [[20.0, 0.5]],
     "fit-actuator:inputs": lambda walk: [["position_error"]],
     "fit-actuator:period": lambda walk: [0.004],
     "fit-actuator:smoothing": lambda walk: [0.02],
@@ -546,12 +545,15 @@ class Walk:
             return [f"files=[{self.recorded('whole', {})}]"]
         if leaf.program == "record_import":
             return ["source=go2_in_air", f"path={self.logs(0)}"]
+        if leaf.program == "fit-actuator" and leaf.key == "gains":
+            two = {**FIVE, "gains": [[20.0, 0.5], [30.0, 0.5]]}
+            return [f"recordings={self.recorded('two gains', two)}", "inputs=[velocity]"]
         if leaf.program == "fit-actuator":
             return [f"recordings={self.recorded('five', FIVE)}"]
         if leaf.program == "export_check":
             return [f"file={self.exported('run')}"]
         if leaf.program == "deploy":
-            swings = ["commands=sinusoid"] if leaf.key.startswith("sinusoid.") else []
+            swings = ["command=sinusoid"] if leaf.key.startswith("sinusoid.") else []
             return [f"bundle={self.exported('run')}", *swings]
         if leaf.program == "gap":
             return [f"logs={self.recorded('held', HELD)}"]
@@ -603,9 +605,7 @@ class Walk:
 
 @cache
 def _compose(program: str, overrides: tuple[str, ...]) -> str:
-    register_groups()
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(config_folder(), version_base="1.3"):
+    with hydra_for(program):
         return json.dumps(OmegaConf.to_container(hydra_compose(program, list(overrides))))
 
 

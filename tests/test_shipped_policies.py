@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from go1exp.cli.settings import shipped_policies, trained
+from go1exp.cli.runs import shipped_policies, trained
 from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.schema.registry import ConfigError

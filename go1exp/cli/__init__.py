@@ -39,11 +39,14 @@ POSITIONAL: dict[str, tuple[str, ...]] = {
 }
 """Settings that may be given by position alone; ``files`` takes all that are left."""
 
-ALIASES = {"deploy": {"robot": "link", "command": "commands"}, "eval": {"observation": "trunk_velocity"}}
-"""Settings by the names that users give them where a group of choices has that name; Hydra would take that one."""
-
 VALUED = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn")
 """Options of Hydra whose value is the word after them."""
+
+FLAGS = (
+    *("--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m"),
+    *("--config-path", "-cp", "--experimental-rerun"),
+)
+"""Hydra's other options."""
 
 ONE_BLAS_THREAD = ("OPENBLAS_NUM_THREADS", "1")
 """Variable and value, read when NumPy is first imported: its matrices are small here, and threads that wait for each
@@ -67,7 +70,9 @@ def main() -> int:
     os.environ.setdefault(*ONE_BLAS_THREAD)
     arguments = sys.argv[1:]
     if arguments[:1] == ["-sc"] and len(arguments) > 1:
-        return _complete(arguments[1])
+        from go1exp.cli import completion
+
+        return completion.serve(arguments[1])
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(HELP.format(verbs="\n".join(f"  {verb:12} {text}" for verb, text in VERBS.items())), end="")
         return 0
@@ -86,59 +91,40 @@ def main() -> int:
         return 2
     if rest and rest[0] in SUBVERBS.get(verb, ()):
         verb, rest = f"{verb}_{rest[0]}", rest[1:]
+    if {"-h", "--help"} & {*rest}:
+        from go1exp.cli.helptext import show
+
+        show(verb, f"go1exp {verb.replace('_', ' ')}", rest)
+        return 0
     return _module(verb).APP.run(_by_name(verb, rest))
 
 
 def _by_name(verb: str, arguments: list[str]) -> list[str]:
-    """Turn arguments by position into ``key=value``: those that are no override, no option and no option's value."""
+    """Turn arguments by position into ``key=value``: those that are no override, no option and no option's value.
+
+    Options come first: Hydra's parser takes none between overrides.
+    """
+    from go1exp.cli.quoting import quoted
+
     keys = list(POSITIONAL.get(verb, ()))
     words: list[str] = []
-    rest: list[str] = []
-    for before, given in zip(["", *arguments], arguments, strict=False):
-        word = _own_name(verb, given)
-        own = "=" in word or word.startswith(("-", "~")) or before in VALUED
-        (rest if own or not keys else words).append(word)
+    options: list[str] = []
+    settings: list[str] = []
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        if word.startswith("-") or before in VALUED:
+            options.append(word)
+        elif "=" in word or word.startswith("~") or not keys:
+            settings.append(word)
+        else:
+            words.append(word)
     named = []
     for key in keys:
         if key == "files" and words:
-            return [*rest, f"files=[{','.join(_quoted(w) for w in words)}]"]
+            return [*options, *settings, f"files=[{','.join(quoted(w) for w in words)}]"]
         if words:
-            named.append(f"{key}={_quoted(words.pop(0))}")
-    return [*rest, *named, *words]
-
-
-def _own_name(verb: str, word: str) -> str:
-    """Return an override with the key that the verb's configuration has for it."""
-    key, equals, value = word.partition("=")
-    return ALIASES.get(verb, {}).get(key, key) + equals + value
-
-
-def _quoted(word: str) -> str:
-    """Write a word so that Hydra takes it as it is."""
-    return "'" + word.replace("'", "\\'") + "'"
+            named.append(f"{key}={quoted(words.pop(0))}")
+    return [*options, *settings, *named, *words]
 
 
 def _module(verb: str):  # type: ignore[no-untyped-def]  # a module with an APP
     return importlib.import_module(f"go1exp.cli.{MODULES.get(verb, verb)}")
-
-
-def _complete(request: str) -> int:
-    """Serve tab completion: verbs here, everything after the verb by that verb's Hydra application."""
-    action, _, shell = request.partition("=")
-    line = os.environ.get("COMP_LINE", "")
-    words = line.split(" ")
-    if action == "query" and len(words) <= 2:
-        print("\n".join(v for v in VERBS if v.startswith(words[-1] if len(words) == 2 else "")))
-        return 0
-    verb, after = words[1] if action == "query" else "train", words[2:]
-    if verb not in VERBS:
-        return 0
-    if action == "query":
-        second = SUBVERBS.get(verb, ())
-        if len(after) > 1 and after[0] in second:
-            verb, after = f"{verb}_{after[0]}", after[1:]
-        elif len(after) == 1:
-            print("".join(f"{word}\n" for word in second if word.startswith(after[0])), end="", flush=True)
-        os.environ["COMP_LINE"] = " ".join([words[0], *after])
-        os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
-    return _module(verb).APP.run(["-sc", f"{action}={shell}"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import shutil
 import sys
 import warnings
@@ -16,14 +15,18 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from go1exp.choices import CONFIG_DIR, given_folders
+from go1exp.cli import FLAGS, VALUED
 from go1exp.cli.files import choices_from_files
-from go1exp.compose import as_container, config_folder, flat_keys, register_groups
-from go1exp.schema.registry import ConfigError, Expected, nearest, unknown_name
+from go1exp.cli.quoting import protected
+from go1exp.compose import as_container, composition_problem
+from go1exp.config_source import seen_by
+from go1exp.schema.registry import ConfigError, Expected
 
 BAD_CONFIG, FAILED, STOPPED, READER_LEFT = 2, 1, 130, 141
 """Exit statuses: configuration refused before anything was built; the work failed; a signal ended it (the last: that of
@@ -47,11 +50,10 @@ class App:
         """Run with command-line arguments; print errors; return the exit status."""
         # Hydra would print its own report and leave; this makes it raise to here instead.
         before = os.environ.get("HYDRA_FULL_ERROR")
-        own_traceback = before == "1"
+        wants_traceback = before == "1"
         os.environ["HYDRA_FULL_ERROR"] = "1"
         defer("torch")
         warnings.filterwarnings("ignore", message="The `render_mode` attribute is not defined")
-        register_groups()
         status: list[int | None] = []
         failure: list[Exception] = []
 
@@ -64,11 +66,13 @@ class App:
                 failure.append(error)  # Hydra would print a report of its own
 
         version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
-        # Tab completion is installed for the program, whichever verb serves it.
         title = f"go1exp {self.title or self.name}"
         try:
-            sys.argv = ["go1exp" if "-sc" in arguments else title, *choices_from_files(arguments)]
-            hydra.main(**version, config_path=config_folder(), config_name=self.name)(task)()
+            _refuse_stray_words(arguments, title)
+            overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
+            sys.argv = [title, *map(protected, overrides)]
+            with seen_by(self.name, folders):
+                hydra.main(**version, config_path=None, config_name=self.name)(task)()
             if failure:
                 raise failure[0]
             sys.stdout.flush()
@@ -76,7 +80,7 @@ class App:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return READER_LEFT
         except Exception as error:
-            if own_traceback:
+            if wants_traceback:
                 raise
             code, message = self._explain(error, arguments)
             print(f"{title}: {message}", file=sys.stderr)
@@ -91,59 +95,47 @@ class App:
         if isinstance(error, ConfigError):
             lines = error.problems
             return BAD_CONFIG, lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems", *lines])
-        if isinstance(error, MissingConfigException):
-            return BAD_CONFIG, _missing_choice(error)
-        if isinstance(error, ValueError) and "override must be a string" in str(error):
-            bad = next((a for a in arguments if _is_group(a.split("=")[0]) and not _is_choice(a)), "a group")
-            return BAD_CONFIG, f"{bad}: a group takes the name of one of its files, such as reward=paper"
-        if isinstance(error, HydraException | OmegaConfBaseException):
-            return BAD_CONFIG, self._bad_override(error, arguments)
+        if isinstance(error, HydraException | OmegaConfBaseException | ValueError):
+            problem = composition_problem(error, self.name, arguments, given_folders(arguments)[1:])
+            if problem:
+                return BAD_CONFIG, problem
         if isinstance(error, OSError):
             return FAILED, f"{error.strerror}: {error.filename}" if error.strerror and error.filename else str(error)
         if isinstance(error, Expected):
             return FAILED, str(error)
         raise error
 
-    def _bad_override(self, error: Exception, arguments: Sequence[str]) -> str:
-        """Name the key that Hydra refused, the value, and the nearest keys that exist."""
-        text = str(error)
-        match = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([^']+)'", text)
-        if not match:
-            cause = error.__cause__ or error
-            return " ".join(line.strip() for line in str(cause).splitlines() if line.strip())
-        key = match.group(1)
-        given = next((a for a in arguments if a.lstrip("+~").split("=")[0].split("@")[0] == key), key)
-        groups = [a for a in arguments if re.match(r"[a-z_]+=[a-z]", a) and a != given]
-        try:
-            known = [k for k in flat_keys(self.name, groups) if k != key]
-        except Exception:  # one of the others is wrong too
-            known = [k for k in flat_keys(self.name) if k != key]
-        close = nearest(key, known) or nearest(key.rsplit(".", 1)[-1], known)
-        hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else "see go1exp list"
-        return f"{given}: no such key {key!r}; {hint}"
+
+def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:
+    """Raise ConfigError where Hydra's parsers would print their usage or a remark on grammar."""
+    problems = []
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        if before in VALUED:
+            continue
+        if word.startswith("-"):
+            if word.partition("=")[0] not in (*VALUED, *FLAGS):
+                problems.append(f"{word}: unknown option; see {title} --help")
+        elif "=" not in word and not word.startswith("~"):
+            problems.append(f"{word}: not a setting, which is key=value; see {title} --help")
+    if problems:
+        raise ConfigError(problems)
 
 
-def _folder(group: str) -> Path:
-    return Path(config_folder()) / ("randomization" if group == "rand" else group)
+def _without_config_dir(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:
+    """Return the arguments without ``--config-dir DIR``, and that folder: we show it to Hydra ourselves, filtered.
 
-
-def _is_group(name: str) -> bool:
-    return bool(name) and _folder(name).is_dir()
-
-
-def _is_choice(argument: str) -> bool:
-    group, _, choice = argument.partition("=")
-    return (_folder(group) / f"{choice}.yaml").is_file()
-
-
-def _missing_choice(error: MissingConfigException) -> str:
-    """Name the group, the choice that it does not have, and the nearest that it has."""
-    group, _, choice = (error.missing_cfg_file or "").partition("/")
-    folder = _folder(group)
-    if not choice or not folder.is_dir():
-        return str(error).split("\n")[0]
-    known = [p.relative_to(folder).with_suffix("").as_posix() for p in folder.rglob("*.yaml")]
-    return unknown_name(f"{group}={choice}", choice, known, f"choice of {group}")
+    Raises:
+        ConfigError: if it is no folder.
+    """
+    folders = given_folders(arguments)[1:]
+    if missing := [str(folder) for folder in folders if not folder.is_dir()]:
+        raise ConfigError([f"--config-dir {folder}: no such folder" for folder in missing])
+    rest = [
+        word
+        for before, word in zip(["", *arguments], arguments, strict=False)
+        if before not in CONFIG_DIR and word.partition("=")[0] not in CONFIG_DIR
+    ]
+    return rest, folders
 
 
 class _Deferred(ModuleType):

@@ -12,10 +12,11 @@ from go1exp.schema.registry import ConfigError
 
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.settings import DeploySettings, parse
+    from go1exp.schema.settings import subset
 
     other = {name: container[name] for name in CHOICES if container.get(name) is not None}
     settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in CHOICES})
-    if settings.link == "go1" and other:
+    if settings.robot == "go1" and other:
         raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
 
     from go1exp.cli.logs import writable
@@ -25,10 +26,9 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.deploy.walk import Plan
 
     writable(settings.out)
-    given = dataclasses.asdict(settings)
-    wish = Wish(settings.commands, settings.sinusoid.amplitude, settings.sinusoid.period)
-    plan = Plan(wish=wish, **{f.name: given[f.name] for f in dataclasses.fields(Plan) if f.name != "wish"})
-    job = Job(settings.bundle, settings.link, plan, settings.out, given["sim"], other, settings.truth)
+    plan = subset(Plan, settings, wish=Wish(settings.command, settings.sinusoid.amplitude, settings.sinusoid.period))
+    sim = dataclasses.asdict(settings.sim)
+    job = Job(settings.bundle, settings.robot, plan, settings.out, sim, other, settings.truth)
     try:
         return do(job, lambda line: print(line, flush=True))
     except RefusedError as error:

@@ -11,7 +11,8 @@ from go1exp.schema.registry import ConfigError
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import EvalSettings, checkpoint_file, parse, trained
+    from go1exp.cli.runs import checkpoint_file, trained
+    from go1exp.cli.settings import EvalSettings, parse
 
     other, container = other_robot.split(container)
     settings = parse(EvalSettings, container)

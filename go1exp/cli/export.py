@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.cli.quoting import command
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import ExportSettings, checkpoint_file, parse, trained
+    from go1exp.cli.runs import checkpoint_file, trained
+    from go1exp.cli.settings import ExportSettings, parse
 
     settings = parse(ExportSettings, container)
     run, out = trained(settings.run, settings.policy, "bundle.zip", settings.out)
@@ -28,7 +30,7 @@ def _task(container: dict[str, Any]) -> None:
     worst = max(found.differences.values())
     print(f"{len(found.trace['time'])} steps of the environment replayed, largest difference {worst:.1e}")
     print(f"written to {out} ({len(data) / 1e6:.2f} MB), SHA-256 {found.seal}")
-    print(f"now: go1exp export check {out}")
+    print(f"now: {command('export', 'check', str(out))}")
 
 
 APP = App("export", _task)

@@ -1,4 +1,4 @@
-"""Group choices that are files of the user's own: ``effect=found/effect.yaml``."""
+"""Group choices that are files of the user's own: ``effect=gap/effect.yaml``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
-from yaml import YAMLError
+from yaml import MarkedYAMLError, YAMLError
 
+from go1exp.choices import config_folder, groups_in, groups_of
 from go1exp.schema.registry import ConfigError
 
 PATHS = {"model": "mjcf"}
@@ -18,42 +19,73 @@ PATHS = {"model": "mjcf"}
 GROUP_IS_FILE = re.compile(r"^(?P<add>\+?)(?P<group>[a-z_]+)=(?P<value>\[?.*\.ya?ml\b.*)$")
 
 
-def choices_from_files(arguments: Sequence[str]) -> list[str]:
+ITEM = re.compile(r"'(?:\\.|[^'])*'|\"(?:\\.|[^\"])*\"|[^\[\],]+")
+"""One name or path of a list, with the quotes round it."""
+
+
+def choices_from_files(arguments: Sequence[str], verb: str) -> list[str]:
     """Return the arguments with every ``group=FILE.yaml`` turned into a choice that Hydra knows.
 
-    A list may mix files and names: ``effect=[found.yaml,payload]``.
+    A list may mix files and names: ``effect=[mine.yaml,payload]``. Quotes round a path are taken off.
 
     Raises:
-        ConfigError: if a file is missing or holds no mapping.
+        ConfigError: if a file is missing, empty, no YAML or no mapping; with every such file.
     """
-    found = []
+    chosen: list[str] = []
+    problems: list[str] = []
     for argument in arguments:
         match = GROUP_IS_FILE.match(argument)
-        if match is None:
-            found.append(argument)
+        group = match["group"] if match else ""
+        if match is None or not (group in groups_of(verb) or (match["add"] and group in groups_in(config_folder()))):
+            chosen.append(argument)
             continue
-        group, value = match["group"], match["value"]
-        items = [item.strip() for item in value.strip("[]").split(",")]
-        names = [_choice(group, item) if re.search(r"\.ya?ml$", item) else item for item in items]
-        chosen = f"[{','.join(names)}]" if value.startswith("[") else names[0]
-        found.append(f"{match['add']}{group}={chosen}")
-    return found
+
+        def name_of(item: re.Match[str], group: str = group) -> str:
+            file = _unquoted(item[0])
+            if not re.search(r"\.ya?ml$", file):
+                return item[0]
+            try:
+                return _choice(group, file)
+            except ConfigError as error:
+                problems.extend(error.problems)
+                return ""
+
+        chosen.append(f"{match['add']}{group}={ITEM.sub(name_of, match['value'])}")
+    if problems:
+        raise ConfigError(problems)
+    return chosen
+
+
+def _unquoted(item: str) -> str:
+    """Return an item of a list without the spaces and the quotes round it."""
+    item = item.strip()
+    return re.sub(r"\\(.)", r"\1", item[1:-1]) if item[:1] in ("'", '"') else item
 
 
 def _choice(group: str, file: str) -> str:
     """Make a file a choice of ``group`` and return its name there."""
-    path = Path(file)
-    if not path.is_file():
-        raise ConfigError([f"{group}={file}: no such file"])
+    path, key = Path(file).expanduser(), f"{group}={file}"
+    if not path.exists():
+        raise ConfigError([f"{key}: no such file"])
     try:
         content = OmegaConf.load(path)
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise ConfigError([f"{key}: not UTF-8 (byte {error.start})"]) from None
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f"line {mark.line + 1}: " if mark else ""
+        raise ConfigError([f"{key}: no YAML ({line}{error.problem})"]) from None
     except (YAMLError, OSError) as error:
-        raise ConfigError([f"{group}={file}: no YAML ({str(error).splitlines()[0]})"]) from None
+        why = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
+        raise ConfigError([f"{key}: cannot be read ({why})"]) from None
+    if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
+        raise ConfigError([f"{key}: is empty; without any, use {group}=none"])
     if not isinstance(content, DictConfig):
-        raise ConfigError([f"{group}={file}: must be a mapping, as the files of conf/{group} are"])
+        raise ConfigError([f"{key}: must be a mapping, as the files of conf/{group} are"])
     named = content.get(PATHS.get(group, ""))
     if isinstance(named, str):
         content[PATHS[group]] = str((path.parent / named).resolve())
-    name = re.sub(r"\W", "_", str(path.with_suffix("")))
+    name = re.sub(r"\W", "_", str(path.with_suffix("")), flags=re.ASCII)  # else Hydra's grammar refuses it
     ConfigStore.instance().store(group=group, name=name, node=content, provider=str(path))
     return name

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
-from go1exp.schema.registry import ConfigError, explain
+from go1exp.cli.quoting import command
+from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,30 +36,36 @@ def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[
     return joint_torque
 
 
+def _with_gains(recordings: list[Recording], gains: tuple[float, float] | None) -> list[Recording]:
+    """Return the recordings made with these gains, kp N m/rad and kd N m s/rad; all of them for None.
+
+    Raises:
+        ConfigError: if there is none.
+    """
+    if gains is None:
+        return recordings
+    kp, kd = gains
+    chosen = [r for r in recordings if {*(r.meta.kp or ())} == {kp} and {*(r.meta.kd or ())} == {kd}]
+    if not chosen:
+        sets = {(max(r.meta.kp), max(r.meta.kd)) for r in recordings if r.meta.kp and r.meta.kd}
+        existing = ", ".join(f"[{p:g},{d:g}]" for p, d in sorted(sets)) or "none that are known"
+        raise ConfigError([f"gains = [{kp:g},{kd:g}]: no recording was made with these; there are {existing}"])
+    return chosen
+
+
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import FitActuatorSettings, parse
-    from go1exp.config import parse_parts
+    from go1exp.cli.parts import parse_with_groups
+    from go1exp.cli.settings import FitActuatorSettings
+    from go1exp.schema.settings import subset
 
-    parts, problems = parse_parts(container, ("robot",))
-    try:
-        settings = parse(FitActuatorSettings, {k: v for k, v in container.items() if k != "robot"})
-    except ConfigError as error:
-        raise ConfigError([*problems, *error.problems]) from None
-    if problems:
-        raise ConfigError(problems)
-
-    from pydantic import ValidationError
+    settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
     from go1exp import fit
-    from go1exp.cli.logs import read_all, writable
+    from go1exp.cli.logs import read_all, remove_empty, writable
 
-    own = {f.name: getattr(settings, f.name) for f in fields(fit.FitSettings)}
-    try:
-        how = fit.FitSettings(**own)
-    except ValidationError as error:
-        raise ConfigError(explain(error, "", own)) from None
+    recordings = _with_gains(read_all(settings.recordings), settings.gains)
+    existed = Path(settings.out).exists()
     out = writable(settings.out)
-    recordings = read_all(settings.recordings)
     bar = spinner(settings.epochs, "fitting")
     stage = [""]
 
@@ -71,14 +78,19 @@ def _task(container: dict[str, Any]) -> None:
     if settings.target == "joint_torque" and settings.smoothing is None:
         print("note: smoothing=0.02 usually serves target=joint_torque better (docs/actuators.md)")
     inverse = _inverse_dynamics(parts["robot"], settings.smoothing) if settings.target == "joint_torque" else None
-    result = fit.fit(recordings, how, progress, inverse)
+    try:
+        result = fit.fit(recordings, subset(fit.FitSettings, settings), progress, inverse)
+    except BaseException:  # refused, or stopped: what was made here and holds nothing goes
+        if not existed:
+            remove_empty(out)
+        raise
     result.net.save(out / "net.npz")
     result.net.export_onnx(out / "net.onnx")
     (out / "report.json").write_text(json.dumps(result.report.as_dict(), indent=2) + "\n")
     pictures = fit.plot(result, out) if settings.plots else []
     print(fit.text(result.report))
     print(f"\nwritten to {out}: net.npz, net.onnx, report.json{''.join(f', {p.name}' for p in pictures)}")
-    print(f"now: go1exp train actuator=net actuator.file={out / 'net.npz'}")
+    print(f"now: {command('train', 'actuator=net', settings={'actuator.file': out / 'net.npz'})}")
 
 
 APP = App("fit-actuator", _task)

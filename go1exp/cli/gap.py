@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from go1exp.cli.app import App, spinner
-from go1exp.schema.registry import ConfigError
+from go1exp.cli.quoting import command
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb
@@ -24,35 +24,28 @@ DOES_NOT_HOLD = 15
 
 
 def _task(container: dict[str, Any]) -> int:
-    from go1exp.cli.settings import GapVerb, parse
-    from go1exp.config import parse_parts
+    from go1exp.cli.parts import parse_with_groups
+    from go1exp.cli.settings import GapVerb
     from go1exp.gap.models import parse_model
+    from go1exp.schema.settings import MISSING
 
-    parts, problems = parse_parts(container, ("robot",))
-    try:
-        settings = parse(GapVerb, {k: v for k, v in container.items() if k not in ("robot", "model")})
-    except ConfigError as error:
-        problems += error.problems
-    try:
-        model = parse_model(container["model"])
-    except ConfigError as error:
-        problems += error.problems
-    if problems:
-        raise ConfigError(problems)
+    if container.get("stage") == "report" and container.get("logs") == MISSING:
+        container = {**container, "logs": []}  # it reads the answer alone
+    settings, parts = parse_with_groups(GapVerb, container, ("robot",), model=parse_model)
     out = Path(settings.out)
 
-    from go1exp.cli.logs import read_all, writable
+    from go1exp.cli.logs import long_enough, read_all, writable
     from go1exp.gap import files
 
     if settings.stage == "report":
         return _report(files.load(out), out)
-    recordings = read_all(settings.logs)
+    recordings = long_enough(read_all(settings.logs), settings.search.window_s + settings.search.burn_s)
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
 
     from go1exp.gap.machine import machine_of
 
-    machine = machine_of(model, parts["robot"])
+    machine = machine_of(parts["model"], parts["robot"])
     if settings.stage == "check":
         return _check(recordings, machine, settings)
     if settings.stage == "localise":
@@ -156,7 +149,7 @@ def _apply(result: GapResult, recordings: list[Recording], machine: Machine, set
         print(f"NOT applied: it was {1 + proof.reported:.3g} in the search, and is worse at this step")
         return DOES_NOT_HOLD
     if result.named and machine.joints == JOINTS:
-        print(f"now: go1exp train effect={out / apply.EFFECT}")
+        print(f"now: {command('train', settings={'effect': out / apply.EFFECT})}")
     return 0
 
 

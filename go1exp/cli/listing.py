@@ -5,7 +5,9 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
+from go1exp.choices import about, choice_files, groups_in
 from go1exp.cli.app import App
+from go1exp.config_source import shown_folders
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -50,19 +52,10 @@ def _parameter(p: inspect.Parameter) -> str:
 
 
 def _choices() -> dict[str, list[tuple[str, str]]]:
-    """Return the files of each group with the first sentence of their comment."""
-    from go1exp import data_root
-
-    found: dict[str, list[tuple[str, str]]] = {}
-    for file in sorted((data_root() / "conf").rglob("*.yaml")):
-        parts = file.relative_to(data_root() / "conf").with_suffix("").parts
-        if len(parts) > 1:
-            group = "rand" if parts[0] == "randomization" else parts[0]
-            lines = file.read_text().splitlines()
-            comments = [line[1:].strip() for line in lines if line.startswith("#") and "@package" not in line]
-            about = " ".join(comments).split(". ")[0].rstrip(".")
-            found.setdefault(group, []).append(("/".join(parts[1:]), about))
-    return found
+    """Return the choices of each group with the first sentence of their file's comment, a user's own included."""
+    folders = shown_folders()
+    groups = dict.fromkeys(group for folder in folders for group in groups_in(folder))
+    return {group: [(name, about(file)) for name, file in choice_files(group, folders).items()] for group in groups}
 
 
 APP = App("list", _task)

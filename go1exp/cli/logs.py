@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,6 +45,34 @@ def writable(folder: str, key: str = "out") -> Path:
     except OSError as error:
         raise ConfigError([f"{key} = {folder!r}: cannot be written to ({error.strerror})"]) from None
     return path
+
+
+def remove_empty(folder: Path) -> None:
+    """Delete a folder for results that got none, and the folders above it that hold nothing else."""
+    with contextlib.suppress(OSError):  # the first that is not empty
+        for path in (folder, *folder.parents):
+            path.rmdir()
+
+
+def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
+    """Return the recordings of at least ``least`` s, and say which are left out.
+
+    Raises:
+        go1exp.recording.RecordingError: if there is none.
+    """
+    from go1exp.recording import RecordingError
+
+    lengths = [float(r.t[-1] - r.t[0]) for r in recordings]
+    short = [
+        f"{r.meta.episode}: {len(r.t)} rows, {length:g} s: too short; windows take {least:g} s"
+        for r, length in zip(recordings, lengths, strict=True)
+        if length < least
+    ]
+    if len(short) == len(recordings):
+        raise RecordingError("\n".join(short))
+    for line in short:
+        print(f"left out: {line}")
+    return [r for r, length in zip(recordings, lengths, strict=True) if length >= least]
 
 
 def read_all(places: str | Sequence[str]) -> list[Recording]:

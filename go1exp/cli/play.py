@@ -7,14 +7,21 @@ from typing import Any
 
 from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
+from go1exp.schema.registry import ConfigError
+
+FORMATS = (".mp4", ".gif")
+"""Endings of a clip's file; the picture beside it is a .png."""
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import PlaySettings, checkpoint_file, parse, trained
+    from go1exp.cli.runs import checkpoint_file, trained
+    from go1exp.cli.settings import PlaySettings, parse
 
     other, container = other_robot.split(container)
     settings = parse(PlaySettings, container)
     run, out = trained(settings.run, settings.policy, "play.mp4", settings.out)
+    if out.suffix.lower() not in FORMATS:
+        raise ConfigError([f"out = {str(out)!r}: a clip is {' or '.join(FORMATS)}"])
     checkpoint = checkpoint_file(run, settings.checkpoint)
 
     from go1exp.env.core import Go1Core
@@ -40,7 +47,8 @@ def _task(container: dict[str, Any]) -> None:
         picture(core, policy, settings.seconds, out.with_suffix(".png"))
         print(f"{error}\nA stick figure instead: {out.with_suffix('.png')}")
         return
-    video.write_mp4(out, frames, settings.fps)
+    write = video.write_gif if out.suffix.lower() == ".gif" else video.write_mp4
+    write(out, frames, settings.fps)
     video.write_strip(out.with_suffix(".png"), frames)
     print(f"written to {out} and {out.with_suffix('.png')}")
 

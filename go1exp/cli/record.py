@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.cli.quoting import command
 from go1exp.schema.registry import ConfigError, Term, bind
 
 if TYPE_CHECKING:
@@ -23,13 +24,19 @@ POLICY = "policy"
 """The excitation that is a trained policy walking."""
 
 
-def _motions(given: Any) -> tuple[list[Term], list[str]]:
-    """Resolve the excitations, a list of names and of ``{name: {parameter: value}}``; return them and the problems."""
+def _motions(given: Any) -> list[Term]:
+    """Resolve the excitations, a list of names and of ``{name: {parameter: value}}``.
+
+    Raises:
+        ConfigError: with every problem of them.
+    """
     if not given or not isinstance(given, list):
-        return [], [f"excitation = {given!r}: must be a list, such as [steps,{{chirp: {{band: [0.2, 5.0]}}}}]"]
+        raise ConfigError([f"excitation = {given!r}: must be a list, such as [steps,{{chirp: {{band: [0.2, 5.0]}}}}]"])
     items = [pair for item in given for pair in (item.items() if isinstance(item, Mapping) else [(item, {})])]
     bound = [bind("excitation", str(key), value, f"excitation.{key}") for key, value in items]
-    return [term for term, _ in bound if term], [p for _, problems in bound for p in problems]
+    if problems := [problem for _, term_problems in bound for problem in term_problems]:
+        raise ConfigError(problems)
+    return [term for term, _ in bound if term]
 
 
 def _unused(settings: RecordSettings) -> list[str]:
@@ -46,29 +53,20 @@ def _task(container: dict[str, Any]) -> None:
     import go1exp.excitations
     import go1exp.record.policy  # noqa: F401  (registers every excitation)
     from go1exp import robot
-    from go1exp.cli.settings import RecordSettings, parse, trained
-    from go1exp.config import parse_parts
+    from go1exp.cli.parts import parse_with_groups
+    from go1exp.cli.runs import trained
+    from go1exp.cli.settings import RecordSettings
     from go1exp.effects.rules import drive_problems, has_gains
 
-    parts, problems = parse_parts(container, RIG)
-    motions, found = _motions(container.get("excitation"))
-    problems += found
-    if parts.get("actuator"):
-        problems += drive_problems(parts["actuator"], parts.get("effect") or (), robot.JOINTS)
-        if not problems and any(m.entry.name != POLICY for m in motions) and not has_gains(parts["actuator"]):
-            problems.append(
-                f"gains: actuator {parts['actuator'].entry.name!r} has none to set; use excitation=[policy]"
-            )
-    rest = {k: v for k, v in container.items() if k not in (*RIG, "excitation")}
-    try:
-        settings = parse(RecordSettings, rest)
-    except ConfigError as error:
-        problems += error.problems
-    else:
-        if any(m.entry.name == POLICY for m in motions) and not (settings.run or settings.policy):
-            problems.append("run: required for excitation=[policy], such as run=runs/NAME, or policy=paper")
-        if motions and all(m.entry.name == POLICY for m in motions):
-            problems += _unused(settings)
+    settings, parts = parse_with_groups(RecordSettings, container, RIG, excitation=_motions)
+    motions = parts["excitation"]
+    problems = drive_problems(parts["actuator"], parts["effect"], robot.JOINTS)
+    if not problems and any(m.entry.name != POLICY for m in motions) and not has_gains(parts["actuator"]):
+        problems.append(f"gains: actuator {parts['actuator'].entry.name!r} has none to set; use excitation=[policy]")
+    if any(m.entry.name == POLICY for m in motions) and not (settings.run or settings.policy):
+        problems.append("run: required for excitation=[policy], such as run=runs/NAME, or policy=paper")
+    if all(m.entry.name == POLICY for m in motions):
+        problems += _unused(settings)
     if problems:
         raise ConfigError(problems)
     walk = trained(settings.run, settings.policy, "", "")[0] if settings.run or settings.policy else None
@@ -120,7 +118,7 @@ def _write(out: Path, recordings: list[Recording]) -> None:
         recording.write(out / f"{r.meta.episode}.parquet", r)
     total = sum(float(r.t[-1] - r.t[0]) for r in recordings)
     print(f"{len(recordings)} recordings, {total:.0f} s, in {out}")
-    print(f"now: go1exp record audit {out}")
+    print(f"now: {command('record', 'audit', str(out))}")
 
 
 APP = App("record", _task)

@@ -3,41 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
-from go1exp import data_root
+from go1exp.fit.settings import FitSettings
 from go1exp.gap.result import GapSettings
 from go1exp.record.plan import Wishes
-from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
+from go1exp.schema import settings as schema
+from go1exp.schema.registry import NonNegative, Positive
+from go1exp.schema.settings import settings
 from go1exp.sim_robot.settings import SimConfig
 
 T = TypeVar("T")
-
-REQUIRED = {
-    "run": "run=runs/NAME",
-    "files": "go1exp record audit recordings/NAME.parquet",
-    "file": "go1exp export check runs/NAME/bundle.zip",
-    "source": "go1exp record import go2_in_air PATH",
-    "path": "go1exp record import go2_in_air PATH",
-    "recordings": "recordings=recordings",
-    "logs": "logs=recordings",
-    "bundle": "go1exp deploy runs/NAME/bundle.zip",
-}
-"""Settings without a default, and how they are given."""
 
 Count = Annotated[int, Field(ge=1)]
 RunFolder = Annotated[str, Field(min_length=1)]
 
 
-@dataclass(frozen=True)
+@settings
 class Grid:
-    """Commanded values per axis, m/s and rad/s; ``cross`` for every combination."""
+    """Commanded velocities.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        x: forward velocities, m/s.
+        y: velocities to the left, m/s.
+        yaw: turning rates, rad/s.
+        cross: every combination of the three axes; false: one axis at a time, the others zero.
+    """
 
     x: tuple[float, ...]
     y: tuple[float, ...]
@@ -45,11 +38,28 @@ class Grid:
     cross: bool
 
 
-@dataclass(frozen=True)
+@settings
 class EvalSettings:
-    """``conf/eval.yaml``."""
+    """``conf/eval.yaml``.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        run: run folder to judge; or give policy.
+        policy: name of a policy that comes with the package, such as paper, in place of run.
+        checkpoint: file of the run; null takes the newest.
+        grid: commanded velocities.
+        episodes: episodes of each command, all at once.
+        duration_s: length of an episode, s.
+        settle_s: time at the start of an episode that does not count for tracking, s.
+        noise: add the observation noise of training.
+        randomize: randomise robots and starts as in training; false takes the nominal robot.
+        push: push the robot as in training.
+        train_ground: use the ground of training; false is flat.
+        trunk_velocity: what the policy sees of it, exact, or estimated by the robot's filter from its sensors.
+        policy_dt: another period of the policy, s; null keeps that of training.
+        physics_dt: another physics step, s, such as 0.00125 for policy_dt=0.0025; null keeps that of training.
+        seed: seed of everything random.
+        out: JSON file; null writes eval.json in the run folder (of a shipped policy paper_eval.json here).
+    """
 
     run: RunFolder | None
     policy: str | None
@@ -74,11 +84,25 @@ class EvalSettings:
             raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
 
 
-@dataclass(frozen=True)
+@settings
 class PlaySettings:
-    """``conf/play.yaml``."""
+    """``conf/play.yaml``.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        run: run folder to watch; or give policy.
+        policy: name of a policy that comes with the package, such as paper, in place of run.
+        checkpoint: file of the run; null takes the newest.
+        velocity: commanded velocity, x m/s, y m/s, yaw rad/s; arrow keys change it in the live viewer.
+        seconds: length of the clip, s.
+        viewer: clip, live, or auto, which is live where there is a display.
+        fps: frames per second of the clip.
+        noise: add the observation noise of training.
+        randomize: randomise the robot as in training; false takes the nominal robot.
+        push: push the robot as in training.
+        train_ground: use the ground of training; false is flat.
+        seed: seed of everything random.
+        out: clip (.mp4, .gif); null writes play.mp4 in the run folder. A picture, .png, goes beside it.
+    """
 
     run: RunFolder | None
     policy: str | None
@@ -95,10 +119,20 @@ class PlaySettings:
     out: str | None
 
 
-@dataclass(frozen=True)
+@settings
 class RecordSettings(Wishes):
-    """``conf/record.yaml`` without the groups and the excitations."""
+    """``conf/record.yaml`` without the groups.
 
+    Attributes:
+        excitation: motions by name (go1exp list excitation); with parameters as {chirp: {band: [0.2, 5.0]}}.
+        run: run folder of the policy of excitation=[policy]; or give policy.
+        policy: name of a policy that comes with the package, such as paper, in place of run.
+        episodes: robots that walk under a policy.
+        physics_dt: physics step, s.
+        out: folder for the recordings.
+    """
+
+    excitation: Any = ()
     run: str | None
     policy: str | None
     episodes: Count
@@ -117,21 +151,29 @@ class RecordSettings(Wishes):
             raise ValueError("\n".join(wrong))
 
 
-@dataclass(frozen=True)
+@settings
 class AuditSettings:
-    """``conf/record_audit.yaml``."""
+    """``conf/record_audit.yaml``.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        files: recordings (.parquet), or folders of them.
+        out: JSON file for the findings; null writes none.
+    """
 
     files: Annotated[tuple[str, ...], Field(min_length=1)]
     out: str | None
 
 
-@dataclass(frozen=True)
+@settings
 class ImportSettings:
-    """``conf/record_import.yaml``."""
+    """``conf/record_import.yaml``.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        source: name of the importer (go1exp list importer).
+        path: its file, or a folder of them.
+        options: the importer's own parameters, such as {rate_hz: 100.0}.
+        out: folder for the recordings.
+    """
 
     source: str
     path: str
@@ -139,11 +181,18 @@ class ImportSettings:
     out: str
 
 
-@dataclass(frozen=True)
+@settings
 class ExportSettings:
-    """``conf/export.yaml``."""
+    """``conf/export.yaml``.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        run: run folder to pack; or give policy.
+        policy: name of a policy that comes with the package, such as paper, in place of run.
+        checkpoint: file of the run; null takes the newest.
+        seconds: length of the trace that loading replays, s.
+        seed: seed of everything random in the trace.
+        out: file; null writes bundle.zip in the run folder (of a shipped policy paper_bundle.zip here).
+    """
 
     run: RunFolder | None
     policy: str | None
@@ -153,34 +202,56 @@ class ExportSettings:
     out: str | None
 
 
-@dataclass(frozen=True)
+@settings
 class ExportCheckSettings:
-    """``conf/export_check.yaml``."""
+    """``conf/export_check.yaml``.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        file: bundle that go1exp export wrote.
+    """
 
     file: Annotated[str, Field(min_length=1)]
 
 
-@dataclass(frozen=True)
+@settings
 class SinusoidSettings:
-    """Sines of all three velocities: amplitudes m/s, m/s, rad/s, and their period, s."""
+    """Sines of all three velocities.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        amplitude: amplitudes of x, y, yaw, m/s, m/s, rad/s.
+        period: their common period, s.
+    """
 
     amplitude: tuple[float, float, float]
     period: Positive
 
 
-@dataclass(frozen=True)
+@settings
 class DeploySettings:
-    """``conf/deploy.yaml`` without the groups."""
+    """``conf/deploy.yaml`` without the groups.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        bundle: file that go1exp export wrote.
+        robot: sim, a simulated robot in another process, or go1, the real one.
+        command: velocity as [x m/s, y m/s, yaw rad/s]; or FILE.csv, sinusoid, keyboard, gamepad.
+        sinusoid: the sines of command=sinusoid.
+        rate: rate of policy and commands, Hz; null takes that of training.
+        seconds: time under the policy, s; null walks until it is stopped (Ctrl-C).
+        stand_up: time from the first pose to the nominal stance, s.
+        lie_down: time for lying down at the end of a walk (time up, Esc or q), s; 0 brakes at once.
+        brake: time for which the drives brake at the end, s.
+        patience: time to wait for the robot's first state, s.
+        keep: newest seconds of the walk that the log has room for.
+        stale: time without a state after which the robot counts as lost, s.
+        spin: time before each cycle for which the core is kept busy, s; quicker, and it costs that core.
+        sim: the simulated robot.
+        truth: also record the simulated trunk's true pose and velocity.
+        out: folder for the logs.
+    """
 
     bundle: Annotated[str, Field(min_length=1)]
-    link: Literal["sim", "go1"]
-    commands: tuple[float, float, float] | str
+    robot: Literal["sim", "go1"]
+    command: tuple[float, float, float] | str
     sinusoid: SinusoidSettings
     rate: Annotated[float, Field(ge=10, le=1000)] | None
     seconds: Positive | None
@@ -196,39 +267,34 @@ class DeploySettings:
     out: str
 
 
-@dataclass(frozen=True)
-class FitActuatorSettings:
-    """``conf/fit-actuator.yaml``; what they mean and further rules are in ``go1exp.fit.FitSettings``."""
+@settings
+class FitActuatorSettings(FitSettings):
+    """``conf/fit-actuator.yaml`` without the group.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        recordings: folder of recordings, or a list of folders and files.
+        gains: take only recordings made with these, as [kp N m/rad, kd N m s/rad]; null takes all, which must agree.
+        plots: draw torque over time, measured and predicted.
+        out: folder for net.npz, net.onnx, report.json and the plots.
+    """
 
     recordings: str | tuple[str, ...]
-    inputs: tuple[str, ...]
-    history: Count
-    period: Positive | None
-    hidden: tuple[Count, ...]
-    skip: bool
-    share: Literal["all", "kind", "none"]
-    target: Literal["tau_est", "joint_torque"]
-    smoothing: Positive | None
-    epochs: Count
-    batch: Count
-    learning_rate: Positive
-    patience: Count
-    epoch_rows: Count
-    holdout: float | tuple[str, ...]
-    validation: float | tuple[str, ...]
-    half_net: bool
-    seed: Annotated[int, Field(ge=0)]
+    gains: tuple[NonNegative, NonNegative] | None
     plots: bool
     out: str
 
 
-@dataclass(frozen=True)
+@settings
 class GapVerb:
-    """``conf/gap.yaml``."""
+    """``conf/gap.yaml`` without the groups.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        logs: folder of recordings, or a list of folders and files.
+        stage: check, localise, replay, explain, apply or report; all runs explain, apply and report.
+        out: folder for verdict.json, effect.yaml, report.html.
+        train_dt: physics step of training, s, at which the answer must hold; also that of replay.
+        search: how the missing effect is searched for.
+    """
 
     logs: str | tuple[str, ...]
     stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report"]
@@ -237,21 +303,32 @@ class GapVerb:
     search: GapSettings
 
 
-@dataclass(frozen=True)
+@settings
 class ListSettings:
-    """``conf/list.yaml``."""
+    """``conf/list.yaml``.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        what: terms, groups, or all.
+        group: only this group, such as reward or rand.
+    """
 
     what: Literal["all", "terms", "groups"]
     group: str | None
 
 
-@dataclass(frozen=True)
+@settings
 class BenchSettings:
-    """``conf/bench.yaml``."""
+    """``conf/bench.yaml``.
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+    Attributes:
+        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime) or gpu (Warp).
+        num_envs: environments of the batch.
+        rounds: alternating measurements of each subject, of which the median counts.
+        seconds: length of a measurement, s.
+        threads: physics threads; 0 takes all cores.
+        overrides: settings of the training that is measured, such as [terrain=rough].
+        out: JSON file for the figures; null writes none.
+    """
 
     suite: Literal["env", "train", "actuator", "deploy", "gpu"]
     num_envs: Count
@@ -262,63 +339,35 @@ class BenchSettings:
     out: str | None
 
 
-def run_folder(path: str, key: str = "run") -> Path:
-    """Return the run folder ``path``; raise ConfigError if it is none, before anything heavy is imported."""
-    folder = Path(path)
-    if not (folder / "config.yaml").is_file():
-        raise ConfigError([f"{key} = {path!r}: not a run folder (it has no config.yaml)"])
-    return folder
+EXAMPLES = {
+    "run": "run=runs/NAME",
+    "files": "go1exp record audit recordings/NAME.parquet",
+    "file": "go1exp export check runs/NAME/bundle.zip",
+    "source": "go1exp record import go2_in_air PATH",
+    "path": "go1exp record import go2_in_air PATH",
+    "recordings": "recordings=recordings",
+    "logs": "logs=recordings",
+    "bundle": "go1exp deploy runs/NAME/bundle.zip",
+}
+"""Settings without a default, and how they are given."""
 
-
-def shipped_policies() -> dict[str, Path]:
-    """Return the run folders of the policies that come with the package, by name."""
-    return {f.parent.name: f.parent for f in sorted((data_root() / "assets" / "policies").glob("*/config.yaml"))}
-
-
-def trained(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[Path, Path]:
-    """Return the folder of the run or of the shipped policy that is meant, and the file that results go to.
-
-    Args:
-        run: run folder.
-        policy: name of a shipped policy, in its place.
-        file: what the results are called, in the run folder; those of a shipped policy go to the present one.
-        out: the user's own file.
-
-    Raises:
-        ConfigError: unless there is exactly one of the two.
-    """
-    if run is None and policy is None:
-        raise ConfigError([f"run: required, such as {REQUIRED['run']}, or a shipped policy, such as policy=paper"])
-    if run is not None and policy is not None:
-        raise ConfigError([f"run = {run!r} and policy = {policy!r}: only one of them"])
-    if policy is None:
-        assert run is not None
-        folder = run_folder(run)
-        return folder, Path(out or folder / file)
-    there = shipped_policies()
-    if policy not in there:
-        raise ConfigError([f"policy = {policy!r}: no such policy; there are {', '.join(there) or 'none'}"])
-    return there[policy], Path(out or f"{policy}_{file}")
-
-
-def checkpoint_file(run: Path, name: str | None) -> Path | None:
-    """Return the checkpoint ``name``, looked for in the run folder, its ``checkpoints/`` and as it stands."""
-    if name is None:
-        return None
-    places = [run / name, run / "checkpoints" / name, Path(name)]
-    found = next((p for p in places if p.is_file()), None)
-    if found is None:
-        there = ", ".join(p.name for p in sorted((run / "checkpoints").glob("*.pt"))) or "none"
-        raise ConfigError([f"checkpoint = {name!r}: no such file in {run}; it has {there}"])
-    return found
+SETTINGS: dict[str, type] = {
+    "eval": EvalSettings,
+    "play": PlaySettings,
+    "record": RecordSettings,
+    "record_audit": AuditSettings,
+    "record_import": ImportSettings,
+    "gap": GapVerb,
+    "export": ExportSettings,
+    "export_check": ExportCheckSettings,
+    "deploy": DeploySettings,
+    "fit-actuator": FitActuatorSettings,
+    "list": ListSettings,
+    "bench": BenchSettings,
+}
+"""Verbs besides ``train``, whose sections are in ``go1exp.config``, and the class of each one's settings."""
 
 
 def parse(kind: type[T], container: Mapping[str, Any]) -> T:
     """Validate a composed configuration as ``kind``; raise ConfigError with every problem."""
-    missing = [key for key, value in container.items() if value == "???"]
-    if missing:
-        raise ConfigError([f"{key}: required, such as {REQUIRED[key]}" for key in missing])
-    try:
-        return TypeAdapter(kind).validate_json(as_json(dict(container)))
-    except ValidationError as error:
-        raise ConfigError(explain(error, "", [f.name for f in fields(kind)])) from None  # type: ignore[arg-type]
+    return schema.parse(kind, container, EXAMPLES)

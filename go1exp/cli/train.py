@@ -9,10 +9,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
+from go1exp.choices import config_folder
 from go1exp.cli.app import STOPPED, App, discard, run_dir
-from go1exp.cli.settings import run_folder as existing
-from go1exp.cli.settings import shipped_policies
-from go1exp.compose import config_folder, key_values
+from go1exp.cli.quoting import command
+from go1exp.cli.runs import run_folder as existing
+from go1exp.cli.runs import shipped_policies
+from go1exp.compose import key_values
 from go1exp.schema.registry import ConfigError, Expected
 
 RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "backend")
@@ -105,9 +107,9 @@ def _task(container: dict[str, Any]) -> int | None:
     except trainer.Stopped:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             raise  # so that the jobs after this one do not start
-        print(f"stopped; go on with: go1exp train resume={run}")
+        print(f"stopped; go on with: {command('train', settings={'resume': run})}")
         return STOPPED
-    print(f"done; now: go1exp eval run={run}")
+    print(f"done; now: {command('eval', settings={'run': run})}")
     return None
 
 

@@ -43,10 +43,10 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
     ) -> None:
         if task is None:
-            from go1exp.compose import compose
+            from go1exp.compose import compose_checked
             from go1exp.config import parse_task
 
-            task = parse_task(compose("train", overrides))
+            task = parse_task(compose_checked("train", overrides))
         self.core = Go1Core(task, 1, first_env=env_index, noise=noise)
         self.observation_space, self.action_space = spaces(self.core)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / task.sim.policy_dt)}

@@ -1,13 +1,20 @@
-"""Actuator nets: what a drive makes of a command, learnt from recordings. ``fit`` is the way in."""
+"""Actuator nets: what a drive makes of a command, learnt from recordings. ``fit`` is the way in.
+
+Names are loaded at their first use: settings are checked before torch and SciPy are imported.
+"""
 
 from __future__ import annotations
 
-from go1exp.fit.fitting import FitResult, fit
-from go1exp.fit.net import ActuatorNet, NetFileError, load
-from go1exp.fit.plots import plot
-from go1exp.fit.report import Report, text
-from go1exp.fit.settings import FitError, FitSettings
-from go1exp.fit.smoothing import SmoothMotion, smooth_motion
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from go1exp.fit.fitting import FitResult, fit
+    from go1exp.fit.net import ActuatorNet, NetFileError, load
+    from go1exp.fit.plots import plot
+    from go1exp.fit.report import Report, text
+    from go1exp.fit.settings import FitError, FitSettings
+    from go1exp.fit.smoothing import SmoothMotion, smooth_motion
 
 __all__ = [
     "ActuatorNet",
@@ -23,3 +30,19 @@ __all__ = [
     "smooth_motion",
     "text",
 ]
+
+_MODULES = {
+    **dict.fromkeys(("FitResult", "fit"), "fitting"),
+    **dict.fromkeys(("ActuatorNet", "NetFileError", "load"), "net"),
+    "plot": "plots",
+    **dict.fromkeys(("Report", "text"), "report"),
+    **dict.fromkeys(("FitError", "FitSettings"), "settings"),
+    **dict.fromkeys(("SmoothMotion", "smooth_motion"), "smoothing"),
+}
+"""Name -> module of this package that defines it."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

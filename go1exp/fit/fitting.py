@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -237,6 +238,20 @@ def _common(recordings: Sequence[Recording], settings: FitSettings) -> tuple[str
     return first.robot, first.joints, settings.period
 
 
+def _sets(recordings: Sequence[Recording]) -> str:
+    """Return the sets of gains in words, each with its number of recordings, and how one is chosen."""
+    counts = Counter((r.meta.kp, r.meta.kd) for r in recordings)
+    pairs = {key: tuple(set(values) if values else set() for values in key) for key in counts}
+    plain = {key: (*kp, *kd) for key, (kp, kd) in pairs.items() if len(kp) == len(kd) == 1}
+    texts = [
+        f"kp {plain[key][0]:g}, kd {plain[key][1]:g} ({n})" if key in plain else f"by joint or unknown ({n})"
+        for key, n in counts.items()
+    ]
+    chosen = next(iter(plain.values()), None)
+    hint = f"; choose one, as gains=[{chosen[0]:g},{chosen[1]:g}]" if chosen else ""
+    return f"{', '.join(texts)}{hint}"
+
+
 def _gains(
     recordings: Sequence[Recording], settings: FitSettings
 ) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
@@ -246,7 +261,8 @@ def _gains(
         values = {getattr(r.meta, key) for r in recordings}
         if len(values) > 1 and "position_error" in settings.inputs:
             raise FitError(
-                f"{key}: differs between the recordings; a net of position errors holds for one set of gains"
+                f"{key} differs between the recordings, and a net of position errors holds for one set of gains: "
+                f"{_sets(recordings)}"
             )
         gains.append(values.pop() if len(values) == 1 else None)
     return gains[0], gains[1]

@@ -26,23 +26,25 @@ class FitSettings:
     instead of 0.050 N m after as many epochs (``benchmarks/actuator_net_ak80.py --all``). False: the paper's alone.
 
     Attributes:
-        inputs: what the net sees, each with ``history`` taps.
+        inputs: what the net sees, each with ``history`` taps; ``tau_cmd`` for drives that are commanded a torque.
         history: taps of each input (Walk These Ways: 3).
         period: time between taps, s; None takes the recordings' nominal sampling period.
         hidden: widths of the hidden layers.
         skip: whether a linear map goes beside them.
-        share: one net for all joints (the paper's way), for each kind, or for each joint.
-        target: ``tau_est``, what the drive reports, or ``joint_torque``, which the caller computes.
+        share: ``all``, one net for all joints (the paper's way), ``kind``, one each for hip, thigh and calf, or
+            ``none``, one per joint.
+        target: ``tau_est``, what the drive reports, or ``joint_torque``, by inverse dynamics (``go1exp fit-actuator``:
+            of a hung Go1).
         smoothing: window over which the inputs' angle and speed are smoothed first, s; None takes them as measured.
         epochs: passes over the training rows, at most; the learning rate falls to zero over them (cosine).
         batch: rows per step.
-        learning_rate: Adam's, at the start.
+        learning_rate: step size of Adam at the start.
         patience: epochs without a better validation error before the training stops.
         epoch_rows: rows of one pass; where there are more, each pass draws that many afresh.
         holdout: episodes never met before the report, by name or as a part of all.
         validation: episodes that decide when to stop, by name or as a part of all.
         half_net: whether to train a net of half the width too, as a reference.
-        seed: of split, initial weights and minibatches.
+        seed: seed of split, initial weights and minibatches.
     """
 
     inputs: Annotated[tuple[InputName, ...], Field(min_length=1)] = ("position_error", "velocity")

@@ -60,7 +60,7 @@ class GapSettings:
         certified: share of the bags in which a term must be found again.
         overlays: windows whose curves are kept for pictures.
         max_rows: simulations side by side.
-        threads: of the physics engine.
+        threads: threads of the physics engine; 0 takes all cores.
         seed: of splits, sign flips and bags.
     """
 

@@ -45,10 +45,17 @@ class Episode:
 
 @dataclass(frozen=True)
 class Wishes:
-    """What is to be recorded; ``conf/record.yaml`` says what each means.
+    """What is to be recorded.
 
-    ``gains`` are pairs kp (N m/rad), kd (N m s/rad); ``seconds`` the length of an episode; ``hang`` pairs of roll and
-    pitch, rad.
+    Attributes:
+        gains: pairs of kp (N m/rad) and kd (N m s/rad); every motion is recorded with each pair.
+        seconds: length of a recording, s.
+        seeds: seeds of the motions; one recording of each.
+        repeats: times that the first recording of each pair of gains is repeated under the same commands.
+        support: hung, ground, or auto, which is what the motion asks for and otherwise hung.
+        hang: pairs of roll and pitch of a hung trunk, rad; every hung motion is recorded at each.
+        seed: seed of the logger's noise, of drawn effects and of a policy's commands.
+        sensors: the logger.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT

@@ -16,7 +16,12 @@ from go1exp.schema.registry import STRICT, Fraction, NonNegative, Positive
 
 @dataclass(frozen=True)
 class Channel:
-    """Errors of one kind of channel: standard deviation of white noise, and the step of its values (0 for none)."""
+    """Errors of one kind of channel, in its unit.
+
+    Attributes:
+        noise: standard deviation of white noise.
+        step: step between the values that can be reported; 0 for none.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
@@ -35,11 +40,11 @@ class SensorConfig:
         q: joint angle, rad.
         qd: joint speed, rad/s.
         tau_est: torque that the drive reports, N m.
-        gyro: rad/s.
-        acc: m/s2.
+        gyro: angular velocity, rad/s.
+        acc: specific force, m/s2.
         attitude: error of the reported attitude as a small rotation, rad (its ``step`` is of the quaternion).
-        foot_force: N.
-        truth: also write the true position and velocity of the base, as motion capture measures them.
+        foot_force: force of a foot's sensor, N.
+        truth: also write the base's true position and velocity, as motion capture would.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT

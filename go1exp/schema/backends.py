@@ -12,7 +12,12 @@ from go1exp.schema.registry import STRICT
 
 @dataclass(frozen=True)
 class CpuBackend:
-    """MuJoCo's batch on a thread pool; ``threads`` 0 takes all cores."""
+    """MuJoCo's batch on a thread pool.
+
+    Attributes:
+        name: ``cpu``.
+        threads: threads of the physics; 0 takes all cores.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 

@@ -15,11 +15,11 @@ class SimConfig:
     """How the simulated robot is set up.
 
     Attributes:
-        start: on its feet in the nominal stance, on its belly, or hung up so that no foot reaches the ground.
+        start: standing in the nominal stance, lying on its belly, or hung up so that no foot reaches the ground.
         noise: noise of its sensors, as a multiple of the paper's Table II.
         delay: delay of datagrams, each way, s.
-        loss: share of the datagrams that are lost, each way.
-        seed: seed of noise, loss and random effects.
+        loss: share of the datagrams that get lost, each way.
+        seed: seed of noise, loss and drawn effects.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT

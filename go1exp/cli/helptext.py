@@ -1,0 +1,164 @@
+"""``go1exp VERB --help``: what a verb does, its groups, every setting in one line, examples.
+
+Nothing is written twice: the settings' lines come from the docstrings of their classes, values from ``conf/``, what a
+verb does and its examples from ``hydra.help`` in ``conf/VERB.yaml``.
+"""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from go1exp.choices import about, choice_files, config_folder, given_folders, groups_of, load
+
+KEY_WIDTH = 34
+"""Columns of ``key=value`` before the text beside it."""
+
+
+def show(verb: str, title: str, arguments: Sequence[str]) -> None:
+    """Print the help of a verb, or of the group that is named among the arguments."""
+    folders = given_folders(arguments)
+    groups = groups_of(verb)
+    container = _composed(verb, arguments, folders[1:])
+    named = next((word for word in arguments if word in groups), None)
+    print("\n".join(_group_page(title, named, groups, container, folders) if named else _page(verb, title, container)))
+
+
+def _composed(verb: str, arguments: Sequence[str], folders: Sequence[Path]) -> dict[str, Any]:
+    """Compose with the overrides among the arguments, or without them where they are wrong: help is for that too."""
+    from go1exp.cli.files import choices_from_files
+    from go1exp.compose import compose
+
+    overrides = [word for word in arguments if "=" in word and not word.startswith("-")]
+    try:
+        return compose(verb, choices_from_files(overrides, verb), folders)
+    except Exception:
+        return compose(verb)
+
+
+def _page(verb: str, title: str, container: Mapping[str, Any]) -> list[str]:
+    hydra_help = load(config_folder() / f"{verb}.yaml")["hydra"]["help"]
+    groups = groups_of(verb)
+    usage = f"{title} {'[group=choice ...] ' if groups else ''}[key=value ...]"
+    lines = [*hydra_help["header"].splitlines(), "", f"Usage: {usage}", ""]
+    if groups:
+        lines.append("Groups (group=choice, or group=FILE.yaml; * is what is chosen otherwise):")
+        for group, default in groups.items():
+            lines += _beside(group, _choices(group, default), 14)
+        lines += ["", f"  {title} --help {next(iter(groups))}      choices and keys of one group", ""]
+    texts = texts_of(verb)
+    lines.append("Settings (key=value; these are the values without it):")
+    for key, value in _flat({k: v for k, v in container.items() if k not in groups}).items():
+        lines += _beside(f"{key}={'' if value == '???' else _plain(value)}", _required(value) + texts.get(key, ""))
+    return [*lines, "", *hydra_help["footer"].rstrip().splitlines()]
+
+
+def _group_page(
+    title: str, group: str, groups: Mapping[str, str | None], container: Mapping[str, Any], folders: Sequence[Path]
+) -> list[str]:
+    lines = [f"{title}: group {group}", "", f"Choices ({group}=NAME, or {group}=FILE.yaml; * without it):"]
+    for name, file in choice_files(group, folders).items():
+        lines += _beside(name + ("*" if name == groups[group] else ""), about(file))
+    settings = container.get(group)
+    if isinstance(settings, dict) and settings:
+        lines += ["", "Keys (key=value):"]
+        texts = _texts_of_group(group, settings)
+        for key, value in settings.items():
+            path = f"{group}.{key}"
+            if isinstance(value, dict) and path in texts:  # a term: its line, then its parameters
+                lines += _beside(path, texts[path])
+                lines += [f"    {name}={_plain(v)}" for name, v in _flat(value, f"{path}.").items()]
+            else:
+                for name, v in _flat({path: value}).items():
+                    lines += _beside(f"{name}={_plain(v)}", texts.get(name, ""))
+        lines += _slots(group)
+    return lines
+
+
+def _slots(group: str) -> list[str]:
+    """Explain the keys that every term of a group may have beside its own parameters."""
+    from go1exp.config import MANY_TERMS
+    from go1exp.schema.settings import attributes
+
+    slots = MANY_TERMS.get(group)
+    texts = attributes(slots) if slots else {}
+    return (
+        ["", *(line for name, text in texts.items() for line in _beside(f"{group}.TERM.{name}", text))] if texts else []
+    )
+
+
+def texts_of(verb: str) -> dict[str, str]:
+    """Return what each setting of a verb means, by key path, groups left out."""
+    from go1exp.cli.settings import SETTINGS
+    from go1exp.schema.settings import lines
+
+    if verb != "train":
+        return lines(SETTINGS[verb])
+    from go1exp.config import SECTIONS, ProcessConfig
+
+    sections = [name for name in SECTIONS if name not in groups_of(verb)]
+    return lines(ProcessConfig) | {k: v for name in sections for k, v in lines(SECTIONS[name], f"{name}.").items()}
+
+
+def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
+    """Return what the keys of a group mean: those of a section by its class, a term by its docstring."""
+    from go1exp.config import ONE_TERM, SECTIONS
+    from go1exp.schema.backends import BACKENDS
+    from go1exp.schema.registry import members
+    from go1exp.schema.settings import lines
+
+    if group == "backend":
+        return lines(BACKENDS[settings["name"]], "backend.")
+    if group in SECTIONS:
+        return lines(SECTIONS[group], f"{group}.")
+    terms = members(group)
+    if group in ONE_TERM:
+        return {f"{group}.term": terms[settings["term"]].doc}
+    names = {key: value.get("term", key) if isinstance(value, dict) else key for key, value in settings.items()}
+    return {f"{group}.{key}": terms[name].doc for key, name in names.items() if name in terms}
+
+
+def _choices(group: str, default: str | None) -> str:
+    """Return the names of a group's choices in a line; those in folders as ``ablation/...``."""
+    names = dict.fromkeys(
+        n if "/" not in n else f"{n.split('/')[0]}/..." for n in choice_files(group, [config_folder()])
+    )
+    listed = ", ".join(name + ("*" if name == default else "") for name in names)
+    return listed if default or group == "experiment" else f"{listed}; without it that of training"
+
+
+def _flat(container: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Return the leaves by key path; an empty mapping is a leaf."""
+    flat: dict[str, Any] = {}
+    for key, value in container.items():
+        flat |= _flat(value, f"{path}{key}.") if isinstance(value, dict) and value else {f"{path}{key}": value}
+    return flat
+
+
+def _plain(value: Any) -> str:
+    """Write a value as the command line takes it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, list):
+        return f"[{','.join(map(_plain, value))}]"
+    return "{}" if value == {} else str(value)
+
+
+def _required(value: Any) -> str:
+    return "(required) " if value == "???" else ""
+
+
+def _width() -> int:
+    return max(60, min(120, shutil.get_terminal_size((120, 24)).columns))
+
+
+def _beside(key: str, text: str, width: int = KEY_WIDTH) -> list[str]:
+    """Return a key and its text side by side, the text wrapped; a long key has a line of its own."""
+    wrapped = textwrap.wrap(text.replace("``", "").replace("None", "null").rstrip("."), _width() - width - 4) or [""]
+    indent = " " * (width + 4)
+    if len(key) > width:
+        return [f"  {key}", *(f"{indent}{line}" for line in wrapped if line)]
+    return [f"  {key:{width}}  {wrapped[0]}".rstrip(), *(f"{indent}{line}" for line in wrapped[1:])]

@@ -1,0 +1,88 @@
+"""Where Hydra finds configuration: ``conf/`` and a user's folder like it, each verb with its own groups only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import ClassVar
+
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+from go1exp.choices import FOLDERS, config_folder, hidden_from
+
+
+class VerbSource(FileConfigSource):
+    """Files of a folder without the groups that a verb does not have; the group ``rand`` is the folder of its files."""
+
+    hidden: ClassVar[frozenset[str]] = frozenset()
+    """Folders that sources made from now on do not show."""
+
+    def __init__(self, provider: str, path: str) -> None:
+        super().__init__(provider, path)
+        self._hidden = type(self).hidden  # of the instance: a launcher may carry it to another process
+
+    @staticmethod
+    def scheme() -> str:
+        """Return what stands before ``://`` in a search path."""
+        return "go1exp"
+
+    def _place(self, config_path: str) -> str | None:
+        """Return where a configuration lies below the folder; None if the verb does not see it."""
+        first, slash, rest = config_path.strip("/").partition("/")
+        if first in self._hidden or first in FOLDERS.values() or FOLDERS.get(first) in self._hidden:
+            return None
+        return FOLDERS.get(first, first) + slash + rest
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read one file, by its name in the group."""
+        place = self._place(config_path)
+        return super().load_config(config_path if place is None else place)
+
+    def is_group(self, config_path: str) -> bool:
+        """Say whether there is a folder for the verb to see."""
+        place = self._place(config_path)
+        return place is not None and super().is_group(place)
+
+    def is_config(self, config_path: str) -> bool:
+        """Say whether there is a file for the verb to see."""
+        place = self._place(config_path)
+        return place is not None and super().is_config(place)
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        """Return the names below a group."""
+        place = self._place(config_path)
+        return [] if place is None else super().list(place, results_filter)
+
+
+class _Folders(SearchPathPlugin):
+    """Puts the folders on Hydra's search path."""
+
+    folders: ClassVar[tuple[Path, ...]] = ()
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in self.folders:
+            search_path.append("main" if folder == config_folder() else "user", f"{VerbSource.scheme()}://{folder}")
+
+
+def shown_folders() -> tuple[Path, ...]:
+    """Return ``conf/`` and the user's folders that Hydra looks into now."""
+    return _Folders.folders or (config_folder(),)
+
+
+@contextmanager
+def seen_by(verb: str, folders: Sequence[Path] = ()) -> Iterator[None]:
+    """Let Hydra find ``conf/`` and the user's ``folders`` as ``verb`` sees them, for what is set up meanwhile."""
+    for plugin in (VerbSource, _Folders):
+        Plugins.instance().register(plugin)
+    before = VerbSource.hidden, _Folders.folders
+    VerbSource.hidden, _Folders.folders = hidden_from(verb), (config_folder(), *folders)
+    try:
+        yield
+    finally:
+        VerbSource.hidden, _Folders.folders = before
