@@ -45,10 +45,16 @@ def groups_of(verb: str) -> dict[str, str | None]:
     return chosen
 
 
+def folder_of(group: str, folder: Path) -> Path:
+    """Return where the files of a group lie in a folder: of ``rand`` in ``randomization``, or in a user's ``rand``."""
+    place = folder / FOLDERS.get(group, group)
+    return place if place.is_dir() else folder / group
+
+
 def groups_in(folder: Path) -> list[str]:
     """Return the groups that have files below ``folder``."""
     names = sorted(path.name for path in folder.iterdir() if path.is_dir() and any(path.rglob("*.yaml")))
-    return [_GROUP_OF_FOLDER.get(name, name) for name in names]
+    return list(dict.fromkeys(_GROUP_OF_FOLDER.get(name, name) for name in names))
 
 
 def hidden_from(verb: str) -> frozenset[str]:
@@ -65,8 +71,8 @@ def choice_files(group: str, folders: Sequence[Path]) -> dict[str, Path]:
     """Return the choices of a group, as ``ablation/no_gait``, each with its file; the first folder goes first."""
     files: dict[str, Path] = {}
     for folder in folders:
-        place = folder / FOLDERS.get(group, group)
-        for file in sorted(place.rglob("*.yaml")):
+        place = folder_of(group, folder)
+        for file in sorted(place.rglob("*.yaml")) if place.is_dir() else ():
             files.setdefault(file.relative_to(place).with_suffix("").as_posix(), file)
     return files
 

@@ -14,7 +14,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
-from go1exp.choices import FOLDERS, config_folder, hidden_from
+from go1exp.choices import FOLDERS, config_folder, folder_of, hidden_from
 
 
 class VerbSource(FileConfigSource):
@@ -37,7 +37,7 @@ class VerbSource(FileConfigSource):
         first, slash, rest = config_path.strip("/").partition("/")
         if first in self._hidden or first in FOLDERS.values() or FOLDERS.get(first) in self._hidden:
             return None
-        return FOLDERS.get(first, first) + slash + rest
+        return folder_of(first, Path(self.path)).name + slash + rest if first else ""
 
     def load_config(self, config_path: str) -> ConfigResult:
         """Read one file, by its name in the group."""

@@ -23,7 +23,6 @@ A recording has a quantity for all its joints (or axes) or for none. Columns hol
 from __future__ import annotations
 
 import math
-import os
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -34,6 +33,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from go1exp.files import opened
 from go1exp.robot import JOINTS, LEGS
 from go1exp.schema.registry import STRICT, Expected, NonNegative, Positive, explain, nearest
 
@@ -342,12 +342,8 @@ def write(path: Path, recording: Recording) -> None:
     table = pa.table({name: pa.array(values) for name, values in recording.channels.items()})
     table = table.replace_schema_metadata({KEY: _META.dump_json(recording.meta)})
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        pq.write_table(table, partial, compression="zstd", use_dictionary=False, write_page_checksum=True)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with opened(path) as file:
+        pq.write_table(table, file, compression="zstd", use_dictionary=False, write_page_checksum=True)
 
 
 def read_folder(path: Path) -> list[Recording]:

@@ -12,22 +12,22 @@ MuJoCo, `mdp/ground.py` reads it for batches.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ConfigDict
+from pydantic import AfterValidator, ConfigDict, Field
 
-from go1exp.schema.registry import STRICT
-
-KINDS = ("flat", "tiles")
-"""Allowed values of `TerrainConfig.kind`."""
+from go1exp.schema.registry import STRICT, NonNegative, Positive, ordered
 
 TILE_TYPES = ("boxes", "bumps", "ramp_up", "ramp_down", "flat")
 """Kinds of tile, in the order in which columns take them."""
 
 FloatArray = NDArray[np.float64]
+
+Count = Annotated[int, Field(ge=1)]
+NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], AfterValidator(ordered)]
 
 
 @dataclass(frozen=True)
@@ -63,65 +63,50 @@ class TerrainConfig:
         ramp_slope: Rise over run of the four sides of the ramp pyramid (legged_gym, Isaac Lab: 0.4).
 
     Raises:
-        ValueError: If a field is out of range; the message names every such field and what it may be.
+        ValueError: If fields do not fit together; the message names every such field and what it may be.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    kind: str = "flat"
-    rows: int = 10
-    cols: int = 20
-    tile_size: float = 8.0
-    border: float = 20.0
-    resolution: float = 0.1
-    platform: float = 2.0
-    seed: int = 0
-    boxes_proportion: float = 0.3
-    bumps_proportion: float = 0.3
-    ramps_proportion: float = 0.3
-    flat_proportion: float = 0.1
-    box_height: tuple[float, float] = (0.0, 0.1)
-    box_cell: float = 0.45
-    bump_amplitude: tuple[float, float] = (0.0, 0.06)
-    bump_length: float = 0.25
-    bump_blend: float = 0.5
-    ramp_slope: tuple[float, float] = (0.0, 0.4)
+    kind: Literal["flat", "tiles"] = "flat"
+    rows: Count = 10
+    cols: Count = 20
+    tile_size: Positive = 8.0
+    border: NonNegative = 20.0
+    resolution: Positive = 0.1
+    platform: Positive = 2.0
+    seed: Annotated[int, Field(ge=0)] = 0
+    boxes_proportion: NonNegative = 0.3
+    bumps_proportion: NonNegative = 0.3
+    ramps_proportion: NonNegative = 0.3
+    flat_proportion: NonNegative = 0.1
+    box_height: NonNegativeRange = (0.0, 0.1)
+    box_cell: Positive = 0.45
+    bump_amplitude: NonNegativeRange = (0.0, 0.06)
+    bump_length: Positive = 0.25
+    bump_blend: NonNegative = 0.5
+    ramp_slope: NonNegativeRange = (0.0, 0.4)
 
     def __post_init__(self) -> None:
-        """Turn YAML lists into tuples and check every field."""
-        problems: list[str] = []
-
-        def need(name: str, ok: bool, rule: str) -> bool:
-            if not ok:
-                problems.append(f"{name}: must be {rule}, not {getattr(self, name)!r}")
-            return ok
-
-        need("kind", self.kind in KINDS, f"one of {', '.join(map(repr, KINDS))}")
-        for name in ("rows", "cols", "seed"):
-            least = 1 if name in ("rows", "cols") else 0
-            need(name, _is_int(getattr(self, name)) and getattr(self, name) >= least, f"a whole number >= {least}")
-        positive = ("tile_size", "resolution", "platform", "box_cell", "bump_length")
-        shares = tuple(f.name for f in fields(self) if f.name.endswith("_proportion"))
-        for name in positive:
-            need(name, _is_real(getattr(self, name)) and getattr(self, name) > 0, "a number > 0")
-        for name in ("border", "bump_blend", *shares):
-            need(name, _is_real(getattr(self, name)) and getattr(self, name) >= 0, "a number >= 0")
-        for name in ("box_height", "bump_amplitude", "ramp_slope"):
-            value = getattr(self, name)
-            if isinstance(value, list | tuple):
-                object.__setattr__(self, name, tuple(value))
-            ok = isinstance(value, list | tuple) and len(value) == 2 and all(map(_is_real, value))
-            need(name, ok and 0 <= value[0] <= value[1], "a pair (low, high) with 0 <= low <= high")
-
-        if not problems:  # the rules between fields
-            for name in ("tile_size", "border"):
-                ok = _is_whole(getattr(self, name) / self.resolution)
-                need(name, ok, f"a whole number of samples of {self.resolution} m")
-            widest = self.tile_size - 4 * self.resolution
-            need("platform", self.platform <= widest, f"at most {widest:g} (two samples short of the tile border)")
-            need("boxes_proportion", sum(getattr(self, n) for n in shares) > 0, f"> 0 when all of {shares} are 0")
+        """Check what concerns several fields."""
+        problems = []
+        for name, length in (("tile_size", self.tile_size), ("border", self.border)):
+            samples = length / self.resolution
+            if abs(samples - round(samples)) > 1e-6:
+                problems.append(f"{name} = {length}: must be a whole number of samples of {self.resolution} m")
+        widest = self.tile_size - 4 * self.resolution
+        if self.platform > widest:
+            rule = f"must be at most {widest:g} (two samples short of the tile border)"
+            problems.append(f"platform = {self.platform}: {rule}")
+        if not any(self.proportions):
+            problems.append("boxes_proportion = 0: must be > 0 when the other three proportions are 0 too")
         if problems:
             raise ValueError("\n".join(problems))
+
+    @property
+    def proportions(self) -> tuple[float, float, float, float]:
+        """Shares of columns with boxes, bumps, ramps and without relief."""
+        return self.boxes_proportion, self.bumps_proportion, self.ramps_proportion, self.flat_proportion
 
     def difficulty(self, row: int) -> float:
         """Return the difficulty of a row, 0 (easiest) to 1."""
@@ -204,19 +189,12 @@ def build_terrain(config: TerrainConfig) -> Terrain:
 
 def column_types(config: TerrainConfig) -> tuple[str, ...]:
     """Deal tile types to columns, (cols,): the first whose cumulative share exceeds j / cols + 0.001 (legged_gym)."""
-    shares = np.array(
-        [
-            config.boxes_proportion,
-            config.bumps_proportion,
-            0.5 * config.ramps_proportion,
-            0.5 * config.ramps_proportion,
-            config.flat_proportion,
-        ]
-    )
+    boxes, bumps, ramps, flat = config.proportions
+    shares = np.array([boxes, bumps, 0.5 * ramps, 0.5 * ramps, flat])
     cumulative = np.cumsum(shares) / shares.sum()
-    found = np.searchsorted(cumulative, np.arange(config.cols) / config.cols + 0.001, side="right")
+    kinds = np.searchsorted(cumulative, np.arange(config.cols) / config.cols + 0.001, side="right")
     last = int(np.flatnonzero(shares)[-1])  # more than 1000 columns reach past 1
-    return tuple(TILE_TYPES[min(int(k), last)] for k in found)
+    return tuple(TILE_TYPES[min(int(kind), last)] for kind in kinds)
 
 
 def _tile(config: TerrainConfig, tile_type: str, row: int, col: int) -> FloatArray:
@@ -298,15 +276,3 @@ def _between(bounds: tuple[float, float], d: float) -> float:
 def _smoothstep(t: FloatArray) -> FloatArray:
     t = np.clip(t, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
-
-
-def _is_int(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-def _is_real(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_whole(value: float) -> bool:
-    return abs(value - round(value)) < 1e-6

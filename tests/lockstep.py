@@ -116,7 +116,7 @@ class InProcess:
 
 @contextmanager
 def lockstep(spoil: Spoil = lambda state: state) -> Iterator[World]:
-    """Let ``go1exp.deploy.job.do`` play at a time of its own; ``spoil`` changes what sensors say, None is silence."""
+    """Let ``go1exp.deploy.job.run_job`` run in simulated time; ``spoil`` changes what sensors say, None is silence."""
     world = World(spoil)
 
     def clock(spin: float, meanwhile: Any) -> Any:

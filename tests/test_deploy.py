@@ -40,7 +40,7 @@ from go1exp.deploy.commands import (
 )
 from go1exp.deploy.controller import LYING, PHASES, Cycle
 from go1exp.deploy.estimate import BLIND_S, KalmanEstimator, settings
-from go1exp.deploy.job import Job, do
+from go1exp.deploy.job import Job, run_job
 from go1exp.deploy.launch import RefusedError, RobotError
 from go1exp.deploy.log import About, Log, Ring
 from go1exp.deploy.messages import Link, LowCmd, LowState
@@ -295,7 +295,7 @@ def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) ->
 
 def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Path]) -> None:
     task = bundle_task(file, {"actuator": {"term": "net", "file": str(make_net()), "period": "exact"}})
-    with pytest.raises(Exception, match="'net' has no kp and kd to command"):
+    with pytest.raises(Exception, match=r"actuator = net: has no kp and kd, .*; use actuator=pd"):
         Robot(task, sim_config({}))
 
 
@@ -310,7 +310,7 @@ def play(
     usual["wish"] = Wish((0.4, 0.0, 0.0))
     output: list[str] = []
     with lockstep(spoil) as world:
-        status = do(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), output.append)
+        status = run_job(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), output.append)
     (account,) = out.glob("*.json")
     kept = list(out.glob("*.parquet"))
     with np.load(next(out.glob("*.npz"))) as cycles:
@@ -572,7 +572,7 @@ def test_a_link_that_breaks_ends_the_walk_with_a_log(file: str) -> None:
         return [make_state(time.perf_counter(), clock=math.nan, in_force=-1)]
 
     link = SimpleNamespace(receive=receive, send=sent.append, close=lambda: None)
-    outcome = walk.go(load(file), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0))
+    outcome = walk.walk(load(file), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0))
     assert outcome.fault is not None
     assert (outcome.fault.name, outcome.fault.message) == ("runtime", "RobotError: the SDK failed")
     assert outcome.status == STATUS["runtime"]
@@ -893,7 +893,7 @@ def test_the_sdks_thread_runs_and_its_failure_is_told() -> None:
 
 def test_without_the_sdk_the_robot_is_refused(file: str, tmp_path: Path) -> None:
     with pytest.raises(RobotError, match=r"no module 'robot_interface'.*never been run on hardware"):
-        do(Job(file, "go1", Plan(), str(tmp_path)), print)
+        run_job(Job(file, "go1", Plan(), str(tmp_path)), print)
 
 
 # ---------------------------------------------------------------------- processes
@@ -1018,10 +1018,10 @@ def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytes
         main([file, "--rate", "-5"])
     assert "-5: must be greater than 0" in capfd.readouterr().err
     with pytest.raises(RefusedError, match=r"sim\.loss = 2"):
-        do(Job(file, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
+        run_job(Job(file, "sim", Plan(), str(tmp_path), sim={"loss": 2.0}), print)
     output: list[str] = []
     with pytest.raises(NotADirectoryError):  # before the robot is started, not when the log is due
-        do(Job(file, "sim", Plan(), f"{file}/logs"), output.append)
+        run_job(Job(file, "sim", Plan(), f"{file}/logs"), output.append)
     assert output == []
     assert list(tmp_path.iterdir()) == []
 

@@ -16,7 +16,7 @@ import pytest
 from go1exp import robot
 from go1exp.deploy import loop as loop_module
 from go1exp.deploy.bundle import Bundle
-from go1exp.deploy.controller import Controller, Cycle
+from go1exp.deploy.controller import Controller, Cycle, Stages
 from go1exp.deploy.loop import Deadlines, MonotonicClock, Timing, run
 from go1exp.deploy.messages import LowCmd, LowState
 from go1exp.deploy.metadata import Port
@@ -303,7 +303,10 @@ def controller(
     link, policy, log = FakeLink(script), FakePolicy(), list[Cycle]()
     about = SimpleNamespace(kp=tuple(KP), kd=tuple(KD), nominal_stance=tuple(NOMINAL), policy_dt=0.04)
     bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=policy))
-    usual: dict[str, Any] = {"rate": 25.0, "stand_up": 0.1, "brake": 0.045, "on_cycle": log.append}
+    usual: dict[str, Any] = {"rate": 25.0, "on_cycle": log.append}
+    times = {"stand_up": 0.1, "lie_down": 0.0, "brake": 0.045}
+    times |= {field.name: settings.pop(field.name) for field in dataclasses.fields(Stages) if field.name in settings}
+    usual["stages"] = Stages(**times)
     made = Controller(bundle, link, commands, estimator or Velocity(), make_safety(), **{**usual, **settings})
 
     def run_cycles(cycles: int, start: int = 0) -> list[bool]:
@@ -424,6 +427,15 @@ def test_a_stop_before_the_robot_has_said_anything_ends_the_loop() -> None:
     assert made.run_cycles(1, 2) == [True]
     assert made.it.phase == "damping"
     assert made.link.sent[-1].damping
+
+
+def test_times_of_a_walk_that_cannot_be_are_refused_together() -> None:
+    with pytest.raises(ValueError, match="must be") as error:
+        Stages(stand_up=-1.0, patience=0.0)
+    assert str(error.value).split("\n") == [
+        "stand_up = -1.0: must be at least 0",
+        "patience = 0.0: must be greater than 0",
+    ]
 
 
 def test_gains_that_nobody_knows_have_to_be_given() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 
 from go1exp.compose import compose
@@ -19,7 +20,7 @@ from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.train import checkpoint
 from go1exp.train.device import DevicePPO
 from go1exp.train.device_update import DeviceUpdate
-from go1exp.train.ppo import AdaptivePPO
+from go1exp.train.ppo import AdaptivePPO, linear_rate
 
 SMALL = (
     *("ppo=paper", "ppo.num_envs=8", "ppo.steps=6", "ppo.hidden=[16,8]", "sim.episode_s=0.2"),
@@ -61,6 +62,22 @@ def test_advantages_and_returns_are_those_of_sb3(learner: Callable[..., DevicePP
     np.testing.assert_allclose(d["returns"].numpy(), theirs.returns, rtol=1e-6, atol=1e-6)
 
 
+def test_advantages_and_returns_on_the_cpu_are_those_of_sb3(learner: Callable[..., AdaptivePPO]) -> None:
+    ppo = learner(AdaptivePPO)
+    _, callback = ppo._setup_learn(48, None)
+    callback.on_training_start({}, {})
+    for _ in range(2):  # episodes of 10 steps end in the second rollout of 6
+        ppo.collect_rollouts(ppo.get_env(), callback, ppo.rollout_buffer, 6)
+    ours = ppo.rollout_buffer
+    assert ours.episode_starts.any()
+    last, ended = torch.randn(8), np.arange(8) % 2 == 0
+    ours.compute_returns_and_advantage(last, ended)
+    advantages, returns = ours.advantages.copy(), ours.returns.copy()
+    RolloutBuffer.compute_returns_and_advantage(ours, last, ended)
+    np.testing.assert_allclose(advantages, ours.advantages, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(returns, ours.returns, rtol=1e-6, atol=1e-6)
+
+
 def test_a_rollout_holds_what_sb3s_own_loop_collects(learner: Callable[..., Any]) -> None:
     """Same seed, same first rollout: observations, actions, rewards with the value beyond a time limit, episodes."""
     mine, theirs = learner(), learner(AdaptivePPO)
@@ -86,10 +103,23 @@ def test_minibatches_hold_every_sample_once(learner: Callable[..., DevicePPO]) -
     assert torch.equal(got.sort().values, wanted)
 
 
-class ThroughSb3(DevicePPO):
-    """The same buffer, and SB3's own update with its hooks."""
+def through_sb3(ppo: AdaptivePPO) -> None:
+    """An update by SB3's own loop and loss, with the hooks of ``AdaptivePPO``."""
+    ppo._old_log_std, ppo._kl = ppo.policy.log_std.detach().clone(), []
+    if ppo.config.schedule == "linear":
+        ppo.policy.optimizer.param_groups[0]["lr"] = linear_rate(ppo.config, ppo.iteration)
+    PPO.train(ppo)
+    ppo._close_iteration()
 
-    train = AdaptivePPO.train
+
+class Sb3Update(AdaptivePPO):
+    train = through_sb3
+
+
+class Sb3UpdateOnDevice(DevicePPO):
+    """The buffer of the device, and SB3's own update."""
+
+    train = through_sb3
     _before_gradient_step = AdaptivePPO._before_gradient_step
     _check_gradient = AdaptivePPO._check_gradient
 
@@ -100,6 +130,7 @@ class ThroughSb3(DevicePPO):
         return going
 
 
+@pytest.mark.parametrize(("ours", "sb3s"), [(DevicePPO, Sb3UpdateOnDevice), (AdaptivePPO, Sb3Update)])
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -108,10 +139,10 @@ class ThroughSb3(DevicePPO):
         ("ppo.schedule=fixed", "ppo.normalize_advantage=false", "ppo.entropy=0.05", "ppo.clip_range=0.02"),
     ],
 )
-def test_an_update_is_sb3s(overrides: tuple[str, ...]) -> None:
+def test_an_update_is_sb3s(ours: type[AdaptivePPO], sb3s: type[AdaptivePPO], overrides: tuple[str, ...]) -> None:
     config = parse_train(compose("train", (*SMALL, "ppo.epochs=3", "ppo.init_std=0.5", *overrides)))
     found: list[tuple[dict[str, torch.Tensor], list[dict[str, float]]]] = []
-    for kind in (DevicePPO, ThroughSb3):
+    for kind in (ours, sb3s):
         core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
         ppo: Any = kind(config.ppo, Go1VecEnv(core), 0, "cpu")
         logs: list[dict[str, float]] = []

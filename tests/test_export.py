@@ -29,7 +29,7 @@ from go1exp.config import ActionConfig, TaskConfig, parse_task, parse_train
 from go1exp.deploy import bundle
 from go1exp.deploy.archive import BundleError, as_json, pack, seal, stored
 from go1exp.deploy.bundle import MEMBERS, Bundle, loads
-from go1exp.deploy.controller import Controller
+from go1exp.deploy.controller import Controller, Stages
 from go1exp.deploy.messages import Link, LowCmd, LowState
 from go1exp.deploy.metadata import Metadata
 from go1exp.deploy.policy import OnnxPolicy
@@ -541,7 +541,9 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
     commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
     estimator = SimpleNamespace(update=lambda state: trace["input.base_lin_vel_b"][len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
-    runtime = Controller(good, cast(Link, link), commands, estimator, safety, stand_up=0.0, on_cycle=observed.append)
+    runtime = Controller(
+        good, cast(Link, link), commands, estimator, safety, stages=Stages(stand_up=0.0), on_cycle=observed.append
+    )
     for state in states:
         assert runtime.cycle(state.t)
     assert safety.fault is None

@@ -15,6 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from go1exp import files
 from go1exp.compose import compose
 from go1exp.config import TrainConfig, parse_train
 from go1exp.env.core import Go1Core
@@ -240,10 +241,19 @@ def test_a_file_in_the_place_of_the_checkpoints_is_named(run: Path) -> None:
 
 
 @needs_full
-def test_a_full_disk_is_reported_with_the_checkpoint_and_costs_none_of_the_others(run: Path) -> None:
+def test_a_full_disk_is_reported_with_the_checkpoint_and_costs_none_of_the_others(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Checkpoint 3 goes to a device without space; torch's writer turns the error into another one at times."""
-    (run / "checkpoints").mkdir(parents=True)
-    (run / "checkpoints/000003.partial").symlink_to(FULL)
+    beside = files._beside
+
+    def on_full_device(final: Path, keep_suffix: bool) -> Path:
+        partial = beside(final, keep_suffix)
+        if final.name == "000003.pt":
+            partial.symlink_to(FULL)
+        return partial
+
+    monkeypatch.setattr(files, "_beside", on_full_device)
     with pytest.raises(OSError, match="No space left on device") as caught:
         train_here(run)
     assert caught.value.errno == errno.ENOSPC

@@ -36,6 +36,8 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     # plain descriptions
     "__init__.py": (*FOREIGN, "torch", "numpy", "go1exp"),
     "errors.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
+    "files.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
+    "signals.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "schema/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     "schema/registry.py": (*FOREIGN, "torch", "go1exp"),
@@ -111,10 +113,10 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
 }
 """File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""
 
-FREE = ("go1exp.__version__", "go1exp.errors")
+FREE = ("go1exp.__version__", "go1exp.errors", "go1exp.files", "go1exp.signals")
 """What every file of the package may import."""
 
-SETTLED = {"compose.py", "config_source.py", "cli/app.py", "cli/files.py", "cli/train.py"}
+SETTLED = {"compose.py", "config_source.py", "cli/app.py", "cli/files.py", "cli/sweep.py", "cli/train.py"}
 """The only files that may import hydra."""
 
 
@@ -294,6 +296,25 @@ def test_no_file_is_longer_than_400_lines() -> None:
     assert {name: length for name, length in lengths.items() if length > 400} == {}
 
 
+LONG_FUNCTIONS = {"gap/explain.py: _explain", "gap/search.py: run", "gap/windows.py: cut"}
+"""Functions that are too long still. The list may only get shorter."""
+
+
+def too_long(name: str) -> Iterator[str]:
+    """Functions of more than 50 lines, not counting their docstrings."""
+    for node in ast.walk(tree(RELATIVE[name])):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            docstring = node.body[0] if ast.get_docstring(node) else None
+            spent = (docstring.end_lineno or 0) - docstring.lineno + 1 if docstring else 0
+            if (node.end_lineno or 0) - node.lineno + 1 - spent > 50:
+                yield f"{name}: {node.name}"
+
+
+def test_no_function_is_longer_than_50_lines() -> None:
+    """How many ways lead through one is ruff's to count (C901 in pyproject.toml)."""
+    assert {function for name in RELATIVE for function in too_long(name)} == LONG_FUNCTIONS
+
+
 def undocumented(body: list[ast.stmt], path: str) -> Iterator[str]:
     for node in body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and not node.name.startswith("_"):
@@ -313,7 +334,7 @@ def test_every_module_says_what_it_is_for() -> None:
 
 
 def test_only_what_talks_to_people_prints() -> None:
-    talkers = ("cli/", "train/", "evaluate/", "deploy/__main__.py")
+    talkers = ("cli/", "train/", "evaluate/", "deploy/__main__.py", "signals.py")
     printing = {
         f"{name}:{node.lineno}"
         for name, file in RELATIVE.items()

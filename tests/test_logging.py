@@ -173,6 +173,22 @@ def test_tensorboard_reads_back_what_was_logged(tmp_path: Path) -> None:
     assert not (tmp_path / "metrics.csv").exists()
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_tensorboard_hides_the_rows_beyond_the_checkpoint_that_a_run_went_on_from(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = LoggerConfig(csv=False, tensorboard=True, wandb=None)
+    for first, last, value in ((1, 3, 0.25), (3, 4, 0.5)):
+        logger = make_logger(config, tmp_path, first - 1, {}, steps=64 * (first - 1))
+        for iteration in range(first, last + 1):
+            logger.record("train/kl", value)
+            logger.dump(step=64 * iteration)
+        logger.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [(e.step, e.value) for e in events.Scalars("train/kl")] == [(64, 0.25), (128, 0.25), (192, 0.5), (256, 0.5)]
+
+
 def test_without_tensorboard_the_other_writers_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import csv
+import fcntl
+import json
 import os
+import pty
 import shutil
 import signal
+import subprocess
+import sys
+import termios
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -14,11 +20,12 @@ from typing import Any
 import pytest
 import torch
 
+from go1exp import data_root
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.train import checkpoint, metrics, run_folder, trainer
+from tests.command import COMMAND_LINE, run_alone
 from tests.command import run as cli
-from tests.command import run_alone
 
 SMALL = (
     "ppo.num_envs=8",
@@ -236,14 +243,64 @@ def test_a_run_on_rough_ground_stopped_by_sigterm_goes_on_with_resume(
     assert_the_same_run(run, reference)
 
 
-def test_a_second_signal_ends_the_run_at_once(
+@pytest.mark.parametrize("numbers", [(signal.SIGINT,) * 2, (signal.SIGTERM,) * 4, (signal.SIGTERM, signal.SIGINT)])
+def test_a_second_signal_is_heard_and_costs_no_checkpoint(
+    numbers: tuple[signal.Signals, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    usual_handler: Callable[[int, FrameType | None], None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    signal_after(monkeypatch, 3, *numbers)
+    with pytest.raises(trainer.Stopped):
+        train_here(tmp_path / "run", [*FLAT, SIX])
+    assert checkpoint.checkpoints(tmp_path / "run")[-1].name == "000003.pt"
+    assert signal.getsignal(signal.SIGINT) is usual_handler
+    words = capsys.readouterr().err
+    assert words.count("stopping after this iteration, with a checkpoint") == 1
+    assert words.count("heard;") == (1 if numbers.count(signal.SIGINT) == 2 else 0)
+
+
+def test_a_third_ctrl_c_ends_the_run_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, usual_handler: Callable[[int, FrameType | None], None]
 ) -> None:
-    signal_after(monkeypatch, 3, signal.SIGINT, signal.SIGINT)
+    signal_after(monkeypatch, 3, signal.SIGINT, signal.SIGINT, signal.SIGINT)
     with pytest.raises(Again):
         train_here(tmp_path / "run", [*FLAT, SIX])
     assert [p.name for p in checkpoint.checkpoints(tmp_path / "run")] == ["000002.pt"]
     assert signal.getsignal(signal.SIGINT) is usual_handler
+
+
+def test_a_signal_in_the_last_iteration_leaves_a_finished_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, usual_handler: Callable[[int, FrameType | None], None]
+) -> None:
+    signal_after(monkeypatch, 2, signal.SIGTERM)
+    with pytest.raises(trainer.Stopped) as caught:
+        train_here(tmp_path / "run", [*FLAT, "ppo.iterations=2"])
+    assert caught.value.finished
+
+
+def test_the_end_of_the_terminal_costs_no_checkpoint(tmp_path: Path) -> None:
+    """The kernel sends SIGHUP, and what is printed from then on fails."""
+    master, slave = pty.openpty()
+    run = tmp_path / "run"
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND_LINE, "train", *FLAT, "ppo.iterations=100000", f"hydra.run.dir={run}"],
+        env={**os.environ, "PYTHONPATH": str(data_root())},
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(slave, termios.TIOCSCTTY, 0),
+    )
+    os.close(slave)
+    text = b""
+    while b"steps/s" not in text:  # the first iteration is done
+        text += os.read(master, 4096)
+    os.close(master)
+    assert process.wait(timeout=300) == 130
+    assert iterations(run / "metrics.csv")[-1] == int(checkpoint.checkpoints(run)[-1].stem)
+    assert json.loads((run / "state.json").read_text())["state"] == "stopped"
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_anew_without_a_row_twice(flat: Path, tmp_path: Path) -> None:
@@ -268,8 +325,11 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_warning(damage: str, flat: P
     whole = newest.read_bytes()
     newest.write_bytes({"truncated": whole[: len(whole) // 2], "empty": b"", "overwritten": b"x" * len(whole)}[damage])
     (killed_copy / "checkpoints/000005.partial").write_bytes(whole)
-    with pytest.warns(UserWarning, match=r"000004\.pt: damaged checkpoint skipped"):
+    with pytest.warns(UserWarning, match=r"000004\.pt: damaged checkpoint .*; skipped") as caught:
         state, path = checkpoint.load_latest(killed_copy)
+    (warning,) = caught
+    assert "\n" not in str(warning.message)
+    assert "weights_only" not in str(warning.message)  # torch's advice to run what the file may hold
     assert path.name == "000002.pt"
     assert state["iteration"] == 2
     if damage == "truncated":
@@ -280,7 +340,7 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_warning(damage: str, flat: P
 
 def test_a_half_written_checkpoint_is_never_taken_for_one(killed_copy: Path) -> None:
     newest = killed_copy / "checkpoints/000004.pt"
-    newest.rename(newest.with_suffix(".partial"))
+    newest.rename(newest.with_name(f"{newest.name}.1a2b3c4d.partial"))
     _, path = checkpoint.load_latest(killed_copy)
     assert path.name == "000002.pt"
 
@@ -289,7 +349,8 @@ def test_with_no_whole_checkpoint_left_nothing_is_trained_over(killed_copy: Path
     for file in checkpoint.checkpoints(killed_copy):
         file.write_bytes(b"")
     before = (killed_copy / "metrics.csv").read_bytes()
-    with pytest.warns(UserWarning, match="damaged"), pytest.raises(FileNotFoundError, match=str(killed_copy)):
+    none_whole = rf"{killed_copy}: none of its 2 checkpoints can be read"
+    with pytest.warns(UserWarning, match="damaged"), pytest.raises(checkpoint.DamagedCheckpoint, match=none_whole):
         train_here(killed_copy, [*FLAT, SIX])
     assert (killed_copy / "metrics.csv").read_bytes() == before
 

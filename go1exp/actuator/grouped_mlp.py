@@ -6,12 +6,15 @@ and the calls on them are made once; the columns are worked through in blocks th
 are a further column of the weights, against a row of ones, which spares a pass over the block.
 
 No column depends on the others. That holds to the bit where the matrix library adds up the products of a column in one
-order however many columns there are. MKL does (tried from 2 to 12288 columns, on one and two threads), but for a single
-column or a single output, which padding avoids.
+order however many columns there are. MKL does when each of its threads gets at least 12 columns and when there is more
+than one output; fewer columns are added up in another order (tried with MKL 2024.2 on Intel AVX-512 and AMD AVX2
+processors and on MKL's SSE4.2, AVX, AVX2 and AVX-512 code paths, on 1 to 3 threads). ``padded_rows`` keeps clear of
+that. Other libraries may differ in the last bits (docs/trust.md).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -31,11 +34,28 @@ OUTPUTS = 4
 FEWEST = 2
 """Columns of a net, at least."""
 
+LANES = 16
+"""Float32 numbers in the widest vector register. Columns come in multiples of it for each thread of the library."""
+
 Layer = tuple[np.ndarray, np.ndarray]
 """Weights (inputs, outputs) and biases (outputs,)."""
 
 Piece = tuple[int, int, int]
 """Columns of one net in a block: net, start, stop."""
+
+
+def padded_rows(rows: int, counts: Sequence[int], device: torch.device) -> int:
+    """Return how many rows to allocate for ``rows`` robots, so that no robot's bits depend on how many there are.
+
+    Args:
+        rows: robots, N.
+        counts: joints of a robot that each net serves; a net's columns are its joints times the rows.
+        device: of the buffers.
+    """
+    threads = torch.get_num_threads() if device.type == "cpu" else 1
+    step = max(LANES // math.gcd(LANES, count) for count in counts)
+    least = -(-LANES * threads // min(counts))
+    return step * -(-max(rows, least) // step)
 
 
 class GroupedMLP:
@@ -115,14 +135,18 @@ def _augmented(weight: np.ndarray, bias: np.ndarray, device: torch.device) -> Te
 
 
 def _blocks(columns: Sequence[int], block: int) -> list[list[Piece]]:
-    """Divide the columns of all nets into blocks; no piece of a net is wider than a block or narrower than 2."""
-    found: list[list[Piece]] = []
+    """Divide the columns of all nets into blocks.
+
+    No piece of a net is wider than a block. A net is cut at multiples of ``LANES`` into pieces of nearly equal width.
+    """
+    blocks: list[list[Piece]] = []
     offset = 0
     for net, count in enumerate(columns):
-        parts = -(-count // block)
-        for start, stop in pairwise(offset + count * i // parts for i in range(parts + 1)):
-            if not found or stop - found[-1][0][1] > block:
-                found.append([])
-            found[-1].append((net, start, stop))
+        parts, lanes = -(-count // block), -(-count // LANES)
+        cuts = [offset + min(count, LANES * (lanes * i // parts)) for i in range(parts + 1)]
+        for start, stop in pairwise(cuts):
+            if not blocks or stop - blocks[-1][0][1] > block:
+                blocks.append([])
+            blocks[-1].append((net, start, stop))
         offset += count
-    return found
+    return blocks

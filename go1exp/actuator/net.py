@@ -11,7 +11,7 @@ from pydantic import AfterValidator
 from pydantic_core import PydanticKnownError
 
 from go1exp import data_root, robot
-from go1exp.actuator.grouped_mlp import FEWEST, GroupedMLP
+from go1exp.actuator.grouped_mlp import GroupedMLP, padded_rows
 from go1exp.drive import DriveSetup
 from go1exp.schema.registry import ConfigError, actuator
 from go1exp.tensors.memory import Memory
@@ -84,12 +84,13 @@ class Net(Memory):
         back = sorted(range(len(order)), key=lambda column: order[column])
         self._order, self._back = (torch.tensor(index, device=setup.device) for index in (order, back))
         n, joints, history = setup.num_envs, len(order), net.info.history
-        rows = max(n, FEWEST)
+        counts = [group.count(k) for k in used]
+        rows = padded_rows(n, counts, setup.device)
         weights, biases, skip = net.folded
         self._mlp = GroupedMLP(
             [[(w[k], b[k]) for w, b in zip(weights, biases, strict=True)] for k in used],
             [skip[k, :, 0] for k in used],
-            [group.count(k) * rows for k in used],
+            [count * rows for count in counts],
             setup.device,
         )
         # Inputs x history x joints x robots; the joints' order is the nets'.

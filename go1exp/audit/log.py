@@ -116,6 +116,7 @@ class Log:
         flags = np.zeros(len(self.t), dtype=bool)
         if self.recording.has("q"):
             q, n = self.recording.joint("q"), self.samples(limits.STILL_TIME)
+            # windows that overlap by four fifths, and one that ends with the last sample
             for first in (*range(0, len(q) - n, max(1, n // 5)), len(q) - n - 1):
                 part = q[max(0, first) : first + n + 1]
                 if first >= 0 and np.all(part.max(axis=0) - part.min(axis=0) < limits.STILL_ANGLE):

@@ -46,7 +46,7 @@ def speed(log: Log) -> Iterator[Finding]:
     q, qd = log.recording.joint("q"), log.recording.joint("qd")
     change = q[last] - q[first]
     lags = np.arange(-most, most + 1)
-    whole = signals.antiderivative(log.t, qd)
+    whole = signals.antiderivative(log.t, qd)  # (T, J): its differences are changes of angle at any lag
     match = np.stack([_correlations(change, whole[last + lag] - whole[first + lag]) for lag in lags])
     # (lags, J, J); a small cost on the lag decides between equal correlations
     best = np.argmax(np.abs(match) - 1e-4 * np.abs(lags)[:, None, None] / most, axis=0)
@@ -115,6 +115,7 @@ def torque(log: Log) -> Iterator[Finding]:
     for lag in range(0, most + 1, log.samples(0.002)):
         late = slice(most - lag, len(tau) - lag)
         expected += [command[late] - state[most:]] + ([command[late] - state[late]] if lag else [])
+    # expected[i] and tau have the same length: the first samples, without a command at the largest lag, are cut.
     tau, on = tau[most:], log.on[most:, None]
     usable = [on & (np.abs(e) < highest) & (np.abs(tau) < highest) for e in expected]
     match = np.array([_masked_correlation(e, tau, use) for e, use in zip(expected, usable, strict=True)])
@@ -148,6 +149,7 @@ def rotation(log: Log) -> Iterator[Finding]:
         if length.min() < 1e-3 or len(first) < limits.ENOUGH:
             continue
         turn = _attitude(log, attitude)
+        # rotation over each window as a vector in body axes (W, 3), small enough to be compared axis by axis
         change = (turn[first].inv() * turn[last]).as_rotvec()
         whole = signals.antiderivative(log.t, log.recording.block(*names))
         integral = whole[last] - whole[first]

@@ -37,6 +37,7 @@ def clock(log: Log) -> Iterator[Finding]:
     message = (
         f"steps vary by {jitter * 1e3:.3g} ms (standard deviation; {jitter / log.dt:.1%}), at most {worst * 1e3:.3g} ms"
     )
+    # A measured clock is never exact; one without any jitter is a row counter times the nominal period.
     if jitter < 1e-6 * log.dt and log.recording.meta.source == "measured":
         message += "; a clock this even was counted, not read, so its true jitter is unknown"
     yield finding("jitter", "t", graded(jitter / log.dt, limits.JITTER), jitter * 1e3, "ms", message)
@@ -54,7 +55,7 @@ def clock(log: Log) -> Iterator[Finding]:
 
 def stale(log: Log) -> tuple[list[Finding], dict[str, float]]:
     """Find rows and channels that repeat although they move; return the share of repeats by channel, too."""
-    reach = log.samples(0.02, 3)
+    reach = log.samples(0.02, 3)  # 20 ms on either side, in which a joint does not stop and start again
     findings: list[Finding] = []
     each = {c: signals.repeats(log.recording.channels[c], log.steps[c], reach) for c in log.measured}
     moving = np.any([r.moving for r in each.values()], axis=0) if each else np.zeros(len(log.t), dtype=bool)
@@ -67,6 +68,7 @@ def stale(log: Log) -> tuple[list[Finding], dict[str, float]]:
         findings.append(finding("duplicates", "all", verdict, share, "", message))
     shares = {}
     for name, r in each.items():
+        # Rows that repeat as a whole are reported once above, not for every channel again.
         shares[name] = max(0.0, r.share - (float((twice & r.stale).sum()) / max(1, int(r.moving.sum()))))
         verdict = graded(shares[name], limits.REPEATS)
         if verdict != "ok":
@@ -126,6 +128,7 @@ def dead(log: Log) -> Iterator[Finding]:
             continue
         quantity = log.quantity[name]
         message = f"is {values[0]:g} throughout"
+        # A constant channel is bad only if something shows that the measured quantity must have changed.
         if quantity in ("qd", "tau_est"):
             joint = name.removeprefix(f"{quantity}_")
             verdict, why = (
@@ -183,6 +186,7 @@ def saturation(log: Log) -> Iterator[Finding]:
         if quantity in ("q", "base_pos", "imu_quat", "base_quat", "foot_force"):
             continue  # an angle may rest where it is largest, and a force at zero, without being clipped
         values = log.recording.channels[name]
+        # Without drives the torque is zero, which is not a limit.
         use = log.on if quantity == "tau_est" else np.ones(len(values), dtype=bool)
         if use.sum() < limits.ENOUGH or np.ptp(values[use]) == 0:
             continue
@@ -226,6 +230,7 @@ def ranges(log: Log) -> Iterator[Finding]:
             over = 0.0
             if known:
                 low, high = JOINT_POS_LIMITS[JOINTS.index(joint)]
+                # 0.3 rad: tolerance for a zero offset; degrees are certain if the values fit as degrees and not as rad
                 inside = np.mean((np.radians(values) > low - 0.3) & (np.radians(values) < high + 0.3))
                 over = float(max(values.max() - high, low - values.min()))
                 degrees = over > limits.POSITION_MARGIN[1] and inside > 0.99 and float(np.abs(values).max()) > 2 * np.pi

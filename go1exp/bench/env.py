@@ -21,7 +21,6 @@ from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.gym_env import Go1Env
 from go1exp.physics.scene import build_model
-from go1exp.schema.backends import CpuBackend
 from go1exp.schema.joint_values import spread
 from go1exp.terrain import build_terrain
 
@@ -49,10 +48,9 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
     """
     terrain = build_terrain(task.terrain)
     model, _ = build_model(task.robot, terrain, task.sim.physics_dt)
-    assert isinstance(task.backend, CpuBackend)
-    batch = Batch(model, num_envs, nthread=task.backend.threads)
+    batch = Batch(model, num_envs, nthread=task.backend.as_reference().threads)
     qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
-    batch.bind("sensordata")
+    batch.bind("sensordata")  # so that sensors are computed and copied, as in the environment
     batch.reset(keyframe=0)
     origins = terrain.tile_origins.reshape(-1, 3)
     qpos[:, :3] += origins[np.arange(num_envs) % len(origins)]

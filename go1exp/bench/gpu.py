@@ -22,7 +22,6 @@ from go1exp.env.core import Go1Core
 from go1exp.env.engine import make_backend
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.physics.scene import build_model
-from go1exp.schema.backends import WarpBackend
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.terrain import build_terrain
@@ -90,6 +89,7 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
         for _ in range(task.sim.decimation):
             backend.step(torque)
 
+    # One graph for all substeps of a policy step, as in the environment.
     replay, _ = backend.capture(hold)  # type: ignore[attr-defined]  # this suite's backend can
 
     def step(given: torch.Tensor) -> None:
@@ -162,7 +162,7 @@ def run(
     Raises:
         ConfigError: if the configuration's backend is not a GPU's.
     """
-    if not isinstance(config.task.backend, WarpBackend) or config.task.backend.device == "cpu":
+    if not config.task.backend.on_gpu:
         raise ConfigError(["suite=gpu needs backend=warp on a CUDA device"])
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, num_envs=num_envs))
     subjects = {"bare": bare_subject(config.task, num_envs), "env": env_subject(config.task, num_envs)}

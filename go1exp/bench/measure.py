@@ -32,6 +32,7 @@ def rates(
     for k in range(rounds):
         for name, subject in subjects.items():
             steps, start = 0, time.perf_counter()
+            # Whole units only: the time is taken after the last one.
             while (elapsed := time.perf_counter() - start) < seconds:
                 steps += subject.work()
             measured[name].append(steps / elapsed)

@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
+from types import FrameType
+
+from go1exp import signals
 
 VERBS = {
     "train": "train a policy from configuration",
@@ -66,9 +70,33 @@ HELP = """usage: go1exp VERB [key=value ...]
 
 
 def main() -> int:
-    """Run the verb on the command line; return the exit status."""
-    os.environ.setdefault(*ONE_BLAS_THREAD)
+    """Run the verb on the command line; return the exit status.
+
+    Ctrl-C, SIGTERM and SIGHUP end it with one line at any time; verbs that have something to save handle them first.
+    """
     arguments = sys.argv[1:]
+    heard: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        heard.append(number)
+        signals.interrupt(number, frame)
+
+    try:
+        with signals.handled(interrupt):
+            return _run(arguments)
+    except BaseException as error:
+        # A library that is interrupted while it is loaded may raise something else.
+        if not heard and not isinstance(error, KeyboardInterrupt):
+            raise
+        signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        )  # what is left is to leave: a second Ctrl-C shall not be a traceback
+        signals.say(f"{' '.join(['go1exp', *arguments[:1]])}: stopped")
+        return signals.STOPPED
+
+
+def _run(arguments: list[str]) -> int:
+    os.environ.setdefault(*ONE_BLAS_THREAD)
     if arguments[:1] == ["-sc"] and len(arguments) > 1:
         from go1exp.cli import completion
 

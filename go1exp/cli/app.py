@@ -6,6 +6,7 @@ import importlib
 import os
 import shutil
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,9 +29,9 @@ from go1exp.compose import as_container, composition_problem
 from go1exp.config_source import seen_by
 from go1exp.schema.registry import ConfigError, Expected
 
-BAD_CONFIG, FAILED, STOPPED, READER_LEFT = 2, 1, 130, 141
-"""Exit statuses: configuration refused before anything was built; the work failed; a signal ended it (the last: that of
-a closed pipe, 128 + 13 as shells count)."""
+BAD_CONFIG, FAILED, READER_LEFT = 2, 1, 141
+"""Exit statuses: configuration refused before anything was built; the work failed; that of a closed pipe, 128 + 13 as
+shells count. What a signal ended has ``go1exp.signals.STOPPED``."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,14 @@ class App:
                 status.append(self.task(as_container(config)))
             except Exception as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
-                    raise  # the launcher, which may sit on another machine, has to know
-                failure.append(error)  # Hydra would print a report of its own
+                    status.append(self._failed_in_sweep(error))
+                else:
+                    failure.append(error)  # Hydra would print a report of its own
 
         version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
         title = f"go1exp {self.title or self.name}"
+        formatwarning = warnings.formatwarning  # usually two lines, one of them of code
+        warnings.formatwarning = lambda message, *rest, **more: f"{title}: warning: {message}\n"
         try:
             _refuse_stray_words(arguments, title)
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
@@ -79,16 +83,40 @@ class App:
         except BrokenPipeError:  # who read our output has left, as `| head` does
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return READER_LEFT
-        except Exception as error:
+        except (Exception, Refused) as caught:
+            error = caught.error if isinstance(caught, Refused) else caught
             if wants_traceback:
-                raise
+                raise error from None
             code, message = self._explain(error, arguments)
             print(f"{title}: {message}", file=sys.stderr)
             return code
         finally:
+            stop_bars()
+            warnings.formatwarning = formatwarning
             if before is None:
                 os.environ.pop("HYDRA_FULL_ERROR", None)
         return next((s for s in status if s), 0) or 0
+
+    def _failed_in_sweep(self, error: Exception) -> int:
+        """Print what went wrong with a job of a sweep and return its status: the other jobs do not depend on it."""
+        about = HydraConfig.get()
+        overrides = list(about.overrides.task)
+        try:
+            status, message = self._explain(error, overrides)
+        except Exception:
+            traceback.print_exc()
+            status, message = FAILED, self.cause(error)
+        name = f"go1exp {self.title or self.name}: job {about.job.num} ({' '.join(overrides)})"
+        print(f"{name}: {message}", file=sys.stderr, flush=True)
+        return status
+
+    def cause(self, error: Exception) -> str:
+        """Return what went wrong in one line, whatever it was."""
+        try:
+            message = self._explain(error, ())[1]
+        except Exception:  # a bug: its kind says more than its message
+            message = f"{type(error).__name__}: {error}"
+        return " ".join(message.split())
 
     def _explain(self, error: Exception, arguments: Sequence[str]) -> tuple[int, str]:
         """Return exit status and message of an exception; re-raise what is a bug."""
@@ -103,6 +131,8 @@ class App:
             return FAILED, f"{error.strerror}: {error.filename}" if error.strerror and error.filename else str(error)
         if isinstance(error, Expected):
             return FAILED, str(error)
+        if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # the latter is torch's
+            return FAILED, f"out of memory: {' '.join(str(error).split())}"
         raise error
 
 
@@ -119,6 +149,14 @@ def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:
             problems.append(f"{word}: not a setting, which is key=value; see {title} --help")
     if problems:
         raise ConfigError(problems)
+
+
+class Refused(BaseException):
+    """Carries a refusal out of Hydra's callbacks, which turn every ``Exception`` into a warning."""
+
+    def __init__(self, error: ConfigError) -> None:
+        super().__init__(str(error))
+        self.error = error
 
 
 def _without_config_dir(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:
@@ -158,10 +196,19 @@ def run_dir() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def discard(run: Path) -> None:
-    """Delete a run folder in which nothing ran: it holds no more than Hydra's notes."""
-    if run.is_dir() and {p.name for p in run.iterdir()} <= {".hydra", "train.log"}:
+def discard(run: Path, of_lock: Sequence[str] = ()) -> None:
+    """Delete a run folder in which nothing ran: it holds no more than Hydra's notes, and the lock if that is ours."""
+    if run.is_dir() and {p.name for p in run.iterdir()} <= {".hydra", "train.log", *of_lock}:
         shutil.rmtree(run)
+
+
+_bars: list[Any] = []
+
+
+def stop_bars() -> None:
+    """End the bars that are still shown: one that an error leaves behind hides the terminal's cursor."""
+    while _bars:
+        _bars.pop().stop()
 
 
 def spinner(total: int, what: str) -> Callable[[int, int], None]:
@@ -174,6 +221,7 @@ def spinner(total: int, what: str) -> Callable[[int, int], None]:
     bar = Progress(console=Console(stderr=True), transient=True)
     task = bar.add_task(what, total=total)
     bar.start()
+    _bars.append(bar)
 
     def update(done: int, total: int) -> None:
         bar.update(task, completed=done, total=total)

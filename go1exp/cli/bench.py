@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
+from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def _task(container: dict[str, Any]) -> None:
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(figures, indent=2) + "\n")
+        write_json(out, figures)
         print(f"\nwritten to {out}")
 
 

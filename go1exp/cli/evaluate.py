@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
+from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError
 
 
@@ -37,7 +37,7 @@ def _task(container: dict[str, Any]) -> None:
         **evaluate(task, policy, config, spinner(1, "evaluating")),
     }
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(report, indent=2) + "\n")
+    write_json(out, report)
     print(table.text(report))
     print(f"\nwritten to {out}")
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from go1exp.cli.app import App, spinner
 from go1exp.cli.quoting import command
+from go1exp.files import write_bytes
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -17,20 +18,25 @@ def _task(container: dict[str, Any]) -> None:
     checkpoint = checkpoint_file(run, settings.checkpoint)
 
     from go1exp.cli.logs import writable
+    from go1exp.config import parse_parts
     from go1exp.deploy.bundle import loads
+    from go1exp.effects.rules import has_gains
     from go1exp.export.build import build
+    from go1exp.train import run_folder
 
     writable(str(out.parent))
     show = spinner(1, "recording a trace")
     data = build(run, checkpoint, seconds=settings.seconds, seed=settings.seed, on_step=show)
     found = loads(data, str(out))
-    partial = out.with_name(f"{out.name}.partial")
-    partial.write_bytes(data)
-    partial.replace(out)
+    write_bytes(out, data)
     worst = max(found.differences.values())
     print(f"{len(found.trace['time'])} steps of the environment replayed, largest difference {worst:.1e}")
     print(f"written to {out} ({len(data) / 1e6:.2f} MB), SHA-256 {found.seal}")
     print(f"now: {command('export', 'check', str(out))}")
+    parts, _ = parse_parts(run_folder.read_config(run), ("actuator",))
+    if not has_gains(parts["actuator"]):
+        name, line = parts["actuator"].entry.name, command("deploy", str(out), "actuator=pd")
+        print(f"note: trained with actuator={name}, which has no gains to command; on a simulated robot: {line}")
 
 
 APP = App("export", _task)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
 from go1exp.cli.quoting import command
+from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def _task(container: dict[str, Any]) -> None:
         raise
     result.net.save(out / "net.npz")
     result.net.export_onnx(out / "net.onnx")
-    (out / "report.json").write_text(json.dumps(result.report.as_dict(), indent=2) + "\n")
+    write_json(out / "report.json", result.report.as_dict())
     pictures = fit.plot(result, out) if settings.plots else []
     print(fit.text(result.report))
     print(f"\nwritten to {out}: net.npz, net.onnx, report.json{''.join(f', {p.name}' for p in pictures)}")

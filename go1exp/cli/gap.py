@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +11,7 @@ from omegaconf import OmegaConf
 
 from go1exp.cli.app import App, spinner
 from go1exp.cli.quoting import command
+from go1exp.files import opened, write_json
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb
@@ -118,13 +118,14 @@ def _replay(recordings: list[Recording], machine: Machine, settings: GapVerb) ->
     if found.flaws:
         return found.exit_code
     out = Path(settings.out)
-    (out / "replay.json").write_text(json.dumps(found.content(), indent=1, allow_nan=False) + "\n")
+    write_json(out / "replay.json", found.content(), indent=1, allow_nan=False)
     kinds = ("free", "held") if len(found.parts) > 1 else ("",)
     curves: dict[str, Any] = {}
     for part, kind in zip(reversed(found.parts), kinds, strict=True):
         about = {**part.curves, "channels": np.array(part.channels), "episodes": np.array(part.episodes)}
         curves |= {f"{kind}_{name}".lstrip("_"): values for name, values in about.items()}
-    np.savez_compressed(out / "replay.npz", **curves)
+    with opened(out / "replay.npz") as file:
+        np.savez_compressed(file, **curves)
     print(f"\nwritten to {out / 'replay.json'}, {out / 'replay.npz'}")
     return 0
 
@@ -139,7 +140,7 @@ def _apply(result: GapResult, recordings: list[Recording], machine: Machine, set
     contents = {path.name: OmegaConf.to_container(OmegaConf.load(path)) for path in written}
     proof = apply.prove(recordings, machine, settings.search, result, contents, settings.train_dt)  # type: ignore[arg-type]
     about = {**asdict(proof), "files": [path.name for path in written]}
-    (out / "applied.json").write_text(json.dumps(about, indent=2) + "\n")
+    write_json(out / "applied.json", about)
     print(f"\nwritten to {', '.join(str(path) for path in written)}")
     print(
         f"at training's step of {1e3 * proof.physics_dt:g} ms the held-out error is {1 + proof.after:.3g} times the "

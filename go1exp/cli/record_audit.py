@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from go1exp.cli.app import App
+from go1exp.files import write_json
 
 STATUS = {"ok": 0, "suspect": 3, "bad": 4}
 """Exit status of each verdict; the worst counts."""
@@ -37,7 +37,7 @@ def _task(container: dict[str, Any]) -> int:
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(found, indent=2) + "\n")
+        write_json(out, found)
         print(f"written to {out}")
     if unreadable:  # the others have been judged all the same
         raise RecordingError("\n".join(unreadable))

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
+from go1exp.deploy.controller import Stages
 from go1exp.fit.settings import FitSettings
 from go1exp.gap.result import GapSettings
 from go1exp.record.plan import Wishes
@@ -227,8 +228,8 @@ class SinusoidSettings:
 
 
 @settings
-class DeploySettings:
-    """``conf/deploy.yaml`` without the groups.
+class DeploySettings(Stages):
+    """``conf/deploy.yaml`` without the groups; the times of the stages are those of the runtime.
 
     Attributes:
         bundle: file that go1exp export wrote.
@@ -237,10 +238,6 @@ class DeploySettings:
         sinusoid: the sines of command=sinusoid.
         rate: rate of policy and commands, Hz; null takes that of training.
         seconds: time under the policy, s; null walks until it is stopped (Ctrl-C).
-        stand_up: time from the first pose to the nominal stance, s.
-        lie_down: time for lying down at the end of a walk (time up, Esc or q), s; 0 brakes at once.
-        brake: time for which the drives brake at the end, s.
-        patience: time to wait for the robot's first state, s.
         keep: newest seconds of the walk that the log has room for.
         stale: time without a state after which the robot counts as lost, s.
         spin: time before each cycle for which the core is kept busy, s; quicker, and it costs that core.
@@ -255,10 +252,6 @@ class DeploySettings:
     sinusoid: SinusoidSettings
     rate: Annotated[float, Field(ge=10, le=1000)] | None
     seconds: Positive | None
-    stand_up: NonNegative
-    lie_down: NonNegative
-    brake: NonNegative
-    patience: Positive
     keep: Annotated[float, Field(gt=0, le=3600)]
     stale: Positive
     spin: Annotated[float, Field(ge=0, le=0.01)]

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from go1exp.choices import config_folder
-from go1exp.cli.app import STOPPED, App, discard, run_dir
+from go1exp.cli import sweep
+from go1exp.cli.app import App, discard, run_dir
 from go1exp.cli.quoting import command
 from go1exp.cli.runs import run_folder as existing
 from go1exp.cli.runs import shipped_policies
 from go1exp.compose import key_values
-from go1exp.schema.registry import ConfigError, Expected
+from go1exp.schema.registry import ConfigError
+from go1exp.signals import STOPPED
+
+if TYPE_CHECKING:
+    from go1exp.config import TrainConfig
+    from go1exp.train.start import Weights
 
 RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "backend")
 """Settings that a resumed run may change: none of them changes what was computed so far (the last three may change
@@ -72,45 +80,129 @@ def _source(start_from: str) -> Path:
     return there[start_from]
 
 
-def _task(container: dict[str, Any]) -> int | None:
+@dataclass(frozen=True)
+class TrainJob:
+    """One training as it was asked for: its folder, its configuration, and whether it goes on with an older one."""
+
+    run: Path
+    config: TrainConfig
+    container: dict[str, Any]
+    resumed: bool
+
+
+def _resolved(container: dict[str, Any], overrides: list[str], run: Path) -> TrainJob:
+    """Return the training that a composed configuration stands for; touches no file.
+
+    Args:
+        container: the configuration.
+        overrides: what was given on the command line.
+        run: the folder that Hydra has for it; a resumed run keeps its own.
+
+    Raises:
+        ConfigError: with everything that is wrong.
+    """
     from go1exp.config import parse_train
 
-    run = run_dir()
-    try:
-        config = parse_train(container)
-    except ConfigError:
-        discard(run)
-        raise
+    config = parse_train(container)
     if config.process.resume:
-        discard(run)
         run = existing(config.process.resume, "resume")
-        container = _resumed(run, list(HydraConfig.get().overrides.task))
-        config = parse_train(container)
-    else:
-        _refuse_other(run, container)
+        container = _resumed(run, overrides)
+        return TrainJob(run, parse_train(container), container, resumed=True)
+    _refuse_other(run, container)
+    return TrainJob(run, config, container, resumed=False)
 
-    from go1exp.train import checkpoint, run_folder, start, trainer
 
-    first = None
+def _check(job: TrainJob) -> None:
+    """Refuse what cannot be trained on this machine, before anything is written."""
+    from go1exp.train import preflight
+
+    preflight.check(job.config)
+
+
+def _task(container: dict[str, Any]) -> int | None:
+    folder = run_dir()
     try:
-        if config.process.start_from and not checkpoint.checkpoints(run):
-            first = start.read(config, _source(config.process.start_from))
-        trainer.try_out(config)
-    except (Expected, ConfigError, FileNotFoundError):
-        if not config.process.resume:
-            discard(run)
+        job = _resolved(container, list(HydraConfig.get().overrides.task), folder)
+        _check(job)
+    except BaseException:
+        discard(folder)
         raise
-    run_folder.write(run, container)
-    print(f"run folder {run}")
+    if job.resumed:
+        discard(folder)
+
+    from go1exp.train import run_lock
+
+    with run_lock.locked(job.run):
+        try:
+            if not job.resumed:
+                _refuse_other(job.run, job.container)  # again: now nobody else can begin one there
+            first = _first_weights(job)
+            if _is_finished(job):
+                return None
+        except BaseException:
+            if not job.resumed:
+                discard(job.run, run_lock.FILES)
+            raise
+        return _train(job, first)
+
+
+def _first_weights(job: TrainJob) -> Weights | None:
+    """Read what ``start_from`` names, unless the run has begun already."""
+    from go1exp.train import checkpoint, start
+
+    source = job.config.process.start_from
+    return start.read(job.config, _source(source)) if source and not checkpoint.checkpoints(job.run) else None
+
+
+def _is_finished(job: TrainJob) -> bool:
+    """Whether the folder holds all iterations already; says so."""
+    from go1exp.train import checkpoint, run_state
+
+    wanted = job.config.ppo.iterations
+    if checkpoint.iterations_done(job.run) < wanted or checkpoint.load_latest(job.run)[0]["iteration"] < wanted:
+        return False
+    run_state.write(job.run, "done")
+    print(f"{job.run} has its {wanted} iterations already; now: {command('eval', settings={'run': job.run})}")
+    return True
+
+
+def _train(job: TrainJob, first: Weights | None) -> int | None:
+    """Train in a folder that is locked, and keep its state; return the exit status."""
+    from go1exp.train import run_folder, run_state, trainer
+
+    run_folder.write(job.run, job.container)
+    run_state.write(job.run, "running")
+    print(f"run folder {job.run}", flush=True)
     try:
-        trainer.train(config, container, run, first)
-    except trainer.Stopped:
+        trainer.train(job.config, job.container, job.run, first)
+    except trainer.Stopped as stopped:
+        run_state.write(job.run, "done" if stopped.finished else "stopped")
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            raise  # so that the jobs after this one do not start
-        print(f"stopped; go on with: {command('train', settings={'resume': run})}")
-        return STOPPED
-    print(f"done; now: {command('eval', settings={'run': run})}")
+            raise KeyboardInterrupt from None  # the jobs after this one do not start
+        if not stopped.finished:
+            print(f"stopped; go on with: {command('train', settings={'resume': job.run})}")
+            return STOPPED
+    except KeyboardInterrupt:
+        run_state.write(job.run, "stopped")
+        print(f"stopped; go on with: {command('train', settings={'resume': job.run})}")
+        raise
+    except Exception as error:
+        run_state.note_failure(job.run, APP.cause(error))
+        raise
+    else:
+        run_state.write(job.run, "done")
+    print(f"done; now: {command('eval', settings={'run': job.run})}")
     return None
 
 
-APP = App("train", _task)
+class _Train(App):
+    """The verb, around which a sweep is checked before and told of after."""
+
+    def run(self, arguments: Sequence[str]) -> int:
+        """Run with command-line arguments; return the exit status."""
+        with sweep.watched(self, arguments, _resolved, _check) as current:
+            status = super().run(arguments)
+        return status or current.status
+
+
+APP = _Train("train", _task)

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from go1exp.errors import Expected
+from go1exp.signals import STOPPED, handled, interrupt, say
 
 FAILED = 1
 
@@ -26,6 +27,8 @@ def not_negative(text: str) -> float:
 
 def arguments(given: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
+    from go1exp.deploy.walk import Plan
+
     parser = argparse.ArgumentParser("python -m go1exp.deploy", description="Run a bundle's policy on a robot.")
     parser.add_argument("bundle", help="file that go1exp export wrote")
     parser.add_argument("--robot", default="sim", help="sim, go1, or the port where a simulated robot listens")
@@ -37,16 +40,23 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--amplitude", default="1,0.3,0.8", help="of the sinusoid")
     parser.add_argument("--period", type=positive, default=10.0, help="of the sinusoid, s")
     parser.add_argument(
-        "--stand-up", type=not_negative, default=2.0, help="s from the first pose to the nominal stance"
+        "--stand-up", type=not_negative, default=Plan.stand_up, help="s from the first pose to the nominal stance"
     )
     parser.add_argument(
-        "--lie-down", type=not_negative, default=2.0, help="s for lying down at the end of a walk; 0: brake at once"
+        "--lie-down",
+        type=not_negative,
+        default=Plan.lie_down,
+        help="s for lying down at the end of a walk; 0: brake at once",
     )
-    parser.add_argument("--brake", type=not_negative, default=2.0, help="s for which the drives brake at the end")
-    parser.add_argument("--keep", type=positive, default=120.0, help="newest seconds that the log has room for")
-    parser.add_argument("--stale", type=positive, default=0.03, help="s without a state after which the robot is lost")
     parser.add_argument(
-        "--spin", type=not_negative, default=0.0008, help="s before each cycle for which the core is kept busy"
+        "--brake", type=not_negative, default=Plan.brake, help="s for which the drives brake at the end"
+    )
+    parser.add_argument("--keep", type=positive, default=Plan.keep, help="newest seconds that the log has room for")
+    parser.add_argument(
+        "--stale", type=positive, default=Plan.stale, help="s without a state after which the robot is lost"
+    )
+    parser.add_argument(
+        "--spin", type=not_negative, default=Plan.spin, help="s before each cycle for which the core is kept busy"
     )
     parser.add_argument("--out", default="runs/deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
@@ -61,9 +71,17 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
 
 def main(given: Sequence[str]) -> int:
     """Walk as the command line says; return the exit status."""
-    options = arguments(given)
+    try:
+        with handled(interrupt):
+            return _walk(arguments(given))
+    except KeyboardInterrupt:
+        say("go1exp.deploy: stopped")
+        return STOPPED
+
+
+def _walk(options: argparse.Namespace) -> int:
     from go1exp.deploy.commands import Wish, parsed
-    from go1exp.deploy.job import Job, do
+    from go1exp.deploy.job import Job, run_job
     from go1exp.deploy.walk import Plan
 
     try:
@@ -82,7 +100,7 @@ def main(given: Sequence[str]) -> int:
         )
         sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "loss", "seed")}
         job = Job(options.bundle, options.robot, plan, options.out, sim, truth=options.truth)
-        return do(job, lambda line: print(line, flush=True))
+        return run_job(job, lambda line: print(line, flush=True))
     except (Expected, OSError, ValueError) as error:
         print(f"go1exp.deploy: {error}", file=sys.stderr)
         return FAILED

@@ -40,6 +40,7 @@ def stored(members: Mapping[str, bytes]) -> bytes:
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, content in members.items():
             info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            # Unix and rw-r--r--, whatever the system: both are in the bytes.
             info.create_system, info.external_attr = 3, 0o644 << 16
             archive.writestr(info, content)
     return buffer.getvalue()

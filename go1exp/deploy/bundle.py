@@ -117,7 +117,7 @@ def replay(policy: OnnxPolicy, trace: Mapping[str, np.ndarray], source: str) -> 
         got = np.concatenate([step[port.name] for step in steps])
         off = np.abs(got.astype(np.float64) - trace[f"output.{port.name}"])
         worst = float(np.max(off))  # NaN if anything is
-        if not worst <= TOLERANCE:
+        if not worst <= TOLERANCE:  # true for NaN as well
             at = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
             replayed, then = got[at], trace[f"output.{port.name}"][at]
             raise BundleError(

@@ -103,7 +103,7 @@ class Table(Constant):
 
     def __call__(self, t: float) -> np.ndarray:
         """Return the row in force."""
-        k = int(np.searchsorted(self._times, t + 1e-9)) - 1
+        k = int(np.searchsorted(self._times, t + 1e-9)) - 1  # 1e-9: rounding of t must not miss a row's time
         return self._rows[k] if k >= 0 else self._velocity
 
 
@@ -186,6 +186,7 @@ class Keyboard(Constant):
         elif key == " ":
             self._velocity = np.zeros(3)
         elif key in STEPS:
+            # rounded: steps of 0.1 that are added up reach zero exactly
             self._velocity = self._limit(np.round(self._velocity + STEPS[key], 6))
 
     def close(self) -> None:
@@ -221,6 +222,7 @@ class Gamepad(Constant):
             CommandError: if pygame is not installed, or there is no gamepad.
         """
         super().__init__((0.0, 0.0, 0.0))
+        # pygame needs a video driver even for a gamepad; the robot's computer has no display.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         try:
@@ -243,6 +245,7 @@ class Gamepad(Constant):
         if self._pad.get_button(0) or self._pad.get_button(1):
             self._stop("a button of the gamepad")
         last = self._pad.get_numaxes() - 1
+        # Sticks count right and back as positive, commands left and forward: hence the sign.
         sticks = -np.array([self._pad.get_axis(min(axis, last)) for axis in (1, 0, 3)])
         self._velocity = stretched(sticks, self._ranges)
 
@@ -320,6 +323,7 @@ def make(wish: Wish, ranges: np.ndarray, stop: Stop, end: Stop | None = None) ->
     elif wish.command == "keyboard":
         source = Keyboard(stop, lambda velocity: np.clip(velocity, ranges[:, 0], ranges[:, 1]), end=end)
     elif wish.command == "gamepad":
+        # A stick needs an end of the range; an axis without one gets 1 m/s or 1 rad/s.
         finite = np.where(np.isfinite(ranges), ranges, np.sign(ranges))
         source = Gamepad(stop, finite)
     elif Path(wish.command).suffix == ".csv":

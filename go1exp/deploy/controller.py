@@ -28,6 +28,35 @@ HALTED, STOOD = 0.4, 0.6
 robot has reached the nominal stance. Directly from a gait it would tip over (chosen on a shipped policy)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Stages:
+    """How long the stages of a walk take, for every command line that starts one.
+
+    Attributes:
+        stand_up: time from the first pose to the nominal stance, s.
+        lie_down: time that the robot is given to lie down when a walk ends in order, s; 0: the drives brake at once.
+        brake: time for which the drives brake at the end, before ``cycle`` returns False, s.
+        patience: time to wait for the robot's first state, s.
+
+    Raises:
+        ValueError: if a time is negative, or ``patience`` not positive.
+    """
+
+    stand_up: float = 2.0
+    lie_down: float = 2.0
+    brake: float = 2.0
+    patience: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Check the times."""
+        times = {"stand_up": self.stand_up, "lie_down": self.lie_down, "brake": self.brake}
+        problems = [f"{name} = {time}: must be at least 0" for name, time in times.items() if not time >= 0.0]
+        if not self.patience > 0.0:
+            problems.append(f"patience = {self.patience}: must be greater than 0")
+        if problems:
+            raise ValueError("\n".join(problems))
+
+
 class Estimator(Protocol):
     """Estimates the trunk's velocity from the robot's sensors."""
 
@@ -82,10 +111,7 @@ class Controller:
         safety: Safety,
         *,
         rate: float | None = None,
-        stand_up: float = 2.0,
-        lie_down: float = 0.0,
-        brake: float = 2.0,
-        patience: float = 5.0,
+        stages: Stages | None = None,
         kp: np.ndarray | None = None,
         kd: np.ndarray | None = None,
         on_cycle: Callable[[Cycle], None] = lambda cycle: None,
@@ -99,10 +125,7 @@ class Controller:
             estimator: gets every new state.
             safety: has the robot's limits.
             rate: cycles per second, Hz; that of training if None.
-            stand_up: time from the first pose to the nominal stance, s.
-            lie_down: time that ``finish`` gives the robot to lie down, s; with 0 the drives brake at once.
-            brake: time for which the drives brake after a fault before ``cycle`` returns False, s.
-            patience: time to wait for the robot's first state, s.
+            stages: how long they take.
             kp: (J,) N m/rad; those of the bundle if None.
             kd: (J,) N m s/rad.
             on_cycle: called after every cycle.
@@ -118,7 +141,7 @@ class Controller:
         self._estimator, self.safety, self._on_cycle = estimator, safety, on_cycle
         self._kp, self._kd = (np.asarray(values, dtype=float) for values in gains)
         self._nominal = np.asarray(about.nominal_stance)
-        self._stand_up, self._lie_down, self._brake, self._patience = stand_up, lie_down, brake, patience
+        self._stages = stages or Stages()
         self._lying = np.tile(LYING, len(self._nominal) // len(LYING))
         self._begin: float | None = None
         self._readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
@@ -140,8 +163,8 @@ class Controller:
         fresh = self._link.receive()
         if fresh:
             self._state = fresh[-1]
-        elif self._state is None and now - self._begin > self._patience:
-            self.safety.fail("no_state", f"the robot has not said anything for {self._patience:g} s", now)
+        elif self._state is None and now - self._begin > self._stages.patience:
+            self.safety.fail("no_state", f"the robot has not said anything for {self._stages.patience:g} s", now)
         self._observation = None
         try:
             wanted = self._wanted(now, fresh)
@@ -158,13 +181,13 @@ class Controller:
         command = sent if heard else None
         about = (self._velocity, self._base, self._observation, fresh)
         self._on_cycle(Cycle(now, self.phase, self._state, command, *about))
-        return self.phase != "damping" or now - self._since < self._brake
+        return self.phase != "damping" or now - self._since < self._stages.brake
 
     def finish(self, now: float) -> None:
         """End the walk without a fault: from the next cycle on the robot lies down, then the drives brake."""
         if self.phase in ("lying_down", "damping"):
             return
-        if self._lie_down > 0 and self.phase != "waiting":
+        if self._stages.lie_down > 0 and self.phase != "waiting":
             self._halting, self._origin = self.phase == "walking", self._target
             self.phase, self._since = "lying_down", now
         else:
@@ -190,7 +213,8 @@ class Controller:
         if self.phase == "waiting":
             self.phase, self._since, self._origin = "standing_up", now, state.joint_pos.copy()
         if self.phase == "standing_up":
-            share = (now - self._since) / self._stand_up if self._stand_up > 0 else 1.0
+            stand_up = self._stages.stand_up
+            share = (now - self._since) / stand_up if stand_up > 0 else 1.0
             if share < 1.0:
                 return LowCmd(self._origin + share * (self._nominal - self._origin), self._kp, self._kd)
             self.phase, self._since = "walking", now
@@ -200,7 +224,7 @@ class Controller:
 
     def _lie(self, state: LowState, now: float) -> LowCmd | None:
         """Stand still under the policy if it walked, move to the nominal stance, lie down; None when that is done."""
-        share = (now - self._since) / self._lie_down
+        share = (now - self._since) / self._stages.lie_down
         if share < HALTED and self._halting:
             self._origin = self._target
             return self._walk(state, now)

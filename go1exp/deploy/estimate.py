@@ -62,6 +62,7 @@ class KalmanEstimator:
         It is NaN before the first valid state. After a refused sample the last estimate stays in force for ``BLIND_S``;
         whether the reading itself is a fault is decided by ``Safety``.
         """
+        # The robot's own clock is even; times of arrival have the delays of the network.
         clock = state.t if math.isnan(state.clock) else state.clock
         row = sample(
             clock,

@@ -1,4 +1,4 @@
-"""A walk from beginning to end, as both command lines start it: bundle, robot, walk, log."""
+"""A walk from start to end, as both command lines run it: bundle, robot, walk, log."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
 from go1exp.deploy.udp import UdpLink
-from go1exp.deploy.walk import STATUS, Outcome, Plan, account, go, interruptible, save, velocity_errors
+from go1exp.deploy.walk import STATUS, Outcome, Plan, account, interruptible, save, velocity_errors, walk
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Job:
-    """What to do.
+    """A walk to run.
 
     Attributes:
         bundle: the file.
-        robot: ``sim``, ``go1``, or the port of this machine at which a simulated robot listens already.
+        robot: ``sim``, ``go1``, or the port of this machine at which a simulated robot already listens.
         plan: how to walk.
         out: folder of the logs.
-        sim: how the simulated robot is set up (``go1exp.sim_robot.machine.SimConfig``).
+        sim: settings of the simulated robot (``go1exp.sim_robot.machine.SimConfig``).
         other: its ``actuator`` and ``effect``, if not those of training.
         truth: also write the simulated trunk's true motion into the recording.
     """
@@ -48,7 +48,7 @@ class Job:
 
 @dataclass
 class _Robot:
-    """The robot at the other end, and whatever must be closed with it."""
+    """The connected robot, and the process to close with it."""
 
     link: Link
     simulated: bool
@@ -57,7 +57,7 @@ class _Robot:
 
 @contextmanager
 def _reached(job: Job, say: Say) -> Iterator[_Robot]:
-    """Open the way to the robot, and close it."""
+    """Open the link to the robot; close it at the end."""
     if job.robot == "go1":
         from go1exp.deploy.go1_sdk import NOTICE, SdkLink
 
@@ -85,13 +85,13 @@ def _reached(job: Job, say: Say) -> Iterator[_Robot]:
             udp.close()
 
 
-def do(job: Job, say: Say) -> int:
-    """Walk, write the log, and return the exit status: 0 if it walked to the end, else that of the fault.
+def run_job(job: Job, say: Say) -> int:
+    """Walk, write the log, and return the exit status: 0 after a whole walk, otherwise that of the fault.
 
-    SIGINT and SIGTERM before anything was commanded end it at once, with the status of an operator's stop.
+    SIGINT and SIGTERM before the first command end it at once, with the status of an operator's stop.
 
     Raises:
-        go1exp.errors.Expected: if bundle, robot, commands or estimator cannot be had.
+        go1exp.errors.Expected: if bundle, robot, commands or estimator are not available.
         OSError: if a file cannot be read or written.
     """
     bundle = bundles.load(job.bundle)
@@ -112,19 +112,19 @@ def do(job: Job, say: Say) -> int:
     try:
         with interruptible(), _reached(job, say) as robot:
             contact = None if robot.simulated else "torque"
-            outcome = go(bundle, robot.link, plan, contact=contact, on_second=say)
+            outcome = walk(bundle, robot.link, plan, contact=contact, on_second=say)
             traffic = getattr(robot.link, "traffic", None)
     except KeyboardInterrupt:
         if outcome is not None:
             raise
         say("stopped before the walk began: nothing was commanded")
         return STATUS["operator_stop"]
-    more: dict[str, Any] = {"robot": job.robot, "link": None if traffic is None else vars(traffic)}
+    extra: dict[str, Any] = {"robot": job.robot, "link": None if traffic is None else vars(traffic)}
     truth: Mapping[str, np.ndarray] = {}
     if robot.process is not None:
-        truth, more["simulated_robot"] = robot.process.truth, robot.process.report
-        more["velocity"] = velocity_errors(outcome.log, truth)
-    content = account(bundle, plan, outcome, more)
+        truth, extra["simulated_robot"] = robot.process.truth, robot.process.report
+        extra["velocity"] = velocity_errors(outcome.log, truth)
+    content = account(bundle, plan, outcome, extra)
     where = About(
         metadata=about,
         kp=np.array(about.kp),
@@ -136,7 +136,7 @@ def do(job: Job, say: Say) -> int:
     )
     files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None)
     say(str(outcome.timing))
-    for line in told(content):
+    for line in summary_lines(content):
         say(line)
     say(f"written to {', '.join(map(str, files))}")
     end = f"until {outcome.asked}" if outcome.asked else "to the end"
@@ -144,8 +144,8 @@ def do(job: Job, say: Say) -> int:
     return outcome.status
 
 
-def told(content: Mapping[str, Any]) -> list[str]:
-    """Return lines on how fast it walked and how well the simulated robot kept real time."""
+def summary_lines(content: Mapping[str, Any]) -> list[str]:
+    """Return lines about the velocity of the walk and the timing of the simulated robot."""
     lines = []
     if velocity := content.get("velocity"):
         mean, rmse, off = (
@@ -164,14 +164,14 @@ def told(content: Mapping[str, Any]) -> list[str]:
 
 
 def _writable(folder: Path) -> None:
-    """Make the folder of the logs; raise OSError if nothing can be written there, rather than after the walk."""
+    """Make the folder of the logs; raise OSError now, before the walk, if nothing can be written there."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         pass
 
 
 def _free(folder: Path, name: str) -> str:
-    """Return ``name``, with a number behind it if there is such a log already."""
+    """Return ``name``, with a number appended if a log of this name exists."""
     free, number = name, 1
     while list(folder.glob(f"{free}.*")):
         number += 1

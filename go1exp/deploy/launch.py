@@ -67,7 +67,7 @@ class SimulatedRobot:
             [sys.executable, "-m", "go1exp.sim_robot"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "OMP_NUM_THREADS": "1"},  # leaves the other cores to the runtime
             start_new_session=True,  # Ctrl-C in the terminal must reach the runtime only
         )
         self.report: dict[str, Any] = {}

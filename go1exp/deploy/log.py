@@ -14,6 +14,7 @@ import numpy as np
 from go1exp import __version__
 from go1exp.deploy.controller import PHASES, Cycle
 from go1exp.deploy.metadata import Metadata
+from go1exp.files import opened
 
 if TYPE_CHECKING:
     from go1exp.recording import Recording
@@ -109,6 +110,7 @@ class Log:
         """Keep a cycle and the states received in it."""
         for state in cycle.fresh:
             row = self.states.next()
+            # in place, by the widths of STATE: nothing is allocated during the walk
             row[0], row[1], row[2] = state.t, state.clock, state.in_force
             row[3:15], row[15:27], row[27:39] = state.joint_pos, state.joint_vel, state.joint_torque
             row[39:43], row[43:46], row[46:49], row[49:53] = (
@@ -156,6 +158,7 @@ class Log:
             channels |= {FOOT_FORCE + leg: feet[:, k] for k, leg in enumerate(about.metadata.legs)}
         if truth is not None:
             channels |= _joined(truth, clock)
+        # A recording needs an increasing clock and finite values; other rows are dropped and counted in the notes.
         good = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
         good &= np.isfinite(np.stack([values for name, values in channels.items()])).all(axis=0)
         if good.sum() < 2:
@@ -212,4 +215,5 @@ def _joined(truth: Mapping[str, np.ndarray], clock: np.ndarray) -> dict[str, np.
 def write_cycles(path: Path, log: Log) -> None:
     """Write the cycles as NumPy's archive: velocities commanded and estimated, targets, phases; the runtime's clock."""
     content: dict[str, Any] = {name: log.cycles.part(name) for name, _ in CYCLE}
-    np.savez(path, phases=np.array(PHASES), **content)
+    with opened(path) as file:
+        np.savez(file, phases=np.array(PHASES), **content)

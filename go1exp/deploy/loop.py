@@ -190,6 +190,7 @@ def run(
             start = clock.now()
             wanted = work(start)
             end = clock.now()
+            # The cycle whose time it is at the end of this one; 1e-9: rounding must not skip a cycle.
             following = max(cycle + 1, math.floor((end - begin) / period + 1e-9))
             if total is not None:
                 following = min(following, total)

@@ -104,6 +104,7 @@ class Metadata:
         wanted["observation"] = sum(block.size for block in self.observation)
         if sizes != wanted:
             raise ValueError(f"outputs: their sizes are {sizes} instead of {wanted}")
+        # Terms follow one another without a gap, from column 0.
         ends = [block.start + block.size for block in self.observation]
         if [block.start for block in self.observation] != [0, *ends[:-1]]:
             raise ValueError("observation: its terms do not follow one another")

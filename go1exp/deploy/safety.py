@@ -167,11 +167,13 @@ class Safety:
         reach, drag = self._reach(command.kp, command.kd)
         still = state.joint_pos + drag * state.joint_vel  # the target that asks for no torque
         target = np.minimum(np.maximum(command.joint_target, still - reach), still + reach)
+        # The range comes last: it holds even if the torque limit asks for a target outside it.
         return np.minimum(np.maximum(target, self._low), self._high)
 
     def _reach(self, kp: np.ndarray, kd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far from where they ask for nothing targets may be, rad, and kd / kp, s; kept for these gains."""
         if self._gains is None or self._gains[0] is not kp or self._gains[1] is not kd:
+            # A joint without kp has no target, so any is allowed.
             limit, held = self._torque_limit, kp > 0.0
             reach = np.divide(limit, kp, out=np.full_like(limit, np.inf), where=held)
             self._gains, self._reached = (kp, kd), (reach, np.divide(kd, kp, out=np.zeros_like(limit), where=held))

@@ -94,6 +94,7 @@ class UdpLink:
         if about is None or about.kind != wire.STATE:
             self.traffic.foreign += 1
             return None
+        # 1: the next state; more: states are missing; 0 or less: an old one.
         ahead = 1 if self._last is None else wire.newer(about.number, self._last)
         if ahead <= 0:
             self.traffic.late += 1

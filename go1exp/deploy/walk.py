@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import resource
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -18,14 +16,16 @@ from typing import Any
 
 import numpy as np
 
+from go1exp import signals
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.commands import Limited, Wish, make, range_array
-from go1exp.deploy.controller import Controller, Cycle, Estimator
+from go1exp.deploy.controller import Controller, Cycle, Estimator, Stages
 from go1exp.deploy.estimate import KalmanEstimator, NoEstimator, settings
 from go1exp.deploy.log import About, Log, write_cycles
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.messages import Link
 from go1exp.deploy.safety import RULES, Fault, Safety, SafetyConfig
+from go1exp.files import write_json
 
 FAULTS = (*RULES, "no_state", "estimator", "command", "runtime")
 FIRST_STATUS = 20
@@ -38,21 +38,15 @@ DONE = "walked to the end"
 TIME = "the end of its time"
 """Who ends a walk that nobody else ends."""
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-
-@dataclass(frozen=True)
-class Plan:
-    """How to walk.
+@dataclass(frozen=True, kw_only=True)
+class Plan(Stages):
+    """How to walk, and how long its stages take.
 
     Attributes:
         rate: cycles per second, at which the policy runs; None: that of training.
         seconds: time under the policy, s; None: until somebody stops it.
         wish: where commands come from.
-        stand_up: time to the nominal stance, s.
-        lie_down: time that the robot is given to lie down when a walk ends in order, s; 0: the drives brake at once.
-        brake: time for which the drives brake at the end, s.
-        patience: time to wait for the robot, s.
         keep: newest seconds of a walk that the log has room for.
         stale: age of the newest state at which the robot counts as lost, s.
         spin: time before each cycle for which the core is kept busy, rehearsing it, s: quicker, at that price.
@@ -61,10 +55,6 @@ class Plan:
     rate: float | None = None
     seconds: float | None = None
     wish: Wish = field(default_factory=lambda: Wish((0.0, 0.0, 0.0)))
-    stand_up: float = 2.0
-    lie_down: float = 2.0
-    brake: float = 2.0
-    patience: float = 5.0
     keep: float = 120.0
     stale: float = SafetyConfig.stale
     spin: float = 0.0008
@@ -119,7 +109,7 @@ def estimator_of(bundle: Bundle, safety: Safety, contact: str | None) -> Estimat
     return KalmanEstimator(settings(bundle.metadata.estimator, **changes), safety.fail)
 
 
-def go(
+def walk(
     bundle: Bundle,
     link: Link,
     plan: Plan,
@@ -134,120 +124,122 @@ def go(
         OSError: if the file of commands cannot be read.
     """
     about = bundle.metadata
-    safety = Safety(
-        about.joints, np.array(about.joint_limits), np.array(about.torque_limit), SafetyConfig(stale=plan.stale)
-    )
+    limits = about.joints, np.array(about.joint_limits), np.array(about.torque_limit)
+    safety = Safety(*limits, SafetyConfig(stale=plan.stale))
     estimator = estimator_of(bundle, safety, contact)
-    rate = plan.rate or 1.0 / about.policy_dt
-    room = plan.keep
-    if plan.seconds is not None:
-        room = min(room, plan.seconds + plan.stand_up + plan.lie_down + plan.brake + plan.patience + 1.0)
-    log = Log(rate, room)
-    asked: list[str] = []
-    commands = make(plan.wish, range_array(about.command_ranges), safety.stop, asked.append)
-    try:
-        return _go(bundle, link, plan, rate, safety, estimator, log, commands, asked, on_second)
-    finally:
-        commands.close()
+    stop_requests: list[str] = []
+    ranges = range_array(about.command_ranges)
+    with contextlib.closing(make(plan.wish, ranges, safety.stop, stop_requests.append)) as commands:
+        walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests)
+        with stopping(safety):
+            clock = MonotonicClock(plan.spin, walk.rehearse)
+            timing = run(walk.cycle, walk.rate, None, clock, lambda timing: on_second(walk.status(timing)))
+        return walk.outcome(timing)
 
 
-def _go(
-    bundle: Bundle,
-    link: Link,
-    plan: Plan,
-    rate: float,
-    safety: Safety,
-    estimator: Estimator,
-    log: Log,
-    commands: Limited,
-    asked: list[str],
-    on_second: Callable[[str], None],
-) -> Outcome:
-    walked, ended, last = 0.0, "", [0.0, 0.0, 0.0]
+class _Walk:
+    """A walk under way: what each cycle does, and how it comes to its end."""
 
-    def on_cycle(cycle: Cycle) -> None:
-        log.note(cycle)
-        last[:] = cycle.base_lin_vel
+    def __init__(
+        self,
+        bundle: Bundle,
+        link: Link,
+        plan: Plan,
+        safety: Safety,
+        estimator: Estimator,
+        commands: Limited,
+        stop_requests: list[str],
+    ) -> None:
+        """Join the parts of the runtime; nothing is sent yet. ``stop_requests`` fills with who asks for an end."""
+        self.rate = plan.rate or 1.0 / bundle.metadata.policy_dt
+        self._link, self._plan, self._safety, self._estimator = link, plan, safety, estimator
+        self._commands, self._stop_requests = commands, stop_requests
+        room = plan.keep
+        if plan.seconds is not None:
+            room = min(room, plan.seconds + plan.stand_up + plan.lie_down + plan.brake + plan.patience + 1.0)
+        self._log = Log(self.rate, room)
+        self._walked, self._ended_by, self._velocity = 0.0, "", np.zeros(3)
+        self._controller = Controller(
+            *(bundle, link, commands, estimator, safety),
+            rate=self.rate,
+            stages=plan,
+            on_cycle=self._note,
+        )
 
-    controller = Controller(
-        *(bundle, link, commands, estimator, safety),
-        rate=rate,
-        stand_up=plan.stand_up,
-        lie_down=plan.lie_down,
-        brake=plan.brake,
-        patience=plan.patience,
-        on_cycle=on_cycle,
-    )
+    def _note(self, cycle: Cycle) -> None:
+        self._log.note(cycle)
+        self._velocity[:] = cycle.base_lin_vel
 
-    def work(now: float) -> bool:
-        nonlocal walked, ended
-        commands.poll()
-        if safety.fault is None and not ended:
-            walked = max(walked, controller.walked(now))
-            # Half a period early: the next cycle would be the first one too many.
-            if plan.seconds is not None and controller.phase == "walking" and walked > plan.seconds - 0.5 / rate:
-                ended = TIME
-                controller.finish(now)
-        for who in asked:
-            if ended or not plan.lie_down or controller.phase == "waiting":
-                safety.stop(who)  # once more, or where there is nothing to be ended in order
-            else:
-                ended = who
-                controller.finish(now)
-        asked.clear()
+    def cycle(self, now: float) -> bool:
+        """Make one cycle at ``now``, s; return whether there is another."""
+        self._commands.poll()
+        if self._safety.fault is None and not self._ended_by:
+            self._end_when_time_is_up(now)
+        self._follow_stop_requests(now)
         try:
-            return controller.cycle(now)
+            return self._controller.cycle(now)
         except Exception as error:  # of the link or the log: nothing else gets out of a cycle
-            safety.fail("runtime", f"{type(error).__name__}: {error}", now)
+            self._safety.fail("runtime", f"{type(error).__name__}: {error}", now)
             with contextlib.suppress(Exception):
-                link.send(safety.damping(None))
+                self._link.send(self._safety.damping(None))
             return False
 
-    def report(timing: Timing) -> None:
-        speed = "" if np.isnan(last).any() else f"; estimate {last[0]:+.2f} {last[1]:+.2f} {last[2]:+.2f} m/s"
-        on_second(f"{controller.phase}: {timing}{speed}")
+    def _end_when_time_is_up(self, now: float) -> None:
+        self._walked = max(self._walked, self._controller.walked(now))
+        if self._plan.seconds is None or self._controller.phase != "walking":
+            return
+        if self._walked > self._plan.seconds - 0.5 / self.rate:  # the next cycle would be the first one too many
+            self._end_in_order(TIME, now)
 
-    def rehearse() -> None:
+    def _follow_stop_requests(self, now: float) -> None:
+        """End the walk in order at the first request; brake at a second one, or where there is nothing to end."""
+        for who in self._stop_requests:
+            if self._ended_by or not self._plan.lie_down or self._controller.phase == "waiting":
+                self._safety.stop(who)
+            else:
+                self._end_in_order(who, now)
+        self._stop_requests.clear()
+
+    def _end_in_order(self, who: str, now: float) -> None:
+        self._ended_by = who
+        self._controller.finish(now)
+
+    def rehearse(self) -> None:
+        """Make a cycle that sends nothing, so that the next one is quick."""
         with contextlib.suppress(Exception):  # what is wrong is the cycle's to find
-            controller.rehearse()
+            self._controller.rehearse()
 
-    with stopping(safety):
-        timing = run(work, rate, None, MonotonicClock(plan.spin, rehearse), report)
-    refused = dict(getattr(estimator, "refused", {}), RESTARTED=getattr(estimator, "restarts", 0))
-    fault = None if controller.finished else safety.fault
-    return Outcome(fault, walked, timing, log, safety, commands, refused, resident(), ended.removeprefix(TIME))
+    def status(self, timing: Timing) -> str:
+        """Return a line on phase, timing and estimated velocity."""
+        x, y, z = self._velocity
+        speed = "" if np.isnan(self._velocity).any() else f"; estimate {x:+.2f} {y:+.2f} {z:+.2f} m/s"
+        return f"{self._controller.phase}: {timing}{speed}"
+
+    def outcome(self, timing: Timing) -> Outcome:
+        """Return what became of the walk."""
+        estimator = self._estimator
+        refused = dict(getattr(estimator, "refused", {}), RESTARTED=getattr(estimator, "restarts", 0))
+        fault = None if self._controller.finished else self._safety.fault
+        parts = timing, self._log, self._safety, self._commands, refused, resident()
+        return Outcome(fault, self._walked, *parts, self._ended_by.removeprefix(TIME))
 
 
 @contextmanager
 def stopping(safety: Safety) -> Iterator[None]:
     """Let signals stop the robot; leave their handlers as they were."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers
-        return
 
     def stop(number: int, frame: FrameType | None) -> None:
         safety.stop(signal.Signals(number).name)
+        if number == signal.SIGHUP:
+            signals.leave_terminal()
 
-    before = {number: signal.signal(number, stop) for number in SIGNALS}
-    try:
+    with signals.handled(stop):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
-@contextmanager
-def interruptible() -> Iterator[None]:
+def interruptible() -> AbstractContextManager[None]:
     """Let signals raise ``KeyboardInterrupt``, SIGINT also where a shell's background had it ignored; put them back."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return signals.handled(signals.interrupt)
 
 
 def resident() -> float | None:
@@ -268,7 +260,7 @@ def age() -> float | None:
         return None
 
 
-def account(bundle: Bundle, plan: Plan, outcome: Outcome, more: Mapping[str, Any]) -> dict[str, Any]:
+def account(bundle: Bundle, plan: Plan, outcome: Outcome, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return a walk as plain data."""
     log, fault = outcome.log, outcome.fault
     joints = bundle.metadata.joints
@@ -290,7 +282,7 @@ def account(bundle: Bundle, plan: Plan, outcome: Outcome, more: Mapping[str, Any
         "first_command_after_s": None if start is None or lived is None else lived - (time.perf_counter() - start),
         "memory_mb": outcome.memory_mb,
         "log": {"states": log.states.count, "overwritten": log.states.overwritten},
-        **more,
+        **extra,
     }
 
 
@@ -305,7 +297,7 @@ def save(
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"{about.episode}.json", folder / f"{about.episode}.npz"]
-    files[0].write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")  # first: nothing else is as small
+    write_json(files[0], content, indent=1, allow_nan=False)  # first: nothing else is as small
     write_cycles(files[1], outcome.log)
     recording = outcome.log.recording(about, truth)
     if recording is not None:

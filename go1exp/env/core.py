@@ -25,7 +25,6 @@ from go1exp.mdp.ground import GroundHeight
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.physics.scene import build_model
-from go1exp.schema.backends import WarpBackend
 from go1exp.tensors.randomness import EnvRandom
 from go1exp.tensors.rotation import projected_gravity, rotate_inverse
 from go1exp.terrain import build_terrain
@@ -71,8 +70,7 @@ class Go1Core:
         model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt, imu=imu, held=held)
         self.backend = make_backend(task.backend, model, sensors, num_envs)
         self.device = self.backend.qpos.device
-        units = getattr(self.backend, "units", None)
-        self.random = EnvRandom(seed, num_envs, first_env, self.device, units=units)
+        self.random = EnvRandom(seed, num_envs, first_env, self.device, units=self.backend.units)
         self._held = held
         self._state = KinematicState.of(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
@@ -99,7 +97,7 @@ class Go1Core:
         self._started = False
         self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
         self._evidence = Evidence()
-        self.captures = isinstance(task.backend, WarpBackend) and task.backend.graph
+        self.captures = task.backend.captures
         self._captured: CapturedStep | None = None
 
     # ------------------------------------------------------------------ construction

@@ -12,7 +12,7 @@ from go1exp.mdp.types import StepResult
 from go1exp.physics.backend import PhysicsBackend
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors
-from go1exp.schema.backends import BackendConfig, CpuBackend
+from go1exp.schema.backends import BackendConfig, CpuBackend, WarpBackend
 
 T = TypeVar("T")
 
@@ -24,18 +24,22 @@ def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: 
         go1exp.schema.registry.Expected: if its packages are not installed.
         go1exp.schema.registry.ConfigError: if its device is not there.
     """
-    if isinstance(config, CpuBackend):
-        return MujocoCpu(model, sensors, num_envs, config.threads)
+    return BUILDERS[config.name](config, model, sensors, num_envs)
+
+
+def _cpu(config: CpuBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+    return MujocoCpu(model, sensors, num_envs, config.threads)
+
+
+def _warp(config: WarpBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
     from go1exp.physics.mujoco_warp import MujocoWarp  # its packages are an extra
 
-    return MujocoWarp(
-        model,
-        sensors,
-        num_envs,
-        device=config.device,
-        nconmax=config.nconmax,
-        njmax=config.njmax,
-    )
+    limits = {"nconmax": config.nconmax, "njmax": config.njmax}
+    return MujocoWarp(model, sensors, num_envs, device=config.device, **limits)
+
+
+BUILDERS: dict[str, Callable[..., PhysicsBackend]] = {"cpu": _cpu, "warp": _warp}
+"""How each engine is built, by the names of ``go1exp.schema.backends.BACKENDS``."""
 
 
 class Captures(Protocol):

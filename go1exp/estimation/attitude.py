@@ -26,6 +26,7 @@ def levelled(
             may begin in the middle of a walk.
     """
     up = acc[t <= t[0] + first].mean(axis=0)
+    # Roll and pitch that bring the mean acceleration onto the vertical; the heading is not observable.
     roll, pitch = np.arctan2(up[1], up[2]), np.arctan2(-up[0], np.hypot(up[1], up[2]))
     rotation = Rotation.from_euler("ZYX", [0.0, pitch, roll])
     rotations = [rotation]
@@ -40,5 +41,4 @@ def levelled(
 
 def vertical(quat: np.ndarray) -> np.ndarray:
     """Return the z axis of the world in the body frame, ``(T, 3)``, for attitudes w-x-y-z ``(T, 4)``."""
-    w, x, y, z = quat.T
-    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    return Rotation.from_quat(quat, scalar_first=True).as_matrix()[:, 2]

@@ -24,10 +24,12 @@ def foot(leg: ChainLeg | PolynomialLeg, q: np.ndarray) -> tuple[np.ndarray, np.n
         slope = np.stack([_slope(u, d) for d in range(3)], axis=1) / leg.scale
         return coefficients @ terms, coefficients @ slope, np.zeros((3, 3))
     (hip, thigh, calf), (side, upper, lower) = q, leg.lengths
+    # Rotation of the hip about x; thigh and calf move in the plane that it turns.
     about_x = np.array([[1, 0, 0], [0, np.cos(hip), -np.sin(hip)], [0, np.sin(hip), np.cos(hip)]])
     knee = np.array([-upper * np.sin(thigh), 0, -upper * np.cos(thigh)])
     shin = np.array([-lower * np.sin(thigh + calf), 0, -lower * np.cos(thigh + calf)])
     below = np.array([0, side, 0]) + knee + shin
+    # Column j of the Jacobian: axis of joint j x arm from it to the foot.
     axes = np.array([[1.0, 0, 0], about_x[:, 1], about_x[:, 1]])
     arms = [about_x @ below, about_x @ (knee + shin), about_x @ shin]
     return np.array(leg.hip) + about_x @ below, np.cross(axes, arms).T, axes.T

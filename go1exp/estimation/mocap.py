@@ -80,7 +80,9 @@ def odometry(rows: np.ndarray, config: FilterConfig) -> np.ndarray:
     """
     t, q = rows[:, column.T], rows[:, column.Q].reshape(-1, 4, 3)
     feet = np.array([[foot(leg, angles)[0] for leg, angles in zip(config.legs, row, strict=True)] for row in q])
+    # of each foot relative to the trunk's origin, in the trunk's axes (T, 4, 3); a standing foot moves with -v
     speed = np.gradient(feet, t, axis=0) + np.cross(rows[:, None, column.GYRO], feet)
+    # Feet on the ground are taken to be the two lowest: three runs have no force sensors. (T, 2)
     low = np.argsort(feet[:, :, 2], axis=1)[:, :2]
     mean = -np.take_along_axis(speed, low[:, :, None], axis=1).mean(axis=1)
     return Rotation.from_quat(rows[:, column.QUAT], scalar_first=True).apply(mean)
@@ -103,6 +105,7 @@ def judge(path: Path, config: FilterConfig, log: Log = SCALER_LOG) -> Judgement:
     leg_velocity = odometry(rows, config)
     leg_place = np.cumsum(leg_velocity * np.gradient(result.t)[:, None], axis=0)
     grid, place, speed = truth(capture)
+    # The start is left out: the filter begins with speed zero, although the robot walks already.
     within = (grid >= result.t[0] + 0.05) & (grid <= result.t[-1])
     if within.sum() < WINDOW:
         raise RecordingError(f"{path}: motion capture and the robot's log have less than {WINDOW * GRID:g} s in common")

@@ -80,6 +80,7 @@ def samples(recording: Recording, log: Log | None = None) -> np.ndarray:
             if log.leg_delay_s:
                 values = np.stack([np.interp(t - log.leg_delay_s, t, one) for one in values.T], axis=1)
             rows[:, place] = values
+    # Three joints per leg, leg by leg: the first joint of each names the leg.
     feet = [FOOT_FORCE + joint.split("_")[0] for joint in joints[::3]]
     if all(foot in recording.channels for foot in feet):
         rows[:, column.FOOT_FORCE] = recording.block(*feet)

@@ -17,7 +17,6 @@ from go1exp.evaluate.estimated import EstimatedVelocity
 from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy
 from go1exp.mdp.commands import FixedVelocity
-from go1exp.schema.backends import CpuBackend
 from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.terrain import TerrainConfig
 
@@ -79,9 +78,8 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     if problems := time_rules(sim):
         raise ConfigError(problems)
     fixed = Term("command", members("command")["fixed_velocity"], {})
-    changes: dict[str, Any] = {"sim": sim, "command": fixed, "curriculum": ()}
-    if not isinstance(task.backend, CpuBackend):
-        changes["backend"] = CpuBackend("cpu", 0)
+    engine = task.backend.as_reference()
+    changes: dict[str, Any] = {"sim": sim, "command": fixed, "curriculum": (), "backend": engine}
     if not config.randomize:
         changes["rand"] = ()
         changes["effect"] = tuple(dataclasses.replace(e, slots={**e.slots, "spread": {}}) for e in task.effect)

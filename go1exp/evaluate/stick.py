@@ -11,6 +11,7 @@ import torch
 from go1exp import robot
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.policy import Policy
+from go1exp.files import replacing
 
 
 def film(core: Go1Core, policy: Policy, seconds: float, count: int = 8) -> list[np.ndarray]:
@@ -52,7 +53,8 @@ def write_png(path: Path, poses: list[np.ndarray]) -> None:
         axes.set(xlim=(-0.45, 0.45), ylim=(-0.05, 0.5), aspect="equal", title=f"x = {centre:.2f} m")
         axes.set_axis_off()
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    with replacing(path, keep_suffix=True) as partial:
+        figure.savefig(partial, dpi=100)
 
 
 def picture(core: Go1Core, policy: Policy, seconds: float, path: Path) -> None:

@@ -9,7 +9,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -35,6 +35,7 @@ from go1exp.evaluate.camera import (
     draw_velocities,
 )
 from go1exp.evaluate.policy import Policy
+from go1exp.files import replacing
 from go1exp.mdp.commands import FixedVelocity
 
 AVERAGE_TIME = 0.5
@@ -173,18 +174,14 @@ def write_gif(path: Path, frames: Iterable[Picture], fps: float = 12, width: int
 @contextmanager
 def _complete(path: Path) -> Iterator[Path]:
     """Yield a temporary file beside ``path`` to write, and rename it when it is complete."""
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.touch()
-        yield partial
-        partial.replace(path)
+        with replacing(path, keep_suffix=True) as partial:
+            partial.touch()
+            yield partial
     except OSError as error:
         reason = f"cannot be written: {error.strerror or error}"
         raise OSError(error.errno or errno.EIO, reason, str(path)) from error
-    finally:
-        with suppress(OSError):
-            partial.unlink()
 
 
 def _velocity(core: Go1Core, env: int) -> list[float]:

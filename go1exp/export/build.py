@@ -88,7 +88,7 @@ def build(
     data = bundle.write(
         metadata(config.task, module, about), run_folder.read_as_written(run), _versions(run), model, trace
     )
-    bundle.loads(data, str(run))
+    bundle.loads(data, str(run))  # read back: what is handed out has been replayed once
     return data
 
 

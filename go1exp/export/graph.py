@@ -131,6 +131,7 @@ def required_inputs(terms: Sequence[Term]) -> tuple[Port, ...]:
     """
     read: set[str] = set()
     for term in terms:
+        # Two rows of zeros: only which fields a term reads matters here.
         sensed = Sensed({port.name: torch.zeros(2, port.size) for port in READINGS}, term.key)
         term(cast(Snapshot, sensed))
         read |= sensed.read
@@ -192,6 +193,7 @@ def to_onnx(module: DeployedPolicy) -> bytes:
 def _exported(module: nn.Module, inputs: Sequence[Port], outputs: Sequence[str]) -> Any:
     """Export the module, and remove everything that depends on where and when it was exported."""
     example = tuple(torch.zeros(2, port.size) for port in inputs)
+    # any number of rows: 1 on the robot, many in tests
     rows = torch.export.Dim("rows", min=1)
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(

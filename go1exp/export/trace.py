@@ -72,7 +72,7 @@ def record(
     steps, period = max(1, round(seconds / task.sim.policy_dt)), task.sim.policy_dt
     rows: list[dict[str, np.ndarray]] = []
     for step in range(steps):
-        before = readings(core)
+        before = readings(core)  # before the step: what the policy is about to see
         policy_input = observation.clone()
         result = core.step(policy(observation))
         core.check(result)

@@ -160,6 +160,7 @@ def _whole(recording: Recording, oldest: np.ndarray, period: float) -> np.ndarra
     first = np.searchsorted(t, oldest + EDGE, side="right") - 1  # last sample at or before the oldest tap
     inside = oldest >= t[0] - EDGE
     longest = GAP * max(period, float(np.median(np.diff(t))) if len(t) > 1 else period)
+    # Cumulative counts: a window is free of gaps if the count at both its ends is equal.
     bad_steps = np.concatenate([[0], np.cumsum(np.diff(t) > longest)])
     off = ~recording.channels["torque_enable"] if "torque_enable" in recording.channels else np.zeros(len(t), bool)
     off_before = np.concatenate([[0], np.cumsum(off)])  # [i]: number of samples before i that are off
@@ -176,6 +177,7 @@ def _since_reversal(t: np.ndarray, qd: np.ndarray) -> np.ndarray:
     turns = t[moving[1:][np.diff(sign[moving]) != 0]]
     if len(turns) == 0:
         return np.full(len(t), np.inf)
+    # nearest of the turn before and the turn after each sample
     after = np.clip(np.searchsorted(turns, t), 1, len(turns) - 1) if len(turns) > 1 else np.zeros(len(t), int)
     return np.asarray(np.minimum(np.abs(turns[after] - t), np.abs(turns[after - 1] - t)))
 
@@ -267,6 +269,7 @@ def _clusters(recordings: Sequence[Recording]) -> list[set[str]]:
 
 def fingerprint(recording: Recording) -> str:
     """Return the SHA-256 of a recording: its metadata as JSON, then its columns by name, as float64 bytes."""
+    # Sorted by name and always float64, so that neither column order nor file format changes the hash.
     digest = hashlib.sha256(TypeAdapter(Meta).dump_json(Meta(**asdict(recording.meta))))
     for name in sorted(recording.channels):
         digest.update(name.encode() + b"\0")

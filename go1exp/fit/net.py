@@ -13,7 +13,6 @@ A file is a NumPy ``.npz`` of plain numbers and one JSON string; nothing in it i
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +22,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from go1exp.files import opened
 from go1exp.schema.registry import STRICT, Expected, NonNegative, Positive, explain
 
 if TYPE_CHECKING:
@@ -229,13 +229,8 @@ class ActuatorNet:
         path = Path(path)
         header = f'{{"{MAGIC}": {_INFO.dump_json(self.info).decode()}}}'
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
-            with partial.open("wb") as file:
-                np.savez(file, allow_pickle=False, header=np.array(header), **self.arrays())
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+        with opened(path) as file:
+            np.savez(file, allow_pickle=False, header=np.array(header), **self.arrays())
 
     def export_onnx(self, path: Path) -> None:
         """Write an ONNX model, ``features`` -> ``torque``, one file, opset 20.

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from go1exp.files import write_bytes
+
 if TYPE_CHECKING:
     from onnx import NodeProto, TensorProto
 
@@ -53,7 +55,7 @@ def write_onnx(
     helper.set_model_props(model, dict(about))
     onnx.checker.check_model(model, full_check=True)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(model.SerializeToString())
+    write_bytes(path, model.SerializeToString())
 
 
 def _layers(

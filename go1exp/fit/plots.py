@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from go1exp.files import replacing
 from go1exp.fit.dataset import Rows
 from go1exp.fit.fitting import FitResult
 from go1exp.fit.report import rmse
@@ -49,7 +50,8 @@ def plot(result: FitResult, folder: Path) -> list[Path]:
         errors = f"net {rmse(torque['net'] - rows.y):.4f}, {best} {rmse(torque[best] - rows.y):.4f}"
         figure.suptitle(f"{joint}: {result.report.target} on held-out episodes, RMSE in N m: {errors}")
         file = folder / f"actuator_net_{joint}.png"
-        figure.savefig(file, dpi=110)
+        with replacing(file, keep_suffix=True) as partial:
+            figure.savefig(partial, dpi=110)
         files.append(file)
     return files
 
@@ -62,6 +64,7 @@ def _stretches(rows: Rows, net: np.ndarray) -> list[tuple[str, np.ndarray]]:
         number = ((rows.t[in_episode] - rows.t[in_episode[0]]) / STRETCH).astype(int)
         pieces += [in_episode[number == n] for n in np.unique(number)]
     longest = max(len(piece) for piece in pieces)
+    # The last piece of an episode may be short; its error says little.
     whole = [piece for piece in pieces if len(piece) > longest / 2]
     order = sorted(whole, key=lambda piece: rmse(net[piece] - rows.y[piece]))
     return [("worst", order[-1]), ("median", order[len(order) // 2])]

@@ -52,6 +52,7 @@ def linear(train: Rows, train_group: np.ndarray, rows: Rows, group: np.ndarray) 
     torque = np.full(len(rows), np.nan)
     for k in np.unique(group):
         train_rows, predicted = train.take(train_group == k), group == k
+        # as the net: normalised by the training rows of the same group
         mean, std = train_rows.x.mean(axis=0), train_rows.x.std(axis=0)
         std = np.where(std > 0, std, 1.0)
         weights = ridge((train_rows.x - mean) / std, train_rows.y - train_rows.y.mean())

@@ -69,7 +69,7 @@ def train(
     left = rows.y - output_mean - z @ skip
     output_std = float(left.std()) or 1.0
     left_validation = validation.y - output_mean - (validation.x - mean) / std @ skip
-    with one_thread():
+    with one_thread():  # more threads are slower for such small matrices, and change the order of sums
         net, curve, best = _descend(
             torch.tensor(z, dtype=torch.float32),
             torch.tensor(left / output_std, dtype=torch.float32),
@@ -116,12 +116,14 @@ def _descend(
     rows = min(len(x), settings.epoch_rows)
     batch = min(settings.batch, rows)
     steps = rows // batch
+    # fused: one kernel for all parameters; the networks are so small that calls cost more than arithmetic
     adam = torch.optim.Adam(net.parameters(), lr=settings.learning_rate, fused=True)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(adam, T_max=settings.epochs * steps)
     best, best_error, kept = 0, float("inf"), {}
     curve = []
     for epoch in range(settings.epochs):
         total = torch.zeros(())
+        # whole minibatches only; another random part of the rows in every epoch
         pick = torch.randperm(len(x), generator=draws)[: steps * batch]
         for x_batch, y_batch in zip(x[pick].split(batch), y[pick].split(batch), strict=True):
             loss = mse_loss(net(x_batch)[:, 0], y_batch)
@@ -151,6 +153,7 @@ def _build(features: int, hidden: tuple[int, ...], draws: torch.Generator) -> to
     layers: list[torch.nn.Module] = []
     widths = (features, *hidden, 1)
     for wide, narrow in pairwise(widths):
+        # Without this PyTorch draws the weights from its global generator, which others use too.
         layer = torch.nn.utils.skip_init(torch.nn.Linear, wide, narrow)
         with torch.no_grad():
             for values in (layer.weight, layer.bias):

@@ -13,6 +13,7 @@ import numpy as np
 
 from go1exp.config import parse_parts
 from go1exp.effects.base import Effect, Param
+from go1exp.files import write_text
 from go1exp.gap.explain import fingerprint, measured
 from go1exp.gap.files import GapFileError
 from go1exp.gap.fit import scores
@@ -81,7 +82,7 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
         path.unlink(missing_ok=True)
         if lines or name == EFFECT:
             head = [f"# {about}", *_provenance(result)]
-            path.write_text("\n".join([*head, *(lines or ["{}"])]) + "\n")
+            write_text(path, "\n".join([*head, *(lines or ["{}"])]) + "\n")
             found.append(path)
     return tuple(found)
 

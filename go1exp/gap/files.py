@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from go1exp.files import write_json
 from go1exp.gap.result import EXIT_CODES, Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
 from go1exp.schema.registry import Expected
 
@@ -26,7 +27,7 @@ def save(result: GapResult, folder: Path) -> Path:
     """Write a result and return its file."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / RESULT
-    path.write_text(json.dumps(result.as_dict(), indent=1) + "\n")
+    write_json(path, result.as_dict(), indent=1)
     return path
 
 

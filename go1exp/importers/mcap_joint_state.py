@@ -126,13 +126,14 @@ def _channels(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the columns, in the order of ``joints``, and the notes."""
     everything = [m for topic in messages.values() for m in topic]
+    # Header stamps are when the state was measured, log times when it was written. One kind for all messages.
     stamped = all(m.stamp_ns > 0 for m in everything)
     clock = {k: np.array([m.stamp_ns if stamped else m.log_ns for m in v], np.int64) for k, v in messages.items()}
     now = clock[state_topic]
     notes = [f"t = 0 is {now[0]} ns of {'the header stamps' if stamped else 'the log'}."]
     if not stamped:
         notes.append("Some messages have no header stamp, so t is the time of logging.")
-    channels = {"t": (now - now[0]) / 1e9}
+    channels = {"t": (now - now[0]) / 1e9}  # from integers: float64 cannot hold ns since 1970
     states: dict[str, Fields] = {"q": "position", "qd": "velocity", "tau_est": "effort"}
     for quantity, key in states.items():
         channels |= _quantity(path, state_topic, messages[state_topic], joints, quantity, key, notes)
@@ -173,7 +174,7 @@ def _quantity(
         names, values = message.state.name, getattr(message.state, key)
         if len(values) != len(names):
             raise RecordingError(f"{path}: {topic}: message {i} has {len(names)} names, but {len(values)} of {key}")
-        if names not in orders:
+        if names not in orders:  # messages may list joints in different orders
             missing = [joint for joint in joints if joint not in names]
             if missing:
                 raise RecordingError(f"{path}: {topic}: message {i} lacks joint {', '.join(missing)}; has {names}")

@@ -246,7 +246,9 @@ def _clock_error(t: np.ndarray, gyro: np.ndarray, clock: np.ndarray, position: n
     grid = np.arange(clock[0], clock[-1], 0.01)
     if len(grid) < 100:
         return 0.0
+    # Speed of the body over 0.1 s, from positions on an even grid.
     place = np.stack([np.interp(grid, clock, one) for one in position.T], axis=1)
+    # The robot stands at the end of each run: the reading there is the offset of the gyro.
     still = np.median(gyro[t > t[-1] - 2.0], axis=0)
     turning = t[np.linalg.norm(gyro - still, axis=1) > MOVING_GYRO]
     moving = grid[5:-5][np.linalg.norm(place[10:] - place[:-10], axis=1) / 0.1 > MOVING_BODY]
@@ -255,12 +257,14 @@ def _clock_error(t: np.ndarray, gyro: np.ndarray, clock: np.ndarray, position: n
     rough = turning[-1] + STOPS_LATER - moving[-1]
     if abs(rough) < CLOCK_SURE:
         return 0.0
+    # Angular velocity in body axes over four samples, which averages the noise of attitudes.
     rate = (attitude[:-4].inv() * attitude[4:]).as_rotvec() / (clock[4:] - clock[:-4])[:, None]
 
     def match(shift: float) -> float:
         mocap_rate = np.stack([np.interp(t, clock[2:-2] + shift, one) for one in np.clip(rate, -3.0, 3.0).T], axis=1)
         return float((mocap_rate * (gyro - still)).sum() / np.sqrt((mocap_rate**2).sum() + 1e-12))
 
+    # The stop is known to within 0.15 s, less than half a stride, so the right maximum is chosen.
     return float(max(rough + np.arange(-0.15, 0.151, 0.01), key=match))
 
 

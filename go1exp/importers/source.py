@@ -127,6 +127,7 @@ def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **abou
     Raises:
         RecordingError: naming ``path``, if anything breaks the format.
     """
+    # What a source does not state is None in the metadata, not a guess.
     known: dict[str, Any] = dict.fromkeys(("base_quat", "kp", "kd", "tau_limit", "excitation", "repeat_of"))
     known |= {"source": "measured", "tool": f"go1exp importer {importer}"}
     known |= {"versions": {"go1exp": __version__, "numpy": np.__version__}}

@@ -62,6 +62,9 @@ class PhysicsBackend(Protocol):
     def derive_constants(self, mask: Tensor) -> None:
         """Recompute what follows from masses and inertias (``mj_setConst``) in the rows of ``mask``."""
 
+    def units(self, key: Tensor, counter: Tensor, count: int) -> Tensor:
+        """Return what ``go1exp.tensors.randomness.unit_numbers`` does, in the way that is quick on this device."""
+
     def drain_metrics(self) -> dict[str, float]:
         """Return figures about the engine since the last call, for a log."""
 

@@ -14,6 +14,7 @@ from mujoco.batch import MODEL_FIELDS, Batch
 from torch import Tensor
 
 from go1exp.physics.scene import Sensors
+from go1exp.tensors.randomness import unit_numbers
 
 STATE_FIELDS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl")
 """What one simulation carries from step to step (no activations in this model; applied forces are written anew)."""
@@ -95,6 +96,10 @@ class MujocoCpu:
     def env_data(self, env: int) -> mujoco.MjData:
         """Return environment ``env``'s state as an MjData of ``env_model``, to render or inspect it."""
         return self._batch.get_data(env)
+
+    def units(self, key: Tensor, counter: Tensor, count: int) -> Tensor:
+        """Return the numbers of ``go1exp.tensors.randomness.unit_numbers``."""
+        return unit_numbers(key, counter, count)
 
     def drain_metrics(self) -> dict[str, float]:
         """Nothing to tell: MuJoCo makes room for whatever there is."""

@@ -44,7 +44,7 @@ class SensorConfig:
         acc: specific force, m/s2.
         attitude: error of the reported attitude as a small rotation, rad (its ``step`` is of the quaternion).
         foot_force: force of a foot's sensor, N.
-        truth: also write the base's true position and velocity, as motion capture would.
+        truth: also write the true position and velocity of the base, as motion capture measures them.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -95,6 +95,7 @@ def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Gen
         channels |= dict(
             zip(VECTORS[f"imu_{name}"], _with_errors(true[name], getattr(config, name), rng).T, strict=True)
         )
+    # The error is a small rotation in the body's axes, so that it does not depend on the attitude.
     error = Rotation.from_rotvec(config.attitude.noise * rng.standard_normal((rows, 3)))
     attitude = Rotation.from_quat(true["quat"], scalar_first=True) * error
     quat = _quantised(attitude.as_quat(canonical=True, scalar_first=True), config.attitude)
@@ -107,6 +108,7 @@ def log(true: Mapping[str, np.ndarray], config: SensorConfig, rng: np.random.Gen
         for name in ("base_pos", "base_quat", "base_lin_vel", "base_ang_vel"):
             if name in true:
                 channels |= dict(zip(VECTORS[name], true[name].T, strict=True))
+    # Samples are lost after everything else is drawn: the noise of the others does not depend on the loss.
     kept = rng.random(rows) >= config.dropped
     kept[0] = True
     return {name: np.ascontiguousarray(values[kept]) for name, values in channels.items()}

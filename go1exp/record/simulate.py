@@ -62,6 +62,7 @@ def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int
     simulated as one batch. ``on_step`` is called with the progress.
     """
     recordings: dict[str, Recording] = {}
+    # (attitude of the trunk, dropped or not): episodes of one kind run as one batch
     places = list(dict.fromkeys((e.hang, e.motion.height > 0) for e in episodes))
     for k, place in enumerate(places):
         group = [e for e in episodes if (e.hang, e.motion.height > 0) == place]
@@ -187,6 +188,7 @@ def policy_task(rig: Rig, trained: TaskConfig, seconds: float) -> TaskConfig:
         ConfigError: if the periods do not divide each other.
     """
     period = trained.sim.policy_dt
+    # Two periods more than recorded, so that no time limit ends an episode.
     sim = dataclasses.replace(
         trained.sim, physics_dt=rig.physics_dt, episode_s=(round(seconds / period) + 2) * period, spread_starts=False
     )

@@ -21,8 +21,17 @@ class CpuBackend:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
+    on_gpu: ClassVar[bool] = False
+    """Whether its tensors are on a GPU."""
+    captures: ClassVar[bool] = False
+    """Whether work on its tensors is recorded once and replayed."""
+
     name: Literal["cpu"]
     threads: Annotated[int, Field(ge=0)]
+
+    def as_reference(self) -> CpuBackend:
+        """Return the settings of the engine that policies are judged on, wherever they were trained: MuJoCo's own."""
+        return self
 
 
 @dataclass(frozen=True)
@@ -51,6 +60,20 @@ class WarpBackend:
         """Check what concerns two settings."""
         if self.graph and self.device == "cpu":
             raise ValueError("graph = True: a CUDA graph needs a CUDA device; use graph=false with device=cpu")
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether its tensors are on a GPU."""
+        return self.device != "cpu"
+
+    @property
+    def captures(self) -> bool:
+        """Whether work on its tensors is recorded once and replayed."""
+        return self.graph
+
+    def as_reference(self) -> CpuBackend:
+        """Return the settings of the engine that policies are judged on, wherever they were trained: MuJoCo's own."""
+        return CpuBackend("cpu", threads=0)
 
 
 BackendConfig = CpuBackend | WarpBackend

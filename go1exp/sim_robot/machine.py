@@ -56,7 +56,10 @@ class Robot:
             ConfigError: if its drives have no gains, since commands set gains.
         """
         if not has_gains(task.actuator):
-            raise ConfigError([f"actuator: {task.actuator.entry.name!r} has no kp and kd to command; use actuator=pd"])
+            name = task.actuator.entry.name
+            raise ConfigError(
+                [f"actuator = {name}: has no kp and kd, which the runtime commands with every target; use actuator=pd"]
+            )
         self._config, self._rng = config, np.random.default_rng(config.seed)
         held = (1.0, 0.0, 0.0, 0.0) if config.start == "hung" else None
         model, blocks = build_model(task.robot, build_terrain(TerrainConfig()), TICK, imu=True, held=held)
@@ -114,7 +117,7 @@ class Robot:
             self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
         self._measured = self.clock, self._in_force
         self._advance()
-        self.clock = round(self.clock / TICK + 1) * TICK
+        self.clock = round(self.clock / TICK + 1) * TICK  # a whole number of ticks: no rounding adds up
 
     def _advance(self) -> None:
         """Make a step, and keep the readings of the instant at which it begins.
@@ -187,6 +190,7 @@ def turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
     """Return attitudes (..., 4), w-x-y-z, rotated by small rotation vectors (..., 3), rad, in the body's axes."""
     w, x, y, z = np.moveaxis(quat, -1, 0)
     a, b, c = np.moveaxis(0.5 * by, -1, 0)
+    # Quaternion product with (1, a, b, c), the small rotation to first order; normalised below.
     parts = (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)
     new = np.stack(parts, axis=-1)
     return new / np.linalg.norm(new, axis=-1, keepdims=True)

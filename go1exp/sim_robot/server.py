@@ -141,8 +141,10 @@ class Server:
         def work(now: float) -> bool:
             nonlocal begin, calls
             begin = min(begin, now - TICK * self.counts.ticks) if calls == 0 else begin
+            # Ticks that should have been simulated by now, less those that were.
             due = int((now - begin) / TICK) + 1 - self.counts.ticks
             if due > MOST_AT_ONCE:
+                # The start is moved, so that the lost time is never made up for.
                 late = (due - MOST_AT_ONCE) * TICK
                 begin, due = begin + late, MOST_AT_ONCE
                 self.counts.slipped += late
@@ -162,6 +164,7 @@ class Server:
         self._listen(now)
         for data in self._uplink.take(now):
             self._obey(data)
+        # The newest command acts in this tick; the state that is sent is of its beginning.
         robot.step()
         state, true = robot.sense()
         self.truth.add(now, true)

@@ -18,8 +18,8 @@ class SimConfig:
         start: standing in the nominal stance, lying on its belly, or hung up so that no foot reaches the ground.
         noise: noise of its sensors, as a multiple of the paper's Table II.
         delay: delay of datagrams, each way, s.
-        loss: share of the datagrams that get lost, each way.
-        seed: seed of noise, loss and drawn effects.
+        loss: share of the datagrams that are lost, each way.
+        seed: seed of noise, loss and random effects.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT

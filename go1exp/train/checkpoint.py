@@ -5,9 +5,7 @@ One file per checkpoint, written beside its final name and renamed when complete
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import os
 import random
 import warnings
 from collections import deque
@@ -18,15 +16,27 @@ import numpy as np
 import torch
 
 from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.errors import Expected
+from go1exp.files import opened
 from go1exp.train.ppo import AdaptivePPO
 
 FORMAT = 1
 SUFFIX = ".pt"
 
 
+class DamagedCheckpoint(Expected):
+    """A checkpoint that is not whole, or none at all; the message names the file."""
+
+
 def checkpoints(run: Path) -> list[Path]:
     """Return the complete checkpoints of a run folder, oldest first."""
     return sorted((run / "checkpoints").glob(f"*{SUFFIX}"))
+
+
+def iterations_done(run: Path) -> int:
+    """Return the iteration of a run folder's newest checkpoint, by its name; 0 without one."""
+    numbers = [int(path.stem) for path in checkpoints(run) if path.stem.isdigit()]
+    return max(numbers, default=0)
 
 
 def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
@@ -36,17 +46,11 @@ def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
         OSError: if it cannot be written; the checkpoints that are there stay.
     """
     final = run / "checkpoints" / f"{ppo.iteration:06d}{SUFFIX}"
-    partial = final.with_suffix(".partial")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
+        with opened(final) as file:
             torch.save(_state(ppo), file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(final)
     except (OSError, RuntimeError) as error:  # torch's zip writer turns some of the system's errors into its own
-        with contextlib.suppress(OSError):
-            partial.unlink()
         number, reason = (error.errno, error.strerror) if isinstance(error, OSError) else (errno.EIO, str(error))
         raise OSError(number, f"checkpoint cannot be written: {reason}", str(final)) from error
     for old in checkpoints(run)[:-keep]:
@@ -55,16 +59,20 @@ def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
 
 
 def load_latest(run: Path) -> tuple[dict[str, Any], Path]:
-    """Read the newest checkpoint that is whole; a damaged one is skipped with a warning.
+    """Read the newest checkpoint that is whole; a damaged one is skipped with a warning of one line.
 
     Raises:
         FileNotFoundError: if the folder holds none.
+        DamagedCheckpoint: if none of those that it holds can be read.
     """
-    for path in reversed(checkpoints(run)):
+    files = checkpoints(run)
+    for path in reversed(files):
         try:
             return read(path), path
-        except Exception as error:  # a truncated or overwritten file fails in many ways
-            warnings.warn(f"{path}: damaged checkpoint skipped ({type(error).__name__}: {error})", stacklevel=2)
+        except DamagedCheckpoint as error:
+            warnings.warn(f"{error}; skipped", stacklevel=2)
+    if files:
+        raise DamagedCheckpoint(f"{run}: none of its {len(files)} checkpoints can be read")
     raise FileNotFoundError(f"{run}: no checkpoint to load (looked for checkpoints/*{SUFFIX})")
 
 
@@ -72,11 +80,19 @@ def read(path: Path) -> dict[str, Any]:
     """Read one checkpoint.
 
     Raises:
-        ValueError: if it was written by an incompatible version.
+        DamagedCheckpoint: if it is not whole, no checkpoint, or one of a version that is not known here.
+        OSError: if the file cannot be opened.
     """
-    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    if state.get("format") != FORMAT:
-        raise ValueError(f"{path}: checkpoint format {state.get('format')!r}, this version reads {FORMAT}")
+    try:
+        with path.open("rb") as file:
+            state: Any = torch.load(file, map_location="cpu", weights_only=True)
+    except OSError:
+        raise
+    except Exception:  # in many ways, and torch's own words advise to run the code that the file may hold
+        raise DamagedCheckpoint(f"{path}: damaged checkpoint (not whole, or not written by go1exp)") from None
+    known = state.get("format") if isinstance(state, dict) else None
+    if known != FORMAT:
+        raise DamagedCheckpoint(f"{path}: checkpoint format {known!r}, this version reads {FORMAT}")
     return state
 
 

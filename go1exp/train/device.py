@@ -2,8 +2,8 @@
 
 SB3's loop takes every step through numpy and looks at every environment's info in Python, its buffer computes
 advantages on the host, and its update waits for the device six times a minibatch (docs/benchmarks.md has what that
-costs). Policy, optimiser, saving, callbacks and logger are SB3's here too; the loss is SB3's law, held to it by
-tests/test_device_training.py.
+costs). Policy, optimiser, saving, callbacks and logger are SB3's here too; advantages and loss are those of
+``go1exp.train.loss``, as on the CPU.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class DevicePPO(AdaptivePPO):
         """Do nothing: the update sets its rate itself."""
 
     def train(self) -> None:
-        """Update on the rollout as SB3 does, wait for the device once, then close the iteration.
+        """Update on the rollout, wait for the device once, then close the iteration.
 
         Raises:
             NumericalFault: if a gradient was not finite; the policy is spoilt by then, the last checkpoint is not.
@@ -137,20 +137,7 @@ class DevicePPO(AdaptivePPO):
         self._kl = figures.pop("kl")
         if not all(figures.pop("finite")):
             raise NumericalFault("gradient of the policy", f"in iteration {self.iteration + 1}", {})
-        last = slice(-self.config.minibatches, None)  # SB3 tells of the last pass
-        means = {
-            name: float(np.mean(values[last if name == "approx_kl" else slice(None)]))
-            for name, values in figures.items()
-        }
-        means["loss"] = figures["loss"][-1]
-        means["explained_variance"] = self.rollout_buffer.explained_variance()
-        means["std"] = float(self.policy.log_std.detach().exp().mean())
-        for name, value in means.items():
-            self.logger.record(f"train/{name}", value)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/clip_range", self.config.clip_range)
-        if self.config.value_clip is not None:
-            self.logger.record("train/clip_range_vf", self.config.value_clip)
+        self._report(figures)
         self._close_iteration()
 
     def _excluded_save_params(self) -> list[str]:

@@ -9,6 +9,7 @@ import torch
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from torch import Tensor
 
+from go1exp.train.loss import write_advantages
 from go1exp.train.ppo import GaussianPolicy, MeanRolloutBuffer
 
 
@@ -48,20 +49,17 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
         self._next.add_(1).remainder_(self.buffer_size)
 
     def estimate(self, last_values: Tensor, last_ended: Tensor) -> None:
-        """Compute advantages and returns: generalised advantage estimation (Schulman et al. 2016), as SB3 does.
+        """Compute advantages and returns.
 
         Args:
             last_values: (N,) of the states after the rollout.
             last_ended: (N,) whether an episode ended in its last step.
         """
-        d, gain = self.data, torch.zeros_like(last_values)
-        for step in reversed(range(self.buffer_size)):
-            last = step == self.buffer_size - 1
-            going = 1.0 - (last_ended.float() if last else d["starts"][step + 1])
-            after = last_values if last else d["values"][step + 1]
-            delta = d["rewards"][step] + self.gamma * after * going - d["values"][step]
-            gain = delta + self.gamma * self.gae_lambda * going * gain
-            d["advantages"][step].copy_(gain)
+        d = self.data
+        write_advantages(
+            *(d[name] for name in ("advantages", "rewards", "values", "starts")),
+            *(last_values, last_ended, self.gamma, self.gae_lambda),
+        )
         torch.add(d["advantages"], d["values"], out=d["returns"])
 
     def episodes(self, most: int) -> list[dict[str, float]]:

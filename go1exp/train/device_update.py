@@ -1,4 +1,4 @@
-"""PPO's gradient steps on the device: the law of SB3's ``PPO.train``, without a look at any value on the way.
+"""PPO's gradient steps on the device, without a look at any value on the way.
 
 One gradient step (gather the minibatch, loss, backward pass, clipping, rate, Adam) is one CUDA graph where the
 environment's step is one. SB3's own loop reads six numbers a minibatch back, which costs more than the arithmetic.
@@ -11,15 +11,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import mse_loss
 
 from go1exp.train.device_buffer import DeviceRolloutBuffer
-from go1exp.train.ppo import AdaptivePPO, adapted_rate, gaussian_kl
+from go1exp.train.loss import ppo_loss
+from go1exp.train.ppo import LOSS_FIGURES, AdaptivePPO, adapted_rate, gaussian_kl
 
-FIGURES = (
-    *("policy_gradient_loss", "value_loss", "entropy_loss", "loss"),
-    *("clip_fraction", "approx_kl", "kl", "finite"),
-)
+FIGURES = (*LOSS_FIGURES, "kl", "finite")
 """What is kept of each gradient step; ``finite`` is 1 if its gradients were."""
 
 WARM_UP = 3
@@ -69,43 +66,21 @@ class DeviceUpdate:
         return dict(zip(FIGURES, self._figures.T.tolist(), strict=True))
 
     def _gradient_step(self) -> None:
-        """SB3's ``PPO.train`` for one minibatch, then rsl_rl's rate; in place, so that it can be replayed."""
+        """Loss, gradients and rsl_rl's rate for one minibatch; in place, so that it can be replayed."""
         c, policy = self._config, self._policy
         batch = self._buffer.batch(self._rows)
-        values, log_prob, entropy = policy.evaluate_actions(batch.observations, batch.actions)
-        values, gain = values.flatten(), batch.advantages
-        assert entropy is not None
-        if c.normalize_advantage:
-            gain = (gain - gain.mean()) / (gain.std() + 1e-8)
-        log_ratio = log_prob - batch.old_log_prob
-        ratio = log_ratio.exp()
-        policy_loss = -torch.min(gain * ratio, gain * ratio.clamp(1 - c.clip_range, 1 + c.clip_range)).mean()
-        if c.value_clip is not None:
-            values = batch.old_values + (values - batch.old_values).clamp(-c.value_clip, c.value_clip)
-        value_loss, entropy_loss = mse_loss(batch.returns, values), -entropy.mean()
-        loss = policy_loss + c.entropy * entropy_loss + c.value_coef * value_loss
+        loss = ppo_loss(policy, batch, c)
 
         self._adam.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.total.backward()
         norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), c.max_grad_norm)
         with torch.no_grad():
             mean = policy.last_distribution.distribution.mean
             kl = gaussian_kl(self._buffer.current_means, self._old_log_std, mean, policy.log_std).mean()
             if c.schedule == "adaptive":
                 self._rate.copy_(adapted_rate(self._rate, kl, c.desired_kl, c.learning_rate_range))
-            clipped = ((ratio - 1).abs() > c.clip_range).float().mean()
-            approx_kl = ((ratio - 1) - log_ratio).mean()
-            figures = (
-                policy_loss,
-                value_loss,
-                entropy_loss,
-                loss,
-                clipped,
-                approx_kl,
-                kl,
-                torch.isfinite(norm).float(),
-            )
-            self._figures.index_copy_(0, self._taken, torch.stack(figures).unsqueeze(0))
+            figures = torch.stack((*loss, kl, torch.isfinite(norm).float()))
+            self._figures.index_copy_(0, self._taken, figures.unsqueeze(0))
             self._taken.add_(1)
         self._adam.step()
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-import os
+import io
+import math
 import uuid
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ from typing import Any
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
 from go1exp.config import LoggerConfig, WandbConfig
-from go1exp.schema.registry import Expected
+from go1exp.files import write_text
+from go1exp.schema.registry import ConfigError, Expected
 
 CLOCK = "time/"
 """Prefix of metrics that depend on the machine's clock; they have a file of their own."""
@@ -37,11 +39,10 @@ class CsvWriter(KVWriter):
         if not rows:
             return
         self._columns[name] = rows[0]
-        whole = [r for r in rows[1:] if len(r) == len(rows[0]) and int(float(r[0])) <= iteration]
-        partial = path.with_suffix(".partial")
-        with partial.open("w", newline="") as file:
-            csv.writer(file).writerows([rows[0], *whole])
-        os.replace(partial, path)
+        whole = [r for r in rows[1:] if len(r) == len(rows[0]) and 0 < _number(r[0]) <= iteration]
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows([rows[0], *whole])
+        write_text(path, text.getvalue())
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Append a row to each file."""
@@ -68,6 +69,14 @@ class CsvWriter(KVWriter):
         """Nothing is kept open."""
 
 
+def _number(text: str) -> float:
+    """Read an iteration's number; NaN, which is in no range, from what a crash of the machine left of one."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 class WandbWriter(KVWriter):
     """Sends metrics to a Weights & Biases run; a resumed run continues under the same id."""
 
@@ -78,7 +87,7 @@ class WandbWriter(KVWriter):
             raise Expected("logger=wandb needs the package wandb: pip install wandb, or use logger=local") from error
         identity = run / "wandb_id"
         if not identity.exists():
-            identity.write_text(uuid.uuid4().hex[:8])
+            write_text(identity, uuid.uuid4().hex[:8])
         self._run = wandb.init(
             project=config.project,
             entity=config.entity,
@@ -100,12 +109,57 @@ class WandbWriter(KVWriter):
         self._run.finish()
 
 
-def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[str, Any]) -> Logger:
-    """Build SB3's logger with the configured writers; ``iteration`` is the one that training continues from."""
+class TensorBoardWriter(TensorBoardOutputFormat):
+    """SB3's, which also hides the rows of a run that went on from an older checkpoint: they come once more."""
+
+    def __init__(self, folder: Path, steps: int) -> None:
+        super().__init__(str(folder))
+        if steps:  # TensorBoard's own mark for it (``SummaryWriter(purge_step)``, which SB3 does not hand on)
+            from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+            restarted = SessionLog(status=SessionLog.START)
+            self.writer._get_file_writer().add_event(Event(session_log=restarted), steps + 1)
+
+
+def check_account(config: LoggerConfig) -> None:
+    """Refuse to log online to Weights & Biases without a key: it would ask, or fail, when all is built.
+
+    Raises:
+        ConfigError: if neither the environment nor a netrc file holds one.
+    """
+    if config.wandb is None or config.wandb.mode != "online":
+        return
+    try:
+        import wandb
+
+        known = wandb.login(prompt=False, verify=False)
+    except ImportError:
+        return  # the writer says what to install
+    except Exception as error:  # a key of a wrong form
+        raise ConfigError([f"logger.wandb.mode = 'online': {' '.join(str(error).split())}"]) from None
+    if not known:
+        raise ConfigError(
+            [
+                "logger.wandb.mode = 'online': there is no API key; set WANDB_API_KEY, or run wandb login, or use "
+                "logger.wandb.mode=offline"
+            ]
+        )
+
+
+def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[str, Any], steps: int = 0) -> Logger:
+    """Build SB3's logger with the configured writers.
+
+    Args:
+        config: which ones.
+        run: the run folder.
+        iteration: that training continues from: later rows are dropped.
+        settings: the run's configuration, for Weights & Biases.
+        steps: environment steps at ``iteration``.
+    """
     writers: list[KVWriter] = []
     if config.tensorboard:
         try:
-            writers.append(TensorBoardOutputFormat(str(run / "tensorboard")))
+            writers.append(TensorBoardWriter(run / "tensorboard", steps))
         except AssertionError:
             print("tensorboard is not installed: metrics go to the other writers only")
     if config.csv:

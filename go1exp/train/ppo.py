@@ -1,8 +1,9 @@
 """Stable-Baselines3's PPO with rsl_rl's KL-adaptive learning rate.
 
-SB3's loss and loop are used as they are. The rule needs two things that SB3 does not keep: the action means at
-collection (the buffer below stores them) and a look at every minibatch between forward pass and gradient step (a hook
-on the optimiser).
+SB3's policy, rollouts and logger are used as they are; advantages and loss are in ``go1exp.train.loss``, where the
+learner on the GPU has them from too. The rule needs two things that SB3 does not keep: the action means at collection
+(the buffer below stores them) and a look at every minibatch between forward pass and gradient step (a hook on the
+optimiser).
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Dis
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
-from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.utils import explained_variance, safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from go1exp.config import PPOConfig
 from go1exp.env.faults import NumericalFault
+from go1exp.train.loss import ppo_loss, write_advantages
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 KL_FACTOR = 2.0
@@ -66,6 +68,10 @@ def policy_settings(config: PPOConfig) -> dict[str, Any]:
         "log_std_init": float(np.log(config.init_std)),
         "bf16": config.matmul_precision == "bf16",
     }
+
+
+LOSS_FIGURES = ("loss", "policy_gradient_loss", "value_loss", "entropy_loss", "clip_fraction", "approx_kl")
+"""SB3's names for the fields of ``Loss``, in their order."""
 
 
 class Bf16MlpExtractor(MlpExtractor):
@@ -118,6 +124,18 @@ class MeanRolloutBuffer(RolloutBuffer):
         """Store one step and the means of the forward pass that chose its actions."""
         self.means[self.pos] = self.policy.last_distribution.distribution.mean.detach().cpu().numpy()
         super().add(*args, **kwargs)
+
+    def compute_returns_and_advantage(self, last_values: Tensor, dones: np.ndarray) -> None:
+        """Compute advantages and returns, (T, N), from the values (N,) after the rollout and whether it ended there."""
+        write_advantages(
+            *(torch.as_tensor(a) for a in (self.advantages, self.rewards, self.values, self.episode_starts)),
+            *(last_values.detach().cpu().flatten(), torch.as_tensor(dones), self.gamma, self.gae_lambda),
+        )
+        self.returns = self.advantages + self.values
+
+    def explained_variance(self) -> float:
+        """Return the share of the returns' variance that the value function explained; NaN without any variance."""
+        return float(explained_variance(self.values.flatten(), self.returns.flatten()))
 
     def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
         """Yield shuffled minibatches."""
@@ -205,8 +223,38 @@ class AdaptivePPO(PPO):
         self._kl: list[float] = []
         if self.config.schedule == "linear":
             self.policy.optimizer.param_groups[0]["lr"] = linear_rate(self.config, self.iteration)
-        super().train()
+        self.policy.set_training_mode(True)
+        batches = (batch for _ in range(self.n_epochs) for batch in self.rollout_buffer.get(self.batch_size))
+        figures = zip(*(self._gradient_step(batch) for batch in batches), strict=True)
+        self._n_updates += self.n_epochs
+        self._report(dict(zip(LOSS_FIGURES, map(list, figures), strict=True)))
         self._close_iteration()
+
+    def _gradient_step(self, batch: RolloutBufferSamples) -> list[float]:
+        """Follow the loss of a minibatch downhill by one step; return the figures of the loss."""
+        loss = ppo_loss(self.policy, batch, self.config)
+        self.policy.optimizer.zero_grad()
+        loss.total.backward()
+        nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.max_grad_norm)
+        self.policy.optimizer.step()
+        return [float(figure.detach()) for figure in loss]
+
+    def _report(self, figures: dict[str, list[float]]) -> None:
+        """Log an update as SB3 does; ``figures`` of each gradient step, by ``LOSS_FIGURES``."""
+        last_epoch = slice(-self.config.minibatches, None)
+        means = {
+            name: float(np.mean(values[last_epoch if name == "approx_kl" else slice(None)]))
+            for name, values in figures.items()
+        }
+        means["loss"] = figures["loss"][-1]
+        means["explained_variance"] = self.rollout_buffer.explained_variance()
+        means["std"] = float(self.policy.log_std.detach().exp().mean())
+        means["clip_range"] = self.config.clip_range
+        if self.config.value_clip is not None:
+            means["clip_range_vf"] = self.config.value_clip
+        for name, value in means.items():
+            self.logger.record(f"train/{name}", value)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _close_iteration(self) -> None:
         """Count the iteration that is complete, and tell of it."""

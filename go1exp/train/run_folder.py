@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import json
 import os
 import platform
-import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +20,7 @@ from omegaconf import OmegaConf
 
 from go1exp import __version__, data_root
 from go1exp.actuator.net import find
+from go1exp.files import write_bytes, write_json, write_text
 
 NET = "actuator.npz"
 """A run's own copy of its actuator net."""
@@ -37,12 +36,12 @@ def write(run: Path, container: dict[str, Any]) -> None:
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
-        (run / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(container)))
-        (run / "meta.json").write_text(json.dumps(_meta(container), indent=2) + "\n")
+        write_text(run / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(container)))
+        write_json(run / "meta.json", _meta(container))
         for settings in _with_files(container.get("actuator")):
             source = find(settings["file"])
             if not (run / NET).exists() or not (run / NET).samefile(source):
-                shutil.copyfile(source, run / NET)
+                write_bytes(run / NET, source.read_bytes())
     except OSError as error:
         raise OSError(error.errno, f"run folder cannot be written: {error.strerror}", str(run)) from error
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.config import TrainConfig, parse_train
+from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError
 from go1exp.train import checkpoint, run_folder
 from go1exp.train.ppo import AdaptivePPO
@@ -71,5 +72,5 @@ def begin(ppo: AdaptivePPO, weights: Weights, run: Path) -> None:
     Iterations, optimiser, learning rate, robots and curriculum begin anew.
     """
     ppo.policy.load_state_dict(weights.policy)
-    (run / FILE).write_text(json.dumps(weights.about, indent=2) + "\n")
+    write_json(run / FILE, weights.about)
     print(f"starting from {weights.about['run']}, iteration {weights.about['iteration']}")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -13,31 +13,43 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.logger import Logger
 
+from go1exp import signals
 from go1exp.config import TrainConfig
-from go1exp.effects.rules import drives
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.schema.registry import ConfigError, Expected
-from go1exp.train import checkpoint, metrics, start
+from go1exp.files import opened, write_json
+from go1exp.schema.registry import Expected
+from go1exp.train import checkpoint, metrics, preflight, start
 from go1exp.train.device import DevicePPO
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
 
+LAST_PRESS = 3
+"""The Ctrl-C that ends training without a checkpoint of the iteration under way."""
+
 
 class Stopped(Expected):
-    """A signal asked training to stop, and the iteration that was under way is complete and saved."""
+    """A signal asked training to stop, and the iteration that was under way is complete and saved.
+
+    Attributes:
+        finished: whether it was the last one anyway.
+    """
+
+    def __init__(self, message: str, finished: bool) -> None:
+        super().__init__(message)
+        self.finished = finished
 
 
 def build(config: TrainConfig) -> AdaptivePPO:
     """Build learner and environment.
 
     Raises:
-        ConfigError: if the device is not there (SB3 would quietly take another).
+        ConfigError: if a device is not there.
     """
-    if config.process.device.startswith("cuda") and not torch.cuda.is_available():
-        raise ConfigError([f"device = {config.process.device!r}: torch finds no CUDA device; use device=cpu"])
+    preflight.check_devices(config)
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)
     core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=config.task.sim.spread_starts)
@@ -46,21 +58,11 @@ def build(config: TrainConfig) -> AdaptivePPO:
     return learner(config.ppo, Go1VecEnv(core), config.process.seed, device)
 
 
-def try_out(config: TrainConfig) -> None:
-    """Build one robot, where that can fail for what a file holds: before a run folder says that this run began.
-
-    Raises:
-        ConfigError: if an actuator net does not fit the robot or the physics step.
-        go1exp.schema.registry.Expected: if its file is damaged.
-    """
-    if any("file" in term.parameters for term, _ in drives(config.task.actuator)):
-        Go1Core(config.task, 1)
-
-
 def train(config: TrainConfig, container: dict[str, Any], run: Path, first: start.Weights | None = None) -> AdaptivePPO:
     """Train in ``run``, from its newest checkpoint if it has one; return the learner.
 
-    SIGINT and SIGTERM end training after the iteration under way, with a checkpoint; a second one ends it at once.
+    SIGINT, SIGTERM and SIGHUP end training after the iteration under way, with a checkpoint. A third SIGINT ends it at
+    once; the checkpoints that are there stay.
 
     Args:
         config: what to train.
@@ -73,6 +75,26 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: star
         NumericalFault: when a number stops being finite; ``fault.npz`` holds the moment.
         OSError: when metrics or a checkpoint cannot be written; what was saved before is untouched.
     """
+    ppo = _begun(config, run, first)
+    logger = metrics.make_logger(config.logger, run, ppo.iteration, container, ppo.num_timesteps)
+    ppo.set_logger(logger)
+    size = config.ppo.num_envs * config.ppo.steps
+    with Progress(ppo.iteration, config.ppo.iterations, size) as progress, _signals() as asked_to_stop:
+        ppo.after_iteration = _Closing(config, run, logger, progress, asked_to_stop)
+        left = config.ppo.iterations * size - ppo.num_timesteps
+        try:
+            if left > 0:
+                ppo.learn(left, reset_num_timesteps=ppo.iteration == 0)
+        except NumericalFault as fault:
+            _keep(fault, run)
+            raise
+        finally:
+            logger.close()
+    return ppo
+
+
+def _begun(config: TrainConfig, run: Path, first: start.Weights | None) -> AdaptivePPO:
+    """Return the learner as training begins or goes on with it."""
     ppo = build(config)
     if checkpoint.checkpoints(run):
         state, path = checkpoint.load_latest(run)
@@ -80,60 +102,69 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: star
         print(f"continuing from {path}")
     elif first is not None:
         start.begin(ppo, first, run)
-    env = ppo.get_env()
-    assert isinstance(env, Go1VecEnv)
-    logger = metrics.make_logger(config.logger, run, ppo.iteration, container)
-    ppo.set_logger(logger)
-    size = config.ppo.num_envs * config.ppo.steps
-    clock = [time.monotonic()]
-
-    with Progress(ppo.iteration, config.ppo.iterations, size) as progress, _signals() as asked_to_stop:
-
-        def after_iteration(ppo: AdaptivePPO) -> None:
-            now = time.monotonic()
-            logger.record("iteration", ppo.iteration)
-            logger.record("time/steps_per_s", size / (now - clock[0]))
-            clock[0] = now
-            for key, value in env.core.drain_metrics(config.ppo.steps).items():
-                logger.record(key, value)
-            progress.update(ppo.iteration, dict(logger.name_to_value))
-            logger.dump(step=ppo.num_timesteps)
-            last = ppo.iteration >= config.ppo.iterations
-            if last or asked_to_stop() or ppo.iteration % config.checkpoint.every == 0:
-                checkpoint.save(ppo, run, config.checkpoint.keep)
-            if asked_to_stop() and not last:
-                raise Stopped(f"stopped after iteration {ppo.iteration}")
-
-        ppo.after_iteration = after_iteration
-        left = config.ppo.iterations * size - ppo.num_timesteps
-        try:
-            if left > 0:
-                ppo.learn(left, reset_num_timesteps=ppo.iteration == 0)
-        except NumericalFault as fault:
-            np.savez(run / "fault.npz", allow_pickle=False, **fault.dump)
-            (run / "fault.json").write_text(json.dumps({"quantity": fault.quantity, "message": str(fault)}) + "\n")
-            raise
-        finally:
-            logger.close()
     return ppo
 
 
+class _Closing:
+    """What is done after each iteration: rows, progress, checkpoint, and the end if somebody asked for it."""
+
+    def __init__(
+        self, config: TrainConfig, run: Path, logger: Logger, progress: Progress, asked_to_stop: Callable[[], bool]
+    ) -> None:
+        self.config, self.run, self.logger, self.progress = config, run, logger, progress
+        self.asked_to_stop = asked_to_stop
+        self._clock = time.monotonic()
+
+    def __call__(self, ppo: AdaptivePPO) -> None:
+        """Close the iteration that ``ppo`` has just completed."""
+        env, steps = ppo.get_env(), self.config.ppo.steps
+        assert isinstance(env, Go1VecEnv)
+        now = time.monotonic()
+        self.logger.record("iteration", ppo.iteration)
+        self.logger.record("time/steps_per_s", self.config.ppo.num_envs * steps / (now - self._clock))
+        self._clock = now
+        for key, value in env.core.drain_metrics(steps).items():
+            self.logger.record(key, value)
+        self.progress.update(ppo.iteration, dict(self.logger.name_to_value))
+        self.logger.dump(step=ppo.num_timesteps)
+        last = ppo.iteration >= self.config.ppo.iterations
+        stopping = self.asked_to_stop()
+        if last or stopping or ppo.iteration % self.config.checkpoint.every == 0:
+            checkpoint.save(ppo, self.run, self.config.checkpoint.keep)
+        if stopping:
+            raise Stopped(f"stopped after iteration {ppo.iteration}", finished=last)
+
+
+def _keep(fault: NumericalFault, run: Path) -> None:
+    """Write the moment at which a number was not finite."""
+    with opened(run / "fault.npz") as file:
+        np.savez(file, allow_pickle=False, **fault.dump)
+    write_json(run / "fault.json", {"quantity": fault.quantity, "message": str(fault)}, indent=None)
+
+
 @contextmanager
-def _signals() -> Iterator[Any]:
-    """Turn the first SIGINT or SIGTERM into a wish that can be asked for; give the second its usual effect."""
+def _signals() -> Iterator[Callable[[], bool]]:
+    """Turn signals into a wish that can be asked for; the third Ctrl-C has the usual effect of one.
+
+    SIGTERM and SIGHUP are no more than a wish however often they come: the end of a terminal sends several.
+    """
     received: list[int] = []
-    usual = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+    usual = signal.getsignal(signal.SIGINT)
 
     def note(number: int, frame: FrameType | None) -> None:
         received.append(number)
-        print("\nstopping after this iteration (again: at once)", flush=True)
-        for s, handler in usual.items():
-            signal.signal(s, handler)
+        presses = received.count(signal.SIGINT)
+        if presses == LAST_PRESS:
+            signal.signal(signal.SIGINT, usual)
+            os.kill(os.getpid(), signal.SIGINT)
+        elif presses == LAST_PRESS - 1 and number == signal.SIGINT:
+            signals.say(
+                "\nheard; stopping when this iteration's checkpoint is written (Ctrl-C again: at once, without it)"
+            )
+        elif len(received) == 1:
+            signals.say("\nstopping after this iteration, with a checkpoint")
+        if number == signal.SIGHUP:
+            signals.leave_terminal()
 
-    for s in usual:
-        signal.signal(s, note)
-    try:
+    with signals.handled(note):
         yield lambda: bool(received)
-    finally:
-        for s, handler in usual.items():
-            signal.signal(s, handler)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 import go1exp.gap.report.figures as figures
 import go1exp.gap.report.tables as tables
 import go1exp.gap.report.words as words
+from go1exp.files import write_text
 from go1exp.gap.result import GapResult
 
 MOST_WINDOWS = 6
@@ -30,14 +30,12 @@ def write_report(result: GapResult, folder: Path) -> list[Path]:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     said = json.dumps(result.as_dict(), indent=1, allow_nan=False, default=str)
-    files = []
+    written = []
     for name, content in (("report.html", page(result)), ("report.json", said + "\n")):
         file = folder / name
-        partial = folder / f".{name}.partial"
-        partial.write_text(content, encoding="utf-8")
-        os.replace(partial, file)  # a reader never sees half a file
-        files.append(file)
-    return files
+        write_text(file, content)
+        written.append(file)
+    return written
 
 
 def page(result: GapResult) -> str:

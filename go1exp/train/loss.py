@@ -1,0 +1,94 @@
+"""The law of PPO: advantages and loss, for every learner on every device.
+
+Both are those of Stable-Baselines3 (``RolloutBuffer.compute_returns_and_advantage`` and ``PPO.train``), to which
+tests/test_device_training.py holds them, written as pure functions of tensors: SB3's own cannot be had without its
+loops, which read numbers back from the device after every minibatch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import mse_loss
+
+from go1exp.config import PPOConfig
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.type_aliases import RolloutBufferSamples
+
+
+class Loss(NamedTuple):
+    """The loss of one minibatch, its parts, and what is reported of it; each ().
+
+    Attributes:
+        total: what the gradient step lowers.
+        policy: the clipped surrogate.
+        value: mean square error of the value function.
+        entropy: the negative mean entropy.
+        clip_fraction: share of samples whose ratio of probabilities left the clip range; without gradient.
+        approx_kl: a sampled divergence from the policy that collected the samples (J. Schulman, "Approximating KL
+            divergence", 2020); without gradient.
+    """
+
+    total: Tensor
+    policy: Tensor
+    value: Tensor
+    entropy: Tensor
+    clip_fraction: Tensor
+    approx_kl: Tensor
+
+
+def ppo_loss(policy: ActorCriticPolicy, batch: RolloutBufferSamples, config: PPOConfig) -> Loss:
+    """Return the clipped loss of a minibatch (Schulman et al. 2017, equations 7 and 9), without a look at any value."""
+    values, log_prob, entropy = policy.evaluate_actions(batch.observations, batch.actions)
+    values, advantage = values.flatten(), batch.advantages
+    assert entropy is not None
+    if config.normalize_advantage and len(advantage) > 1:
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    log_ratio = log_prob - batch.old_log_prob
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1 - config.clip_range, 1 + config.clip_range)
+    policy_loss = -torch.min(advantage * ratio, advantage * clipped).mean()
+    if config.value_clip is not None:
+        values = batch.old_values + (values - batch.old_values).clamp(-config.value_clip, config.value_clip)
+    value_loss, entropy_loss = mse_loss(batch.returns, values), -entropy.mean()
+    total = policy_loss + config.entropy * entropy_loss + config.value_coef * value_loss
+    with torch.no_grad():
+        clip_fraction = ((ratio - 1).abs() > config.clip_range).float().mean()
+        approx_kl = ((ratio - 1) - log_ratio).mean()
+    return Loss(total, policy_loss, value_loss, entropy_loss, clip_fraction, approx_kl)
+
+
+def write_advantages(
+    advantages: Tensor,
+    rewards: Tensor,
+    values: Tensor,
+    starts: Tensor,
+    last_values: Tensor,
+    last_ended: Tensor,
+    gamma: float,
+    gae_lambda: float,
+) -> None:
+    """Write the generalised advantage estimates (Schulman et al. 2016, equation 16) of a rollout into ``advantages``.
+
+    Args:
+        advantages: (T, N), written.
+        rewards: (T, N); a step that met a time limit has the discounted value of what would have come after it in it.
+        values: (T, N) of the states in which the steps were taken.
+        starts: (T, N) float, 1 where an episode began with the step.
+        last_values: (N,) of the states after the rollout.
+        last_ended: (N,) whether an episode ended with the last step.
+        gamma: discount of a step.
+        gae_lambda: weight of longer looks ahead.
+    """
+    advantage = torch.zeros_like(last_values)
+    for step in reversed(range(len(rewards))):
+        last = step == len(rewards) - 1
+        continues = 1.0 - (last_ended.float() if last else starts[step + 1])
+        after = last_values if last else values[step + 1]
+        delta = rewards[step] + gamma * after * continues - values[step]
+        advantage = delta + gamma * gae_lambda * continues * advantage
+        advantages[step].copy_(advantage)

@@ -1,0 +1,61 @@
+"""What can be known to go wrong before a run folder says that a run began."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import torch
+
+from go1exp.config import TrainConfig
+from go1exp.effects.rules import drives
+from go1exp.env.core import Go1Core
+from go1exp.schema.backends import WarpBackend
+from go1exp.schema.registry import ConfigError
+from go1exp.train import memory_need, metrics
+
+
+def check(config: TrainConfig) -> None:
+    """Refuse a training that this machine cannot run. Makes no file.
+
+    Raises:
+        ConfigError: if a device, a package or an account is not there, if it does not fit into memory, or if an
+            actuator net does not fit the robot or the physics step.
+        go1exp.errors.Expected: if a net's file is damaged.
+        FileNotFoundError: if it is not there.
+    """
+    check_devices(config)
+    memory_need.check(config, engine_device(config))
+    metrics.check_account(config.logger)
+    if any("file" in term.parameters for term, _ in drives(config.task.actuator)):
+        Go1Core(config.task, 1)
+
+
+def engine_device(config: TrainConfig) -> torch.device:
+    """Return the device on which the environments live."""
+    backend = config.task.backend
+    return torch.device(backend.device if isinstance(backend, WarpBackend) else "cpu")
+
+
+def check_devices(config: TrainConfig) -> None:
+    """Refuse devices and engines that are not there (SB3 would quietly take another).
+
+    Raises:
+        ConfigError: naming each.
+    """
+    backend, problems = config.task.backend, []
+    wanted = [("device", config.process.device, "device=cpu")]
+    if isinstance(backend, WarpBackend):
+        missing = [name for name in ("warp", "mujoco_warp") if importlib.util.find_spec(name) is None]
+        if missing:
+            problems.append(
+                "backend = 'warp': needs the packages mujoco-warp and warp-lang: pip install 'go1exp[gpu]', or use "
+                "backend=cpu"
+            )
+        wanted.append(("backend.device", backend.device, "backend=cpu"))
+    for key, name, instead in wanted:
+        if name.startswith("cuda") and not torch.cuda.is_available():
+            problems.append(f"{key} = {name!r}: torch finds no CUDA device; use {instead}")
+        elif name.startswith("cuda:") and int(name[5:]) >= torch.cuda.device_count():
+            problems.append(f"{key} = {name!r}: torch finds {torch.cuda.device_count()} CUDA devices, numbered from 0")
+    if problems:
+        raise ConfigError(problems)

@@ -1,0 +1,247 @@
+"""Bad input of every verb ends in one clean line and a status; paths may hold any letters, and hints can be copied."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from go1exp import recording
+from go1exp.choices import config_folder
+from go1exp.cli import main
+from go1exp.cli.files import choices_from_files
+from go1exp.cli.logs import remove_empty
+from go1exp.cli.quoting import command, protected
+from go1exp.compose import compose, compose_checked
+from go1exp.recording import Meta, Recording
+from go1exp.robot import JOINTS
+from go1exp.schema.registry import ConfigError
+
+Run = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Types a command line in a folder of its own, in this process; gives the status and what was complained of."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def type_in(*words: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["go1exp", *words])
+        status = main()
+        return status, capsys.readouterr().err
+
+    return type_in
+
+
+def made(folder: Path, episode: str, rows: int, kp: float = 20.0) -> Path:
+    """A recording of a hung Go1 at 500 Hz."""
+    count = len(JOINTS)
+    meta = Meta(
+        robot="go1", joints=JOINTS, rate_hz=500.0, base="fixed", base_quat=(1.0, 0.0, 0.0, 0.0), kp=(kp,) * count,
+        kd=(0.5,) * count, tau_limit=None, excitation=None, episode=episode, repeat_of=None, source="simulated",
+        tool="test", versions={}, notes="",
+    )  # fmt: skip
+    t = np.arange(rows) / 500.0
+    wave = {
+        f"{quantity}_{joint}": 0.1 * np.sin(9.0 * t)
+        for quantity in ("q", "qd", "q_target", "tau_est")
+        for joint in JOINTS
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    recording.write(folder / f"{episode}.parquet", Recording(meta, {"t": t, **wave}))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"\xff\xfea: 1", "not UTF-8 (byte 0)"),
+        (b"", "is empty; without any, use effect=none"),
+        (b"# nothing but a remark\n", "is empty; without any, use effect=none"),
+        (b"coulomb:\n  bound: [0.1\n  x: 2\n", "no YAML (line 3: expected ',' or ']', but got ':')"),
+        (b"- coulomb\n", "must be a mapping, as the files of conf/effect are"),
+    ],
+)
+def test_an_effect_file_that_is_none_is_refused_by_name_and_line(
+    content: bytes, said: str, run: Run, tmp_path: Path
+) -> None:
+    (tmp_path / "e.yaml").write_bytes(content)
+    assert run("train", "effect=e.yaml") == (2, f"go1exp train: effect=e.yaml: {said}\n")
+    assert [p.name for p in tmp_path.iterdir()] == ["e.yaml"]
+
+
+def test_every_wrong_file_is_named_at_once(run: Run) -> None:
+    status, text = run("train", "effect=[a.yaml,payload]", "reward=b.yaml")
+    assert (status, text.splitlines()[1:]) == (2, ["  effect=a.yaml: no such file", "  reward=b.yaml: no such file"])
+
+
+def test_a_file_that_says_none_is_none(tmp_path: Path, run: Run) -> None:
+    (tmp_path / "mine.yaml").write_text((config_folder() / "effect/none.yaml").read_text())
+    assert compose("train", choices_from_files(["effect=mine.yaml"], "train"))["effect"] == {}
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        ("train word", 2, "go1exp train: word: not a setting, which is key=value; see go1exp train --help"),
+        ("eval --foo", 2, "go1exp eval: --foo: unknown option; see go1exp eval --help"),
+        ("list reward rand", 2, "go1exp list: rand: not a setting, which is key=value; see go1exp list --help"),
+        ("train --config-dir nowhere reward=x", 2, "no such folder"),
+        ("eval reward=paper", 2, "go1exp eval: reward=paper: no such key 'reward'; see --help"),
+        ("eval policy=papr", 2, "go1exp eval: policy: unknown shipped policy 'papr'; did you mean 'paper'?"),
+        ("eval run=.", 2, "go1exp eval: run = '.': not a run folder (it has no config.yaml)"),
+        ("play policy=paper out=x.xyz", 2, "go1exp play: out = 'x.xyz': a clip is .mp4 or .gif"),
+        ("play policy=paper out=.", 2, "go1exp play: out = '.': is a folder; name the file, such as out=play.mp4"),
+        ("gap report", 1, "go1exp gap: gap/verdict.json: no such file; run go1exp gap explain first"),
+        ("gap logs=.", 1, "go1exp gap: .: no *.parquet in it"),
+        ("export check .", 1, "go1exp export check: Is a directory: ."),
+        ("deploy nowhere.zip", 1, "go1exp deploy: No such file or directory: nowhere.zip"),
+        ("deploy walk.zip robot=sm", 2, "go1exp deploy: robot = 'sm': input should be 'sim' or 'go1'"),
+        (
+            "train reward=shrt",
+            2,
+            "go1exp train: reward=shrt: unknown choice of reward 'shrt'; known: paper, paper_literal",
+        ),
+    ],
+)
+def test_bad_input_is_answered_in_one_line(words: str, status: int, said: str, run: Run, tmp_path: Path) -> None:
+    code, text = run(*words.split())
+    assert code == status, text
+    assert said in text
+    assert text.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_users_own_choices_are_among_those_that_are_known(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "mine/reward").mkdir(parents=True)
+    (tmp_path / "mine/reward/short.yaml").write_text("gait: {weight: 1.0}\n")
+    said = "go1exp train: reward=shrt: unknown choice of reward 'shrt'; did you mean 'short'?\n"
+    assert run("train", "--config-dir", "mine", "reward=shrt") == (2, said)
+
+
+@pytest.mark.parametrize("folder", ["rand", "randomization"])
+def test_randomisations_of_ones_own_lie_in_either_folder(folder: str, tmp_path: Path) -> None:
+    (tmp_path / folder).mkdir()
+    (tmp_path / folder / "calm.yaml").write_text("link_mass: {range: [0.9, 1.1]}\n")
+    assert list(compose("train", ["rand=calm"], [tmp_path])["rand"]) == ["link_mass"]
+
+
+def test_gap_leaves_out_recordings_that_are_too_short(run: Run, tmp_path: Path) -> None:
+    made(tmp_path / "logs", "three", rows=3)
+    for stage in ("all", "check", "replay"):
+        said = "go1exp gap: three: 3 rows, 0.004 s: too short; windows take 0.37 s\n"
+        assert run("gap", stage, "logs=logs") == (1, said)
+
+
+def test_a_fit_of_several_sets_of_gains_says_which_there_are_and_leaves_no_folder(run: Run, tmp_path: Path) -> None:
+    for kp in (20.0, 35.0):
+        for k in range(3):
+            made(tmp_path / "logs", f"kp{kp:g}_{k}", rows=50, kp=kp)
+    status, text = run("fit-actuator", "recordings=logs", "out=nets/mine")
+    assert status == 1
+    assert "kp 20, kd 0.5 (3), kp 35, kd 0.5 (3); choose one, as gains=[20,0.5]" in text
+    said = "go1exp fit-actuator: gains = [35,1]: no recording was made with these; there are [20,0.5], [35,0.5]\n"
+    assert run("fit-actuator", "recordings=logs", "gains=[35,1]", "out=nets/mine") == (2, said)
+    assert not (tmp_path / "nets").exists()
+
+
+def test_of_several_sets_of_gains_a_fit_takes_the_one_that_is_chosen(run: Run, tmp_path: Path) -> None:
+    for kp in (20.0, 35.0):
+        for k in range(4):
+            made(tmp_path / "logs", f"kp{kp:g}_{k}", rows=60, kp=kp)
+    small = ("hidden=[4]", "epochs=1", "half_net=false", "plots=false", "share=all")
+    status, text = run("fit-actuator", "recordings=logs", "gains=[35,0.5]", "out=nets/mine", *small)
+    assert status == 0, text
+    from go1exp.fit import load
+
+    assert load(tmp_path / "nets/mine/net.npz").info.kp == (35.0,) * len(JOINTS)
+
+
+def test_only_empty_folders_are_taken_away(tmp_path: Path) -> None:
+    (tmp_path / "a/b/c").mkdir(parents=True)
+    (tmp_path / "a/kept").touch()
+    remove_empty(tmp_path / "a/b/c")
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["kept"]
+
+
+# ---------------------------------------------------------------------- paths
+
+NAMES = (
+    "a b",
+    "a=b",
+    "it's",
+    "a#b",
+    "é",
+    "(x)",
+    "1_000",
+    "2026",
+    "$x",
+    "a{b",
+    "a&b",
+    "a;b",
+    "a!b",
+    "a\\",
+    "x(1)/y",
+    "~/x",
+)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hydra_takes_a_path_as_it_is(name: str) -> None:
+    for key in ("run", "out", "actuator.file", "+logs"):
+        assert OverridesParser.create().parse_override(protected(f"{key}={name}")).value() == name
+
+
+@pytest.mark.parametrize(
+    "text", ["run=null", "run=a,b", "run='a b'", "files=[a,b]", "out=${x}", "seed=1 2", "run=glob(*)"]
+)
+def test_what_is_meant_for_hydra_stays(text: str) -> None:
+    assert protected(text) == text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_hint_can_be_copied(name: str) -> None:
+    program, verb, key_value = shlex.split(command("eval", settings={"run": Path("runs") / name}))
+    assert (program, verb) == ("go1exp", "eval")
+    assert OverridesParser.create().parse_override(protected(key_value)).value() == str(Path("runs") / name)
+    assert command("eval", settings={"run": "runs/a b"}) == "go1exp eval run='runs/a b'"
+
+
+def test_a_run_folder_may_be_called_anything(run: Run, tmp_path: Path) -> None:
+    status, text = run("eval", "run=runs/my walk = é")
+    assert (status, text.split("run = ")[1].split(":")[0]) == (2, "'runs/my walk = é'")
+
+
+@pytest.mark.parametrize("given", ["effect={}", "effect=[{},payload]", "+effect={}"])
+def test_an_effect_file_may_be_called_anything(given: str, tmp_path: Path) -> None:
+    file = tmp_path / "é = it.yaml"
+    file.write_text("coulomb: {bound: 0.3}\n")
+    chosen = choices_from_files([given.format(file).replace("+", "")], "train")
+    assert compose("train", chosen)["effect"]["coulomb"] == {"bound": 0.3}
+
+
+# ---------------------------------------------------------------------- Python
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("reward.foot_slip.wieght=-1", "no such key 'reward.foot_slip.wieght'; did you mean 'reward.foot_slip.weight'"),
+        ("terrain=hilly", "terrain=hilly: unknown choice of terrain 'hilly'; known: flat, rough"),
+    ],
+)
+def test_the_environment_refuses_overrides_in_the_words_of_the_command_line(override: str, said: str) -> None:
+    import go1exp.gym  # noqa: F401  (registers the environment)
+
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        gymnasium.make("Go1-v0", overrides=[override])
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        compose_checked("train", [override])

@@ -1,0 +1,130 @@
+"""What this machine cannot run is refused in a line, before a run folder says that a run began."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from go1exp import data_root
+from go1exp.compose import compose
+from go1exp.config import LoggerConfig, TrainConfig, WandbConfig, parse_train
+from go1exp.schema.registry import ConfigError
+from go1exp.train import memory_need, metrics, preflight
+
+COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
+CPU = torch.device("cpu")
+
+
+def config(*overrides: str) -> TrainConfig:
+    return parse_train(compose("train", overrides))
+
+
+def test_on_the_command_line_nothing_is_left_behind(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", COMMAND_LINE, "train", "ppo.num_envs=100000000"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(data_root())},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 2, done.stdout
+    assert done.stderr.startswith("go1exp train: ppo.num_envs = 100000000: with ppo.steps = ")
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.glob("runs/*"))
+
+
+# ---------------------------------------------------------------------- devices
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["device=cuda"], "device = 'cuda': torch finds no CUDA device; use device=cpu"),
+        (["backend=warp"], "backend.device = 'cuda': torch finds no CUDA device; use backend=cpu"),
+    ],
+)
+def test_a_device_that_is_not_there_is_refused(
+    overrides: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    with pytest.raises(ConfigError) as caught:
+        preflight.check(config(*overrides))
+    assert caught.value.problems == [message]
+
+
+def test_the_second_of_one_device_and_an_engine_that_is_not_installed_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError) as caught:
+        preflight.check_devices(config("backend=warp", "device=cuda:1"))
+    engine, device = caught.value.problems
+    assert "pip install 'go1exp[gpu]'" in engine
+    assert device == "device = 'cuda:1': torch finds 1 CUDA devices, numbered from 0"
+
+
+# ---------------------------------------------------------------------- memory
+
+
+def test_what_a_training_takes_grows_with_all_that_it_holds() -> None:
+    base = memory_need.needed_bytes(config("ppo.num_envs=4096"))
+    assert 25e6 < base < 1e9
+    for bigger in ("ppo.num_envs=8192", "ppo.steps=1000", "ppo.hidden=[4096,4096]"):
+        overrides = ["ppo.num_envs=4096", bigger] if "num_envs" not in bigger else [bigger]
+        assert memory_need.needed_bytes(config(*overrides)) > base
+    assert memory_need.needed_bytes(config("ppo.num_envs=4096", "backend=warp")) > 4096 * 4 * 18 * 64
+
+
+def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory_need, "_available", lambda device: 8_000_000_000)
+    memory_need.check(config("ppo.num_envs=4096"), CPU)
+    with pytest.raises(ConfigError, match=r"at least \d+\.\d GB, and 8\.0 GB are free in memory") as caught:
+        memory_need.check(config("ppo.num_envs=10000000"), CPU)
+    assert len(caught.value.problems) == 1
+
+
+def group(folder: Path, limit_file: str, limit: str, used: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / limit_file).write_text(f"{limit}\n")
+    (folder / "memory.stat").write_text(f"{used} 1000\nfile 777777\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "place", "limit_file", "used"),
+    [("0::/job/step", "", "memory.max", "anon"), ("4:cpu,memory:/job/step", "memory", "memory.limit_in_bytes", "rss")],
+)
+def test_the_limit_of_a_container_or_of_a_job_counts(
+    line: str, place: str, limit_file: str, used: str, tmp_path: Path
+) -> None:
+    (tmp_path / "cgroup").write_text(f"7:pids:/elsewhere\n{line}\n")
+    group(tmp_path / place / "job", limit_file, "50000", used)
+    group(tmp_path / place / "job/step", limit_file, "max", used)
+    assert memory_need._of_group(tmp_path / "cgroup", tmp_path) == 49000
+    group(tmp_path / place / "job/step", limit_file, "20000", used)
+    assert memory_need._of_group(tmp_path / "cgroup", tmp_path) == 19000
+    assert memory_need._of_group(tmp_path / "nothing", tmp_path) is None
+
+
+# ---------------------------------------------------------------------- accounts
+
+
+def test_online_logging_without_a_key_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("WANDB_API_KEY", "WANDB_IDENTITY_TOKEN_FILE"):
+        monkeypatch.delenv(name, raising=False)
+    for name in ("HOME", "WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
+        monkeypatch.setenv(name, str(tmp_path))
+    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
+    account = WandbConfig(project="go1exp-tests", mode="online", group=None, entity=None)
+    with pytest.raises(ConfigError, match="there is no API key; set WANDB_API_KEY") as caught:
+        metrics.check_account(LoggerConfig(csv=True, tensorboard=False, wandb=account))
+    assert len(caught.value.problems) == 1

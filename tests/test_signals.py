@@ -1,0 +1,60 @@
+"""Ctrl-C, SIGTERM and the end of a terminal: one line and status 130, whatever the process is doing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from go1exp import data_root
+
+WHILE_LOADING = """
+import os, signal, sys
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.{name})
+sys.meta_path.insert(0, Interrupt())
+{program}
+"""
+PROGRAM = "from go1exp.cli import main; sys.exit(main())"
+RUNTIME = "from go1exp.deploy.__main__ import main; sys.exit(main(sys.argv[1:]))"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module", "name"),
+    [
+        ("gap logs=nowhere", "hydra", "SIGINT"),
+        ("eval policy=paper", "torch", "SIGINT"),
+        ("play policy=paper", "mujoco", "SIGHUP"),
+        ("record", "mujoco", "SIGTERM"),
+        ("train", "stable_baselines3", "SIGINT"),
+        ("deploy nowhere.zip", "numpy", "SIGINT"),
+    ],
+)
+def test_a_signal_at_any_time_is_one_line_and_a_status(arguments: str, module: str, name: str, tmp_path: Path) -> None:
+    code = WHILE_LOADING.format(module=module, name=name, program=PROGRAM)
+    done = interrupted(tmp_path, code, arguments)
+    assert (done.returncode, done.stderr) == (130, f"go1exp {arguments.split()[0]}: stopped\n")
+    assert not list(tmp_path.rglob(".hydra"))
+
+
+def test_the_runtime_of_the_robot_ends_with_one_line_too(tmp_path: Path) -> None:
+    code = WHILE_LOADING.format(module="numpy", name="SIGHUP", program=RUNTIME)
+    done = interrupted(tmp_path, code, "nowhere.zip")
+    assert (done.returncode, done.stderr) == (130, "go1exp.deploy: stopped\n")
+
+
+def interrupted(cwd: Path, code: str, arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments.split()],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(data_root())},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
