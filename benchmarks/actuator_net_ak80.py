@@ -2,8 +2,8 @@
 
     python benchmarks/actuator_net_ak80.py [FOLDER] [--all]
 
-FOLDER holds ``ak80_double_pendulum`` (default: ``../shared/data`` beside the repository). Every number is of episodes
-that the net never met:
+FOLDER holds ``ak80_double_pendulum`` (default: ``../shared/data`` beside the repository). Every number is of held-out
+episodes:
 
 1. design A, each of its nine episodes held out in turn; one other decides when to stop, seven train;
 2. design A again, together with each episode all others that play the same elbow command are held out;

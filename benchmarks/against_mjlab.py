@@ -6,13 +6,13 @@
 go1exp trains ``experiment=paper_flat backend=warp ppo=paper``, mjlab 1.6.0 its task ``Mjlab-Velocity-Flat-Unitree-Go1``
 with its own runner (rsl_rl) and settings, except that its physics step is go1exp's, 2 ms, and ten of them make a policy
 step as here. ``own_steps=true`` measures it with its own 5 ms x 4 as well. The tasks are not the same: each has its own
-rewards, noise, randomisation and contact model, which the output lists as far as they cost time.
+rewards, noise, randomisation and contact model; the output lists those that cost time.
 
-FOLDER holds mjlab with its needs, which are older than go1exp's, so each side is a process of its own; torch may come
-from there or from the Python that runs this. No viewer, no logger, no checkpoints on either side; building, compiling,
-recording of graphs and the first iterations are over before anything counts. The processes work in turns, each a round
-of at least ``seconds`` at a time, while the others wait for a line on their standard input. A side that fails is
-reported with what it wrote last, and the other is measured all the same.
+FOLDER holds mjlab with its dependencies, which are older than those of go1exp, so each side is a process of its own;
+torch may come from there or from the Python that runs this. Neither side has a viewer, a logger or checkpoints;
+building, compiling, recording of graphs and the first iterations do not count. The processes work in turns, each for a
+round of at least ``seconds``, while the others wait for a line on their standard input. A side that fails is reported
+with its last output, and the other is still measured.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ START_S, ANSWER_S = 1500.0, 600.0
 """How long a side may take until it can be measured (kernels are compiled), and over ten times a round's length."""
 
 ENGINE = ("mujoco", "mujoco_warp", "warp", "torch")
-"""Modules both sides use, in versions of their own."""
+"""Modules that both sides use, each in its own versions."""
 
 TAIL = 30
 """Lines of a failed side's output that are shown."""
@@ -308,7 +308,7 @@ def report(sides: Sequence[Side]) -> str:
 
 
 def lacking(folder: Path) -> list[str]:
-    """Return what of mjlab's needs is not in a folder, in words."""
+    """Return the dependencies of mjlab that a folder lacks, one line each."""
     installed = {d.metadata["Name"].lower().replace("_", "-"): d.version for d in distributions(path=[str(folder)])}
     return [
         f"{name} {wanted}".strip() + (f" (there is {installed[name]})" if name in installed else "")
@@ -318,7 +318,7 @@ def lacking(folder: Path) -> list[str]:
 
 
 def pins() -> list[str]:
-    """Return pip's words for the torch and the warp that are here, as far as they are."""
+    """Return pip's requirements for the installed versions of torch and warp."""
     installed = {d.metadata["Name"]: d.version.partition("+")[0] for d in distributions()}
     return [f"{name}=={installed[name]}" for name in ("torch", "warp-lang") if name in installed]
 

@@ -1,8 +1,8 @@
 """Walks of the light runtime in real time: ``python -m benchmarks.deploy_walks bundle=FILE [seconds=12] [x=1.0]``.
 
 ``python -m go1exp.deploy`` against the simulated robot in its own process, with the Kalman filter's velocity and the
-noise of Table II, at 50, 100, 200 and 400 Hz: how the loop keeps its time, how far the estimate is off the true
-velocity, and how far the walk is off its command.
+noise of Table II, at 50, 100, 200 and 400 Hz: timing of the loop, error of the estimated velocity, and error of the
+walk against its command.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ RATES = (50, 100, 200, 400)
 
 
 def walk(bundle: str, rate: int, seconds: float, x: float) -> dict[str, Any]:
-    """Walk once; return the runtime's own account.
+    """Walk once; return the runtime's report.
 
     Raises:
         SystemExit: if the walk did not come to its end.
     """
     with tempfile.TemporaryDirectory(prefix="go1exp-") as folder:
         arguments = [bundle, "--rate", str(rate), "--seconds", str(seconds), "--command", f"{x},0,0", "--out", folder]
-        arguments += ["--stale", "0.2"]  # the machine may have something else to do
+        arguments += ["--stale", "0.2"]  # tolerant, since the machine may be busy
         run = subprocess.run([sys.executable, "-m", "go1exp.deploy", *arguments], capture_output=True, text=True)
         if run.returncode:
             raise SystemExit(f"{rate} Hz: {run.stderr.strip() or run.stdout.strip()}")

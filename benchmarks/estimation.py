@@ -1,10 +1,9 @@
 """The Kalman filter in numbers: python benchmarks/estimation.py [speed] [scaler] [sim] [--run RUN] [--data FOLDER] ...
 
 1. ``speed``: updates per second on one core, from C++ and one by one from Python.
-2. ``scaler``: the walks of a real robot under motion capture, beside plain leg odometry; FOLDER holds such
-   runs (``.npz``)
-   (default: ``scaler_walk_mocap`` in ``../shared/data`` beside the repository, or in GO1EXP_DATA). With
-   ``--leave-one-out`` the setting that distance depends on most, ``foot_drift``, is chosen for each run on the others.
+2. ``scaler``: the walks of a real robot under motion capture, compared with plain leg odometry; FOLDER holds such
+   runs as ``.npz`` (default: ``scaler_walk_mocap`` in ``../shared/data`` beside the repository, or in GO1EXP_DATA).
+   With ``--leave-one-out`` the setting that matters most for distance, ``foot_drift``, is chosen on the other runs.
 3. ``sim``: a simulated Go1 under the policy of ``--run`` with random commands up to 1.5 m/s (and straight on
    at 1.5 m/s), sensors at 500 Hz with the standard deviations of the paper's Table II, on flat ground and on the
    paper's terrain; without a run it squats. ``--every 5`` feeds the filter at 100 Hz, ``--lost 0.2`` without a fifth.
@@ -129,13 +128,13 @@ def real(folder: Path, leave_one_out: bool) -> None:
 
 
 def kept(count: int, every: int, lost: float) -> np.ndarray:
-    """Which of so many samples the filter gets: every so many, and of those all but a random share."""
+    """Return the indices of the samples that the filter gets: one of ``every``, without a random share ``lost``."""
     rows = np.arange(count)[every - 1 :: every]
     return rows[np.random.default_rng(0).random(len(rows)) >= lost]
 
 
 def score(recordings: Sequence[Recording], ground: str, every: int, lost: float) -> None:
-    """Print how well each simulated robot's velocity was known by a filter that gets some of the samples."""
+    """Print the error of each simulated robot's estimated velocity, for a filter that gets a part of the samples."""
     config = go1()
     for r in recordings:
         fed = kept(len(r.t), every, lost)
@@ -188,7 +187,7 @@ def simulated(run: Path | None, seconds: float, robots: int, every: int, lost: f
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Run the parts that the command line selects."""
     torch.set_num_threads(1)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(

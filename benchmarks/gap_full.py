@@ -61,9 +61,9 @@ def main(arguments: Sequence[str]) -> None:
         where = [f"out={out / kind}", f"seed={seed + k}", f"kinds={kind}", f"n={n}", f"sizes={sizes}"]
         generate.main([*where, f"jobs={jobs}"])
         gap_solve.main([f"cases={out / kind}", f"out={out / f'out_{kind}'}", f"jobs={jobs}"])
-    found = merged(out, tuple(PLAN))
-    print(score.table(found))
-    (out / "results.json").write_text(json.dumps(score.flat(found), indent=1) + "\n")
+    total = merged(out, tuple(PLAN))
+    print(score.table(total))
+    (out / "results.json").write_text(json.dumps(score.flat(total), indent=1) + "\n")
 
 
 if __name__ == "__main__":

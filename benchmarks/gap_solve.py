@@ -30,8 +30,8 @@ def solve(case: Path, out: Path, settings: dict[str, Any]) -> str:
     from go1exp.compose import compose
     from go1exp.config import parse_parts
     from go1exp.gap import files
-    from go1exp.gap.explain import explain
     from go1exp.gap.result import GapResult, GapSettings
+    from go1exp.gap.stages.explain import explain
     from go1exp.recording import RecordingError, read_folder
 
     torch.set_num_threads(1)

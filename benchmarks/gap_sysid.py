@@ -33,9 +33,9 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.gap import told
+from benchmarks.gap import known
 from go1exp import robot
-from go1exp.gap.windows import noise
+from go1exp.gap.data.cutting import noise
 from go1exp.physics.model import load_robot
 from go1exp.recording import Recording, RecordingError, read_folder
 
@@ -51,7 +51,7 @@ FITTED: dict[str, tuple[str, float, float, float]] = {
     "encoder_offset": ("offset", -0.15, 0.15, 0.0),
     "base_tilt": ("pitch", -0.2, 0.2, 0.0),
 }
-"""Effect -> its parameter, bounds and start, in the units of ``told.TOLERANCES``; bounds chosen wide."""
+"""Effect -> its parameter, bounds and start, in the units of ``known.TOLERANCES``; bounds chosen wide."""
 
 SLOTS = dict.fromkeys(FITTED, np.arange(robot.NUM_JOINTS))
 SLOTS |= {"link_mass": np.array([0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 7, 8]), "base_tilt": np.zeros(1, dtype=int)}
@@ -66,13 +66,13 @@ GOOD, WORST = 1.5, 1e3
 
 def scene(recording: Recording) -> mujoco.MjSpec:
     """Return the held nominal robot with the recording's attitude and gains: joints, links and position drives."""
-    meta, spec = recording.meta, load_robot(told.NOMINAL["inertia"])
+    meta, spec = recording.meta, load_robot(known.NOMINAL["inertia"])
     for thing in (spec.joint("root"), *spec.keys, *spec.geoms):
         spec.delete(thing)
     spec.body("trunk").quat = list(meta.base_quat or (1.0, 0.0, 0.0, 0.0))
     spec.option.timestep, spec.option.integrator = 1.0 / meta.rate_hz, mujoco.mjtIntegrator.mjINT_RK4
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    effort = robot.per_joint(told.NOMINAL["effort_limit"])
+    effort = robot.per_joint(known.NOMINAL["effort_limit"])
     for j, name in enumerate(robot.JOINTS):
         joint, drive = spec.joint(name), spec.actuator(name)
         joint.solref_friction, joint.solimp_friction = [2.0 / meta.rate_hz, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
@@ -86,16 +86,16 @@ def scene(recording: Recording) -> mujoco.MjSpec:
 
 def parameters() -> Any:
     """Return everything that is free, as deviations from null in tolerances."""
-    found = sysid.ParameterDict()
+    free = sysid.ParameterDict()
     for effect, (name, low, high, start) in FITTED.items():
-        scaled = (np.array([start, low, high]) - told.null(effect, name)) / told.TOLERANCES[effect][name]
-        found.add(sysid.Parameter(effect, *(np.full(SLOTS[effect].max() + 1, v) for v in scaled)))
-    return found
+        scaled = (np.array([start, low, high]) - known.null(effect, name)) / known.TOLERANCES[effect][name]
+        free.add(sysid.Parameter(effect, *(np.full(SLOTS[effect].max() + 1, v) for v in scaled)))
+    return free
 
 
 def with_values(nominal: dict[int, mujoco.MjModel], params: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Return a copy of the nominal model of a specification (by its ``id``) with these parameters."""
-    value = {e: told.null(e, n) + told.TOLERANCES[e][n] * params[e].value[SLOTS[e]] for e, (n, *_) in FITTED.items()}
+    value = {e: known.null(e, n) + known.TOLERANCES[e][n] * params[e].value[SLOTS[e]] for e, (n, *_) in FITTED.items()}
     model = copy.copy(nominal[id(spec)])
     link, trunk = model.jnt_bodyid, model.body("trunk").id
     model.dof_armature += value["armature"]
@@ -179,10 +179,10 @@ def identify(recordings: Sequence[Recording]) -> dict[str, Any]:
     cut = int(np.ceil(FIT_SHARE * len(recordings)))
     fit, kept = Fit(recordings[:cut], sd), Fit(recordings[cut:], sd)
     options = {"max_iters": ITERATIONS, "xtol": 0.01, "x_scale": "jac", "output": io.StringIO()}
-    best, found = sysid.optimize(parameters(), fit.residual, verbose=False, jacobian=fit.jacobian, **options)
-    half = sysid.calculate_intervals(fit.residual(found.x, best)[0], found.jac)[1]
-    before, after = kept.rms(np.zeros_like(found.x)), kept.rms(found.x)
-    rows = candidates(found.x, half)
+    best, optimum = sysid.optimize(parameters(), fit.residual, verbose=False, jacobian=fit.jacobian, **options)
+    half = sysid.calculate_intervals(fit.residual(optimum.x, best)[0], optimum.jac)[1]
+    before, after = kept.rms(np.zeros_like(optimum.x)), kept.rms(optimum.x)
+    rows = candidates(optimum.x, half)
     named = [r for r in rows if any(r["params"].values())]
     return {
         "verdict": (("no gap", "unexplained"), ("explained", "partly explained"))[bool(named)][after >= GOOD],
@@ -201,8 +201,8 @@ def candidates(x: np.ndarray, half: np.ndarray) -> list[dict[str, Any]]:
         begin = int(at.max()) + 1
         beyond = (np.abs(x[at]) > 1.0) & (np.abs(x[at]) > half[at])
         places = robot.JOINTS if len(at) > 1 else ("robot",)
-        ends = np.stack([x[at], x[at] - half[at], x[at] + half[at]], axis=1) * told.TOLERANCES[effect][name]
-        ends += told.null(effect, name)
+        ends = np.stack([x[at], x[at] - half[at], x[at] + half[at]], axis=1) * known.TOLERANCES[effect][name]
+        ends += known.null(effect, name)
         band = {p: v for p, v, out in zip(places, ends.tolist(), beyond, strict=True) if out}
         row: dict[str, Any] = {"effect": effect, "joints": [p for p in band if p != "robot"], "alias_set": [effect]}
         row |= {"params": {name: {p: v[0] for p, v in band.items()}}, "status": "certified"}

@@ -1,9 +1,10 @@
-"""The paper's loop in simulation: a drive that the trainer has not seen is recorded, learnt and met on new motions.
+"""The paper's loop in simulation: a drive unknown to the training is recorded, fitted and compared on new motions.
 
     python benchmarks/paper_loop.py run=RUN [out=DIR] [seconds=15]
 
-RUN is a run folder trained with ideal drives (``go1exp train experiment=demo``). Prints how far the joints of a hung
-robot are from those of the hidden drive under the same targets, in closed loop, for ideal PD drives and for the net.
+RUN is a run folder trained with ideal drives (``go1exp train experiment=demo``). Prints the
+RMSE of the joint angles of a hung robot against those with the hidden drive, under the same targets in closed loop, for
+ideal PD drives and for the net.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ HIDDEN = [
     "effect.torque_speed_limit.peak=0.8",
     "effect.torque_speed_limit.droop=1.25",
 ]
-"""The drive: torque follows in 8 ms, gears rub with 0.3 to 0.4 N m, a battery that has 0.8 of its voltage."""
+"""The hidden drive: torque follows in 8 ms, dry friction of 0.3 to 0.4 N m, a battery at 0.8 of its voltage."""
 
 MOTIONS = ("multisine", "gait", "steps", "chirp")
 SEEDS = (101, 102)

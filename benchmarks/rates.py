@@ -21,11 +21,11 @@ PHYSICS_DT = {50: 0.002, 100: 0.002, 200: 0.00125, 400: 0.00125}
 """Rate of the policy, Hz -> step of the physics, s: the longest up to 2 ms that fits."""
 
 MODEST = (1.5, 1.5, 1.2)
-"""Commands up to here count for tracking, m/s and rad/s."""
+"""Largest commands that count for tracking, m/s and rad/s."""
 
 
 def modest(row: dict[str, Any]) -> bool:
-    """Tell whether a row of a report is of a command within ``MODEST``."""
+    """Return whether the command of a report's row is within ``MODEST``."""
     return all(abs(value) <= most for value, most in zip(row["command"], MODEST, strict=True))
 
 
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     commands = grid(GRID["x"], GRID["y"], GRID["yaw"], cross=False)
     off = dict.fromkeys(("randomize", "push", "train_ground"), False)
     reports = []
-    print("rate  velocity   told 2.0 m/s  told 1.8 rad/s  RMSE xy  RMSE yaw  falls", flush=True)
+    print("rate  velocity   cmd. 2.0 m/s  cmd. 1.8 rad/s  RMSE xy  RMSE yaw  falls", flush=True)
     for velocity in ("exact", "estimated"):
         for rate, physics_dt in PHYSICS_DT.items():
             wanted = EvalConfig(

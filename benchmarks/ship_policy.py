@@ -3,10 +3,10 @@
 ``python -m benchmarks.ship_policy run=RUN name=NAME [first=RUN] [episodes=31]``
 
 Writes ``assets/policies/NAME``: the run's configuration and origin, its curves (every tenth iteration), a checkpoint
-that holds the policy alone (what only training needs stays behind), and evaluations on the CPU engine: on flat ground
+that holds only the policy (without what only training needs), and evaluations on the CPU engine: on flat ground
 with noise, with nothing random (``rand=none``), with noise at 100 Hz, and on the ground of training with all that
 training does to a robot. ``first`` is the run that ``run`` started from (``start_from``): its configuration, origin and
-curves go to ``first_stage``. Without ``run`` the policy that is there is evaluated again.
+curves go to ``first_stage``. Without ``run`` the present policy is evaluated again.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ EVALUATIONS: dict[str, dict[str, Any]] = {
     "flat_100_hz": {"noise": True, "policy_dt": 0.01},
     "training_ground": {"noise": True, "randomize": True, "push": True, "train_ground": True},
 }
-"""Evaluation -> what is on in it."""
+"""Evaluation -> settings that differ from the default."""
 
 FIRST = "first_stage"
-"""What tells of the run that a policy's run started from."""
+"""Folder for the origin of the run that a policy's run started from."""
 
 EVERY = 10
 """Iterations between rows of the shipped curves."""
 
 
 def shipped(run: Path, to: Path) -> None:
-    """Copy what a shipped policy needs: configuration, origin, curves, the policy's weights."""
+    """Copy the parts of a shipped policy: configuration, origin, curves, the policy's weights."""
     state, path = checkpoint.load_latest(run)
     (to / "checkpoints").mkdir(parents=True, exist_ok=True)
     for old in [*(to / "checkpoints").glob("*"), *(to / FIRST).glob("*"), to / start.FILE]:
@@ -60,7 +60,7 @@ def shipped(run: Path, to: Path) -> None:
 
 
 def copy_origin(run: Path, to: Path) -> None:
-    """Copy what tells of a run: configuration, origin, curves."""
+    """Copy the origin of a policy from its run: configuration, versions, curves."""
     to.mkdir(exist_ok=True)
     for name in ("config.yaml", "meta.json", start.FILE):
         if (run / name).exists():

@@ -30,6 +30,33 @@ def as_container(config: DictConfig) -> dict[str, Any]:
     return {str(k): v for k, v in container.items()}
 
 
+VALUE_PER_JOINT = re.compile(
+    r"(?P<add>\+{0,2})(?P<key>(effect\.[^.=]+|actuator(\.drive)*)\.(?!(drive|spread)=)[^.=@]+)=\s*[\[{]"
+)
+"""An override that writes a value per joint as a list or as a mapping."""
+
+
+OPEN = re.compile(r"model\.tolerances[.=]")
+"""An override of a mapping to which a user may add keys; the verb checks them."""
+
+
+def as_hydra_takes_them(overrides: Sequence[str]) -> list[str]:
+    """Return overrides in a form that Hydra accepts, where it is stricter than our documents.
+
+    A value per joint may change its form: number, list or mapping. Hydra merges a mapping into what the file has, and
+    refuses if that is a list, such as ``bound: [0.2, 0.2, 0.3]``. So such a value is removed first; a joint that the
+    new mapping leaves out is without the effect. A tolerance may be given although the file names none (``++``).
+    """
+    accepted = []
+    for override in overrides:
+        if match := VALUE_PER_JOINT.match(override):
+            # Two spellings of the key, since a sweep keeps only the last override of each.
+            accepted += [f"{'++' if match['add'] else ''}{match['key']}=null", f"+{override.lstrip('+')}"]
+        else:
+            accepted.append(f"++{override}" if OPEN.match(override) else override)
+    return accepted
+
+
 @contextmanager
 def hydra_for(name: str, folders: Sequence[Path] = ()) -> Iterator[None]:
     """Set Hydra up for what ``conf/<name>.yaml`` may choose from, with a user's ``folders`` of further choices."""
@@ -41,7 +68,7 @@ def hydra_for(name: str, folders: Sequence[Path] = ()) -> Iterator[None]:
 def compose(name: str, overrides: Sequence[str] = (), folders: Sequence[Path] = ()) -> dict[str, Any]:
     """Compose ``conf/<name>.yaml`` with command-line overrides outside a Hydra application."""
     with hydra_for(name, folders):
-        return as_container(hydra_compose(name, list(overrides)))
+        return as_container(hydra_compose(name, as_hydra_takes_them(overrides)))
 
 
 def compose_checked(name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Hydra in, plain frozen dataclasses out. Nothing below this module sees a YAML or an OmegaConf.
 
-``compose`` turns overrides into a plain dict; ``parse`` turns that dict into a ``TrainConfig`` or raises one
-``ConfigError`` that lists everything wrong with it. Neither imports torch's machinery nor builds anything.
+``compose.compose`` turns overrides into a plain dict. ``parse_train`` turns that dict into a ``TrainConfig``, or raises
+one ``ConfigError`` that lists everything wrong with it. Neither imports torch's machinery nor builds anything.
 """
 
 from __future__ import annotations
@@ -20,11 +20,15 @@ import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
 from go1exp.effects.rules import drive_problems
 from go1exp.robot import RobotConfig
+from go1exp.schema import plugins
 from go1exp.schema.backends import BACKENDS, BackendConfig, CpuBackend
+from go1exp.schema.learner import CheckpointConfig as CheckpointConfig
+from go1exp.schema.learner import LoggerConfig as LoggerConfig
+from go1exp.schema.learner import PPOConfig as PPOConfig
+from go1exp.schema.learner import WandbConfig as WandbConfig
 from go1exp.schema.registry import (
     STRICT,
     ConfigError,
-    Fraction,
     NonNegative,
     Positive,
     Term,
@@ -35,7 +39,6 @@ from go1exp.schema.registry import (
 )
 from go1exp.terrain import TerrainConfig
 
-Count = Annotated[int, Field(ge=1)]
 CountOrZero = Annotated[int, Field(ge=0)]
 
 
@@ -104,113 +107,6 @@ class TaskConfig:
 
 
 @dataclass(frozen=True)
-class PPOConfig:
-    """The learner. Its numbers in ``conf/ppo`` are the paper's (section III-A) and, where it prints none, Isaac Lab's.
-
-    Attributes:
-        num_envs: environments that run side by side.
-        iterations: rollouts, each followed by an update.
-        steps: policy steps per environment and iteration.
-        epochs: passes over a rollout.
-        minibatches: gradient steps per pass; must divide num_envs x steps.
-        learning_rate: step size of Adam; the first value unless the schedule is fixed.
-        schedule: ``adaptive`` steers the rate by the KL divergence (rsl_rl's rule), ``fixed`` keeps it, ``linear``
-            lowers it to the least of ``learning_rate_range`` over the iterations.
-        desired_kl: the divergence per update that ``adaptive`` aims at.
-        learning_rate_range: bounds of the learning rate.
-        gamma: discount factor.
-        gae_lambda: decay of the advantage estimator (GAE).
-        clip_range: how far the probability ratio may move from 1.
-        value_clip: bound of the value function's change; null for none.
-        entropy: weight of the entropy bonus.
-        value_coef: weight of the value loss.
-        max_grad_norm: gradient clip, norm over actor and critic together.
-        normalize_advantage: normalise advantages over each minibatch, as SB3 does.
-        init_std: initial standard deviation of the actions.
-        orthogonal_init: SB3's initial weights (gain sqrt(2), last layer of the actor 0.01); else PyTorch's, as rsl_rl.
-        hidden: layers of actor and critic each.
-        activation: nonlinearity between the layers.
-        matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16.
-    """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    num_envs: Count
-    iterations: Count
-    steps: Count
-    epochs: Count
-    minibatches: Count
-    learning_rate: Positive
-    schedule: Literal["adaptive", "fixed", "linear"]
-    desired_kl: Positive
-    learning_rate_range: tuple[Positive, Positive]
-    gamma: Fraction
-    gae_lambda: Fraction
-    clip_range: Positive
-    value_clip: Positive | None
-    entropy: NonNegative
-    value_coef: NonNegative
-    max_grad_norm: Positive
-    normalize_advantage: bool
-    init_std: Positive
-    orthogonal_init: bool
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
-    activation: Literal["elu", "relu", "tanh"]
-    matmul_precision: Literal["highest", "bf16"]
-
-
-@dataclass(frozen=True)
-class WandbConfig:
-    """Weights & Biases.
-
-    Attributes:
-        project: name of the project.
-        mode: offline, or online, which needs an account.
-        group: name under which runs are shown together, or null.
-        entity: team or user, or null for the account's default.
-    """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    project: Annotated[str, Field(min_length=1)]
-    mode: Literal["offline", "online"]
-    group: str | None
-    entity: str | None
-
-
-@dataclass(frozen=True)
-class LoggerConfig:
-    """Where metrics go besides the progress bar.
-
-    Attributes:
-        csv: write metrics.csv in the run folder.
-        tensorboard: write TensorBoard's event files in the run folder.
-        wandb: Weights & Biases, or null for none.
-    """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    csv: bool
-    tensorboard: bool
-    wandb: WandbConfig | None
-
-
-@dataclass(frozen=True)
-class CheckpointConfig:
-    """When checkpoints are written.
-
-    Attributes:
-        every: iterations from checkpoint to checkpoint.
-        keep: newest checkpoints that stay.
-    """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
-    every: Count
-    keep: Count
-
-
-@dataclass(frozen=True)
 class ProcessConfig:
     """Settings at the top level of the YAML.
 
@@ -220,6 +116,7 @@ class ProcessConfig:
         torch_threads: threads of torch, 0 for its own choice.
         resume: run folder to continue; nothing but iterations, checkpoints, threads, device and backend may change.
         start_from: run folder, or name of a shipped policy, whose weights a new run begins with.
+        plugins: files and packages with terms of your own, such as [my_terms.py] (docs/extending.md).
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -228,7 +125,8 @@ class ProcessConfig:
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     torch_threads: CountOrZero
     resume: str | None
-    start_from: str | None = None  # runs of older versions have no such key
+    start_from: str | None = None  # runs of older versions have neither key
+    plugins: str | tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -351,14 +249,14 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
                     problems.append(unknown_name("backend.name", str(settings["name"]), BACKENDS, "engine"))
                     continue
                 kind = BACKENDS[settings["name"]]
-            parts[name], found = _section(kind, settings, name)
+            parts[name], complaints = _section(kind, settings, name)
         elif name in MANY_TERMS:
-            parts[name], found = _terms(name, settings)
+            parts[name], complaints = _terms(name, settings)
         elif not isinstance(settings, Mapping) or "term" not in settings:
-            found = [f"{name}.term: required, but not given"]
+            complaints = [f"{name}.term: required, but not given"]
         else:
-            parts[name], found = bind(name, str(settings["term"]), settings, name)
-        problems += found
+            parts[name], complaints = bind(name, str(settings["term"]), settings, name)
+        problems += complaints
     return parts, problems
 
 
@@ -395,7 +293,7 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
         problems.append("observation: at least one term is required")
     terrain: Any = parts.get("terrain")
     for rule in (parts.get("curriculum") or ()) if terrain else ():
-        top, start = terrain.rows - 1, rule.parameters["start_level_max"]
+        top, start = terrain.rows - 1, rule.parameters.get("start_level_max", 0)
         if terrain.kind == "flat":
             problems.append(f"curriculum.{rule.key}: needs graded ground; use terrain=rough, or curriculum=none")
         elif start > top:
@@ -411,7 +309,8 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
 
 
 def parse_task(container: Mapping[str, Any]) -> TaskConfig:
-    """Validate the environment's part of a composed configuration; raise ConfigError with every problem."""
+    """Load the plugins of a composed configuration, validate its task; raise ConfigError with every problem."""
+    plugins.use(container.get(plugins.KEY))
     wanted = tuple(f.name for f in fields(TaskConfig))
     parts, problems = parse_parts(container, wanted)
     problems += _cross_rules(parts)
@@ -421,7 +320,8 @@ def parse_task(container: Mapping[str, Any]) -> TaskConfig:
 
 
 def parse_train(container: Mapping[str, Any]) -> TrainConfig:
-    """Validate a composed training configuration; raise ConfigError with every problem."""
+    """Load the plugins of a training configuration and validate it; raise ConfigError with every problem."""
+    plugins.use(container.get(plugins.KEY))
     task_names = tuple(f.name for f in fields(TaskConfig))
     others = ("ppo", "logger", "checkpoint")
     top = tuple(f.name for f in fields(ProcessConfig))
@@ -431,9 +331,9 @@ def parse_train(container: Mapping[str, Any]) -> TrainConfig:
         for key, value in container.items()
         if key not in known
     ]
-    parts, found = parse_parts(container, (*task_names, *others))
-    process, complaints = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
-    problems += found + complaints + _cross_rules(parts)
+    parts, of_parts = parse_parts(container, (*task_names, *others))
+    process, of_process = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
+    problems += of_parts + of_process + _cross_rules(parts)
     if problems:
         raise ConfigError(problems)
     task = TaskConfig(**{name: parts[name] for name in task_names})

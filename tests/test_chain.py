@@ -14,9 +14,9 @@ import pytest
 from go1exp import cli, data_root, recording
 from go1exp.compose import compose
 from go1exp.config import parse_parts
-from go1exp.gap.machine import hung
 from go1exp.gap.result import GapSettings
-from go1exp.gap.retrace import Part, retrace
+from go1exp.gap.robots.hung import hung
+from go1exp.gap.stages.replay import Part, replay
 from go1exp.recording import Recording, joint_channels
 from tests.small_run import SMALL
 
@@ -50,7 +50,7 @@ def replayed(log: Recording, shift: int) -> Part:
     channels = {n: np.roll(v, shift) if n in names else v for n, v in log.channels.items()}
     moved = dataclasses.replace(log, channels={name: values[1:-1] for name, values in channels.items()})
     machine = hung(parse_parts(compose("gap", ["logs=x"]), ("robot",))[0]["robot"])
-    (part,) = retrace([moved], machine, GapSettings(threads=1), STEP).parts
+    (part,) = replay([moved], machine, GapSettings(threads=1), STEP).parts
     return part
 
 

@@ -49,8 +49,7 @@ from go1exp.deploy.udp import UdpLink
 from go1exp.deploy.walk import FAULTS, STATUS, Plan
 from go1exp.estimation import from_json, go1, make_filter, sample, to_json
 from go1exp.export.build import build
-from go1exp.gap.prepare import unusable
-from go1exp.gap.standing import StandingGo1
+from go1exp.gap.robots.hung import hung
 from go1exp.recording import VECTORS
 from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
@@ -375,7 +374,8 @@ def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(file: 
     done = play(file, tmp_path, job={"sim": {"noise": 0.1}, "other": {"effect": {"coulomb": {"bound": 0.4}}}})
     assert "coulomb" not in done.recording.meta.notes
     assert not any(name.startswith("base_") for name in done.recording.channels)
-    assert unusable(done.recording, audit(done.recording), StandingGo1(bundle_task(file, {}).robot)) == []
+    standing = hung(bundle_task(file, {}).robot).suited([done.recording])
+    assert standing.flaws(done.recording, audit(done.recording)) == []
 
 
 def test_the_same_walk_gives_the_same_numbers(file: str, tmp_path: Path) -> None:

@@ -68,7 +68,22 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     "deploy.yaml:hydra": "Hydra's own settings",
-    "model/go1.yaml:model": "the Go1 is that of the group robot",
+    **{
+        f"{verb}.yaml:plugins": "tests/test_plugins.py shows what it does"
+        for verb in (
+            "train",
+            "eval",
+            "play",
+            "record",
+            "record_import",
+            "fit-actuator",
+            "gap",
+            "export",
+            "list",
+            "bench",
+        )
+    },
+    "model/go1.yaml:model": "the Go1 is that of the group robot; test_gap_tolerances.py shows what its tolerances do",
     **{
         f"model/{name}.yaml:model": "a robot that is not simulated here; test_gap_machines.py shows what its keys do"
         for name in ("go2", "xl330_pendulum", "ak80_double_pendulum_a", "ak80_double_pendulum_c", "so101")
@@ -135,7 +150,7 @@ SMALL: dict[str, dict[str, Any]] = {
         "search.max_terms": 1,
         "search.shortlist": 1,
         "search.iterations": 1,
-        "search.bags": 0,
+        "search.bootstraps": 0,
         "search.overlays": 1,
         "search.threads": 1,
     },
@@ -343,7 +358,7 @@ def parse(program: str, container: dict[str, Any]) -> Any:
         if problems:
             raise ConfigError(problems)
     kind, elsewhere = SETTINGS[program]
-    return settings.parse(kind, {k: v for k, v in container.items() if k not in elsewhere})
+    return settings.parse(kind, {k: v for k, v in container.items() if k not in (*elsewhere, "plugins")})
 
 
 SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
@@ -883,8 +898,9 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
     the whole one, but a replay has ten variants and not sixty.
     """
     from go1exp.cli.gap import APP, DOES_NOT_HOLD
-    from go1exp.gap import box, machine
     from go1exp.gap.result import EXIT_CODES
+    from go1exp.gap.robots import hung
+    from go1exp.gap.search import tolerances
 
     built: set[tuple[int, int]] = set()
 
@@ -894,8 +910,8 @@ def gap_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
     few = put(container, "search.effects", ["coulomb", "viscous"])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(box, "BOX", ("viscous",))
-        patch.setattr(machine, "MujocoCpu", backend)
+        patch.setattr(tolerances, "nominal", lambda robot: ("viscous",))
+        patch.setattr(hung, "MujocoCpu", backend)
         _, files = outcome(APP, few, walk, (*EXIT_CODES.values(), DOES_NOT_HOLD))
     yield "files", sorted(files)
     yield "batches", sorted(built)

@@ -21,11 +21,11 @@ from go1exp.compose import compose
 from go1exp.config import parse_task
 from go1exp.env.core import Go1Core
 from go1exp.gap import files
-from go1exp.gap.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
-from go1exp.gap.explain import explain
-from go1exp.gap.machine import hung
-from go1exp.gap.prepare import prepare, unusable
+from go1exp.gap.comparison import prepare
 from go1exp.gap.result import Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
+from go1exp.gap.robots.hung import hung
+from go1exp.gap.stages.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
+from go1exp.gap.stages.explain import explain
 from go1exp.record import simulate
 from go1exp.recording import Recording
 from go1exp.robot import JOINTS
@@ -70,7 +70,7 @@ def whole() -> GapResult:
         after=replace(where, flagged=~where.flagged),
         not_excited={"payload": "squat"},
         advice=("Record steps.",),
-        bags={"coulomb": 0.9, "base_tilt": NAN},
+        bootstrap_share={"coulomb": 0.9, "base_tilt": NAN},
         waterfall=(("model as it is", 56.3), ("within tolerances", NAN)),
         overlays=(Overlay("chirp_0", np.array([0.0, 0.002, 0.004]), curves, curves, curves, {"q_a": NAN}),),
         box={"viscous": {"damping": {"FR_hip": 0.01, "FL_hip": NAN}}},
@@ -116,7 +116,7 @@ def test_a_result_comes_back_whole(original: GapResult, tmp_path: Path) -> None:
 def test_comparing_results_sees_differences() -> None:
     assert equal(whole(), whole())
     assert not equal(whole(), replace(whole(), seconds=1.0))
-    assert not equal(whole(), replace(whole(), bags={"coulomb": 0.9, "base_tilt": 0.0}))
+    assert not equal(whole(), replace(whole(), bootstrap_share={"coulomb": 0.9, "base_tilt": 0.0}))
     assert not equal((1,), [1])
 
 
@@ -133,13 +133,31 @@ def test_a_result_that_is_missing_or_damaged_is_refused_in_words(tmp_path: Path)
         "before": {"joints": ["a"]},
         "waterfall": [["one"]],
         "candidates": {"a": 1},
-        "bags": {"a": {}, "b": "x"},
+        "bootstrap_share": {"a": {}, "b": "x"},
     }
     damaged += [json.dumps({**plain, key: value}).encode() for key, value in changes.items()]
     for content in damaged:
         file.write_bytes(content)
         with pytest.raises(files.GapFileError, match=r"verdict\.json: not a result of go1exp gap"):
             files.load(tmp_path)
+
+
+def test_a_result_of_an_older_version_which_says_bags_is_read(tmp_path: Path) -> None:
+    file = files.save(whole(), tmp_path)
+    plain = json.loads(file.read_text())
+    plain["bags"] = plain.pop("bootstrap_share")
+    del plain["tolerances"]
+    file.write_text(json.dumps(plain))
+    assert files.load(tmp_path).bootstrap_share["coulomb"] == 0.9
+
+
+def test_the_public_face_of_gap_has_every_name_that_it_promises() -> None:
+    from go1exp import gap
+
+    assert gap.explain is explain
+    assert all(getattr(gap, name) is not None for name in gap.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'explian'"):
+        gap.explian  # noqa: B018
 
 
 # ---------------------------------------------------------------------- what training reads
@@ -325,7 +343,7 @@ def test_what_is_not_for_training_is_not_asked_of_the_proof(tmp_path: Path) -> N
 def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
     rig, (recording, *_) = robot()
     machine, meta = hung(rig.robot), recording.meta
-    assert unusable(recording, audit(recording), machine) == []
+    assert machine.flaws(recording, audit(recording)) == []
     swapped = replace(recording, meta=replace(meta, joints=(*meta.joints[1:], meta.joints[0])))
     bare = {k: v for k, v in recording.channels.items() if not k.startswith("qd_")}
     stuck = {**recording.channels, "q_FR_hip": np.full(len(recording.t), 0.1)}
@@ -335,7 +353,7 @@ def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
         (replace(recording, channels=bare), f"{meta.episode}: no qd"),
         (replace(recording, channels=stuck), f"{meta.episode}: q_FR_hip: "),
     ):
-        flaws = unusable(changed, audit(changed), machine)
+        flaws = machine.flaws(changed, audit(changed))
         assert any(said in line for line in flaws), (said, flaws)
         answer = explain([recording, changed], rig.robot)
         assert (answer.verdict, answer.exit_code) == ("bad log", 14)
@@ -347,8 +365,7 @@ def test_logs_of_another_robot_or_without_what_is_needed_are_refused() -> None:
 def test_one_bad_log_of_many_is_left_out_and_said() -> None:
     rig, recordings = robot()
     stuck = {**recordings[0].channels, "q_FR_hip": np.full(len(recordings[0].t), 0.1)}
-    ready = prepare([replace(recordings[0], channels=stuck), *recordings[1:]], hung(rig.robot), GapSettings())
-    assert ready.flaws == ()
+    _, ready = prepare([replace(recordings[0], channels=stuck), *recordings[1:]], hung(rig.robot), GapSettings())
     assert ready.recordings == recordings[1:]
     assert ready.warnings
     assert all(w.startswith(f"Left out: {recordings[0].meta.episode}: ") for w in ready.warnings)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from go1exp.gap import box
+from go1exp.gap.search import tolerances
 
 
-def limits(low: float, high: float, weight: float, size: int) -> box.Bounds:
+def limits(low: float, high: float, weight: float, size: int) -> tolerances.Bounds:
     ones = np.ones(size)
-    return box.Bounds(low * ones, high * ones, 0.0 * ones, weight * ones)
+    return tolerances.Bounds(low * ones, high * ones, 0.0 * ones, weight * ones)
 
 
 def test_it_is_bounded_least_squares() -> None:
@@ -19,7 +19,7 @@ def test_it_is_bounded_least_squares() -> None:
     for _ in range(20):
         columns, wanted = rng.standard_normal((40, 8)), rng.standard_normal(40)
         some = limits(-0.1, 0.15, 2.0, 8)
-        x = box.solve(columns.T @ columns, columns.T @ wanted, some)
+        x = tolerances.solve(columns.T @ columns, columns.T @ wanted, some)
         rows = np.vstack([columns, np.sqrt(2.0) * np.eye(8)])
         slow = lsq_linear(rows, np.concatenate([wanted, np.zeros(8)]), (-0.1, 0.15), tol=1e-12).x
         np.testing.assert_allclose(x, slow, atol=1e-6)
@@ -29,10 +29,10 @@ def test_columns_that_say_the_same_but_for_rounding_are_no_crash() -> None:
     """Their products, summed in float32, can be indefinite by more than the prior holds."""
     matrix = 1e8 * np.array([[1.0, 1.0 + 5e-8, 0.0], [1.0 + 5e-8, 1.0, 0.0], [0.0, 0.0, 1.0]])
     assert np.linalg.eigvalsh(matrix).min() < -1.0
-    x = box.solve(matrix, 1e8 * np.array([0.3, 0.3, 0.2]), limits(-1.0, 1.0, 1e-6, 3))
+    x = tolerances.solve(matrix, 1e8 * np.array([0.3, 0.3, 0.2]), limits(-1.0, 1.0, 1e-6, 3))
     np.testing.assert_allclose([x[0] + x[1], x[2]], [0.3, 0.2], atol=1e-5)
 
 
 def test_what_is_indefinite_for_another_reason_is_said() -> None:
     with pytest.raises(np.linalg.LinAlgError, match="by far more than their rounding"):
-        box.solve(np.array([[1.0, 2.0], [2.0, 1.0]]), np.zeros(2), limits(-1.0, 1.0, 1e-9, 2))
+        tolerances.solve(np.array([[1.0, 2.0], [2.0, 1.0]]), np.zeros(2), limits(-1.0, 1.0, 1e-9, 2))

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.gap import cases, damage, generate, laws, logger, outside, told
+from benchmarks.gap import cases, damage, generate, known, laws, logger, outside
 from benchmarks.gap.motions import HIGH, LOW, MOTIONS, RATE
 from benchmarks.gap.simulate import Episode, Samples, build, simulate
 from benchmarks.gap.truth import Truth, apply
@@ -64,8 +64,8 @@ def test_the_tolerances_are_those_of_the_library() -> None:
         params: Any = entry.target.params  # type: ignore[attr-defined]
         library[name] = {p.name: p.tolerance for p in params if p.tolerance != math.inf}
         nulls |= {(name, p.name): p.null for p in params if p.tolerance != math.inf}
-    assert library == told.TOLERANCES
-    assert nulls == {(e, p): told.null(e, p) for e, ps in told.TOLERANCES.items() for p in ps}
+    assert library == known.TOLERANCES
+    assert nulls == {(e, p): known.null(e, p) for e, ps in known.TOLERANCES.items() for p in ps}
 
 
 # ---------------------------------------------------------------------- laws
@@ -250,7 +250,7 @@ def test_every_effect_beyond_the_library_moves_the_robot(effect: str) -> None:
     on_thighs = EVERY % 3 == 1 if effect == "coupled_joints" else ~NONE
     a, b = (run(x, hold(0.6, target=target, on=on), on=on_thighs).q for x in (truth, Truth()))
     assert np.abs(a - b).max() > 3e-3
-    assert effect not in told.LIBRARY
+    assert effect not in known.LIBRARY
 
 
 @pytest.mark.parametrize("name", MOTIONS)
@@ -285,29 +285,29 @@ def test_the_case_does_not_depend_on_the_others_and_sizes_go_round() -> None:
     assert {(e["effect"], e["size"]) for e in drawn} == {(e, s) for e in cases.HUNG for s in cases.SIZES}
     for e in drawn:
         for name in e["sizes"]:
-            away = np.abs(np.asarray(e["drawn"][name]) - told.null(e["effect"], name))
-            assert away.max() <= 1.16 * e["size"] * told.TOLERANCES[e["effect"]][name]
+            away = np.abs(np.asarray(e["drawn"][name]) - known.null(e["effect"], name))
+            assert away.max() <= 1.16 * e["size"] * known.TOLERANCES[e["effect"]][name]
             if e["effect"] not in ("base_tilt", "asymmetric_friction"):
-                assert away.min() >= 0.999 * e["size"] * told.TOLERANCES[e["effect"]][name]
+                assert away.min() >= 0.999 * e["size"] * known.TOLERANCES[e["effect"]][name]
 
 
 def test_the_background_is_within_the_tolerances() -> None:
     for seed in range(20):
         truth, new = Truth(), Truth()
         cases.background(truth, np.random.default_rng(seed), None)
-        assert np.abs(truth.mass - 1).max() < told.TOLERANCES["link_mass"]["scale"]
-        assert np.abs(truth.com).max() < told.TOLERANCES["link_com"]["along"]
-        assert np.abs(truth.armature - new.armature).max() < 1.01 * told.TOLERANCES["armature"]["added"]
-        assert truth.forward.max() < told.TOLERANCES["coulomb"]["bound"]
-        assert truth.viscous.max() < told.TOLERANCES["viscous"]["damping"]
-        assert np.abs(truth.tilt).max() < told.TOLERANCES["base_tilt"]["roll"]
-        assert np.abs(truth.offset).max() < told.TOLERANCES["encoder_offset"]["offset"]
+        assert np.abs(truth.mass - 1).max() < known.TOLERANCES["link_mass"]["scale"]
+        assert np.abs(truth.com).max() < known.TOLERANCES["link_com"]["along"]
+        assert np.abs(truth.armature - new.armature).max() < 1.01 * known.TOLERANCES["armature"]["added"]
+        assert truth.forward.max() < known.TOLERANCES["coulomb"]["bound"]
+        assert truth.viscous.max() < known.TOLERANCES["viscous"]["damping"]
+        assert np.abs(truth.tilt).max() < known.TOLERANCES["base_tilt"]["roll"]
+        assert np.abs(truth.offset).max() < known.TOLERANCES["encoder_offset"]["offset"]
 
 
 def test_pairs_are_of_two_families_and_beyond_is_beyond() -> None:
     for index in range(30):
         pair = [e["effect"] for e in cases.make("pair", index, 9, 2, 0.1).answer["effects"]]
-        assert pair[1] not in told.family(pair[0])
+        assert pair[1] not in known.family(pair[0])
     base, spoilt = Truth(), Truth()
     cases.background(base, np.random.default_rng(4), None)
     cases.background(spoilt, np.random.default_rng(4), "coulomb")
@@ -400,7 +400,7 @@ def test_the_command_seals_writes_and_continues(
         for r in found:
             text = json.dumps(dataclasses.asdict(r.meta))
             assert r.meta.source == "measured"
-            assert not any(word in text for word in (*told.LIBRARY, *outside.EFFECTS, answer["kind"]))
+            assert not any(word in text for word in (*known.LIBRARY, *outside.EFFECTS, answer["kind"]))
     assert bad == 1
     removed = next(out / name for name, answer in known.items() if answer["kind"] == "single")
     before = (removed / "episode_00.parquet").read_bytes()
@@ -434,7 +434,7 @@ def test_the_answer_is_the_robot_and_not_only_what_was_added() -> None:
     case = cases.make("single", cases.HUNG.index("armature"), 5, 2, 0.2)
     (effect,) = case.answer["effects"]
     at = [robot.JOINTS.index(j) for j in effect["joints"]]
-    nominal = np.tile(told.NOMINAL["armature"], 4)
+    nominal = np.tile(known.NOMINAL["armature"], 4)
     assert not case.answer["clean"]
     np.testing.assert_allclose(effect["params"]["added"], (case.truth.armature - nominal)[at], atol=1e-9)
     assert np.abs(np.subtract(effect["params"]["added"], effect["drawn"]["added"])).max() > 1e-6

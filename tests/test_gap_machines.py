@@ -17,14 +17,18 @@ from omegaconf import OmegaConf
 from go1exp import data_root
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
+from go1exp.effects.tolerances import declared
 from go1exp.env.plant import Plant
-from go1exp.gap import box
-from go1exp.gap.explain import explain
-from go1exp.gap.machine import FixedBase, HungGo1, machine_of, tolerances_of
-from go1exp.gap.models import ModelConfig, parse_model
-from go1exp.gap.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, prepare, slope
+from go1exp.gap.comparison import NotComparable, prepare
+from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, slope
+from go1exp.gap.data.windows import averaged
 from go1exp.gap.result import GapSettings
-from go1exp.gap.windows import averaged
+from go1exp.gap.robots.choice import robot_of
+from go1exp.gap.robots.description import ModelConfig, parse_model
+from go1exp.gap.robots.fixed_base import FixedBase
+from go1exp.gap.robots.hung import HungGo1
+from go1exp.gap.search import tolerances
+from go1exp.gap.stages.explain import explain
 from go1exp.importers import import_recordings
 from go1exp.recording import Meta, Recording, joint_channel
 from go1exp.schema.registry import ConfigError, bind
@@ -44,7 +48,7 @@ def description(name: str, **changes: Any) -> dict[str, Any]:
 def machine(name: str, **changes: Any) -> FixedBase:
     config = parse_model(description(name, **changes))
     assert isinstance(config, ModelConfig)
-    found = machine_of(config, None)  # type: ignore[arg-type]
+    found = robot_of(config, None)  # type: ignore[arg-type]
     assert isinstance(found, FixedBase)
     return found
 
@@ -154,7 +158,7 @@ def test_a_wrong_description_is_told_by_its_key(changes: Mapping[str, Any], said
 
 def test_the_go1_is_the_model_without_a_file() -> None:
     robot: Any = object()
-    assert machine_of(parse_model({"mjcf": None}), robot) == HungGo1(robot)
+    assert robot_of(parse_model({"mjcf": None}), robot) == HungGo1(robot)
     with pytest.raises(ConfigError, match=r"model.mjcf: is null, which is the Go1; base would do nothing"):
         parse_model({"mjcf": None, "base": "trunk"})
     with pytest.raises(ConfigError, match=r"model = 'go7': must be a choice"):
@@ -167,7 +171,7 @@ def test_a_users_own_file_names_its_model_from_where_it_lies(tmp_path: Path) -> 
     (tmp_path / "parts/mine.xml").write_text(source.read_text())
     own = {**description("xl330_pendulum"), "mjcf": "parts/mine.xml", "search": {"window_s": 0.7}}
     OmegaConf.save(OmegaConf.create(own), tmp_path / "mine.yaml")
-    given = choices_from_files([f"model={tmp_path}/mine.yaml"])
+    given = choices_from_files([f"model={tmp_path}/mine.yaml"], "gap")
     container = compose("gap", given)
     model = parse_model(container["model"])
     assert model is not None
@@ -178,14 +182,11 @@ def test_a_users_own_file_names_its_model_from_where_it_lies(tmp_path: Path) -> 
     FixedBase.of(model)
 
 
-def test_a_machines_own_tolerances_count_while_it_is_at_hand() -> None:
+def test_a_robot_carries_its_tolerances_and_another_robot_beside_it_has_others() -> None:
     key = ("base_tilt", "roll")
-    declared = box.param(key).tolerance
-    with tolerances_of(machine("go2")):
-        assert box.param(key).tolerance == 0.05
-        with tolerances_of(HungGo1(None)):  # type: ignore[arg-type]
-            assert box.param(key).tolerance == declared
-    assert box.param(key).tolerance == declared
+    go2, go1 = machine("go2"), HungGo1(None)  # type: ignore[arg-type]
+    assert go2.tolerances.param(key).tolerance == 0.05
+    assert go1.tolerances.param(key) == declared(key)
 
 
 # ---------------------------------------------------------------------- recordings
@@ -211,28 +212,29 @@ def servo(episode: str = "one", seconds: float = 6.0, **about: Any) -> Recording
 
 def test_gains_come_from_the_recording_else_from_its_notes_else_from_the_model() -> None:
     xl330 = machine("xl330_pendulum")
-    ready = prepare([servo(), servo("two", kp=(1.5,), kd=(0.1,))], xl330, GapSettings())
-    assert ready.flaws == ()
+    _, ready = prepare([servo(), servo("two", kp=(1.5,), kd=(0.1,))], xl330, GapSettings())
     assert [(r.meta.kp, r.meta.kd) for r in ready.recordings] == [((0.0019 * 200,), (0.048,)), ((1.5,), (0.1,))]
     assert any("guess: kp 0.38 1.5, kd 0.048 0.1" in line for line in ready.warnings)
     without = machine("xl330_pendulum", firmware=None)
-    assert "says no gains" in prepare([servo()], without, GapSettings()).flaws[0]
-    assert "is of the robot 'go2'" in prepare([servo(robot="go2")], xl330, GapSettings()).flaws[0]
+    with pytest.raises(NotComparable, match="says no gains"):
+        prepare([servo()], without, GapSettings())
+    with pytest.raises(NotComparable, match="is of the robot 'go2'"):
+        prepare([servo(robot="go2")], xl330, GapSettings())
 
 
 def test_a_speed_that_disagrees_with_the_angle_is_not_compared() -> None:
     xl330 = machine("xl330_pendulum")
     good, bad = servo(), servo("two")
-    assert prepare([good], xl330, GapSettings()).ignored == ()
+    assert prepare([good], xl330, GapSettings())[1].ignored == ()
     bad.channels["qd_pendulum"] *= 1.15
-    ready = prepare([good, bad], xl330, GapSettings())
+    fitting, ready = prepare([good, bad], xl330, GapSettings())
     assert ready.ignored == ("qd",)
     assert "times the change of q_pendulum" in ready.warnings[0]
-    windows = ready.windows()
+    windows = fitting.windows(ready)
     assert np.all(np.isinf(windows.scale[:, 1]))
     assert np.all(np.isfinite(windows.scale[:, 0]))
     lacking = Recording(good.meta, {k: v for k, v in good.channels.items() if k != "qd_pendulum"})
-    ready = prepare([lacking], xl330, GapSettings())
+    fitting, ready = prepare([lacking], xl330, GapSettings())
     assert "1 of 1 recordings have none" in ready.warnings[0]
     np.testing.assert_allclose(ready.recordings[0].joint("qd")[5:-5], good.joint("qd")[5:-5], atol=0.8)
 
@@ -240,18 +242,20 @@ def test_a_speed_that_disagrees_with_the_angle_is_not_compared() -> None:
 def test_one_bad_recording_of_many_is_left_out_and_said() -> None:
     xl330 = machine("xl330_pendulum")
     many = [servo(f"e{k}") for k in range(4)]
-    ready = prepare([*many, servo("strange", robot="other")], xl330, GapSettings())
+    _, ready = prepare([*many, servo("strange", robot="other")], xl330, GapSettings())
     assert [r.meta.episode for r in ready.recordings] == ["e0", "e1", "e2", "e3"]
     assert any(line.startswith("Left out: strange: is of the robot 'other'") for line in ready.warnings)
     half = [servo("x", robot="other"), servo("y", robot="other")]
-    assert len(prepare([many[0], *half], xl330, GapSettings()).flaws) == 2
+    with pytest.raises(NotComparable) as refused:
+        prepare([many[0], *half], xl330, GapSettings())
+    assert len(refused.value.flaws) == 2
 
 
 def test_hours_of_recordings_cost_no_more_than_minutes() -> None:
-    ready = prepare([servo(seconds=200.0)], machine("xl330_pendulum"), GapSettings())
+    fitting, ready = prepare([servo(seconds=200.0)], machine("xl330_pendulum"), GapSettings())
     assert ready.settings.stride_s == pytest.approx(200.0 / MOST_WINDOWS, rel=0.01)
     assert any("s in every" in line for line in ready.warnings)
-    assert len(ready.windows()) <= MOST_WINDOWS
+    assert len(fitting.windows(ready)) <= MOST_WINDOWS
 
 
 def test_a_slope_is_that_of_a_parabola() -> None:
@@ -321,7 +325,7 @@ QUICK = GapSettings(
     shortlist=2,
     iterations=2,
     max_terms=1,
-    bags=20,
+    bootstraps=20,
     overlays=1,
     threads=1,
 )
@@ -330,7 +334,8 @@ QUICK = GapSettings(
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only some of the nominal parameters may vary, so that a replay has ten variants and not forty."""
-    monkeypatch.setattr(box, "BOX", ("strength", "coulomb", "viscous", "link_mass", "base_tilt"))
+    few = ("strength", "coulomb", "viscous", "link_mass", "base_tilt")
+    monkeypatch.setattr(tolerances, "nominal", lambda machine: few)
 
 
 @pytest.mark.usefixtures("few")
@@ -383,10 +388,9 @@ def test_real_recordings_can_be_compared(source: str, folder: str, name: str) ->
     robot = machine(name)
     logs = import_recordings(source, DATA / folder, {})[:4]
     defaults = {k: v for k, v in dataclasses.asdict(robot.config.search).items() if v is not None}
-    ready = prepare(logs, robot, GapSettings(**defaults))
-    assert ready.flaws == ()
+    fitting, ready = prepare(logs, robot, GapSettings(**defaults))
     assert ready.ignored == ("qd",)
-    windows = ready.windows()
+    windows = fitting.windows(ready)
     assert len(windows) >= 20
     assert np.all(np.isfinite(windows.scale[:, 0]))
 

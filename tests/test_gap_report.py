@@ -140,7 +140,7 @@ FULL: dict[str, Any] = {
         "These logs cannot tell base_tilt from link_com; record two attitudes of the trunk (hang=[[0,0],[0,0.5]]) "
         "to separate them.",
     ),
-    "bags": {"kd_scale": 0.95, "coulomb": 0.7, "base_tilt": 0.8},
+    "bootstrap_share": {"kd_scale": 0.95, "coulomb": 0.7, "base_tilt": 0.8},
     "waterfall": (("model as it is", 56.3), ("within tolerances", 40.2), ("kd_scale", 6.4), ("coulomb", 0.312)),
     "box": {
         "strength": {"scale": {j: 1.0 + 0.05 * np.sin(k) for k, j in enumerate(robot.JOINTS)}},
@@ -180,7 +180,7 @@ def answer(verdict: str, **changes: Any) -> GapResult:
             else c
             for c in candidates()
         )
-        usual["closed"], usual["bags"], usual["advice"] = math.nan, {}, ()
+        usual["closed"], usual["bootstrap_share"], usual["advice"] = math.nan, {}, ()
         usual["excess"] = {"null": 1.4 * level, "box": level, "final": level}
         usual["waterfall"] = (("model as it is", 1.4 * level), ("within tolerances", level))
     return GapResult(**{**usual, **changes})
@@ -319,7 +319,7 @@ def test_a_page_copes_with_numbers_that_are_none() -> None:
         named=(odd, strange),
         excess={"null": math.inf, "box": math.nan},
         waterfall=(("model as it is", math.nan), ("within tolerances", 2.0), ("odd", -1.5)),
-        bags={"kd_scale": math.nan},
+        bootstrap_share={"kd_scale": math.nan},
         closed=math.nan,
     )
     said = Reader(page(changed)).text
@@ -344,7 +344,7 @@ def test_names_of_others_stay_text(tmp_path: Path) -> None:
         named=(replace(full.named[0], joints=(nasty,), params={"scale": {nasty: 1.5}}, interval=interval),),
         candidates=(replace(full.candidates[0], joints=(nasty,), reason=nasty, alias_class=("kd_scale", nasty)),),
         overlays=(overlay(rng, nasty, (nasty, "膝_左"), 0.0),),
-        bags={nasty: 0.5},
+        bootstrap_share={nasty: 0.5},
         waterfall=((nasty, 4.0), (nasty, 1.0)),
         warnings=(nasty,),
         not_excited={nasty: nasty},

@@ -13,17 +13,21 @@ import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import RIG
 from go1exp.compose import compose
 from go1exp.config import parse_parts
-from go1exp.gap import strain
-from go1exp.gap.box import Bounds, solve
-from go1exp.gap.explain import explain, measured
-from go1exp.gap.fit import scores
-from go1exp.gap.judge import max_t, splits
-from go1exp.gap.likelihood import Layout, gram, predicted
-from go1exp.gap.machine import HungGo1, hung
-from go1exp.gap.prepare import prepare
-from go1exp.gap.replay import Probe, padded
+from go1exp.gap.comparison import compare
+from go1exp.gap.data.cutting import even_clock, noise
+from go1exp.gap.data.splits import splits
+from go1exp.gap.data.windows import held
+from go1exp.gap.replay.replayer import padded
+from go1exp.gap.replay.rows import Probe
 from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
-from go1exp.gap.windows import even_clock, held, noise
+from go1exp.gap.robots.hung import HungGo1, hung
+from go1exp.gap.score.likelihood import gram
+from go1exp.gap.score.linear import Layout, predicted
+from go1exp.gap.search import strain
+from go1exp.gap.search.fit import scores
+from go1exp.gap.search.significance import max_t
+from go1exp.gap.search.tolerances import Bounds, solve
+from go1exp.gap.stages.explain import explain
 from go1exp.record import simulate
 from go1exp.recording import Meta, Recording
 from tests.laboratory import recorded
@@ -35,7 +39,7 @@ QUICK = GapSettings(
     shortlist=3,
     iterations=2,
     max_terms=1,
-    bags=20,
+    bootstraps=20,
     overlays=1,
 )
 
@@ -218,11 +222,10 @@ def test_a_clock_need_not_start_at_zero(plain: tuple[simulate.Rig, list[Recordin
     weaker = {("strength_drift", "rate"): np.full(12, 0.05)}
     chi2 = []
     for logs in (found, late):
-        ready = prepare(logs, hung(rig.robot), QUICK)
-        windows = ready.windows()
+        comparison = compare(logs, hung(rig.robot), QUICK)
+        windows = comparison.windows
         np.testing.assert_allclose(windows.elapsed, windows.begin - 1000.0 * (logs is late), atol=2e-3)
-        score, _ = measured(ready, windows, 0.001, 0.002)
-        chi2.append(scores(score, [weaker], np.arange(len(windows)), 0.001)[0])
+        chi2.append(scores(comparison.scorer, [weaker], np.arange(len(windows)), 0.001)[0])
     assert chi2[0].mean() > 2.0
     np.testing.assert_allclose(chi2[1], chi2[0], rtol=1e-3)
 

@@ -1,4 +1,4 @@
-"""``go1exp.gap`` on a robot on its feet: the first state and the IMU against the truth, a null, a payload."""
+"""``go1exp.gap`` on a robot on its feet: the initial state and the IMU against the truth, a null, a payload."""
 
 from __future__ import annotations
 
@@ -11,21 +11,25 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.gap import alone, box, profile
-from go1exp.gap.base_state import AGREE, Base, Log, base_state
-from go1exp.gap.explain import explain
-from go1exp.gap.first_state import settled
-from go1exp.gap.fit import residuals
-from go1exp.gap.judge import splits
-from go1exp.gap.likelihood import Scorer
-from go1exp.gap.localise import ON_FEET, REGIMES, localise
-from go1exp.gap.machine import HungGo1
-from go1exp.gap.prepare import prepare
-from go1exp.gap.replay import Probe, Replayer, variants
+from go1exp.effects.tolerances import declared, sizes
+from go1exp.gap.comparison import prepare
+from go1exp.gap.data.splits import splits
+from go1exp.gap.data.standing import StandingWindows
+from go1exp.gap.data.trunk import AGREE, Base, Log, base_state
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.rows import Probe, variants
+from go1exp.gap.replay.standing import StandingReplayer
 from go1exp.gap.result import GapSettings
-from go1exp.gap.search import Search
-from go1exp.gap.standing import StandingGo1, StandingReplayer, StandingWindows, on_feet
-from go1exp.gap.trial import excess
+from go1exp.gap.robots.hung import HungGo1
+from go1exp.gap.robots.standing import StandingGo1
+from go1exp.gap.score.initial_state import settled
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.localise import ON_FEET, REGIMES, localise
+from go1exp.gap.search import profile_likelihood
+from go1exp.gap.search.fit import residuals
+from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.trial import excess
+from go1exp.gap.stages.explain import explain
 from go1exp.physics.legs import Legs
 from go1exp.physics.scene import build_model
 from go1exp.recording import VECTORS, Recording
@@ -33,7 +37,7 @@ from go1exp.robot import RobotConfig
 from go1exp.terrain import TerrainConfig, build_terrain
 from tests import laboratory
 
-QUICK = GapSettings(window_s=0.1, stride_s=0.25, physics_dt=0.002, bags=20, overlays=0)
+QUICK = GapSettings(window_s=0.1, stride_s=0.25, physics_dt=0.002, bootstraps=20, overlays=0)
 
 
 @cache
@@ -89,11 +93,12 @@ def test_a_walking_base_is_estimated_where_two_feet_agree_and_nowhere_else() -> 
 
 def ready(config: RobotConfig, recordings: tuple[Recording, ...]) -> tuple[StandingReplayer, float]:
     """Return the replayer of ``QUICK`` windows, and its step."""
-    done = prepare(recordings, HungGo1(config), QUICK)
-    windows = done.windows()
-    assert isinstance(windows, StandingWindows)
+    machine, done = prepare(recordings, HungGo1(config), QUICK)
+    windows = machine.windows(done)
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(windows), 1))
-    return StandingReplayer(done.machine, windows, level, 512, 1), float(windows.period)
+    replayer = machine.replayer(windows, level, 512, 1)
+    assert isinstance(replayer, StandingReplayer)
+    return replayer, float(windows.period)
 
 
 def test_the_replayed_imu_says_what_the_engine_s_own_sensors_say() -> None:
@@ -156,8 +161,8 @@ def test_regimes_of_the_ground_follow_the_feet() -> None:
 def test_hung_windows_among_standing_ones_are_replayed_as_by_themselves() -> None:
     config, recordings = recorded("excitation=[squat,gait]")
     _, hung = recorded("excitation=[chirp]", "support=hung")
-    assert isinstance(on_feet(HungGo1(config), (*recordings, *hung)), StandingGo1)
-    assert isinstance(on_feet(HungGo1(config), hung), HungGo1)
+    assert isinstance(HungGo1(config).suited((*recordings, *hung)), StandingGo1)
+    assert isinstance(HungGo1(config).suited(hung), HungGo1)
     replayer, dt = ready(config, (*recordings, *hung))
     windows = replayer.windows
     assert isinstance(windows, StandingWindows)
@@ -195,8 +200,8 @@ def search_in(*overrides: str) -> Search:
 @pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it() -> None:
     search = search_in("+effect.payload.mass=1.0")
-    plain = excess(search.held_out({}))
-    found = alone.cause(search)
+    plain = excess(search.state.held_out({}))
+    found = search.single_cause()
     assert found is not None
     assert found.name == "payload"
     assert found.theta["payload", "mass"].item() == pytest.approx(1.0, abs=0.1)
@@ -209,31 +214,31 @@ def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> 
     config, recordings = recorded("excitation=[gait]", "seeds=[0,1]", "+effect.payload.mass=2.0")
     replayer, dt = ready(config, recordings)
     score, _ = settled(replayer, dt, 0.00015)
-    everything, begun = np.arange(len(score.windows)), profile.begun(score, dt)
+    everything, begun = np.arange(len(score.windows)), profile_likelihood.begun(score, dt)
     assert begun.windows is replayer.windows
-    found, _ = profile.fitted(begun, box.sizes("payload"), everything, dt)
+    found, _ = profile_likelihood.fitted(begun, sizes("payload"), everything, dt)
     assert found["payload", "mass"].item() == pytest.approx(2.0, abs=0.2)
     truth = {("payload", "mass"): np.array([2.0])}
-    right, none = (np.log(profile.chi2(begun, theta, everything, dt)).mean() for theta in (truth, {}))
+    right, none = (np.log(profile_likelihood.chi2(begun, theta, everything, dt)).mean() for theta in (truth, {}))
     assert right < 0.5
     assert none > right + 1.0
-    # By first states that suit the nominal model the truth is hidden.
+    # By initial states that suit the nominal model the truth is hidden.
     hidden = np.log(score.chi2(residuals(score, [truth], everything, dt)[0], everything)).mean()
     assert hidden > right + 0.5
 
 
 def test_rungs_of_a_ladder_are_on_both_sides_of_null_and_no_farther_than_a_parameter_goes() -> None:
-    found = profile.ladder(box.param(("payload", "mass")))
+    found = profile_likelihood.ladder(declared(("payload", "mass")))
     assert found == pytest.approx([-0.8, -0.4, 0.0, 0.4, 0.8, 1.6, 3.2])
 
 
 def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
     search = search_in()
-    assert alone.cause(search) is None
+    assert search.single_cause() is None
     assert search.candidates == []
-    assert excess(search.held_out({})) < search.settings.material
+    assert excess(search.state.held_out({})) < search.settings.material
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_drives_that_are_all_a_little_weak_are_no_payload() -> None:
-    assert alone.cause(search_in("+effect.strength.scale=0.93")) is None
+    assert search_in("+effect.strength.scale=0.93").single_cause() is None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import gap_sysid
-from benchmarks.gap import cases, generate, logger, score, told
+from benchmarks.gap import cases, generate, known, logger, score
 from benchmarks.gap.simulate import simulate
 from benchmarks.gap.truth import Truth, apply
 from go1exp import robot
@@ -37,7 +37,7 @@ def recordings(truth: Truth, seconds: float, motions: tuple[str, ...] = ("steps"
 @pytest.mark.parametrize("effect", gap_sysid.FITTED)
 def test_the_model_at_the_hidden_values_replays_the_hidden_robot(effect: str) -> None:
     name = gap_sysid.FITTED[effect][0]
-    null, unit = told.null(effect, name), told.TOLERANCES[effect][name]
+    null, unit = known.null(effect, name), known.TOLERANCES[effect][name]
     truth = Truth()
     value = null + 5.0 * unit if effect == "base_tilt" else np.full(robot.NUM_JOINTS, null + 5.0 * unit)
     apply(truth, effect, {"roll": 0.0, name: value} if effect == "base_tilt" else {name: value}, EVERY)
@@ -78,7 +78,7 @@ def test_a_large_armature_is_found_and_the_verdict_can_be_scored(tmp_path: Path)
     assert verdict["named"][0]["effect"] == "armature"
     assert verdict["named"][0]["joints"] == ["FL_thigh"]
     assert verdict["named"][0]["params"]["added"]["FL_thigh"] == pytest.approx(0.005, rel=0.1)
-    assert {c["effect"] for c in verdict["candidates"]} == set(gap_sysid.FITTED) <= set(told.LIBRARY)
+    assert {c["effect"] for c in verdict["candidates"]} == set(gap_sysid.FITTED) <= set(known.LIBRARY)
     found = score.judge({case.name: case.answer}, score.read_results(tmp_path / "out"))
     assert found.figures["top1_exact"][0] == 1.0, found.failures
 

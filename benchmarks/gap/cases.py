@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap import logger, outside, told
+from benchmarks.gap import known, logger, outside
 from benchmarks.gap.motions import MOTIONS, RATE
 from benchmarks.gap.simulate import Episode
 from benchmarks.gap.truth import Truth, apply, differences
@@ -43,7 +43,7 @@ DAMAGES = (
     *("swapped_joints", "flipped_sign", "dropped", "shifted_commands", "degrees", "truncated", "frozen", "repeated"),
 )
 
-HUNG = tuple(e for e in told.LIBRARY if e not in told.GROUND_ONLY)
+HUNG = tuple(e for e in known.LIBRARY if e not in known.GROUND_ONLY)
 """Effects that a hung robot feels."""
 
 Values = dict[str, np.ndarray | float]
@@ -92,7 +92,7 @@ def joints_of(scope: str, rng: np.random.Generator) -> np.ndarray:
 
 def draw_values(effect: str, size: float, joints: np.ndarray, rng: np.random.Generator) -> Values:
     """Draw parameters whose sizes are 1 to 1.15 times ``size`` tolerances, up or down where both make sense."""
-    tolerance, n = told.TOLERANCES[effect], len(joints)
+    tolerance, n = known.TOLERANCES[effect], len(joints)
 
     def much(name: str) -> np.ndarray:
         return tolerance[name] * size * rng.uniform(1.0, 1.15, n)
@@ -104,7 +104,7 @@ def draw_values(effect: str, size: float, joints: np.ndarray, rng: np.random.Gen
     if effect == "payload":
         return {"mass": float(much("mass")[0])}
     if effect == "joint_stop":
-        return {"time_constant": told.null(effect, "time_constant") + much("time_constant")}
+        return {"time_constant": known.null(effect, "time_constant") + much("time_constant")}
     if effect == "link_com":
         return {"along": sign * much("along")}
     if effect in ("strength", "kp_scale", "kd_scale", "link_mass", "link_inertia"):
@@ -141,7 +141,7 @@ def effect_answer(effect: str, size: float, joints: np.ndarray, values: Values) 
         "joints": [] if per_robot else [robot.JOINTS[j] for j in joints],
         "drawn": drawn,
         "params": dict(drawn),
-        "sizes": list(told.TOLERANCES[effect]),
+        "sizes": list(known.TOLERANCES[effect]),
     }
 
 
@@ -185,17 +185,17 @@ BEYOND = ("armature", "base_tilt", "coulomb", "encoder_offset", "link_com", "lin
 def experiment(motions: Sequence[str], count: int, seconds: float, rng: np.random.Generator) -> list[Episode]:
     """Return ``count`` episodes, the last an exact repetition of another; gains and attitudes go round."""
     t = np.arange(round(seconds * RATE)) / RATE
-    first, found = int(rng.integers(3)), []
+    first, episodes = int(rng.integers(3)), []
     for k in range(count - 1):
         name = motions[k % len(motions)]
         target, on = MOTIONS[name](t, rng)
         kp, kd = GAINS[(first + k) % 3]
-        found.append(Episode(f"e{k:02d}", name, target, on, kp, kd, (0.0, PITCHES[k % 2])))
-    old = found[int(rng.integers(len(found)))]
+        episodes.append(Episode(f"e{k:02d}", name, target, on, kp, kd, (0.0, PITCHES[k % 2])))
+    old = episodes[int(rng.integers(len(episodes)))]
     again = Episode(
         f"e{count - 1:02d}", old.excitation, old.target, old.on, old.kp, old.kd, old.hang, repeat_of=old.name
     )
-    return [*found, again]
+    return [*episodes, again]
 
 
 # ---------------------------------------------------------------------- cases
@@ -252,7 +252,7 @@ def make(
         add(_cycle(names, index), _cycle(tuple(sizes), index // len(names)), scope)
     elif kind == "pair":
         add(*_pair(rng, names))
-        add(*_pair(rng, [e for e in names if e not in told.family(effects[0]["effect"]) | _CLASH]))
+        add(*_pair(rng, [e for e in names if e not in known.family(effects[0]["effect"]) | _CLASH]))
     elif kind == "outside":
         which = _cycle(tuple(outside.EFFECTS), index)
         on[joints_of(str(rng.choice(("all", "kind"))), rng)] = True
@@ -273,11 +273,11 @@ def make(
         at = np.array([robot.JOINTS.index(name) for name in effect["joints"]], dtype=int)
         for key, value in differences(truth, effect["effect"], at).items():
             effect["params"][key] = value if isinstance(value, float) else [float(x) for x in value]
-    own = tuple(int(x) for x in noise.generate_state(4))
+    case_seed = tuple(int(x) for x in noise.generate_state(4))
     episodes = experiment(motions, count, seconds, rng)
     dt = 1e-4 if truth.yielding.any() else float(rng.choice([2e-4, 2.5e-4]))
     answer = {"kind": kind, "effects": effects, "background_beyond": beyond, "clean": clean, "dt": dt, **detail}
-    return Case(name, kind, truth, without, episodes, dt, logger.draw(rng), on, damage, own, answer)
+    return Case(name, kind, truth, without, episodes, dt, logger.draw(rng), on, damage, case_seed, answer)
 
 
 _CLASH = {"backlash", "flexibility", "asymmetric_friction"}

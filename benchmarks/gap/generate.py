@@ -1,6 +1,6 @@
 """Write sealed cases: ``python -m benchmarks.gap.generate out=DIR kinds=null,single n=10 seed=123``.
 
-Each case is a folder of recordings under ``out``; ``out/told.json`` says what the solver may know. The answers go to a
+Each case is a folder of recordings under ``out``; ``out/known.json`` says what the solver may know. The answers go to a
 file of their own, whose SHA-256 is written to ``out/SEAL`` and printed before anything is simulated: publish it, run
 the solver, then show the answers. An interrupted run is continued by the same command. ``signals=DIR`` also simulates
 each robot without its effect and writes how many times the noise the angles change; that doubles the time.
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap import cases, logger, told
+from benchmarks.gap import cases, known, logger
 from benchmarks.gap.damage import damage, truncate
 from benchmarks.gap.simulate import simulate
 from go1exp.recording import Recording
@@ -33,11 +33,11 @@ def recordings(case: cases.Case) -> list[Recording]:
     world, noise, harm = ([*case.seed, k] for k in range(3))
     samples = simulate(case.truth, case.episodes, case.dt, np.random.default_rng(world), case.on)
     rng = np.random.default_rng(noise)
-    found = [
+    whole = [
         Recording(logger.meta(e), logger.log(case.logger, samples, k, e.target, e.on, rng))
         for k, e in enumerate(case.episodes)
     ]
-    return damage(found, case.damage, np.random.default_rng(harm)) if case.damage else found
+    return damage(whole, case.damage, np.random.default_rng(harm)) if case.damage else whole
 
 
 def write_case(case: cases.Case, out: Path, signals: Path | None = None) -> None:
@@ -89,7 +89,7 @@ def settings(arguments: Sequence[str]) -> argparse.Namespace:
         "usage: python -m benchmarks.gap.generate out=DIR seed=INT [kinds=null,single] [n=10] [episodes=8] "
         "[seconds=5] [effects=coulomb,lag] [sizes=1,2,5] [answers=FILE] [signals=DIR] [jobs=1]\n"
         f"kinds: {', '.join(cases.KINDS)}\n"
-        f"effects (of single and pair): {', '.join(told.LIBRARY)}"
+        f"effects (of single and pair): {', '.join(known.LIBRARY)}"
     )
     for argument in arguments:
         key, _, value = argument.partition("=")
@@ -101,25 +101,25 @@ def settings(arguments: Sequence[str]) -> argparse.Namespace:
             raise SystemExit(f"{argument!r}: not a number\n{words}") from None
     if usual["out"] is None or usual["seed"] is None:
         raise SystemExit(words)
-    found = argparse.Namespace(**usual)
-    found.out = Path(found.out)
-    found.answers = Path(found.answers) if found.answers else found.out.with_name(found.out.name + ".answers.json")
-    found.signals = Path(found.signals) if found.signals else None
-    found.kinds = tuple(found.kinds.split(","))
+    chosen = argparse.Namespace(**usual)
+    chosen.out = Path(chosen.out)
+    chosen.answers = Path(chosen.answers) if chosen.answers else chosen.out.with_name(chosen.out.name + ".answers.json")
+    chosen.signals = Path(chosen.signals) if chosen.signals else None
+    chosen.kinds = tuple(chosen.kinds.split(","))
     try:
-        found.sizes = tuple(float(size) for size in found.sizes.split(","))
+        chosen.sizes = tuple(float(size) for size in chosen.sizes.split(","))
     except ValueError:
-        raise SystemExit(f"sizes={found.sizes}: not numbers\n{words}") from None
-    found.effects = tuple(e for e in found.effects.split(",") if e)
-    for name, known in [*((k, cases.KINDS) for k in found.kinds), *((e, told.LIBRARY) for e in found.effects)]:
-        if name not in known:
-            raise SystemExit(f"{name!r}: there are {', '.join(known)}")
-    if found.episodes < 2 or found.seconds <= 0 or found.n < 1:
+        raise SystemExit(f"sizes={chosen.sizes}: not numbers\n{words}") from None
+    chosen.effects = tuple(e for e in chosen.effects.split(",") if e)
+    for name, allowed in [*((k, cases.KINDS) for k in chosen.kinds), *((e, known.LIBRARY) for e in chosen.effects)]:
+        if name not in allowed:
+            raise SystemExit(f"{name!r}: must be one of {', '.join(allowed)}")
+    if chosen.episodes < 2 or chosen.seconds <= 0 or chosen.n < 1:
         raise SystemExit("episodes must be at least 2, seconds more than 0, n at least 1")
-    for secret in (found.answers, found.signals):
-        if secret and found.out in (secret, *secret.parents):
+    for secret in (chosen.answers, chosen.signals):
+        if secret and chosen.out in (secret, *secret.parents):
             raise SystemExit(f"{secret}: must not lie beside the cases, where a solver reads")
-    return found
+    return chosen
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -136,8 +136,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     s.answers.parent.mkdir(parents=True, exist_ok=True)
     s.answers.write_bytes(text)
     mark.write_text(f"{digest}  {s.answers.name}\n")
-    (s.out / "told.json").write_text(
-        json.dumps({"nominal": told.NOMINAL, "tolerances": told.TOLERANCES, "library": told.LIBRARY}, indent=1) + "\n"
+    (s.out / "known.json").write_text(
+        json.dumps({"nominal": known.NOMINAL, "tolerances": known.TOLERANCES, "library": known.LIBRARY}, indent=1)
+        + "\n"
     )
     print(f"sealed {len(todo)} cases: sha256 {digest} of {s.answers}", flush=True)
     left = [case for case in todo if not (s.out / case.name).is_dir()]

@@ -17,8 +17,8 @@ def share(outcomes: Sequence[bool]) -> Figure:
     """Return the share of true outcomes with Wilson's interval (0 to 1 if there are none)."""
     if not outcomes:
         return None, 0.0, 1.0, 0
-    found = stats.binomtest(sum(outcomes), len(outcomes)).proportion_ci(method="wilson")
-    return sum(outcomes) / len(outcomes), float(found.low), float(found.high), len(outcomes)
+    interval = stats.binomtest(sum(outcomes), len(outcomes)).proportion_ci(method="wilson")
+    return sum(outcomes) / len(outcomes), float(interval.low), float(interval.high), len(outcomes)
 
 
 def median(values: Sequence[float], what: Callable[..., Any] = np.median) -> Figure:
@@ -28,7 +28,7 @@ def median(values: Sequence[float], what: Callable[..., Any] = np.median) -> Fig
     middle = float(what(values))
     if len(set(values)) == 1:
         return middle, middle, middle, len(values)
-    found = stats.bootstrap(
+    interval = stats.bootstrap(
         (np.asarray(values, dtype=float),), what, n_resamples=2000, method="percentile", rng=np.random.default_rng(0)
     ).confidence_interval
-    return middle, float(found.low), float(found.high), len(values)
+    return middle, float(interval.low), float(interval.high), len(values)

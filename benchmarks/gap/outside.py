@@ -132,9 +132,9 @@ class CoupledJoints(Outside):
 
     def joint(self, t: float, q: np.ndarray, v: np.ndarray, torque: np.ndarray) -> np.ndarray | float:
         """Return the torque on the thighs."""
-        found = np.zeros_like(torque)
-        found[:, 1::3] = self.values["share"] * torque[:, 2::3]
-        return found * self.scene.on
+        coupled = np.zeros_like(torque)
+        coupled[:, 1::3] = self.values["share"] * torque[:, 2::3]
+        return coupled * self.scene.on
 
 
 class PatchyFriction(Outside):

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap import told
+from benchmarks.gap import known
 from benchmarks.gap.intervals import median, share
 
 VISIBLE = 1.0
@@ -92,8 +92,8 @@ class Judged:
     def allowed(self) -> frozenset[str]:
         """Names that are no mistake: of the hidden effects' families, and a background that is beyond tolerance."""
         names = [*self.true, *([self.answer["background_beyond"]] if self.answer.get("background_beyond") else [])]
-        found = frozenset().union(*(told.family(n) for n in names))
-        return found.union(*(told.EQUIVALENT.get(n, frozenset()) for n in names))
+        collected = frozenset().union(*(known.family(n) for n in names))
+        return collected.union(*(known.EQUIVALENT.get(n, frozenset()) for n in names))
 
     @property
     def wrong(self) -> list[str]:
@@ -105,12 +105,12 @@ class Judged:
         ranked = self.named or ([] if self.result is None else self.result.get("candidates", []))
         order = [n["effect"] for n in ranked]
         beyond = self.answer.get("background_beyond")
-        spare = told.family(beyond) - self.families() if beyond else frozenset()
+        spare = known.family(beyond) - self.families() if beyond else frozenset()
         return [str(n) for n in order if n not in spare]
 
     def families(self) -> frozenset[str]:
         """Names that stand for a hidden effect."""
-        return frozenset().union(*(told.family(n) | told.EQUIVALENT.get(n, frozenset()) for n in self.true))
+        return frozenset().union(*(known.family(n) | known.EQUIVALENT.get(n, frozenset()) for n in self.true))
 
 
 @dataclass
@@ -187,7 +187,7 @@ def judge(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
     library = singles + of("pair")
     _misses(score, "wrong_explained_library", [(c, c.verdict == "explained" and bool(c.wrong)) for c in library])
 
-    score.rate("pair_recall", ((c, all(_found(c, true) for true in c.true)) for c in of("pair")))
+    score.rate("pair_recall", ((c, all(_recovered(c, true) for true in c.true)) for c in of("pair")))
     score.rate("pair_precision", ((c, n["effect"] in c.allowed) for c in of("pair") for n in c.named))
     score.rate("not_excited_unnamed", ((c, c.result is not None and not c.mentioned) for c in of("not_excited")))
     score.rate("not_excited_said", ((c, c.verdict == "not excited") for c in of("not_excited")))
@@ -217,12 +217,12 @@ def _sets(case: Judged) -> set[str]:
 
 def _equivalent(case: Judged) -> bool:
     """Whether a set was named that describes the hidden effect exactly."""
-    return any(told.EQUIVALENT.get(n, frozenset({"-"})) <= _sets(case) for n in case.true)
+    return any(known.EQUIVALENT.get(n, frozenset({"-"})) <= _sets(case) for n in case.true)
 
 
-def _found(case: Judged, true: str) -> bool:
+def _recovered(case: Judged, true: str) -> bool:
     names = {n["effect"] for n in case.named}
-    return bool(names & told.family(true)) or bool(names & told.EQUIVALENT.get(true, frozenset()))
+    return bool(names & known.family(true)) or bool(names & known.EQUIVALENT.get(true, frozenset()))
 
 
 def _parameters(cases: Iterable[Judged]) -> tuple[list[float], list[bool]]:
@@ -252,7 +252,7 @@ def _compare(true: dict[str, Any], named: dict[str, Any], parameter: str) -> tup
     if isinstance(band, list) and np.ndim(band) == 1:
         band = [band] * len(estimate)
     bands = {} if band is None else _by_joint(named.get("joints", []), band)
-    absent = told.null(true["effect"], parameter)
+    absent = known.null(true["effect"], parameter)
     errors, inside = [], []
     for joint in truth.keys() & estimate.keys():
         size = abs(truth[joint] - absent)
@@ -286,12 +286,12 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
 
 def flat(score: Score) -> dict[str, float | int | None]:
     """Return the figures as ``results.json`` holds them; intervals under ``<figure>_low`` and ``_high``."""
-    found: dict[str, float | int | None] = {}
+    collected: dict[str, float | int | None] = {}
     for name, (value, low, high, n) in score.figures.items():
-        found |= {name: value, f"{name}_n": n}
+        collected |= {name: value, f"{name}_n": n}
         if np.isfinite([low, high]).all():
-            found |= {f"{name}_low": low, f"{name}_high": high}
-    return found
+            collected |= {f"{name}_low": low, f"{name}_high": high}
+    return collected
 
 
 def table(score: Score) -> str:

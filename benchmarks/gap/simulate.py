@@ -113,7 +113,7 @@ def simulate(truth: Truth, episodes: Sequence[Episode], dt: float, rng: np.rando
         ctrl[:] = drive.step(-1.0, target[0], everyone, qpos, qvel)
         batch.step()
     drive.begin()
-    found = Samples(*(np.empty((rows, n, robot.NUM_JOINTS)) for _ in range(3)))
+    samples = Samples(*(np.empty((rows, n, robot.NUM_JOINTS)) for _ in range(3)))
     for row in range(rows):
         for sub in range(per):
             t = row / RATE + sub * dt
@@ -124,11 +124,11 @@ def simulate(truth: Truth, episodes: Sequence[Episode], dt: float, rng: np.rando
                     if push is not None:
                         forces[:, calves, :3] = push
             if sub == 0:
-                found.q[row], found.qd[row], found.torque[row] = drive.angle, drive.speed, drive.made
+                samples.q[row], samples.qd[row], samples.torque[row] = drive.angle, drive.speed, drive.made
             batch.step()
             if sub == 0:  # a speed of Euler's belongs half a step earlier
-                found.qd[row] += 0.5 * (drive.rotor_speed(qpos, qvel) - drive.speed)
-    return found
+                samples.qd[row] += 0.5 * (drive.rotor_speed(qpos, qvel) - drive.speed)
+    return samples
 
 
 class _Drive:

@@ -107,7 +107,7 @@ def apply(truth: Truth, effect: str, values: Mapping[str, np.ndarray | float], j
 
     Args:
         truth: the robot; what it has already stays.
-        effect: a name of ``told.LIBRARY``.
+        effect: a name of ``known.LIBRARY``.
         values: parameter -> value, or values of ``joints`` one by one.
         joints: indices of the joints (or of their links).
 
@@ -165,12 +165,12 @@ def differences(truth: Truth, effect: str, joints: np.ndarray) -> dict[str, np.n
 
     Args:
         truth: the robot, with all its effects and its background.
-        effect: a name of ``told.LIBRARY``.
+        effect: a name of ``known.LIBRARY``.
         joints: indices of the joints at which the effect was added.
     """
     if effect == "base_tilt":
         return {"roll": float(truth.tilt[0]), "pitch": float(truth.tilt[1])}
-    found = {
+    by_parameter = {
         "coulomb": {"bound": np.minimum(truth.forward, truth.backward)},
         "asymmetric_friction": {"forward": truth.forward, "backward": truth.backward},
         "viscous": {"damping": truth.viscous},
@@ -180,4 +180,4 @@ def differences(truth: Truth, effect: str, joints: np.ndarray) -> dict[str, np.n
         "link_mass": {"scale": truth.mass},
         "link_com": {"along": -truth.com[:, 2]},
     }.get(effect, {})
-    return {name: values[joints] for name, values in found.items()}
+    return {name: values[joints] for name, values in by_parameter.items()}

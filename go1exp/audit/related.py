@@ -13,6 +13,9 @@ from go1exp.audit.log import Log, finding, graded
 from go1exp.audit.report import Finding
 from go1exp.recording import VECTORS, joint_channel
 
+SPEED_CHECKS = ("scale", "lag", "repeats")
+"""Checks after which a recorded speed is not to be trusted, even if they only call it suspect."""
+
 
 def _scale_finding(
     check: str, name: str, against: str, s: signals.Scale, pair: tuple[float, float]

@@ -22,10 +22,11 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from go1exp.choices import CONFIG_DIR, given_folders
-from go1exp.cli import FLAGS, VALUED
+from go1exp.cli import plugins
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.quoting import protected
-from go1exp.compose import as_container, composition_problem
+from go1exp.cli.verbs import FLAGS, VALUED
+from go1exp.compose import as_container, as_hydra_takes_them, composition_problem
 from go1exp.config_source import seen_by
 from go1exp.schema.registry import ConfigError, Expected
 
@@ -60,7 +61,7 @@ class App:
 
         def task(config: DictConfig) -> None:
             try:
-                status.append(self.task(as_container(config)))
+                status.append(self.task(plugins.begin(self.name, as_container(config))))
             except Exception as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
                     status.append(self._failed_in_sweep(error))
@@ -74,7 +75,7 @@ class App:
         try:
             _refuse_stray_words(arguments, title)
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
-            sys.argv = [title, *map(protected, overrides)]
+            sys.argv = [title, *map(protected, as_hydra_takes_them(overrides))]
             with seen_by(self.name, folders):
                 hydra.main(**version, config_path=None, config_name=self.name)(task)()
             if failure:

@@ -15,7 +15,7 @@ from typing import Any
 
 from go1exp import data_root
 from go1exp.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in, groups_of, load
-from go1exp.cli import POSITIONAL, SUBVERBS, VALUED, VERBS
+from go1exp.cli.verbs import POSITIONAL, SUBVERBS, VALUED, VERBS
 
 OPTIONS = ("--help", "--cfg", "--multirun", "--config-dir", "--resolve", "--package", "--info")
 STAGES = ("check", "localise", "replay", "explain", "apply", "report")

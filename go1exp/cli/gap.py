@@ -15,8 +15,8 @@ from go1exp.files import opened, write_json
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb
-    from go1exp.gap.machine import Machine
     from go1exp.gap.result import GapResult
+    from go1exp.gap.robots.protocol import Robot
     from go1exp.recording import Recording
 
 DOES_NOT_HOLD = 15
@@ -26,7 +26,7 @@ DOES_NOT_HOLD = 15
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.settings import GapVerb
-    from go1exp.gap.models import parse_model
+    from go1exp.gap.robots.description import parse_model
     from go1exp.schema.settings import MISSING
 
     if container.get("stage") == "report" and container.get("logs") == MISSING:
@@ -43,85 +43,85 @@ def _task(container: dict[str, Any]) -> int:
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
 
-    from go1exp.gap.machine import machine_of
+    from go1exp.gap.robots.choice import robot_of
 
-    machine = machine_of(parts["model"], parts["robot"])
+    robot = robot_of(parts["model"], parts["robot"])
     if settings.stage == "check":
-        return _check(recordings, machine, settings)
+        return _check(recordings, robot, settings)
     if settings.stage == "localise":
-        return _localise(recordings, machine, settings)
+        return _localise(recordings, robot, settings)
     if settings.stage == "replay":
-        return _replay(recordings, machine, settings)
+        return _replay(recordings, robot, settings)
     if settings.stage == "apply":
         result = files.load(out)
-        return _apply(result, recordings, machine, settings) or result.exit_code
+        return _apply(result, recordings, robot, settings) or result.exit_code
 
-    from go1exp.gap.explain import explain
+    from go1exp.gap.stages.explain import explain
 
-    result = explain(recordings, machine, settings.search, _progress())
+    result = explain(recordings, robot, settings.search, _progress())
     print(f"\n{result.sentence}\n\nwritten to {files.save(result, out)}")
     status = result.exit_code
     if settings.stage == "all" and result.verdict != "bad log":
-        status = _apply(result, recordings, machine, settings) or status
+        status = _apply(result, recordings, robot, settings) or status
     if settings.stage == "all":
         _report(result, out)
     return status
 
 
 def _progress() -> Callable[[str, float], None]:
-    """Return a callback that shows how far the work is, and in a file says each stage once."""
-    bar, said = spinner(100, "gap"), [""]
+    """Return a callback that shows how far the work is, and prints the name of each step once."""
+    bar, last = spinner(100, "gap"), [""]
 
     def show(what: str, share: float) -> None:
-        if what != said[0]:
-            said[0] = what
+        if what != last[0]:
+            last[0] = what
             print(f"{what} ...", flush=True)
         bar(round(100 * share), 100)
 
     return show
 
 
-def _check(recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
+def _check(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Say whether the logs are fit to be compared, their floors, and which effects they could not show."""
     from go1exp.audit import audit
-    from go1exp.gap.survey import survey
+    from go1exp.gap.stages.check import check
 
     for recording in recordings:
         report = audit(recording)
         print(f"{recording.meta.episode}: {report.verdict}")
         for flaw in report.flaws:
             print(f"  {flaw.verdict:8} {flaw.channel}: {flaw.message}")
-    found = survey(recordings, machine, settings.search, _progress())
-    print(f"\n{found.text()}")
-    return found.exit_code
+    result = check(recordings, robot, settings.search, _progress())
+    print(f"\n{result.text()}")
+    return result.exit_code
 
 
-def _localise(recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
+def _localise(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Print where the plain model is wrong."""
     from go1exp.gap.report import localisation_text
-    from go1exp.gap.survey import survey
+    from go1exp.gap.stages.localise import localise
 
-    found = survey(recordings, machine, settings.search, _progress(), screen=False)
-    if found.where is not None:
-        print(f"\n{localisation_text(found.where)}")
-    return found.exit_code
+    result = localise(recordings, robot, settings.search, _progress())
+    if result.where is not None:
+        print(f"\n{localisation_text(result.where)}")
+    return result.exit_code
 
 
-def _replay(recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
+def _replay(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Print what training's simulator does under the same commands, and write it with its curves."""
     import numpy as np
 
-    from go1exp.gap.retrace import retrace
+    from go1exp.gap.stages.replay import replay
 
-    found = retrace(recordings, machine, settings.search, settings.train_dt, _progress())
-    print(f"\n{found.text()}")
-    if found.flaws:
-        return found.exit_code
+    result = replay(recordings, robot, settings.search, settings.train_dt, _progress())
+    print(f"\n{result.text()}")
+    if result.flaws:
+        return result.exit_code
     out = Path(settings.out)
-    write_json(out / "replay.json", found.content(), indent=1, allow_nan=False)
-    kinds = ("free", "held") if len(found.parts) > 1 else ("",)
+    write_json(out / "replay.json", result.content(), indent=1, allow_nan=False)
+    kinds = ("free", "held") if len(result.parts) > 1 else ("",)
     curves: dict[str, Any] = {}
-    for part, kind in zip(reversed(found.parts), kinds, strict=True):
+    for part, kind in zip(reversed(result.parts), kinds, strict=True):
         about = {**part.curves, "channels": np.array(part.channels), "episodes": np.array(part.episodes)}
         curves |= {f"{kind}_{name}".lstrip("_"): values for name, values in about.items()}
     with opened(out / "replay.npz") as file:
@@ -130,15 +130,15 @@ def _replay(recordings: list[Recording], machine: Machine, settings: GapVerb) ->
     return 0
 
 
-def _apply(result: GapResult, recordings: list[Recording], machine: Machine, settings: GapVerb) -> int:
+def _apply(result: GapResult, recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Write the effect files, read them back as training does, and score them at training's step."""
-    from go1exp.gap import apply
+    from go1exp.gap.stages import apply
     from go1exp.robot import JOINTS
 
     out = Path(settings.out)
     written = apply.write(result, out)
     contents = {path.name: OmegaConf.to_container(OmegaConf.load(path)) for path in written}
-    proof = apply.prove(recordings, machine, settings.search, result, contents, settings.train_dt)  # type: ignore[arg-type]
+    proof = apply.prove(recordings, robot, settings.search, result, contents, settings.train_dt)  # type: ignore[arg-type]
     about = {**asdict(proof), "files": [path.name for path in written]}
     write_json(out / "applied.json", about)
     print(f"\nwritten to {', '.join(str(path) for path in written)}")
@@ -149,7 +149,7 @@ def _apply(result: GapResult, recordings: list[Recording], machine: Machine, set
     if not proof.holds:
         print(f"NOT applied: it was {1 + proof.reported:.3g} in the search, and is worse at this step")
         return DOES_NOT_HOLD
-    if result.named and machine.joints == JOINTS:
+    if result.named and robot.joints == JOINTS:
         print(f"now: {command('train', settings={'effect': out / apply.EFFECT})}")
     return 0
 

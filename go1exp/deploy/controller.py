@@ -94,7 +94,7 @@ class Cycle:
 
 
 class Controller:
-    """Runs a bundle's policy on whatever is at the other end of a link.
+    """Runs a bundle's policy on the robot at the other end of a link.
 
     Attributes:
         phase: one of ``PHASES``.

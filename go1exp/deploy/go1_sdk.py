@@ -106,7 +106,9 @@ class SdkLink:
             self._tick = tick
             self._arrived.append(_read(self._state, now))
         if self._tick is not None or self._wanted is not None:
-            self._fill(now)  # before, the empty command goes out, as in the example: a robot answers who speaks
+            self._fill(
+                now
+            )  # before that an empty command is sent, as in the SDK's example: the robot answers only then
         self._udp.SetSend(self._command)
         self._udp.Send()
 

@@ -169,7 +169,7 @@ def run(
     Args:
         work: one cycle; gets the clock's time at its start, s.
         rate: cycles per second.
-        seconds: how long; None for as long as ``work`` wants.
+        seconds: duration, s; None: until ``work`` returns False.
         clock: the system's monotonic one if None.
         on_report: called with the timing every ``report_every`` s, after the work of a cycle.
         report_every: s.

@@ -1,8 +1,8 @@
-"""Everything that keeps robot and people safe, in one place.
+"""All safety of the runtime, in one module.
 
-Targets are cut to what the drives may be asked for (``Safety.limited``). A fault, found by any of ``RULES``, ends the
-walk: from then on the drives only brake, whatever anyone asks for, until a person starts anew. A rule is a method that
-returns what is wrong in words, or None; its name is that of the fault in the log.
+Targets are limited to what the drives can do (``Safety.limited``). A fault by any of ``RULES`` ends the walk: from then
+on the drives only brake, whatever is commanded, until a person starts again. A rule is a method that returns a message,
+or None; its name is that of the fault in the log.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ SDK_RANGE = {"hip": (-1.047, 1.047), "thigh": (-0.663, 2.966), "calf": (-2.721, 
 """Targets that the vendor's SDK lets through, rad (``go1_const.h``, used by its Safety.PositionLimit)."""
 
 DEFAULT_KD = 2.0
-"""Braking gain, N m s/rad: lets a Go1 sink in about a second and is far from what makes its drives chatter (chosen)."""
+"""Braking gain, N m s/rad (chosen): a Go1 sinks in about a second, and its drives are far from chattering."""
 
 
 READ = ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
 ASKED = ("joint_target", "kp", "kd")
-"""Parts of a state and of a command that have to be numbers."""
+"""Parts of a state and of a command that must be finite."""
 
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """Where the faults begin.
+    """Limits of the faults.
 
     Attributes:
-        tilt: angle between the trunk's z axis and the vertical, rad (chosen: no gait of training leans that far).
-        stale: age of the newest state, s (15 messages of the SDK).
-        beyond_stop: how far a joint may be measured beyond its stop, rad (the SDK's PositionProtect: 5 degrees).
+        tilt: largest angle between the trunk's z axis and the vertical, rad (chosen: beyond any gait of training).
+        stale: largest age of the newest state, s (15 messages of the SDK).
+        beyond_stop: largest measured angle beyond a stop, rad (the SDK's PositionProtect: 5 degrees).
         power: sum of |torque x speed| over the joints, W (the SDK's PowerProtect at level 5 of 10).
         torque_margin: reported torque over the joint's limit, as a factor (the report is an estimate).
-        count: a torque or power fault needs so many more cycles over the limit than under it (the SDK: 6 of 2 ms).
-        quat_error: how far the length of the attitude quaternion may be off 1.
-        damping_kd: gain that the drives brake with, N m s/rad.
+        count: cycles over the limit, minus cycles under it, that make a torque or power fault (the SDK: 6 of 2 ms).
+        quat_error: largest difference of the attitude quaternion's length from 1.
+        damping_kd: gain with which the drives brake, N m s/rad.
     """
 
     tilt: float = 1.0
@@ -54,7 +54,7 @@ class SafetyConfig:
 
 @dataclass(frozen=True)
 class Fault:
-    """Why the walk ended: the rule's name, when (s, the runtime's clock), and what was wrong."""
+    """Why the walk ended: name of the rule, time (s, the runtime's clock), and message."""
 
     name: str
     t: float
@@ -78,11 +78,11 @@ class _Counter:
 
 
 class Safety:
-    """Judges every cycle before its command goes out.
+    """Checks every cycle before its command is sent.
 
     Attributes:
         fault: the first fault, or None. It stays.
-        clamped: cycles in which a target of each joint was cut, (J,).
+        clamped: cycles in which the target of each joint was limited, (J,).
     """
 
     def __init__(
@@ -93,14 +93,14 @@ class Safety:
         config: SafetyConfig | None = None,
         target_range: np.ndarray | None = None,
     ) -> None:
-        """Take a robot's limits.
+        """Set the limits of a robot.
 
         Args:
             joints: names, J.
             stops: hard stops (J, 2), rad.
             torque_limit: (J,) N m.
-            config: where the faults begin.
-            target_range: (J, 2) rad that targets are cut to; None for the Go1's SDK.
+            config: limits of the faults.
+            target_range: (J, 2) rad to which targets are limited; None for that of the Go1's SDK.
         """
         self.config = config or SafetyConfig()
         self._joints, self._stops, self._torque_limit = tuple(joints), np.asarray(stops), np.asarray(torque_limit)
@@ -117,15 +117,15 @@ class Safety:
     # ------------------------------------------------------------------ what callers use
 
     def stop(self, who: str) -> None:
-        """Stop at the next cycle, for ``who``: a key, a signal. Does nothing else, so a signal handler may call it."""
+        """Stop at the next cycle; ``who`` (a key, a signal) asked for it. Only a flag is set: signal-safe."""
         self._stop = who
 
     def review(self, state: LowState | None, command: LowCmd | None, now: float) -> LowCmd:
-        """Return the command that may go out: the one that was asked for, within limits, or damping.
+        """Return the command to send: the given one within limits, or damping.
 
         Args:
             state: the newest state ever received; None before the first.
-            command: what is asked for; None if nothing is, which leaves the drives braking.
+            command: the wanted command; None if there is none: the drives brake.
             now: the runtime's clock, s.
         """
         if self.fault is None:
@@ -138,7 +138,7 @@ class Safety:
         return self.limited(state, command)
 
     def fail(self, name: str, message: str, now: float) -> None:
-        """Report a fault that was found elsewhere, such as a filter that diverged; the first one stays."""
+        """Report a fault from another module, such as a filter that diverged; the first fault stays."""
         if self.fault is None:
             self.fault = Fault(name, now, message)
 
@@ -149,29 +149,29 @@ class Safety:
         return LowCmd(target, self._zeros, self._braking, damping=True)
 
     def limited(self, state: LowState, command: LowCmd) -> LowCmd:
-        """Cut targets to where they ask for no more than the peak torque, and then to the SDK's range and the stops.
+        """Limit targets so that they need at most the peak torque, and then to the SDK's range and the stops.
 
-        Where a joint moves so fast that both cannot be had, the range wins.
+        If a joint moves so fast that both are not possible, the range has priority.
         """
         target = self._cut(state, command)
         self.clamped += target != command.joint_target
         return LowCmd(target, command.kp, command.kd, command.damping)
 
     def rehearse(self, state: LowState, command: LowCmd) -> None:
-        """Do the work of a review without a judgement, for ``Controller.rehearse``."""
+        """Do the work of a review without any result, for ``Controller.rehearse``."""
         for rule in (Safety.not_finite, Safety.attitude, Safety.tilt, Safety.joint_range):
             rule(self, state, command, state.t)
         self._cut(state, command)
 
     def _cut(self, state: LowState, command: LowCmd) -> np.ndarray:
         reach, drag = self._reach(command.kp, command.kd)
-        still = state.joint_pos + drag * state.joint_vel  # the target that asks for no torque
+        still = state.joint_pos + drag * state.joint_vel  # (J,) the target that gives zero torque
         target = np.minimum(np.maximum(command.joint_target, still - reach), still + reach)
         # The range comes last: it holds even if the torque limit asks for a target outside it.
         return np.minimum(np.maximum(target, self._low), self._high)
 
     def _reach(self, kp: np.ndarray, kd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far from where they ask for nothing targets may be, rad, and kd / kp, s; kept for these gains."""
+        """Return the largest distance of targets from zero torque, rad, and kd / kp, s; cached for these gains."""
         if self._gains is None or self._gains[0] is not kp or self._gains[1] is not kd:
             # A joint without kp has no target, so any is allowed.
             limit, held = self._torque_limit, kp > 0.0
@@ -186,14 +186,14 @@ class Safety:
         return None if self._stop is None else f"asked for by {self._stop}"
 
     def stale_state(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """The robot has not said anything for too long; before its first word nothing has begun."""
+        """The newest state is too old; before the first state this is no fault."""
         if state is None:
-            return None  # nothing has begun: the drives are left braking until a first state comes
+            return None  # the drives brake until a first state arrives
         age = now - state.t
         return f"the newest state is {1e3 * age:.0f} ms old" if age > self.config.stale else None
 
     def not_finite(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """A reading or a command is no number."""
+        """A reading or a command is not finite."""
         given: list[tuple[LowState | LowCmd, str]] = [(state, name) for name in READ] if state is not None else []
         given += [(command, name) for name in ASKED] if command is not None else []
         vectors = [getattr(message, name) for message, name in given]
@@ -205,7 +205,7 @@ class Safety:
         return f"{name} of {where} is {values[k]}"
 
     def attitude(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """The attitude is none, as from an IMU that has not started."""
+        """The attitude is not a unit quaternion, as from an IMU that has not started."""
         if state is None:
             return None
         length = math.sqrt(float(state.imu_quat @ state.imu_quat))
@@ -220,7 +220,7 @@ class Safety:
         return f"the trunk leans by {math.degrees(angle):.0f} degrees" if angle > self.config.tilt else None
 
     def joint_range(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """A joint is measured where it cannot be."""
+        """A joint is measured beyond its stop."""
         if state is None:
             return None
         beyond = np.maximum(self._stops[:, 0] - state.joint_pos, state.joint_pos - self._stops[:, 1])
@@ -240,7 +240,7 @@ class Safety:
         return f"{self._joints[k]} reports {state.joint_torque[k]:.1f} N m, its limit is {self._torque_limit[k]:g} N m"
 
     def power(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """The drives turn over too much power, for some cycles, whichever way it flows."""
+        """The sum of |torque x speed| is too large, for some cycles; driving and braking count alike."""
         if state is None:
             return None
         power = float(np.abs(state.joint_torque * state.joint_vel).sum())
@@ -261,7 +261,7 @@ RULES: dict[str, Rule] = {
     "torque": Safety.torque,
     "power": Safety.power,
 }
-"""Name of a fault -> its rule, in the order in which they are asked; the first that speaks is the fault."""
+"""Name of a fault -> its rule, in the order of evaluation; the first rule with a message is the fault."""
 
 
 def lean(quat: np.ndarray) -> float:
@@ -274,5 +274,5 @@ def lean(quat: np.ndarray) -> float:
 
 
 def sdk_range(joints: Sequence[str]) -> np.ndarray:
-    """Return the targets (J, 2), rad, that the Go1's SDK lets through; any for a joint that is none of its kinds."""
+    """Return the targets (J, 2), rad, that the Go1's SDK accepts; unlimited for a joint of another kind."""
     return np.array([SDK_RANGE.get(name.rsplit("_", 1)[-1], (-np.inf, np.inf)) for name in joints])

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import TWO_GAIN_SETS, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -23,10 +24,16 @@ class Armature(Effect):
 
     title = "rotor inertia"
     params = (Param("added", "kg m2", -0.01, 0.05, 0.0, 0.001, "joint", "inertia about the joint's axis"),)
+    identification = Identification(
+        nominal=True,
+        rank=3,
+        confounded=("kp_scale", "link_mass", "strength"),
+        told_apart_by=TWO_GAIN_SETS,
+    )
     fields = ("dof_armature",)
     added: Tensor
 
     def edit_model(self, model: ModelFields) -> None:
         """Add to the joints' own inertia."""
-        own = model.field("dof_armature")[:, -self.added.shape[1] :]
-        own.copy_((own + self.added).clamp(min=0.0))
+        inertia = model.field("dof_armature")[:, -self.added.shape[1] :]
+        inertia.copy_((inertia + self.added).clamp(min=0.0))

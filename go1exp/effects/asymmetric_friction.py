@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ class AsymmetricFriction(Effect):
         Param("forward", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "further friction while the angle grows"),
         Param("backward", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "further friction while the angle falls"),
     )
+    identification = Identification(simpler="coulomb", excitation="slow_ramps")
     forward: Tensor
     backward: Tensor
 

@@ -6,6 +6,7 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Gears, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -23,6 +24,10 @@ class Backlash(Effect):
 
     title = "play in the gears"
     params = (Param("gap", "rad", 0.0, 0.1, 0.0, 0.001, "joint", "free angle from flank to flank"),)
+    identification = Identification(
+        levels=({"gap": 0.002}, {"gap": 0.015}),
+        excitation="slow_ramps",
+    )
     gap: Tensor
 
     def on_gears(self, gears: Gears) -> Gears:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from go1exp.drive import DriveSetup, ModelFields
+from go1exp.effects.identification import Identification
 from go1exp.schema.joint_values import JointValues, each_within
 from go1exp.tensors.memory import Memory
 
@@ -104,6 +105,8 @@ class Effect(Memory):
     title: ClassVar[str] = ""
     """What it is, as the object of a sentence: "the model lacks ..."."""
     params: ClassVar[tuple[Param, ...]] = ()
+    identification: ClassVar[Identification] = Identification()
+    """How it is looked for in recordings."""
     fields: ClassVar[tuple[str, ...]] = ()
     """Model fields that ``edit_model`` writes."""
     joint_values: ClassVar[tuple[str, ...]] = ()

@@ -9,6 +9,7 @@ import torch
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Measured, Param
+from go1exp.effects.identification import TWO_ATTITUDES, Identification
 from go1exp.schema.registry import effect
 from go1exp.tensors.rotation import quat_multiply
 
@@ -39,6 +40,13 @@ class BaseTilt(Effect):
         Param("roll", "rad", -0.2, 0.2, 0.0, 0.0087, "robot", "left side up"),
         Param("pitch", "rad", -0.2, 0.2, 0.0, 0.0087, "robot", "nose down"),
     )
+    identification = Identification(
+        nominal=True,
+        rank=9,
+        excitation="slow_ramps",
+        confounded=("encoder_offset", "link_com"),
+        told_apart_by=TWO_ATTITUDES,
+    )
     fields = ("opt.gravity",)
     roll: Tensor
     pitch: Tensor
@@ -57,12 +65,12 @@ class BaseTilt(Effect):
 
     def on_sensor(self, measured: Measured) -> Measured:
         """Turn what the IMU says; a held one feels gravity as it is, and tells an attitude to match."""
-        turned = ("gravity", "gyro", "acc") if self.setup.floating else ("gravity",)
-        found = {name: getattr(measured, name) for name in turned}
-        seen = {k: _tilted(self.roll, self.pitch, v) for k, v in found.items() if v is not None}
+        names = ("gravity", "gyro", "acc") if self.setup.floating else ("gravity",)
+        vectors = {name: getattr(measured, name) for name in names}
+        readings = {name: _tilted(self.roll, self.pitch, v) for name, v in vectors.items() if v is not None}
         if measured.quat is not None:
-            seen["quat"] = self._attitude(measured.quat)
-        return dataclasses.replace(measured, **seen)
+            readings["quat"] = self._attitude(measured.quat)
+        return dataclasses.replace(measured, **readings)
 
     def _attitude(self, quat: Tensor) -> Tensor:
         """Return the orientation (N, 4) of a frame that is tilted in the one of orientation ``quat``."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification, Periodic
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -29,6 +30,12 @@ class Cogging(Effect):
         Param("amplitude", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "largest torque"),
         Param("count", "-", 1.0, 150.0, 38.0, math.inf, "joint", "periods per turn of the joint"),
         Param("phase", "rad", -math.pi, math.pi, 0.0, math.inf, "joint", "phase at angle zero"),
+    )
+    identification = Identification(
+        # Over a radian of motion, neighbouring counts differ by half a period.
+        periodic=Periodic("amplitude", "phase", "count", counts=tuple(float(count) for count in range(18, 64, 3))),
+        free_shapes=("phase", "count"),
+        excitation="slow_ramps",
     )
     amplitude: Tensor
     count: Tensor

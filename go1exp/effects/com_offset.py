@@ -8,6 +8,7 @@ import torch
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ class ComOffset(Effect):
         Param("y", "m", -0.1, 0.1, 0.0, 0.005, "robot", "shift to the left"),
         Param("z", "m", -0.1, 0.1, 0.0, 0.005, "robot", "shift up"),
     )
+    identification = Identification(nominal=True, rank=21, needs_ground=True, excitation="squat")
     fields = ("body_ipos",)
     x: Tensor
     y: Tensor

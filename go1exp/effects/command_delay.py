@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Param
 from go1exp.effects.delayed import Delayed
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -23,6 +24,12 @@ class CommandDelay(Delayed):
 
     title = "a delay of commands"
     params = (Param("delay", "s", 0.0, 0.06, 0.0, 0.001, "joint", "age of the target"),)
+    identification = Identification(
+        nominal=True,
+        rank=10,
+        levels=({"delay": 0.01},),
+        excitation="steps",
+    )
 
     def on_target(self, target: Tensor) -> Tensor:
         """Return the target of ``delay`` ago."""

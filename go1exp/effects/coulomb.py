@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ class Coulomb(Effect):
 
     title = "dry friction"
     params = (Param("bound", "N m", 0.0, 3.0, 0.0, 0.05, "joint", "friction torque"),)
+    identification = Identification(nominal=True, rank=4, excitation="slow_ramps")
     fields = ("dof_frictionloss",)
     bound: Tensor
 

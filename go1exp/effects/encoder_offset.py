@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import TWO_ATTITUDES, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -21,6 +22,13 @@ class EncoderOffset(Effect):
 
     title = "a zero error of the encoders"
     params = (Param("offset", "rad", -0.15, 0.15, 0.0, 0.003, "joint", "reading at true zero"),)
+    identification = Identification(
+        nominal=True,
+        rank=8,
+        excitation="slow_ramps",
+        confounded=("base_tilt", "link_com"),
+        told_apart_by=TWO_ATTITUDES,
+    )
     order = 10  # after the transmission: the encoder reads the motor's side
     offset: Tensor
 

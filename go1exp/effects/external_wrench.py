@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ class ExternalWrench(Effect):
         Param("pitch", "N m", -10.0, 10.0, 0.0, 0.2, "robot", "about y"),
         Param("yaw", "N m", -10.0, 10.0, 0.0, 0.2, "robot", "about z"),
     )
+    identification = Identification(needs_ground=True, excitation="squat")
     x: Tensor
     y: Tensor
     z: Tensor

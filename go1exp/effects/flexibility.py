@@ -7,6 +7,7 @@ import math
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Gears, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ class Flexibility(Effect):
     params = (
         Param("compliance", "rad/(N m)", 0.0, 0.02, 0.0, 5e-4, "joint", "twist per torque"),
         Param("damping", "-", 0.02, 1.0, 0.05, math.inf, "joint", "damping ratio of the rotor on this spring"),
+    )
+    identification = Identification(
+        levels=({"compliance": 0.001}, {"compliance": 0.004}),
     )
     compliance: Tensor
     damping: Tensor

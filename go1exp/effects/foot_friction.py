@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from go1exp import robot
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -26,6 +27,13 @@ class FootFriction(Effect):
 
     title = "a change of foot friction"
     params = (Param("scale", "-", 0.1, 2.5, 1.0, 0.1, "robot", "friction over the model's"),)
+    identification = Identification(
+        nominal=True,
+        rank=22,
+        needs_ground=True,
+        levels=({"scale": -0.3}, {"scale": 0.3}),
+        excitation="squat",
+    )
     fields = ("geom_friction",)
     scale: Tensor
 

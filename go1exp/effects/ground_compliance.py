@@ -9,6 +9,7 @@ import torch
 from go1exp import robot
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -31,6 +32,13 @@ class GroundCompliance(Effect):
 
     title = "compliance of the ground"
     params = (Param("time_constant", "s", 0.004, 0.1, NULL, 0.003, "robot", "of the contact's spring-damper"),)
+    identification = Identification(
+        nominal=True,
+        rank=23,
+        needs_ground=True,
+        levels=({"time_constant": 0.01}, {"time_constant": -0.008}),
+        excitation="drop",
+    )
     fields = ("geom_solref",)
     time_constant: Tensor
 

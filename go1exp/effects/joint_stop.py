@@ -8,6 +8,7 @@ import torch
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -28,6 +29,10 @@ class JointStop(Effect):
 
     title = "softness of the joint stops"
     params = (Param("time_constant", "s", 0.004, 0.2, NULL, 0.003, "joint", "of the stop's spring-damper"),)
+    identification = Identification(
+        levels=({"time_constant": 0.006}, {"time_constant": 0.03}),
+        excitation="steps",
+    )
     fields = ("jnt_solref",)
     time_constant: Tensor
 

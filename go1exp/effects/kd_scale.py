@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import TWO_KD, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -22,6 +23,13 @@ class KdScale(Effect):
 
     title = "a change of the speed gain"
     params = (Param("scale", "-", 0.0, 3.0, 1.0, 0.15, "joint", "real gain over configured gain"),)
+    identification = Identification(
+        nominal=True,
+        rank=1,
+        excitation="torque_off",
+        confounded=("viscous",),
+        told_apart_by=TWO_KD,
+    )
     scale: Tensor
 
     def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:

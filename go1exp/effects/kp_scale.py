@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import TWO_GAIN_SETS, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -21,6 +22,13 @@ class KpScale(Effect):
 
     title = "a change of the position gain"
     params = (Param("scale", "-", 0.2, 2.0, 1.0, 0.1, "joint", "real gain over configured gain"),)
+    identification = Identification(
+        nominal=True,
+        rank=0,
+        weighs_on_legs=True,
+        confounded=("armature", "link_mass", "strength"),
+        told_apart_by=TWO_GAIN_SETS,
+    )
     scale: Tensor
 
     def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ import torch
 
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import SHARP_EDGES, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -27,6 +28,10 @@ class Lag(Effect):
 
     title = "a lag of torque"
     params = (Param("time", "s", 0.0, 0.05, 0.0, 0.001, "joint", "time constant"),)
+    identification = Identification(
+        confounded=("torque_delay",),
+        told_apart_by=SHARP_EDGES,
+    )
     memory = ("_made", "_asked", "_fresh")
     order = 40
     time: Tensor

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import TWO_ATTITUDES, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -23,6 +24,12 @@ class LinkCom(Effect):
 
     title = "a shift of link mass"
     params = (Param("along", "m", -0.05, 0.05, 0.0, 0.002, "joint", "shift away from the trunk"),)
+    identification = Identification(
+        nominal=True,
+        rank=7,
+        confounded=("base_tilt", "encoder_offset"),
+        told_apart_by=TWO_ATTITUDES,
+    )
     fields = ("body_ipos",)
     along: Tensor
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import TWO_GAIN_SETS, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -22,6 +23,13 @@ class LinkMass(Effect):
 
     title = "a change of link mass"
     params = (Param("scale", "-", 0.5, 2.0, 1.0, 0.05, "joint", "mass over the model's"),)
+    identification = Identification(
+        nominal=True,
+        rank=6,
+        weighs_on_legs=True,
+        confounded=("armature", "kp_scale", "strength"),
+        told_apart_by=TWO_GAIN_SETS,
+    )
     fields = ("body_mass", "body_inertia")
     scale: Tensor
 

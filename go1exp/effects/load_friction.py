@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ class LoadFriction(Effect):
 
     title = "friction that grows with load"
     params = (Param("coefficient", "-", 0.0, 0.5, 0.0, 0.01, "joint", "friction per torque of the drive"),)
+    identification = Identification(simpler="coulomb", excitation="slow_ramps")
     coefficient: Tensor
 
     def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:

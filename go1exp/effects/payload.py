@@ -9,6 +9,7 @@ import torch
 
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -49,6 +50,13 @@ class Payload(Effect):
         Param("y", "m", -0.2, 0.2, 0.0, math.inf, "robot", "to the left"),
         Param("z", "m", -0.2, 0.3, 0.1, math.inf, "robot", "up; 0.1 lies on top"),
     )
+    identification = Identification(
+        nominal=True,
+        rank=20,
+        needs_ground=True,
+        free_shapes=("x", "y", "z"),
+        excitation="squat",
+    )
     fields = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
     order = 10  # after a shift of the trunk's own centre
     mass: Tensor
@@ -60,11 +68,11 @@ class Payload(Effect):
         """Join the point mass to the trunk."""
         trunk = model.ids("body", ("trunk",))
         mass, com, moments, quat = (model.field(name)[:, trunk] for name in self.fields)
-        own, com, moments, quat = mass, com[:, 0], moments[:, 0], quat[:, 0]
-        total = own + self.mass
+        com, moments, quat = com[:, 0], moments[:, 0], quat[:, 0]
+        total = mass + self.mass
         lever = torch.cat([self.x, self.y, self.z], dim=1) - com
-        reduced = (own * self.mass / total).unsqueeze(-1)
-        square = lever.square().sum(-1)[:, None, None] * torch.eye(3, dtype=own.dtype, device=own.device)
+        reduced = (mass * self.mass / total).unsqueeze(-1)
+        square = lever.square().sum(-1)[:, None, None] * torch.eye(3, dtype=mass.dtype, device=mass.device)
         turned = _axes(quat)
         inertia = turned @ torch.diag_embed(moments) @ turned.mT
         inertia = inertia + reduced * (square - lever.unsqueeze(-1) * lever.unsqueeze(-2))
@@ -72,6 +80,6 @@ class Payload(Effect):
         principal = torch.maximum(principal, LEAST * moments.amin(-1, keepdim=True))
         axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # right-handed
         new = (total, com + self.mass / total * lever, principal, _quat(axes))
-        for name, before, after in zip(self.fields, (own, com, moments, quat), new, strict=True):
+        for name, before, after in zip(self.fields, (mass, com, moments, quat), new, strict=True):
             kept = torch.where(self.mass == 0.0, before, after)  # an inertia composed anew has other last bits
             model.field(name)[:, trunk] = kept if name == "body_mass" else kept.unsqueeze(1)

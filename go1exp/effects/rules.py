@@ -36,9 +36,9 @@ def _values_problems(term: Term, path: str, joints: Sequence[str]) -> list[str]:
             except ValueError as error:
                 problems.append(f"{path}.{name} = {value!r}: {error}")
                 continue
-            left_out = [j for j, missing in zip(joints, np.isnan(full), strict=True) if missing]
-            if left_out and term.entry.group == "actuator" and term.entry.parameters[name].default is not None:
-                problems.append(f"{path}.{name} = {value!r}: gives {', '.join(left_out)} no value")
+            without_value = [j for j, missing in zip(joints, np.isnan(full), strict=True) if missing]
+            if without_value and term.entry.group == "actuator" and term.entry.parameters[name].default is not None:
+                problems.append(f"{path}.{name} = {value!r}: gives {', '.join(without_value)} no value")
     return problems
 
 

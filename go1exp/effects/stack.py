@@ -158,10 +158,10 @@ class EffectStack:
     def measure(self, true: Measured) -> Measured:
         """Return what the robots' sensors say; the joint readings come from ``on_encoder``."""
         q, qd = self.on_encoder(true.joint_pos, true.joint_vel)
-        seen = Measured(q, qd, true.gravity, true.gyro, true.acc, true.quat)
+        readings = Measured(q, qd, true.gravity, true.gyro, true.acc, true.quat)
         for effect in self._acting["on_sensor"]:
-            seen = effect.on_sensor(seen)
-        return seen
+            readings = effect.on_sensor(readings)
+        return readings
 
     @property
     def senses(self) -> bool:

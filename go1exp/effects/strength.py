@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import TWO_GAIN_SETS, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -21,6 +22,13 @@ class Strength(Effect):
 
     title = "a change of drive strength"
     params = (Param("scale", "-", 0.3, 1.5, 1.0, 0.05, "joint", "torque made over torque asked for"),)
+    identification = Identification(
+        nominal=True,
+        rank=2,
+        weighs_on_legs=True,
+        confounded=("armature", "kp_scale", "link_mass"),
+        told_apart_by=TWO_GAIN_SETS,
+    )
     order = 10
     scale: Tensor
 

@@ -42,9 +42,9 @@ class StrengthDrift(Effect):
 
     def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque made; the step's time passes."""
-        left = torch.maximum(1.0 - self.rate * self._time, self.floor)
+        remaining = torch.maximum(1.0 - self.rate * self._time, self.floor)
         self._time += self.setup.physics_dt
-        return torque * left
+        return torque * remaining
 
     def reset(self, mask: Tensor) -> None:
         """Begin an episode in the rows of ``mask`` (N,)."""

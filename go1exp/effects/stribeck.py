@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -28,6 +29,12 @@ class Stribeck(Effect):
         Param("strength", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "further friction at rest"),
         Param("speed", "rad/s", 0.01, 2.0, 0.2, math.inf, "joint", "speed at which exp(-1) of it is left"),
         Param("exponent", "-", 0.5, 4.0, 2.0, math.inf, "joint", "how suddenly it fades"),
+    )
+    identification = Identification(
+        shapes=({"speed": 0.1}, {"speed": 0.5}),
+        free_shapes=("speed",),
+        simpler="coulomb",
+        excitation="slow_ramps",
     )
     strength: Tensor
     speed: Tensor

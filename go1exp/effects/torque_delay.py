@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Param
 from go1exp.effects.delayed import Delayed
+from go1exp.effects.identification import SHARP_EDGES, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -23,6 +24,13 @@ class TorqueDelay(Delayed):
 
     title = "a delay of torque"
     params = (Param("delay", "s", 0.0, 0.02, 0.0, 0.001, "joint", "age of the torque"),)
+    identification = Identification(
+        nominal=True,
+        rank=11,
+        excitation="steps",
+        confounded=("lag",),
+        told_apart_by=SHARP_EDGES,
+    )
     order = 30
 
     def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 
 from go1exp.actuator.envelope import envelope
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -37,6 +38,15 @@ class TorqueSpeedLimit(Effect):
         Param("peak", "-", 0.2, 1.0, 1.0, 0.05, "joint", "peak torque over the robot's"),
         Param("droop", "-", 0.0, 2.5, 0.0, 0.1, "joint", "the robot's top speed over that at which the line ends"),
         Param("stall", "-", 1.0, 3.0, 1.0, math.inf, "joint", "torque of the line at rest over the peak"),
+    )
+    identification = Identification(
+        common=True,  # few joints ever reach a limit, and one supply feeds them all
+        levels=(
+            *({"peak": -change} for change in (0.1, 0.3, 0.55, 0.7)),
+            *({"droop": change} for change in (0.2, 0.6, 1.0, 1.6)),
+        ),
+        free_shapes=("stall",),
+        excitation="steps",
     )
     order = 50
     peak: Tensor

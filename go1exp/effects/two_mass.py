@@ -89,13 +89,15 @@ class TwoMass(Memory):
         half = 0.5 * gears.gap
         end = torch.minimum(torch.maximum(loose, -half), half)
         pressed = (loose != end) | (gears.gap == 0.0)
-        stretch, both = ahead - end, rotor * s + beta
+        stretch, divisor = ahead - end, rotor * s + beta
 
         rigid = (s == 0.0) & (gears.gap == 0.0)
-        through = torch.where(pressed, (rotor * stretch + beta * torque) / both, 0.0)
-        carried = torch.where(pressed, rotor * beta / both, 0.0)
-        self._pull.copy_(torch.where(pressed, (s * torque - stretch) / both, torque / rotor).masked_fill_(rigid, 0.0))
-        self._share.copy_(torch.where(pressed, rotor * s / both, 1.0).masked_fill_(rigid, 0.0))
+        through = torch.where(pressed, (rotor * stretch + beta * torque) / divisor, 0.0)
+        carried = torch.where(pressed, rotor * beta / divisor, 0.0)
+        self._pull.copy_(
+            torch.where(pressed, (s * torque - stretch) / divisor, torque / rotor).masked_fill_(rigid, 0.0)
+        )
+        self._share.copy_(torch.where(pressed, rotor * s / divisor, 1.0).masked_fill_(rigid, 0.0))
         return rigid, torch.where(rigid, torque, through), torch.where(rigid, inertia, carried)
 
     def follow(self, acceleration: Tensor) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
+from go1exp.effects.identification import TWO_KD, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -22,6 +23,13 @@ class Viscous(Effect):
 
     title = "viscous friction"
     params = (Param("damping", "N m s/rad", 0.0, 2.0, 0.0, 0.02, "joint", "torque per speed"),)
+    identification = Identification(
+        nominal=True,
+        rank=5,
+        excitation="torque_off",
+        confounded=("kd_scale",),
+        told_apart_by=TWO_KD,
+    )
     damping: Tensor
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:

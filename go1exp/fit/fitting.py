@@ -85,7 +85,7 @@ def fit(
     held_out_report = report(
         held_out.rows, torque, references, thresholds(rows, joints), episodes, parts, settings.target
     )
-    # The net's file says how good it is; that is known only now.
+    # The net's file contains its held-out error, which is known only now.
     provenance = replace(info.provenance, held_out_rmse=rmse(torque - held_out.rows.y))
     net = replace(net, info=replace(info, provenance=provenance))
     torques = {"net": torque} | {r.name: r.torque for r in references if r.torque is not None}
@@ -122,7 +122,7 @@ def _describe(
     joints: tuple[str, ...],
     period: float,
 ) -> NetInfo:
-    """Return what the net's file says about the net, with a held-out error of 0 until that is known."""
+    """Return the metadata of the net's file, with a held-out error of 0 until that is known."""
     kp, kd = _gains(recordings, settings)
     provenance = Provenance(
         recordings={r.meta.episode: fingerprint(r) for r in recordings},

@@ -33,7 +33,7 @@ def write_onnx(
         path: file to write.
         weights: layer by layer (K, in, out), normalisation folded in.
         biases: layer by layer (K, out).
-        skip: linear map beside them, (K, F, 1); left out where it is zero.
+        skip: linear map added to the output, (K, F, 1); left out if it is zero.
         about: metadata of the model: what a program must know to compute its inputs.
     """
     import onnx

@@ -14,7 +14,7 @@ Part = Annotated[float, Field(gt=0, lt=1)]
 
 
 class FitError(Expected):
-    """Recordings that do not serve the fit that was asked for."""
+    """Recordings that cannot be used for the requested fit."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -26,11 +26,11 @@ class FitSettings:
     instead of 0.050 N m after as many epochs (``benchmarks/actuator_net_ak80.py --all``). False: the paper's alone.
 
     Attributes:
-        inputs: what the net sees, each with ``history`` taps; ``tau_cmd`` for drives that are commanded a torque.
+        inputs: inputs of the net, each with ``history`` taps; ``tau_cmd`` for drives that are commanded a torque.
         history: taps of each input (Walk These Ways: 3).
         period: time between taps, s; None takes the recordings' nominal sampling period.
         hidden: widths of the hidden layers.
-        skip: whether a linear map goes beside them.
+        skip: whether a linear map is added to them.
         share: ``all``, one net for all joints (the paper's way), ``kind``, one each for hip, thigh and calf, or
             ``none``, one per joint.
         target: ``tau_est``, what the drive reports, or ``joint_torque``, by inverse dynamics (``go1exp fit-actuator``:
@@ -41,8 +41,8 @@ class FitSettings:
         learning_rate: step size of Adam at the start.
         patience: epochs without a better validation error before the training stops.
         epoch_rows: rows of one pass; where there are more, each pass draws that many afresh.
-        holdout: episodes never met before the report, by name or as a part of all.
-        validation: episodes that decide when to stop, by name or as a part of all.
+        holdout: held-out episodes, used for the report only, by name or as a share of all.
+        validation: episodes that decide when to stop, by name or as a share of all.
         half_net: whether to train a net of half the width too, as a reference.
         seed: seed of split, initial weights and minibatches.
     """

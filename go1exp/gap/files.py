@@ -58,8 +58,11 @@ def from_dict(plain: Mapping[str, Any]) -> GapResult:
     values["before"], values["after"] = (_localisation(plain[key]) for key in ("before", "after"))
     values["overlays"] = tuple(_overlay(item) for item in plain["overlays"])
     values["waterfall"] = tuple((str(label), _number(value)) for label, value in plain["waterfall"])
-    for name in ("excess", "bags", "box"):
+    for name in ("excess", "box"):
         values[name] = _numbers(plain[name])
+    # Results of older versions call it bags.
+    values["bootstrap_share"] = _numbers(plain["bags"] if "bags" in plain else plain["bootstrap_share"])
+    values["tolerances"] = _numbers(plain.get("tolerances", {}))  # of an older version: the declared ones
     for name in ("closed", "seconds"):
         values[name] = _number(plain[name])
     for name in ("advice", "warnings"):

@@ -56,12 +56,12 @@ class GapSettings:
         adequate: excess up to which the model counts as right (floor 1 is excess 0).
         material: excess of the model within its tolerances below which there is no gap.
         confirm_fraction: share of the episodes that is kept for the last check.
-        bags: resamplings of the episodes.
-        certified: share of the bags in which a term must be found again.
+        bootstraps: resamples of the episodes.
+        certified: share of the bootstraps in which a term must be named again.
         overlays: windows whose curves are kept for pictures.
         max_rows: simulations side by side.
         threads: threads of the physics engine; 0 takes all cores.
-        seed: of splits, sign flips and bags.
+        seed: of splits, sign flips and bootstraps.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -83,7 +83,7 @@ class GapSettings:
     adequate: Positive = 0.5
     material: Positive = 0.1
     confirm_fraction: Fraction = 0.2
-    bags: Annotated[int, Field(ge=0)] = 40
+    bootstraps: Annotated[int, Field(ge=0)] = 40
     certified: Fraction = 0.8
     overlays: Annotated[int, Field(ge=0)] = 4
     max_rows: Count = 1024
@@ -218,10 +218,11 @@ class GapResult:
         after: localisation with what was named.
         not_excited: effect -> excitation to record next.
         advice: what to record to tell apart what these data cannot, a sentence each.
-        bags: effect -> share of the bags in which it was found.
+        bootstrap_share: effect -> share of the bootstraps in which it was named again.
         waterfall: (label, excess) from the plain model down to what remains.
         overlays: windows to look at.
         box: parameters within their tolerances: effect -> parameter -> joint or ``robot`` -> value.
+        tolerances: that counted: effect -> parameter -> tolerance; where there is none, the effect's declared one.
         provenance: hashes, versions, seeds, steps.
         warnings: what a reader must know, a sentence each.
         seconds: time it took.
@@ -238,10 +239,11 @@ class GapResult:
     after: Localisation | None = None
     not_excited: dict[str, str] = field(default_factory=dict)
     advice: tuple[str, ...] = ()
-    bags: dict[str, float] = field(default_factory=dict)
+    bootstrap_share: dict[str, float] = field(default_factory=dict)
     waterfall: tuple[tuple[str, float], ...] = ()
     overlays: tuple[Overlay, ...] = ()
     box: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
+    tolerances: dict[str, dict[str, float]] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     seconds: float = math.nan

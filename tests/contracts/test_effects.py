@@ -18,11 +18,13 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp import data_root, robot
 from go1exp.compose import compose
 from go1exp.config import MANY_TERMS, TaskConfig, parse_task
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Effect, Measured, Param
+from go1exp.effects.identification import LAST
 from go1exp.effects.stack import HOOKS
 from go1exp.env.core import Go1Core
 from go1exp.env.plant import Plant, drive_setup
@@ -35,7 +37,7 @@ from go1exp.tensors.rotation import rotate_inverse
 from go1exp.terrain import build_terrain
 
 DT = 0.002
-EFFECTS = members("effect")
+EFFECTS, EXCITATIONS = members("effect"), members("excitation")
 each = pytest.mark.parametrize("entry", EFFECTS.values(), ids=EFFECTS.keys())
 
 PROBES: dict[tuple[str, str], float] = {
@@ -254,6 +256,93 @@ def test_choices_of_effects_compose_alone_and_together() -> None:
         choice = f"effect={names[0]}" if len(names) == 1 else f"effect=[{','.join(names)}]"
         found = parse_task(compose("train", [choice])).effect
         assert sorted(t.key for t in found) == sorted(n for n in names if n != "none")
+
+
+# ---------------------------------------------------------------------- identification
+
+
+def names_of(entry: Entry, shapes: bool) -> set[str]:
+    """Return the names of the shape parameters, or of those that have a tolerance."""
+    return {p.name for p in kind(entry).params if (p.tolerance == math.inf) == shapes}
+
+
+@each
+def test_a_simpler_effect_exists_and_has_fewer_numbers(entry: Entry) -> None:
+    how = kind(entry).identification
+    if how.simpler:
+        simpler = EFFECTS[how.simpler]
+        assert simpler is not entry
+        assert not kind(simpler).identification.simpler
+        numbers_of = [len(sizes(e)) + len(kind(e).identification.free_shapes) for e in (simpler, entry)]
+        assert numbers_of[0] <= numbers_of[1]
+        assert len(kind(simpler).params) <= len(kind(entry).params)
+
+
+@each
+def test_the_excitation_that_shows_an_effect_exists_and_stands_if_the_effect_needs_ground(entry: Entry) -> None:
+    how = kind(entry).identification
+    assert how.excitation in EXCITATIONS
+    on_feet = EXCITATIONS[how.excitation].target.__module__ == "go1exp.excitations.ground"
+    assert on_feet == how.needs_ground
+
+
+@each
+def test_shapes_and_levels_are_parameters_within_their_bounds(entry: Entry) -> None:
+    how, by_name = kind(entry).identification, {p.name: p for p in kind(entry).params}
+    assert {*how.free_shapes} <= names_of(entry, shapes=True)
+    for shapes in how.shapes:
+        assert {*shapes} <= {*how.free_shapes}, "a shape that is tried and then held fast"
+        for name, value in shapes.items():
+            p = by_name[name]
+            assert (p.per == "joint" and p.unit == "rad") if math.isnan(value) else p.low <= value <= p.high
+    for level in how.levels:
+        assert {*level} <= names_of(entry, shapes=False)
+        for name, change in level.items():
+            assert change != 0.0
+            assert by_name[name].low <= by_name[name].null + change <= by_name[name].high
+    if how.periodic:
+        assert {how.periodic.amplitude} == names_of(entry, shapes=False)
+        assert {how.periodic.phase, how.periodic.count} <= names_of(entry, shapes=True)
+        count = by_name[how.periodic.count]
+        assert all(count.low <= value <= count.high for value in how.periodic.counts)
+        assert not how.levels
+        assert not how.shapes
+
+
+@each
+def test_a_confounded_effect_exists_and_both_say_the_same_of_how_to_tell_them_apart(entry: Entry) -> None:
+    how = kind(entry).identification
+    assert bool(how.confounded) == bool(how.told_apart_by)
+    assert how.told_apart_by == "" or how.told_apart_by.startswith("record ")
+    assert any(name in how.told_apart_by for name in EXCITATIONS) or "=[[" in how.told_apart_by or not how.confounded
+    for name in how.confounded:
+        other = kind(EFFECTS[name]).identification
+        assert name != entry.name
+        if entry.name in other.confounded:
+            assert other.told_apart_by == how.told_apart_by
+
+
+@each
+def test_a_place_is_joints_of_which_all_have_one_value_or_the_robot(entry: Entry) -> None:
+    how = kind(entry).identification
+    if how.common or how.weighs_on_legs:
+        assert {p.per for p in sizes(entry)} == {"joint"}
+    assert how.nominal or how.rank == LAST
+
+
+@each
+def test_an_effect_needs_ground_if_and_only_if_a_held_robot_does_not_feel_it(entry: Entry) -> None:
+    if True not in places(entry):
+        assert kind(entry).identification.needs_ground
+        return
+    without, read = plain(True, 100), Rig(1, [term(entry.name, probes(entry))], held=True).run(100)
+    ratio = max(float((read[channel] - without[channel]).abs().max()) / FLOORS[channel] for channel in ("q", "qd"))
+    assert (ratio > 0.01) != kind(entry).identification.needs_ground, ratio
+
+
+def test_ranks_of_nominal_effects_differ() -> None:
+    ranks = [kind(e).identification.rank for e in EFFECTS.values() if kind(e).identification.nominal]
+    assert len(ranks) == len({*ranks})
 
 
 # ---------------------------------------------------------------------- absence

@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 import go1exp.gap.report.words as words
+from go1exp.effects.tolerances import Tolerances
 from go1exp.gap.report.svg import PAGE_INCHES, draw
 from go1exp.gap.result import GapResult, NamedEffect, Overlay
 
@@ -147,10 +148,10 @@ def waterfall(result: GapResult) -> Markup:
             axes.barh(k, value - start, left=start, color=colour, height=0.62)
             if k:
                 axes.plot([start, start], [k - 1.31, k + 0.31], color=GREY, lw=0.7)
-            said = words.number(steps[k][1])
+            caption = words.number(steps[k][1])
             if k and start > 0:
-                said += f"   ({words.number(100 * (value / start - 1), 2)} %)"
-            axes.annotate(said, (max(value, start, 1.0), k), (4, 0), textcoords="offset points", va="center")
+                caption += f"   ({words.number(100 * (value / start - 1), 2)} %)"
+            axes.annotate(caption, (max(value, start, 1.0), k), (4, 0), textcoords="offset points", va="center")
         axes.barh(rows - 1, shown[-1] - 1.0, left=1.0, color=MEASURED, height=0.62)
         axes.annotate(
             words.number(steps[-1][1]), (max(shown[-1], 1.0), rows - 1), (4, 0), textcoords="offset points", va="center"
@@ -175,9 +176,9 @@ def _step(label: str) -> str:
     return label if label.startswith(("within", "without", "with ")) else f"with {label}"
 
 
-def forest(named: NamedEffect, name: str, index: int) -> Markup:
+def forest(named: NamedEffect, name: str, index: int, tolerances: Tolerances) -> Markup:
     """Draw the values of one parameter with their 95 % intervals, over the tolerance about null."""
-    declared, values = words.param(named.effect, name), named.params[name]
+    declared, values = words.param(named.effect, name, tolerances), named.params[name]
     intervals = named.interval.get(name, {})
 
     def paint() -> Figure:
@@ -211,7 +212,7 @@ def box(result: GapResult) -> Markup:
     rows = []
     for effect, by_name in result.box.items():
         for name, values in by_name.items():
-            declared = words.param(effect, name)
+            declared = words.param(effect, name, words.tolerances(result))
             if declared and math.isfinite(declared.tolerance):
                 unit = words.unit(effect, name)
                 label = f"{effect} {name} (± {words.number(declared.tolerance)}{' ' if unit else ''}{unit})"
@@ -239,9 +240,9 @@ def box(result: GapResult) -> Markup:
     return draw("box", "Parameters within their tolerances", paint) if rows else Markup()
 
 
-def bags(result: GapResult) -> Markup:
-    """Draw in which share of the bags each effect was found, with the line from which it is certified."""
-    rows = sorted(((n, v) for n, v in result.bags.items() if math.isfinite(v)), key=lambda pair: -pair[1])
+def bootstraps(result: GapResult) -> Markup:
+    """Draw in which share of the bootstraps each effect was named again, with the line from which it is certified."""
+    rows = sorted(((n, v) for n, v in result.bootstrap_share.items() if math.isfinite(v)), key=lambda pair: -pair[1])
     certified = words.limit(result, "certified")
 
     def paint() -> Figure:
@@ -266,7 +267,7 @@ def bags(result: GapResult) -> Markup:
         axes.set_xlim(0, 112)
         axes.set_xticks(range(0, 101, 20))
         axes.grid(axis="y", visible=False)
-        axes.set_xlabel(f"bags in which it was found, % (dashed: certified from {words.share(certified)})")
+        axes.set_xlabel(f"bootstraps in which it was named again, % (dashed: certified from {words.share(certified)})")
         return figure
 
-    return draw("bags", "Stability over bags", paint) if rows else Markup()
+    return draw("bootstraps", "Stability over bootstraps", paint) if rows else Markup()

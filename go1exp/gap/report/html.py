@@ -29,9 +29,9 @@ def write_report(result: GapResult, folder: Path) -> list[Path]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    said = json.dumps(result.as_dict(), indent=1, allow_nan=False, default=str)
+    plain = json.dumps(result.as_dict(), indent=1, allow_nan=False, default=str)
     written = []
-    for name, content in (("report.html", page(result)), ("report.json", said + "\n")):
+    for name, content in (("report.html", page(result)), ("report.json", plain + "\n")):
         file = folder / name
         write_text(file, content)
         written.append(file)
@@ -59,7 +59,7 @@ def _context(result: GapResult) -> dict[str, Any]:
                 "where": words.place(n.effect, n.joints, words.everyone(result)),
                 "sizes": words.sizes(n),
                 "rivals": words.rivals(n),
-                "bags": result.bags.get(n.effect),
+                "bootstrap_share": result.bootstrap_share.get(n.effect),
             }
             for n in result.named
         ],
@@ -79,7 +79,9 @@ def _context(result: GapResult) -> dict[str, Any]:
             if len(window.t) and window.measured
         ],
         "waterfall": figures.waterfall(result) if any(v == v for _, v in result.waterfall) else None,
-        "forests": [figures.forest(n, name, k) for k, (n, name) in enumerate(forests[:MOST_FORESTS])],
+        "forests": [
+            figures.forest(n, name, k, words.tolerances(result)) for k, (n, name) in enumerate(forests[:MOST_FORESTS])
+        ],
         "box": figures.box(result),
-        "bags": figures.bags(result),
+        "bootstraps": figures.bootstraps(result),
     }

@@ -71,8 +71,8 @@ def _own_ids(source: str, name: str) -> str:
     used = dict.fromkeys(re.findall(r'(?:url\(#|href="#)([\w-]+)', source))
     numbered = {old: f"{name}-{k}" for k, old in enumerate(used)}
 
-    def own(found: re.Match[str]) -> str:
-        return f' id="{numbered[found[1]]}"' if found[1] in numbered else ""
+    def unique(match: re.Match[str]) -> str:
+        return f' id="{numbered[match[1]]}"' if match[1] in numbered else ""
 
-    source = re.sub(r' id="([^"]*)"', own, source)
-    return re.sub(r'(url\(#|href="#)([\w-]+)', lambda found: found[1] + numbered[found[2]], source)
+    source = re.sub(r' id="([^"]*)"', unique, source)
+    return re.sub(r'(url\(#|href="#)([\w-]+)', lambda match: match[1] + numbered[match[2]], source)

@@ -87,13 +87,13 @@ def heat_maps(result: GapResult) -> list[Heat]:
         return []
     both = [m for m in (before, after) if m is not None]
     top = max((float(np.nanmax(m.excess)) for m in both if np.isfinite(m.excess).any()), default=1.0)
-    found = [_excess("Before: the plain model", before, top)]
+    maps = [_excess("Before: the plain model", before, top)]
     if after is None:
-        return [*found, _samples(before)]
-    found.append(_excess("After: with what is named, and the tolerances used", after, top))
+        return [*maps, _samples(before)]
+    maps.append(_excess("After: with what is named, and the tolerances used", after, top))
     if after.excess.shape == before.excess.shape:
-        found.append(_fall(before, after, top))
-    return [*found, _samples(before)]
+        maps.append(_fall(before, after, top))
+    return [*maps, _samples(before)]
 
 
 def _title(m: Localisation, j: int, r: int) -> str:
@@ -108,8 +108,8 @@ def _grid(m: Localisation, cell: Any) -> list[tuple[str, list[Cell]]]:
 def _excess(title: str, m: Localisation, top: float) -> Heat:
     def cell(j: int, r: int) -> Cell:
         value = float(m.excess[j, r])
-        said = f"{_title(m, j, r)}; excess {words.number(value)}"
-        return _cell(value, "excess", top, bool(m.flagged[j, r]), said)
+        text = f"{_title(m, j, r)}; excess {words.number(value)}"
+        return _cell(value, "excess", top, bool(m.flagged[j, r]), text)
 
     return Heat(title, "excess over the floor; 0 is right", m.regimes, _grid(m, cell))
 
@@ -117,8 +117,8 @@ def _excess(title: str, m: Localisation, top: float) -> Heat:
 def _fall(before: Localisation, after: Localisation, top: float) -> Heat:
     def cell(j: int, r: int) -> Cell:
         value = float(before.excess[j, r] - after.excess[j, r])
-        said = f"{_title(before, j, r)}; excess falls by {words.number(value)}"
-        return _cell(value, "fall", top, False, said)
+        text = f"{_title(before, j, r)}; excess falls by {words.number(value)}"
+        return _cell(value, "fall", top, False, text)
 
     return Heat("Difference: before minus after", "purple: better, orange: worse", before.regimes, _grid(before, cell))
 
@@ -148,10 +148,10 @@ def size(candidate: Candidate) -> list[str]:
         if not values:
             continue
         if len(values) <= LONGEST:
-            said = ", ".join(words.number(v) for v in values)
+            text = ", ".join(words.number(v) for v in values)
         else:
-            said = f"{words.number(min(values))} to {words.number(max(values))}"
-        lines.append(f"{name} {said} {words.unit(candidate.effect, name)}".strip())
+            text = f"{words.number(min(values))} to {words.number(max(values))}"
+        lines.append(f"{name} {text} {words.unit(candidate.effect, name)}".strip())
     return lines
 
 
@@ -176,7 +176,7 @@ class Evidence:
 def evidence(result: GapResult) -> list[tuple[str, list[Evidence]]]:
     """Return the candidates in the order given, under a heading for each term of the search."""
     everyone = words.everyone(result)
-    found: dict[str, list[Evidence]] = {}
+    tables: dict[str, list[Evidence]] = {}
     for c in result.candidates:
         silent = c.status == "not excited"
         row = Evidence(
@@ -194,8 +194,8 @@ def evidence(result: GapResult) -> list[tuple[str, list[Evidence]]]:
             reason=c.reason,
         )
         heading = "Not excited by these logs" if silent else f"Term {c.stage} of the search"
-        found.setdefault(heading, []).append(row)
-    return list(found.items())
+        tables.setdefault(heading, []).append(row)
+    return list(tables.items())
 
 
 @dataclass(frozen=True)
@@ -214,18 +214,18 @@ class Value:
 
 def values(result: GapResult) -> list[Value]:
     """Return every value of the named effects, with its 95 % interval and its size in tolerances."""
-    found = []
+    rows = []
     for named in result.named:
         for name, by_joint in named.params.items():
-            p = words.param(named.effect, name)
+            p = words.param(named.effect, name, words.tolerances(result))
             for joint, value in by_joint.items():
                 pair = named.interval.get(name, {}).get(joint)
                 interval = f"{words.number(pair[0])} to {words.number(pair[1])}" if pair else words.NOTHING
                 graded = p is not None and math.isfinite(p.tolerance)
                 over = words.number(abs(value - p.null) / p.tolerance, 2) if p and graded else words.NOTHING
                 unit = words.unit(named.effect, name) or words.NOTHING
-                found.append(Value(named.effect, name, joint, words.number(value), interval, unit, over, named.status))
-    return found
+                rows.append(Value(named.effect, name, joint, words.number(value), interval, unit, over, named.status))
+    return rows
 
 
 def floors(result: GapResult) -> list[tuple[str, str, str, str, str]]:
@@ -235,11 +235,11 @@ def floors(result: GapResult) -> list[tuple[str, str, str, str, str]]:
     f = result.floors
     tables: Sequence[Mapping[str, float]] = (f.noise, f.numerical, f.repeatability or {})
     names = dict.fromkeys(name for table in tables for name in table)
-    found = []
+    rows = []
     for name in names:
         noise, numerical, repeated = (words.number(table.get(name)) for table in tables)
-        found.append((name, words.UNITS.get(name, ""), noise, numerical, repeated))
-    return found
+        rows.append((name, words.UNITS.get(name, ""), noise, numerical, repeated))
+    return rows
 
 
 def provenance(result: GapResult) -> list[tuple[str, list[tuple[str, str]]]]:

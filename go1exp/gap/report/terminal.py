@@ -18,7 +18,7 @@ def text(result: GapResult) -> str:
     """Return the summary for a terminal: plain text without markup, lines of up to 100 characters but for commands."""
     lines = [f"{result.verdict.upper()} (exit code {result.exit_code})", *_wrapped(result.sentence), ""]
     if result.named:
-        head = ("effect", "where", "size", "95 % interval", "status", "bags")
+        head = ("effect", "where", "size", "95 % interval", "status", "bootstraps")
         lines += [*_table([head, *_rows(result)]), ""]
     if result.excess:
         lines += _table([("held-out error", "floor 1"), *words.errors(result)])
@@ -44,19 +44,19 @@ def localisation_text(where: Localisation) -> str:
     for j, joint in enumerate(where.joints):
         cells = (short(float(where.excess[j, r])) + ("*" if where.flagged[j, r] else " ") for r in seen)
         rows.append((joint, *cells))
-    said = "Mean excess over the noise floor by joint and regime; 0 is right, * significant."
-    return "\n".join([said, *_table(rows)]) + "\n"
+    title = "Mean excess over the noise floor by joint and regime; 0 is right, * significant."
+    return "\n".join([title, *_table(rows)]) + "\n"
 
 
 def _rows(result: GapResult) -> list[tuple[str, ...]]:
-    found: list[tuple[str, ...]] = []
+    rows: list[tuple[str, ...]] = []
     for named in result.named:
         at = words.place(named.effect, named.joints, words.everyone(result))
-        bags = words.share(result.bags.get(named.effect, math.nan))
+        stable = words.share(result.bootstrap_share.get(named.effect, math.nan))
         name = " or ".join((named.effect, *words.rivals(named)))
         every = words.sizes(named)
         if not every:
-            found.append((name, at, words.NOTHING, words.NOTHING, named.status, bags))
+            rows.append((name, at, words.NOTHING, words.NOTHING, named.status, stable))
         for k, size in enumerate(every):
             pairs = named.interval.get(size.name, {}).values()
             interval = words.NOTHING
@@ -64,9 +64,9 @@ def _rows(result: GapResult) -> list[tuple[str, ...]]:
                 low, high = min(a for a, _ in pairs), max(b for _, b in pairs)
                 interval = f"{words.number(low)} to {words.number(high)}"
             first = (name, at) if k == 0 else ("", "")
-            last = (named.status, bags) if k == 0 else ("", "")
-            found.append((*first, f"{size.name} {size.short}", interval, *last))
-    return found
+            last = (named.status, stable) if k == 0 else ("", "")
+            rows.append((*first, f"{size.name} {size.short}", interval, *last))
+    return rows
 
 
 def _wrapped(sentence: str) -> list[str]:

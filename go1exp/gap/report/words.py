@@ -13,8 +13,9 @@ import numpy as np
 import go1exp.effects
 import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
 from go1exp.effects.base import Param
+from go1exp.effects.tolerances import DECLARED, Tolerances
+from go1exp.gap.answer import where
 from go1exp.gap.result import GapResult, GapSettings, Localisation, NamedEffect
-from go1exp.gap.verdict import where
 from go1exp.schema.registry import members
 
 NOTHING = "–"
@@ -66,17 +67,22 @@ def errors(result: GapResult) -> list[tuple[str, str]]:
     return [(ERRORS[k], error(result.excess[k])) for k in keys]
 
 
-def param(effect: str, name: str) -> Param | None:
+def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | None:
     """Return the declaration of a parameter, None for one that is not registered (any more)."""
     entry = members("effect").get(effect)
-    declared: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
-    return next((p for p in declared if p.name == name), None)
+    known: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
+    return tolerances.param((effect, name)) if any(p.name == name for p in known) else None
+
+
+def tolerances(result: GapResult) -> Tolerances:
+    """Return the tolerances that counted."""
+    return Tolerances.of(result.tolerances)
 
 
 def unit(effect: str, name: str) -> str:
     """Return the unit of a parameter, empty for none."""
-    found = param(effect, name)
-    return "" if found is None or found.unit == "-" else found.unit
+    declared = param(effect, name)
+    return "" if declared is None or declared.unit == "-" else declared.unit
 
 
 def meaning(effect: str) -> str:
@@ -87,8 +93,8 @@ def meaning(effect: str) -> str:
 
 def is_size(effect: str, name: str) -> bool:
     """Return whether a parameter says how much of the effect there is, as opposed to its shape."""
-    found = param(effect, name)
-    return found is None or math.isfinite(found.tolerance)
+    declared = param(effect, name)
+    return declared is None or math.isfinite(declared.tolerance)
 
 
 def of_robot(effect: str) -> bool:
@@ -149,7 +155,7 @@ class Size:
 
 def sizes(named: NamedEffect) -> list[Size]:
     """Return the parameters that say how much of a named effect there is."""
-    found = []
+    rows = []
     for name, by_joint in named.params.items():
         values = np.array(list(by_joint.values()), dtype=float)
         if not len(values) or not is_size(named.effect, name):
@@ -157,8 +163,8 @@ def sizes(named: NamedEffect) -> list[Size]:
         widths = [0.5 * (b - a) for a, b in named.interval.get(name, {}).values()]
         half = float(np.mean(widths)) if widths else math.nan
         low, high = float(values.min()), float(values.max())
-        found.append(Size(name, float(values.mean()), half, low, high, len(values), unit(named.effect, name)))
-    return found
+        rows.append(Size(name, float(values.mean()), half, low, high, len(values), unit(named.effect, name)))
+    return rows
 
 
 def rivals(named: NamedEffect) -> tuple[str, ...]:
@@ -168,8 +174,8 @@ def rivals(named: NamedEffect) -> tuple[str, ...]:
 
 def limit(result: GapResult, name: str) -> float:
     """Return a limit of the settings (``adequate``, ``certified``), from the provenance if it says them."""
-    said = result.provenance.get("settings")
-    value = said.get(name) if isinstance(said, Mapping) else None
+    settings = result.provenance.get("settings")
+    value = settings.get(name) if isinstance(settings, Mapping) else None
     return float(value if isinstance(value, int | float) else getattr(GapSettings(), name))
 
 
@@ -187,34 +193,38 @@ def would_change(result: GapResult) -> list[str]:
     allowed = number(1.0 + limit(result, "adequate"))
     final, box = (result.excess.get(k, math.nan) for k in ("final", "box"))
     rest = worst(result.after)
-    found = []
+    changes = []
     if result.verdict == "bad log":
-        found.append("Recordings without these flaws; the command go1exp record audit FILE says whether they are gone.")
+        changes.append(
+            "Recordings without these flaws; the command go1exp record audit FILE says whether they are gone."
+        )
     elif result.verdict == "not excited":
-        found.append("Recordings that move more: the last section says which.")
+        changes.append("Recordings that move more: the last section says which.")
     elif result.verdict == "no gap":
-        found.append(f"A held-out error above {allowed} that the tolerances cannot take up; it is {error(box)}.")
+        changes.append(f"A held-out error above {allowed} that the tolerances cannot take up; it is {error(box)}.")
     elif result.verdict == "explained":
-        found.append(f"A held-out error above {allowed} in spite of what is named; it is {error(final)}.")
+        changes.append(f"A held-out error above {allowed} in spite of what is named; it is {error(final)}.")
     else:
         at = f", largest at {rest}" if rest else ""
-        found.append(
+        changes.append(
             f"An effect that takes the held-out error to {allowed} or less; {error(final)} is left{at}. "
             "No effect of the library does."
         )
     for named in result.named:
         if rivals(named):
-            found.append(f"Data that separate {named.effect} from {' and '.join(rivals(named))} may change the name.")
+            changes.append(f"Data that separate {named.effect} from {' and '.join(rivals(named))} may change the name.")
         if named.status == "compensating":
             bar = share(limit(result, "certified"))
-            found.append(f"{named.effect} is certified only if it is found in {bar} of the bags and little is left.")
+            changes.append(
+                f"{named.effect} is certified only if it is named again in {bar} of the bootstraps and little is left."
+            )
     if result.verdict == "unexplained" and result.candidates:
         near = max(result.candidates, key=lambda c: c.log_gain)
         if near.status == "rejected":
-            found.append(f"The nearest was {near.effect}: {near.reason}.")
+            changes.append(f"The nearest was {near.effect}: {near.reason}.")
     if result.verdict in ("no gap", "explained") and result.not_excited:
-        found.append("Motions that show what these logs cannot (last section) may reveal more.")
-    return found
+        changes.append("Motions that show what these logs cannot (last section) may reveal more.")
+    return changes
 
 
 @dataclass(frozen=True)
@@ -241,13 +251,13 @@ def record(names: Sequence[str], *more: str, out: str) -> str:
 def next_recordings(result: GapResult) -> list[Next]:
     """Return what to record next: first what tells apart equals, then what shows effects that these logs cannot."""
     known = members("excitation")
-    found: list[Next] = []
+    recordings: list[Next] = []
     for sentence in result.advice:
         names = [name for name in known if re.search(rf"\b{re.escape(name)}\b", sentence)]
         more = re.findall(r"\b((?:gains|hang)=\[\[[-\d.,\[\]]*\]\])", sentence)
         if names or more:
-            out = f"recordings/apart{len(found) + 1 if found else ''}"
-            found.append(Next(sentence, record(names or ["chirp", "steps"], *more, out=out)))
+            out = f"recordings/apart{len(recordings) + 1 if recordings else ''}"
+            recordings.append(Next(sentence, record(names or ["chirp", "steps"], *more, out=out)))
     by_name: dict[str, list[str]] = {}
     for effect, name in result.not_excited.items():
         if name in known:
@@ -257,5 +267,5 @@ def next_recordings(result: GapResult) -> list[Next]:
         if names:
             effects = tuple(effect for name in names for effect in by_name[name])
             why = "Shows what a robot feels only on its feet." if ground else "Shows what these logs cannot."
-            found.append(Next(why, record(names, out=out), effects))
-    return found
+            recordings.append(Next(why, record(names, out=out), effects))
+    return recordings

@@ -1,0 +1,81 @@
+"""What an identification must know of an effect beside its law: where to look for it, and with what it is confused.
+
+Every effect carries one :class:`Identification` (``Effect.identification``); the gap workflow reads it and knows no
+effect by name. The defaults suit an effect of the joints that most models leave out and that any motion shows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+MEAN_ANGLE = math.nan
+"""Stands in ``Identification.shapes`` for the angle at which each joint is on average, rad."""
+
+LAST = 100
+"""Rank of an effect that does not choose one."""
+
+TWO_KD = "record torque_off swings, or two values of kd (gains=[[20,0.5],[20,1.0]])"
+TWO_ATTITUDES = "record two attitudes of the trunk (hang=[[0,0],[0,0.5]])"
+SHARP_EDGES = "record steps, whose edges tell a delay from a lag"
+TWO_GAIN_SETS = "record slow_ramps and a chirp at two gain sets"
+
+
+@dataclass(frozen=True)
+class Periodic:
+    """Parameters of a torque that is periodic in the angle: amplitude sin(count q + phase).
+
+    For one ``count`` it is linear in amplitude cos(phase) and amplitude sin(phase), so these two are fitted; ``count``
+    is tried value by value.
+
+    Attributes:
+        amplitude: name of the parameter with a tolerance.
+        phase: name of the phase, rad.
+        count: name of the number of periods per turn.
+        counts: values of ``count`` to try.
+    """
+
+    amplitude: str
+    phase: str
+    count: str
+    counts: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """How an effect is looked for in recordings.
+
+    Attributes:
+        nominal: every model has a value for it, if only the null one, so it may move within its tolerance from the
+            start (the tolerance box). An effect that is not nominal must be missing beyond doubt before it is used.
+        rank: place among the nominal effects, smaller first, then in the order of registration. Resampling draws its
+            random numbers in this order, so a change of it changes intervals within their own uncertainty.
+        needs_ground: it acts on the trunk or on the feet; a robot whose trunk is held does not feel it.
+        common: its parameters have one value for all joints. For effects that few joints ever show.
+        weighs_on_legs: one such error, equal at all joints, moves the legs of a standing robot as a change of weight
+            does; an effect of the trunk must explain recordings better than it.
+        levels: changes from null, by parameter, in its unit, at which it is probed; each may become the start of a fit.
+            For effects with a threshold, or far from linear. Empty: twice the tolerance of each parameter.
+        shapes: values of its shape parameters with which it is tried. Empty: their null values.
+        free_shapes: shape parameters that a full fit may change.
+        periodic: its parameters, if it is a torque that is periodic in the angle.
+        simpler: effect that explains nearly the same with fewer numbers, and is taken where it does as well.
+        excitation: motion that shows it best (``go1exp list excitations``).
+        confounded: effects that many recordings cannot tell from it. It is enough if one of two names the other.
+        told_apart_by: what to record to tell them apart, the end of a sentence that begins with "record".
+    """
+
+    nominal: bool = False
+    rank: int = LAST
+    needs_ground: bool = False
+    common: bool = False
+    weighs_on_legs: bool = False
+    levels: tuple[Mapping[str, float], ...] = ()
+    shapes: tuple[Mapping[str, float], ...] = ()
+    free_shapes: tuple[str, ...] = ()
+    periodic: Periodic | None = None
+    simpler: str = ""
+    excitation: str = "chirp"
+    confounded: tuple[str, ...] = ()
+    told_apart_by: str = ""

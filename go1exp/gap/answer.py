@@ -1,0 +1,300 @@
+"""From a search to an answer: named effects with intervals, the verdict, the sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from go1exp.effects.tolerances import Tolerances, declared, effect_class, sizes
+from go1exp.gap.replay.rows import Key, Theta
+from go1exp.gap.result import Candidate, NamedEffect, Verdict
+from go1exp.gap.score.linear import Layout
+from go1exp.gap.search import significance, tolerances
+from go1exp.gap.search.evidence import inaudible
+from go1exp.gap.search.fit import fit
+from go1exp.gap.search.stepwise import SILENT, Search
+from go1exp.gap.search.trial import excess, removed
+from go1exp.schema.registry import members
+
+MOST = 0.75
+"""Share of the excess that terms must remove before the first of them is certified although a gap remains."""
+
+QUANTILES = (0.025, 0.975)
+"""Of a 95 % interval."""
+
+FEWEST_BOOTSTRAPS = 20
+"""Resamples from which an interval can be read, also where the user asks for fewer."""
+
+LAW = 0.04
+"""Relative standard deviation of a value because no robot follows a law of the library exactly: the intervals of sealed
+effects (265 values), widened to it, hold 89 % of the truths; with 2 %, 76 %."""
+
+
+def told_apart(names: Sequence[str]) -> tuple[str, ...]:
+    """Return what to record to tell apart effects that are confounded, each thing once; empty if none of them says."""
+    how = {name: tolerances.identification(name) for name in names}
+    return tuple(
+        dict.fromkeys(
+            how[first].told_apart_by if second in how[first].confounded else how[second].told_apart_by
+            for first, second in combinations(names, 2)
+            if second in how[first].confounded or first in how[second].confounded
+        )
+    )
+
+
+def advice(aliases: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Return what to record to tell apart the members of alias sets."""
+    sentences = []
+    for names in aliases.values():
+        if len(names) > 1:
+            what = ", and ".join(told_apart(names)) or "record chirp and steps"
+            sentences.append(f"These logs cannot tell {' from '.join(names)}; {what} to separate them.")
+    return tuple(sentences)
+
+
+def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str]:
+    """Return effects that these data cannot show, and the excitation that would; ``held``: the trunk is."""
+    silent = [effect for effect, loud in signal.items() if loud < SILENT]
+    unfelt = [effect for effect in members("effect") if held and tolerances.identification(effect).needs_ground]
+    return {effect: tolerances.identification(effect).excitation for effect in (*silent, *unfelt)}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a search comes to.
+
+    Attributes:
+        verdict: one of six.
+        named: effects that the data ask for, strongest first.
+        theta: values of the model with them.
+        excess: as in :class:`~go1exp.gap.result.GapResult`.
+        closed: share of the held-out excess that the named effects removed; NaN without one.
+    """
+
+    verdict: Verdict
+    named: tuple[NamedEffect, ...]
+    theta: Theta
+    excess: dict[str, float]
+    closed: float
+
+
+def concluded(search: Search, warnings: list[str]) -> Answer:
+    """Come to an answer: terms that held-out episodes or resamples do not support are withdrawn from the search.
+
+    Args:
+        search: that is done.
+        warnings: to which what was withdrawn is added.
+    """
+    settings = search.settings
+    plain = excess(search.state.held_out({}))
+    if search.state.terms and not search.confirmed():
+        warnings.append(
+            f"Withdrawn, since episodes kept for a last check do not bear it out: {', '.join(search.state.terms)}."
+        )
+        search.withdraw("episodes kept for a last check do not bear it out")
+    first, final = search.first, search.steps[-1][1]
+    theta, drawn = resampled_values(search)
+    named = name_terms(search, theta, drawn, final <= settings.adequate, removed(first, final) > MOST)
+    if named and first <= settings.adequate and not any(n.status == "certified" for n in named):
+        doubtful = ", ".join(n.effect for n in named)
+        warnings.append(f"Withdrawn, since the tolerances explain these logs and nothing else is sure: {doubtful}.")
+        search.withdraw("the tolerances suffice, and resamples of the logs do not agree on it")
+        final, theta, named = search.first, search.state.theta, ()
+    verdict = decide(search, first, final)
+    reached = {"null": plain, "box": first, "final": final}
+    if len(search.splits.confirm):
+        confirmed = reached["confirm"] = excess(search.state.held_out(windows=search.splits.confirm))
+        if named and verdict == "explained" and confirmed > 2.0 * settings.adequate:
+            verdict = "partly explained"
+            warnings.append(f"On episodes kept for a last check the error is {1 + confirmed:.3g} times the floor.")
+    return Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan)
+
+
+def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
+    """Fit once more, on all windows but those for the last check, and bootstrap the fit; nothing to do without terms.
+
+    Returns:
+        The values, and by parameter of the terms their resampled values (B, J) or (B, 1).
+    """
+    scorer, machine = search.state.scorer, search.state.machine
+    if not search.state.terms:
+        return search.state.theta, {}
+    fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
+    linear = search.state.linear(search.state.theta, fitted)
+    (best,) = fit(scorer, [search.state.model(search.state.theta)], linear, 1, search.dt)
+    assert best.chi2 is not None
+    layout = Layout.of(machine, linear.probes)
+    grams = linear.grams(scorer) / np.maximum(best.chi2, 1.0)[..., None, None]
+    limits = tolerances.bounds(layout, linear.probes, search.state.theta, search.state.may)
+    episode = scorer.windows.episode[fitted]
+    drawn: dict[Key, list[np.ndarray]] = {}
+    spread = 1.0 / np.sqrt(limits.weight)
+    for _ in range(max(search.settings.bootstraps, FEWEST_BOOTSTRAPS)):
+        matrix, right = layout.total(grams[significance.resampled(episode, search.rng)])
+        # The nominal values are themselves uncertain by their tolerances, and motion fixes many of them only relative
+        # to each other: drawing where they lie puts that uncertainty into the interval.
+        centre = limits.centre + spread * search.rng.standard_normal(layout.size)
+        x = tolerances.solve(matrix, right, replace(limits, centre=centre))
+        for key, value in tolerances.moved(search.state.theta, layout, linear.probes, x, machine).items():
+            if key[0] in search.state.terms:
+                null = search.state.tolerances.param(key).null
+                law = 1.0 + LAW * search.rng.standard_normal(value.shape)
+                drawn.setdefault(key, []).append(null + (value - null) * law)
+    return best.theta, {key: np.stack([np.ravel(v) for v in values]) for key, values in drawn.items()}
+
+
+def name_terms(
+    search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], adequate: bool, mostly: bool
+) -> tuple[NamedEffect, ...]:
+    """Return the accepted effects with intervals, at the joints where they leave their tolerances beyond doubt.
+
+    Args:
+        search: that accepted them.
+        theta: fitted values.
+        drawn: resampled values by parameter (B, J) or (B, 1).
+        adequate: whether the model with them counts as right.
+        mostly: whether they remove most of the excess, so that the first may be certified although a gap remains.
+    """
+    joints, known = search.state.scorer.windows.joints, search.state.tolerances
+    named = []
+    for number, effect in enumerate(search.state.terms):
+        per_joint = [key for key in sizes(effect) if known.param(key).per == "joint"]
+        at = _joints_beyond(per_joint, theta, drawn, joints, known)
+        params: dict[str, dict[str, float]] = {}
+        interval: dict[str, dict[str, tuple[float, float]]] = {}
+        for key in (key for key in theta if key[0] == effect):
+            samples = drawn.get(key, np.ravel(theta[key])[None])
+            params[key[1]], interval[key[1]] = _by_joint(key, theta[key], samples, joints, at)
+        stable = search.shares.get(effect, 0.0) >= search.settings.certified
+        somewhere = bool(at) or not per_joint
+        certified = stable and somewhere and (adequate or (number == 0 and mostly))
+        status = "certified" if certified else "compensating"
+        named.append(
+            NamedEffect(effect, at, params, interval, search.aliases[effect], status)  # type: ignore[arg-type]
+        )
+    return tuple(named)
+
+
+def _joints_beyond(
+    keys: Sequence[Key], theta: Theta, drawn: Mapping[Key, np.ndarray], joints: Sequence[str], known: Tolerances
+) -> tuple[str, ...]:
+    """Return the joints at which one of the parameters leaves its tolerance, and is not null, beyond doubt."""
+    beyond, at_best = np.zeros(len(joints), dtype=bool), np.zeros(len(joints), dtype=bool)
+    for key in keys:
+        p = known.param(key)
+        low, high = np.quantile(drawn[key], QUANTILES, axis=0)
+        value = np.broadcast_to(theta[key], len(joints))
+        at_best |= np.abs(value - p.null) > p.tolerance
+        beyond |= (np.abs(value - p.null) > p.tolerance) & ((low > p.null) | (high < p.null))
+    if not beyond.any():  # few windows show it: a resample without them does not show where it is
+        beyond = at_best
+    return tuple(j for j, b in zip(joints, beyond, strict=True) if b)
+
+
+def _by_joint(
+    key: Key, value: np.ndarray, samples: np.ndarray, joints: Sequence[str], at: Sequence[str]
+) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Return the values and the 95 % intervals of a parameter by joint (those of ``at``), or by ``robot``."""
+    names = joints if declared(key).per == "joint" else ("robot",)
+    values = np.broadcast_to(np.ravel(value), len(names))
+    low, high = (np.broadcast_to(v, len(names)) for v in np.quantile(samples, QUANTILES, axis=0))
+    kept = [k for k, n in enumerate(names) if n == "robot" or n in at]
+    intervals = {names[k]: (float(min(low[k], values[k])), float(max(high[k], values[k]))) for k in kept}
+    return {names[k]: float(values[k]) for k in kept}, intervals
+
+
+def decide(search: Search, first: float, final: float) -> Verdict:
+    """Return the verdict from the held-out excesses within the tolerances, and with the terms."""
+    settings = search.settings
+    loud = [effect for effect, s in search.signal.items() if s >= SILENT]
+    if search.state.terms:
+        return "explained" if final <= settings.adequate else "partly explained"
+    if first > settings.adequate:
+        return "unexplained"
+    return "not excited" if len(loud) < 0.5 * len(search.signal) else "no gap"
+
+
+def where(joints: Sequence[str], everyone: Sequence[str]) -> str:
+    """Say which joints, by kind or leg if they are all of one."""
+    chosen = set(joints)
+    if chosen == set(everyone):
+        return "all joints"
+    kinds, legs = {j.rsplit("_", 1)[-1] for j in chosen}, {j.split("_", 1)[0] for j in chosen}
+    for names, kind in ((kinds, lambda j: j.rsplit("_", 1)[-1]), (legs, lambda j: j.split("_", 1)[0])):
+        if chosen == {j for j in everyone if kind(j) in names} and len(names) < len(chosen):
+            return f"the {' and '.join(sorted(names))} joints"
+    return ", ".join(joints)
+
+
+def sentence(answer: Answer, search: Search, silent: Mapping[str, str], more: Sequence[str]) -> str:
+    """Put the answer into words.
+
+    Args:
+        answer: what the search comes to.
+        search: that is done.
+        silent: effects that the data cannot show.
+        more: what to record next, a sentence each.
+    """
+    everyone = search.state.scorer.windows.joints
+    first, final = 1.0 + answer.excess["box"], 1.0 + answer.excess["final"]
+    parts = [_opening(answer.verdict, first), *(_lacking(effect, everyone) for effect in answer.named)]
+    if answer.named:
+        parts.append(
+            f"With that the held-out error falls from {first:.3g} to {final:.3g} times the noise floor (floor 1)."
+        )
+    if answer.verdict == "partly explained":
+        parts.append("The rest is explained by nothing in the library, so what is named may stand for something else.")
+    rejected = [c.effect for c in search.candidates if c.status == "rejected" and c.stage == 1][:2]
+    if answer.named and rejected:
+        parts.append(f"{' and '.join(rejected)} {'was' if len(rejected) == 1 else 'were'} considered and rejected.")
+    quiet = [
+        effect for effect in silent if effect in search.signal or not tolerances.identification(effect).needs_ground
+    ]
+    if quiet:
+        parts.append(f"These logs cannot show {', '.join(quiet)}.")
+    return " ".join([*filter(None, parts), *more])
+
+
+def _opening(verdict: Verdict, first: float) -> str:
+    """Return the sentence of a verdict that names nothing; ``first`` is the error within the tolerances, in floors."""
+    return {
+        "no gap": f"The model agrees with these logs within its tolerances: error {first:.3g} times the noise floor.",
+        "not excited": "These logs move too little to compare the model with.",
+        "unexplained": f"The model is wrong, with an error of {first:.3g} times the noise floor, and no effect of the "
+        "library explains it.",
+    }.get(verdict, "")
+
+
+def _lacking(effect: NamedEffect, everyone: Sequence[str]) -> str:
+    """Return the sentence about one effect that the model lacks."""
+    texts = []
+    for _, name in sizes(effect.effect):
+        values = np.array(list(effect.params.get(name, {}).values()))
+        if len(values):
+            p = declared((effect.effect, name))
+            half = np.mean([0.5 * (b - a) for a, b in effect.interval[name].values()])
+            spread = f", {values.min():.3g} to {values.max():.3g}" if len(values) > 1 else ""
+            unit = "" if p.unit == "-" else f" {p.unit}"
+            texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}")
+    at = f" at {where(effect.joints, everyone)}" if effect.joints else ""
+    doubt = "" if effect.status == "certified" else " (compensating, not certified)"
+    title = f"{effect_class(effect.effect).title} ({effect.effect})"
+    return f"The model lacks {title}{at}: {'; '.join(texts)}{doubt}."
+
+
+def evidence(search: Search) -> tuple[Candidate, ...]:
+    """Return the candidates, best first, with those that the data cannot show."""
+    quiet = inaudible(search.signal, SILENT, [c.effect for c in search.candidates])
+    accepted = {c.effect for c in search.candidates if c.status == "accepted"} - set(search.state.terms)
+    kept = [
+        replace(c, status="rejected", reason="dropped: the other terms do as well without it")
+        if c.status == "accepted" and c.effect in accepted
+        else c
+        for c in search.candidates
+    ]
+    order = {"accepted": 0, "alias": 1, "rejected": 2}
+    return (*sorted(kept, key=lambda c: (c.stage, order[c.status])), *quiet)

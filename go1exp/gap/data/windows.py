@@ -1,0 +1,130 @@
+"""Windows: short pieces of recordings, with what to replay and what to compare it with."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+PAST_S = 0.064
+"""Commands before a window that are kept, s: the longest command delay that an effect may have, and a little."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """W windows of at most n samples of C quantities of J joints; what is missing has weight 0.
+
+    Attributes:
+        joints: their names.
+        quantities: names of the C quantities.
+        period: the logger's, s.
+        episode: (W,) index of the recording.
+        begin: (W,) time of the initial state by the recording's clock, s.
+        origin: (W,) time at which the recording begins, by the same clock, s.
+        q: (W, J) initial state, rad.
+        qd: (W, J) rad/s.
+        qdd: (W, J) rad/s2.
+        q_sd: (W, J) its standard deviation.
+        qd_sd: (W, J)
+        kp: (W, J) gains.
+        kd: (W, J)
+        t: (W, n) times of the samples since the initial state, s.
+        y: (W, n, C, J) what was measured.
+        scale: (W, C, J) standard deviation of its noise.
+        valid: (W, n) bool.
+        edges: per window, times (E,) since the initial state and targets (E, J) in force from each on.
+        switches: per window, times (E,) and whether the drives are on from each on.
+        length: time to replay, s.
+    """
+
+    joints: tuple[str, ...]
+    quantities: tuple[str, ...]
+    period: float
+    episode: np.ndarray
+    begin: np.ndarray
+    origin: np.ndarray
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    q_sd: np.ndarray
+    qd_sd: np.ndarray
+    kp: np.ndarray
+    kd: np.ndarray
+    t: np.ndarray
+    y: np.ndarray
+    scale: np.ndarray
+    valid: np.ndarray
+    edges: tuple[tuple[np.ndarray, np.ndarray], ...]
+    switches: tuple[tuple[np.ndarray, np.ndarray], ...]
+    length: float
+
+    def __len__(self) -> int:
+        return len(self.episode)
+
+    @property
+    def elapsed(self) -> np.ndarray:
+        """(W,) time of the initial state since the episode began, s."""
+        return self.begin - self.origin
+
+    @property
+    def of_joints(self) -> int:
+        """How many of the quantities, the first ones, are the joints'."""
+        return len(self.quantities)
+
+    @property
+    def base_sd(self) -> np.ndarray:
+        """(W, B) standard deviations of a free base's initial state; B is 0 for one that is held."""
+        return np.empty((len(self), 0))
+
+    @property
+    def channels(self) -> tuple[tuple[str, int, int], ...]:
+        """Name, quantity and place of every reading."""
+        return tuple((f"{q}_{j}", c, i) for c, q in enumerate(self.quantities) for i, j in enumerate(self.joints))
+
+    def by_quantity(self, values: np.ndarray) -> dict[str, float]:
+        """Return the median of values (W, C, J) by quantity."""
+        return {name: float(np.median(values[:, c])) for c, name in enumerate(self.quantities)}
+
+    def unknown(self, y: np.ndarray) -> list[np.ndarray]:
+        """Return changes of the readings ``y`` (W, n, C, J) per standard deviation of what sensors may be off by."""
+        return []
+
+    def loads(self) -> np.ndarray | None:
+        """Return which joints' legs carry weight (W, n, J) bool; None for a robot that is held."""
+        return None
+
+    @property
+    def observable(self) -> tuple[str, ...]:
+        """Quantities that a simulation can tell, whether they are compared or not."""
+        return (*self.quantities[:2], "tau_est")
+
+    def moved(self, x: np.ndarray) -> Windows:
+        """Return windows whose initial states are moved by ``x`` (W, 2 J + B) standard deviations."""
+        joints = len(self.joints)
+        q, qd = x[:, :joints], x[:, joints : 2 * joints]
+        return dataclasses.replace(self, q=self.q + q * self.q_sd, qd=self.qd + qd * self.qd_sd)
+
+
+def averaged(changes: tuple[np.ndarray, np.ndarray], times: np.ndarray) -> np.ndarray:
+    """Return the means (K, ...) of a held signal over the even steps that begin at ``times`` (K,).
+
+    That is second order in the step for changes between steps too, as the plant lets a change at the beginning of a
+    step count for half of it.
+    """
+    at, values = changes
+    place = (at - times[0]) / (times[1] - times[0])
+    index = np.searchsorted(place, np.arange(len(times)) + 1e-6, side="right") - 1
+    mean = np.array(values[index.clip(0)], dtype=float)
+    step = np.floor(place + 1e-6).astype(int)
+    share = 1.0 - (place - step)
+    for k in np.flatnonzero((step >= 0) & (step < len(times)) & (place - step > 1e-6)):
+        if k:  # the first is in force from the beginning
+            mean[step[k]] += share[k] * (values[k] - values[k - 1])
+    return mean
+
+
+def held(changes: tuple[np.ndarray, np.ndarray], times: np.ndarray) -> np.ndarray:
+    """Return the values (K, ...) of a held signal at even ``times`` (K,); it changes at the nearest of them."""
+    index = np.searchsorted(changes[0], times + 0.49 * (times[1] - times[0]), side="right") - 1
+    return np.asarray(changes[1][index.clip(0)])

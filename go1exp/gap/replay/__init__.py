@@ -1,0 +1,1 @@
+"""The model run through windows of recordings, many variants side by side."""

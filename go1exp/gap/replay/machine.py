@@ -1,0 +1,48 @@
+"""What the gap workflow must know of a robot to replay it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import go1exp.actuator
+import go1exp.effects  # noqa: F401  (registers every effect)
+from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import Tolerances
+from go1exp.schema.registry import Term, bind
+
+NEEDLESS = 1 << 4 | 1 << 13
+"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
+
+
+class Machine(Protocol):
+    """A robot that can be replayed."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints."""
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Joints that move together, equally many in each group; groups do not feel each other."""
+
+    @property
+    def base_probe(self) -> tuple[float, ...]:
+        """Changes of a free base's initial state by which its influence is measured; empty for one that is held."""
+
+    @property
+    def tolerances(self) -> Tolerances:
+        """How far the nominal parameters may be off."""
+
+    def drive(self) -> Term:
+        """Return what turns commands into torques."""
+
+    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` held robots, and their drives."""
+
+
+def pd() -> Term:
+    """Return the ideal PD law."""
+    term = bind("actuator", "pd", {}, "pd")[0]
+    assert term is not None
+    return term

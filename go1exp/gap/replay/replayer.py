@@ -1,0 +1,187 @@
+"""The model run through windows of recordings, many variants side by side, on the plant that training uses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import go1exp.effects  # noqa: F401  (registers every effect)
+from go1exp.drive import DriveSetup
+from go1exp.effects.base import Measured
+from go1exp.env.plant import FRICTION, Plant
+from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
+from go1exp.gap.replay.machine import Machine
+from go1exp.gap.replay.rows import Rows
+from go1exp.schema.registry import bind
+
+
+@dataclass
+class Replayer:
+    """Runs the model through windows; keeps its batches of simulations for the next call.
+
+    Attributes:
+        machine: the robot.
+        windows: what to replay.
+        quats: (W, 4) attitude of the base.
+        max_rows: simulations side by side.
+        threads: of the engine.
+    """
+
+    machine: Machine
+    windows: Windows
+    quats: np.ndarray
+    max_rows: int
+    threads: int
+    made: int = 0
+    _backends: dict[Any, tuple[Any, DriveSetup, set[str]]] = field(default_factory=dict)
+    _inputs: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)
+
+    def run(self, rows: Rows, dt: float) -> np.ndarray:
+        """Return what sensors would measure (R, n, C, J) at the windows' sample times."""
+        w = self.windows
+        y = np.empty((len(rows.window), w.t.shape[1], len(w.quantities), len(w.joints)))
+        attitudes, which = np.unique(self.quats[rows.window].round(6), axis=0, return_inverse=True)
+        for k, quat in enumerate(attitudes):
+            mine = np.flatnonzero(which.ravel() == k)
+            pieces = int(np.ceil(len(mine) / self.max_rows))
+            for piece in np.array_split(mine, pieces):
+                size = min(padded(len(piece)), self.max_rows)
+                full = np.concatenate([piece, np.repeat(piece[-1:], size - len(piece))])
+                y[piece] = self._batch(rows.part(full), dt, tuple(float(v) for v in quat))[: len(piece)]
+        return y
+
+    def _plant(self, rows: Rows, dt: float, quat: tuple[float, ...]) -> Plant:
+        """Return a plant whose effects are exactly those of ``rows``, on a backend that may be an old one."""
+        key = (len(rows.window), dt, quat)
+        if key not in self._backends:
+            self._backends[key] = (*self.machine.build(len(rows.window), dt, quat, self.threads), set())
+        backend, setup, touched = self._backends[key]
+        for name in touched:
+            backend.field(name).copy_(backend.compiled(name))
+        if touched:
+            backend.derive_constants(torch.ones(len(rows.window), dtype=torch.bool))
+        names = list(dict.fromkeys(effect for effect, _ in rows.values))
+        terms = [bind("effect", name, {}, name)[0] for name in names]
+        plant = Plant(backend, setup, self.machine.drive(), [term for term in terms if term is not None])
+        touched |= set(plant.effects.fields) | {FRICTION, "dof_armature"}
+        for (effect, parameter), value in rows.values.items():
+            live = getattr(plant.effects.effects[effect], parameter)
+            live.copy_(torch.as_tensor(value))
+        kp, kd = (torch.as_tensor(v[rows.window]) for v in (self.windows.kp, self.windows.kd))
+        plant.set_gains(kp, kd)
+        plant.refresh()
+        return plant
+
+    def _begin(self, plant: Plant, rows: Rows, past: Tensor, dt: float) -> None:
+        """Put the robots into their windows' initial states, as the encoders see them."""
+        w = self.windows
+        q, qd = torch.as_tensor(w.q[rows.window]), torch.as_tensor(w.qd[rows.window])
+        if rows.q is not None and rows.qd is not None:
+            q, qd = q + torch.as_tensor(rows.q), qd + torch.as_tensor(rows.qd)
+        everyone = torch.ones(len(q), dtype=torch.bool)
+        effects, backend = plant.effects, plant.backend
+        plant.enabled = None
+        backend.reset(everyone, *self._state(plant, rows, q, qd))
+        plant.reset(everyone, past[0])
+        seen, _ = effects.on_encoder(q, qd)
+        true = q - (seen - q)
+        if effects.rotors:  # the twist under the torque that the drive makes at this pose
+            torque = plant.actuator.torque(past[-1], q, qd)
+            gears = effects.gears()
+            twist = gears.compliance * torque + 0.5 * gears.gap * torque.sign()
+            true = true - twist
+        half = 0.5 * dt * torch.as_tensor(w.qdd[rows.window])  # the engine's speeds are half a step old
+        backend.reset(everyone, *self._state(plant, rows, true, qd - 3.0 * half))
+        plant.reset(everyone, past[-1])
+        plant.qd.copy_(qd - half)
+        if effects.rotors:
+            effects.rotors.twist.copy_(twist)
+        for target in past:  # what a delayed command remembers
+            effects.on_target(target)
+        for effect in effects.effects.values():
+            if hasattr(effect, "_time"):
+                effect._time.copy_(torch.as_tensor(w.elapsed[rows.window]).unsqueeze(1))
+
+    def _state(self, plant: Plant, rows: Rows, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the coordinates and speeds of robots whose joints are at ``q`` (R, J) and ``qd``."""
+        return q, qd
+
+    def observing(self, windows: Windows) -> Replayer:
+        """Return a replayer of the same windows with other quantities (``Windows.observable``): with torques."""
+        return Replayer(self.machine, windows, self.quats, self.max_rows, self.threads)
+
+    def _recorder(self, steps: int, rows: int) -> Any:
+        """Return what records more than the joints, or None."""
+        return None
+
+    def _signals(self, dt: float) -> tuple[Tensor, Tensor]:
+        """Return targets (K, W, J) and whether drives are on (K, W) at every step, the past included."""
+        if dt not in self._inputs:
+            w = self.windows
+            steps = np.arange(-round(PAST_S / dt), int(np.ceil(w.length / dt)) + 1) * dt
+            targets = np.stack([averaged(changes, steps) for changes in w.edges], axis=1)
+            enabled = np.stack([held(changes, steps) for changes in w.switches], axis=1)
+            self._inputs[dt] = torch.as_tensor(targets), torch.as_tensor(enabled)
+        return self._inputs[dt]
+
+    def _batch(self, rows: Rows, dt: float, quat: tuple[float, ...]) -> np.ndarray:
+        """Run a batch, all windows at once."""
+        w = self.windows
+        plant = self._plant(rows, dt, quat)
+        index = torch.as_tensor(rows.window)
+        targets, enabled = self._signals(dt)
+        targets, enabled = targets[:, index], enabled[:, index]
+        past = round(PAST_S / dt)
+        self._begin(plant, rows, targets[:past], dt)
+        always = bool(enabled.all())
+        steps = len(targets) - past
+        first = max(int(np.floor(w.t[:, 0].min() / dt)) - 1, 0)
+        kept = steps - first
+        shape = (kept, len(index), len(w.joints))
+        q, qd, torque = np.empty(shape), np.empty(shape), np.empty(shape) if "tau_est" in w.quantities else None
+        senses = plant.effects.senses
+        recorder = self._recorder(kept, len(index))
+        for k in range(steps):
+            if k >= first:
+                seen = Measured(plant.q, plant.speed())
+                if senses:
+                    seen = plant.effects.measure(seen)
+                q[k - first], qd[k - first] = seen.joint_pos.numpy(), seen.joint_vel.numpy()
+                if recorder is not None:
+                    recorder.record(k - first, plant)
+            if not always:
+                plant.enabled = enabled[past + k]
+            plant.step(targets[past + k])
+            if torque is not None and k >= first:
+                torque[k - first] = plant.torque.numpy()
+        self.made += len(index) * steps
+        at = w.t[rows.window] / dt - first
+        y = _sampled(q, qd, torque, at, dt)
+        return y if recorder is None else recorder.joined(y, at, plant, dt)
+
+
+def padded(rows: int) -> int:
+    """Return how many simulations to make for ``rows``: at most a quarter, or 7, more, so that few sizes are built."""
+    step = min(max(8, 1 << max(rows.bit_length() - 3, 0)), 64)  # whole vectors of eight: same bits wherever a row is
+    return -(-rows // step) * step
+
+
+def _sampled(q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float) -> np.ndarray:
+    """Interpolate (K, R, J) to the times ``at`` (R, n), in steps: angles by cubics, the rest by lines."""
+    low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(q) - 2)
+    share = np.maximum(at - low, 0.0)[..., None]
+    row = np.arange(at.shape[0])[:, None]
+    if share.max() < 1e-4:
+        parts = [q[low, row], qd[low, row], *([torque[low, row]] if torque is not None else [])]
+        return np.stack(parts, axis=2)
+    a, b, va, vb = q[low, row], q[low + 1, row], qd[low, row] * dt, qd[low + 1, row] * dt
+    s2, s3 = share**2, share**3
+    angle = a + share * va + s2 * (3 * (b - a) - 2 * va - vb) + s3 * (2 * (a - b) + va + vb)
+    parts = [angle, (va + share * (vb - va)) / dt]
+    if torque is not None:
+        parts.append(torque[low, row] + share * (torque[low + 1, row] - torque[low, row]))
+    return np.stack(parts, axis=2)

@@ -1,0 +1,93 @@
+"""What is to be simulated: values of effects, and changes of them, window by window."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import go1exp.effects  # noqa: F401  (registers every effect)
+from go1exp.gap.replay.machine import Machine
+from go1exp.schema.registry import members
+
+Key = tuple[str, str]
+"""Effect and parameter."""
+Theta = dict[Key, np.ndarray]
+"""Values by key: (J,) per joint, or (1,) of the robot."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """R simulations to make.
+
+    Attributes:
+        window: (R,) which window each replays.
+        values: of the effects, (R, J) or (R, 1).
+        q: (R, J) added to the initial angles, rad; None for nothing.
+        qd: (R, J) added to the initial speeds, rad/s.
+        base: (R, 9) added to a free base's first height, roll and pitch, velocity and rate.
+    """
+
+    window: np.ndarray
+    values: Mapping[Key, np.ndarray]
+    q: np.ndarray | None = None
+    qd: np.ndarray | None = None
+    base: np.ndarray | None = None
+
+    def part(self, which: np.ndarray) -> Rows:
+        """Return some of them."""
+        moved = (None if v is None else v[which] for v in (self.q, self.qd, self.base))
+        return Rows(self.window[which], {k: v[which] for k, v in self.values.items()}, *moved)
+
+
+def null(effect: str) -> Theta:
+    """Return the null values of an effect as arrays (1,)."""
+    return {(effect, p.name): np.array([p.null]) for p in members("effect")[effect].target.params}  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One changed simulation beside the unchanged one.
+
+    Attributes:
+        key: parameter that is changed, or None for an initial state.
+        place: which joint of each group; None for a parameter of the robot.
+        delta: (J,) or (1,) by how much, per joint.
+        also: other parameters that are set meanwhile (shapes), by key.
+    """
+
+    key: Key | str
+    place: int | None
+    delta: np.ndarray
+    also: Theta = field(default_factory=dict)
+
+
+def variants(
+    machine: Machine, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], known: Iterable[Key] = ()
+) -> Rows:
+    """Return rows, window by window: the model as it is, then each probe."""
+    joints, size = len(machine.joints), 1 + len(probes)
+    count = len(windows) * size
+    groups = np.array(machine.groups)
+    full: dict[Key, np.ndarray] = {}
+    keys = {*theta, *(p.key for p in probes if isinstance(p.key, tuple)), *(k for p in probes for k in p.also), *known}
+    for effect in dict.fromkeys(sorted(name for name, _ in keys)):
+        for key, value in null(effect).items():
+            per = {p.name: p.per for p in members("effect")[effect].target.params}[key[1]]  # type: ignore[attr-defined]
+            wide = joints if per == "joint" else 1
+            full[key] = np.tile(np.broadcast_to(theta.get(key, value), (wide,)), (count, 1))
+    q, qd, base = np.zeros((count, joints)), np.zeros((count, joints)), np.zeros((count, len(machine.base_probe)))
+    for k, probe in enumerate(probes):
+        mine = slice(1 + k, None, size)
+        if probe.key == "base":
+            base[mine] += probe.delta
+            continue
+        columns = slice(None) if probe.place is None else groups[:, probe.place]
+        if isinstance(probe.key, str):
+            (q if probe.key == "q" else qd)[mine, columns] += probe.delta[columns]
+            continue
+        for key, value in probe.also.items():
+            full[key][mine] = value
+        full[probe.key][mine, columns] += probe.delta[columns]
+    return Rows(np.repeat(windows, size), full, q, qd, base)

@@ -1,0 +1,1 @@
+"""Robots that the gap workflow can compare with recordings."""

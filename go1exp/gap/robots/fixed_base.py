@@ -1,0 +1,158 @@
+"""Any chain of hinges on a fixed base, from a description."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import go1exp.actuator  # noqa: F401  (registers every actuator)
+from go1exp.actuator.setup import Gains
+from go1exp.audit import AuditReport
+from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import DECLARED, Tolerances
+from go1exp.gap.data.cutting import cut
+from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
+from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.machine import NEEDLESS, pd
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.result import GapSettings
+from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, gain_warnings, wrong_speeds
+from go1exp.gap.robots.description import ModelConfig
+from go1exp.physics.fixed_base import NO_SENSORS, FixedBaseError, build_fixed_base, feel_each_other
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.recording import Recording
+from go1exp.schema.registry import ConfigError, Entry, Term
+from go1exp.tensors.randomness import EnvRandom
+
+
+class TorqueDrive(Gains):
+    """A drive that is commanded a torque: its target is a torque, N m, clipped at the peak. Gains do nothing."""
+
+    def __init__(self, setup: DriveSetup) -> None:
+        """Note the peak torque."""
+        self.kp, self.kd = setup.zeros(), setup.zeros()
+        self._limit = setup.effort_limit
+
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+        """Return the joint torques (N, J), N m."""
+        return torch.clamp(target, -self._limit, self._limit)
+
+    def reset(self, mask: Tensor) -> None:
+        """Nothing to forget."""
+
+
+@dataclass(frozen=True)
+class FixedBase:
+    """A robot of hinges on a fixed base.
+
+    Attributes:
+        config: its description.
+        joints: names, as recordings have them.
+        groups: numbers of the joints that move together.
+        effort: peak torque (J,), N m.
+        top_speed: (J,) rad/s.
+        tolerances: of nominal parameters.
+    """
+
+    config: ModelConfig
+    joints: tuple[str, ...]
+    groups: tuple[tuple[int, ...], ...]
+    effort: tuple[float, ...]
+    top_speed: tuple[float, ...]
+    tolerances: Tolerances = DECLARED
+    base_probe: tuple[float, ...] = ()
+
+    @staticmethod
+    def of(config: ModelConfig, path: str = "model") -> FixedBase:
+        """Check a description against its MuJoCo file.
+
+        Raises:
+            ConfigError: with every problem, each naming its key.
+        """
+        index = {name: k for k, name in enumerate(config.joints)}
+        groups = tuple(tuple(index[name] for name in group) for group in config.joint_groups)
+        effort, top = (tuple(float(v) for v in config.per_joint(name)) for name in ("torque_limit", "speed_limit"))
+        machine = FixedBase(config, config.joints, groups, effort, top, Tolerances.of(config.tolerances))
+        try:
+            model = machine.model(0.001, (1.0, 0.0, 0.0, 0.0))
+        except FixedBaseError as error:
+            raise ConfigError([f"{path}.{error}"]) from None
+        group_of = {k: g for g, members in enumerate(groups) for k in members}
+        for a in range(len(index)):
+            for b in range(a):
+                if group_of[a] != group_of[b] and feel_each_other(model, a, b):
+                    names = f"{config.joints[b]} and {config.joints[a]}"
+                    raise ConfigError([f"{path}.groups: {names} must be in one group, since one carries the other"])
+        return machine
+
+    def model(self, physics_dt: float, base_quat: Sequence[float]) -> Any:
+        """Return the compiled MuJoCo model."""
+        file, base = Path(self.config.mjcf), self.config.base
+        return build_fixed_base(file, base, self.joints, self.effort, physics_dt, base_quat, NEEDLESS)
+
+    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` robots, and their drives."""
+        backend = MujocoCpu(self.model(physics_dt, base_quat), NO_SENSORS, num, threads)
+        like = backend.qpos
+
+        def tensor(values: Sequence[float]) -> Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=like.dtype, device=like.device)
+
+        setup = DriveSetup(
+            num_envs=num,
+            physics_dt=physics_dt,
+            joints=self.joints,
+            effort_limit=tensor(self.effort),
+            velocity_limit=tensor(self.top_speed),
+            armature=backend.compiled("dof_armature"),
+            random=EnvRandom(0, num, device=like.device),
+            device=like.device,
+            dtype=like.dtype,
+            floating=False,
+        )
+        return backend, setup
+
+    def drive(self) -> Term:
+        """Return what turns commands into torques."""
+        if self.config.drive == "torque":
+            return Term("torque", Entry("actuator", "torque", TorqueDrive), {})
+        return pd()
+
+    def suited(self, recordings: Sequence[Recording]) -> FixedBase:
+        """Return itself: its base is always fixed."""
+        return self
+
+    def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
+        """Return why a recording cannot be compared, a line each."""
+        return flaws_of(recording, report, self.config)
+
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
+        """Return recordings with what they lack taken from the description, and windows whose number is affordable."""
+        warnings = []
+        wrong = wrong_speeds(recordings, reports, self.config)
+        if wrong:
+            warnings.append(f"Speeds are not compared, and initial speeds come from the angles: {wrong}.")
+        whole = tuple(completed(r, self.config, bool(wrong)) for r in recordings)
+        warnings += [*clock_warnings(recordings, whole, self.config), *gain_warnings(recordings, self.config)]
+        settings, more = spaced(whole, settings, len(self.groups[0]))
+        return Ready(whole, settings, ("qd",) if wrong else (), (*warnings, *more))
+
+    def windows(self, ready: Ready) -> Windows:
+        """Cut recordings into windows; what is ignored has infinite noise."""
+        windows = cut(ready.recordings, ready.settings)
+        if self.config.clock == "speeds":
+            windows.scale[:, 0] = noise_in_time(ready.recordings)
+        for c, quantity in enumerate(windows.quantities):
+            if quantity in ready.ignored:
+                windows.scale[:, c] = np.inf
+        return windows
+
+    def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
+        """Return what runs this robot through windows."""
+        return Replayer(self, windows, quats, max_rows, threads)

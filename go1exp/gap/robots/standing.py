@@ -1,0 +1,92 @@
+"""A Go1 on its feet, its trunk free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from go1exp import robot
+from go1exp.audit import AuditReport
+from go1exp.drive import DriveSetup
+from go1exp.effects.tolerances import DECLARED, Tolerances
+from go1exp.env.plant import drive_setup
+from go1exp.gap.data.prepare import Ready
+from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet
+from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.machine import Machine, pd
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.standing import StandingReplayer
+from go1exp.gap.result import GapSettings
+from go1exp.gap.robots.go1_logs import go1_flaws
+from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import build_model
+from go1exp.recording import Recording
+from go1exp.robot import RobotConfig
+from go1exp.schema.registry import Term
+from go1exp.tensors.randomness import EnvRandom
+from go1exp.terrain import TerrainConfig, build_terrain
+
+NO_SENSORS = 1 << 13
+"""MuJoCo's mjDSBL_SENSOR: the IMU's readings follow from the motion of the base, and those of contacts cost time."""
+
+BASE_PROBE = (5.0e-4, 1.0e-3, 1.0e-3, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
+"""Changes of a base's initial height, roll, pitch, velocity and rate by which their influence is measured."""
+
+ONE_GROUP = (tuple(range(robot.NUM_JOINTS)),)
+"""Legs feel each other through a trunk that is free: all joints are one group."""
+
+
+@dataclass(frozen=True)
+class StandingGo1:
+    """A Go1 that stands or moves on flat ground, its trunk free.
+
+    Attributes:
+        config: of the robot.
+        held: the same robot with its trunk held, for recordings of it that were made so.
+        joints: names.
+        groups: all joints in one.
+        base_probe: as for :class:`~go1exp.gap.replay.machine.Machine`.
+        tolerances: of nominal parameters.
+    """
+
+    config: RobotConfig
+    held: Machine
+    joints: tuple[str, ...] = robot.JOINTS
+    groups: tuple[tuple[int, ...], ...] = ONE_GROUP
+    base_probe: tuple[float, ...] = BASE_PROBE
+    tolerances: Tolerances = DECLARED
+
+    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
+        model, blocks = build_model(self.config, build_terrain(TerrainConfig(kind="flat")), physics_dt)
+        model.opt.disableflags |= NO_SENSORS
+        backend = MujocoCpu(model, blocks, num, threads)
+        return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+
+    def drive(self) -> Term:
+        """Return the ideal PD law."""
+        return pd()
+
+    def suited(self, recordings: Sequence[Recording]) -> StandingGo1:
+        """Return itself: it can be compared with recordings of a held trunk too."""
+        return self
+
+    def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
+        """Return why a recording cannot be compared, a line each."""
+        return go1_flaws(recording, report, self.joints, free=True)
+
+    def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
+        """Return the recordings as they are, with windows that suit contact."""
+        return Ready(tuple(recordings), for_feet(settings, recordings))
+
+    def windows(self, ready: Ready) -> StandingWindows:
+        """Cut recordings into windows that begin where at least two feet carry weight."""
+        return cut_standing(ready.recordings, ready.settings, self.config)
+
+    def replayer(self, windows: Windows, quats: np.ndarray, max_rows: int, threads: int) -> Replayer:
+        """Return what replays windows on the feet, and those of a held trunk among them."""
+        standing = cast(StandingWindows, windows)  # that this robot cut
+        return StandingReplayer(self, standing, quats, max_rows, threads, held=self.held)

@@ -1,0 +1,141 @@
+"""How well the model explains windows of data: Gaussian noise, with the unknown initial state and clock averaged out.
+
+A window's residual r and its change J per parameter, both in units of the noise, have the covariance I + S S', where S
+is the change per standard deviation of the initial state, and of the time between stamps of commands and of readings.
+All that fits and scores need is the Gram matrix of [J r] in the metric of that covariance, window by window and group
+of joints by group.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.machine import Machine
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.rows import Probe, Rows, Theta, variants
+
+STATE_PROBE = (1.0e-3, 0.05)
+"""Change of an initial angle, rad, and speed, rad/s, by which its influence is measured."""
+
+
+def grouped(machine: Machine, y: np.ndarray) -> np.ndarray:
+    """Sort (R, n, C, J) by groups of joints into (R, G, m), m = n C K."""
+    split = y[..., np.array(machine.groups)]  # R n C G K
+    return np.moveaxis(split, 3, 1).reshape(len(y), len(machine.groups), -1)
+
+
+def gram(columns: np.ndarray, state: np.ndarray) -> np.ndarray:
+    """Return A' (I + S S')^-1 A (..., p, p) of columns A (..., m, p) and state sensitivities S (..., m, k).
+
+    By Woodbury's identity: A'A - A'S (I + S'S)^-1 S'A.
+    """
+    shape, k = columns.shape, state.shape[-1]
+    wide = np.concatenate([columns, state], axis=-1).reshape(-1, shape[-2], shape[-1] + k)
+    # One product of matrices at a time goes to BLAS; NumPy's stacked product of transposed arrays does not.
+    inner = np.stack([a.T @ a for a in wide]).astype(np.float64)
+    plain, cross = inner[:, :-k, :-k], inner[:, -k:, :-k]
+    metric = inner[:, -k:, -k:] + np.eye(k)
+    weighted = plain - np.swapaxes(cross, -1, -2) @ np.linalg.solve(metric, cross)
+    return np.asarray(weighted.reshape(*shape[:-2], shape[-1], shape[-1]))
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """Scores replays of windows.
+
+    Attributes:
+        replayer: the model.
+        scale: (W, C, J) standard deviation of noise and numerical error.
+        state: (W, G, m, k) change of the readings, in units of ``scale``, per standard deviation of the initial state
+            and of the clock.
+        renewed: returns a scorer whose floors and initial states suit other values of the model.
+        clock_s: what the clock was taken to be off by, s.
+        expected: the windows with their initial states as sensors tell them, where those were moved; None if not.
+    """
+
+    replayer: Replayer
+    scale: np.ndarray
+    state: np.ndarray
+    renewed: Callable[[Theta], Scorer] | None = None
+    clock_s: float = 0.0
+    expected: Windows | None = None
+
+    @property
+    def windows(self) -> Windows:
+        """What is scored."""
+        return self.replayer.windows
+
+    @property
+    def size(self) -> np.ndarray:
+        """(W,) number of values in a window and group."""
+        w = self.windows
+        used = np.isfinite(self.scale).sum((1, 2)) / len(self.replayer.machine.groups)
+        return np.asarray(w.valid.sum(1) * used)
+
+    def unit(self, y: np.ndarray, window: np.ndarray) -> np.ndarray:
+        """Return readings, or differences of them, (R, n, C, J) in units of the noise as (R, G, m)."""
+        scaled = y / self.scale[window][:, None] * self.windows.valid[window][:, :, None, None]
+        return grouped(self.replayer.machine, scaled.astype(np.float32))
+
+    def residual(self, rows: Rows, dt: float) -> np.ndarray:
+        """Return what was measured minus what each row says, (R, G, m) in units of the noise."""
+        return self.unit(self.windows.y[rows.window] - self.replayer.run(rows, dt), rows.window)
+
+    def chi2(self, residual: np.ndarray, window: np.ndarray) -> np.ndarray:
+        """Return chi2 per value (R, G) of residuals (R, G, m)."""
+        whole = gram(residual[..., None], self.state[window])[..., 0, 0]
+        return np.asarray(whole / self.size[window][:, None])
+
+
+def state_probes(machine: Machine) -> list[Probe]:
+    """Return the probes of the initial state: angles, then speeds, of each place in the groups; then of a free base."""
+    places, joints = range(len(machine.groups[0])), len(machine.joints)
+    joints_probes = [
+        Probe(kind, place, np.full(joints, size))
+        for kind, size in zip(("q", "qd"), STATE_PROBE, strict=True)
+        for place in places
+    ]
+    return joints_probes + [Probe("base", None, row) for row in np.diag(machine.base_probe)]
+
+
+def _start_sd(windows: Windows, machine: Machine, probe: Probe) -> np.ndarray:
+    """Return the standard deviation of a coordinate of the initial state (W, G), in changes by its probe."""
+    if probe.key == "base":
+        axis = int(np.argmax(probe.delta))
+        return windows.base_sd[:, axis, None] / machine.base_probe[axis]
+    sd = windows.q_sd if probe.key == "q" else windows.qd_sd
+    return sd[:, np.array(machine.groups)[:, probe.place]] / STATE_PROBE[probe.key == "qd"]
+
+
+def scorer(
+    replayer: Replayer,
+    theta: Theta,
+    scale: np.ndarray,
+    dt: float,
+    clock_s: float = 0.0,
+    some: np.ndarray | None = None,
+) -> Scorer:
+    """Measure how the initial states, and a clock that is off by ``clock_s``, act on the readings, at ``theta``.
+
+    With the numbers of ``some`` windows, ``state`` is that of those alone.
+    """
+    w, machine = replayer.windows, replayer.machine
+    probes = state_probes(machine)
+    everything = np.arange(len(w)) if some is None else some
+    rows = variants(machine, theta, everything, probes)
+    empty = Scorer(replayer, scale, np.empty(0), clock_s=clock_s)
+    y = replayer.run(rows, dt).reshape(len(everything), 1 + len(probes), *w.y.shape[1:])
+    columns = []
+    for k, probe in enumerate(probes):
+        sd = _start_sd(w, machine, probe)[everything]
+        per = empty.unit(y[:, 1 + k] - y[:, 0], everything)
+        columns.append(per * sd[..., None].astype(np.float32))
+    columns += [empty.unit(change, everything) for change in w.unknown(y[:, 0])]
+    if clock_s:
+        columns.append(empty.unit(clock_s * np.gradient(y[:, 0], w.period, axis=1), everything))
+    return dataclasses.replace(empty, state=np.stack(columns, axis=-1))

@@ -1,0 +1,121 @@
+"""The linear model of readings about some values: its columns, and the unknowns that they belong to."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.gap.replay.machine import Machine
+from go1exp.gap.replay.rows import Probe, Theta, variants
+from go1exp.gap.score.likelihood import Scorer, gram
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which unknown each column of each group belongs to.
+
+    Attributes:
+        index: (G, p) unknown of column p in group g: one for each group, but one in all for a parameter of the robot.
+        size: number of unknowns.
+        joint: (size,) joint of each unknown, -1 for the robot.
+        probe: (size,) column of each.
+    """
+
+    index: np.ndarray
+    size: int
+    joint: np.ndarray
+    probe: np.ndarray
+
+    @staticmethod
+    def of(machine: Machine, probes: Sequence[Probe]) -> Layout:
+        """Number the unknowns, column by column."""
+        groups = len(machine.groups)
+        index = np.zeros((groups, len(probes)), dtype=int)
+        joint: list[int] = []
+        column: list[int] = []
+        for p, probe in enumerate(probes):
+            joints = [-1] if probe.place is None else [machine.groups[g][probe.place] for g in range(groups)]
+            index[:, p] = len(joint) + (np.zeros(groups, dtype=int) if probe.place is None else np.arange(groups))
+            joint += joints
+            column += [p] * len(joints)
+        return Layout(index, len(joint), np.array(joint, dtype=int), np.array(column, dtype=int))
+
+    def total(self, grams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sum Grams (W, G, p+1, p+1) into the normal equations: matrix (size, size), right side (size,)."""
+        summed = grams.sum(0)
+        matrix, right = np.zeros((self.size, self.size)), np.zeros(self.size)
+        for g, at in enumerate(self.index):
+            np.add.at(matrix, (at[:, None], at[None]), summed[g, :-1, :-1])
+            np.add.at(right, at, summed[g, :-1, -1])
+        return matrix, right
+
+    def part(self, columns: np.ndarray) -> np.ndarray:
+        """Return the unknowns of some columns (bool mask or numbers)."""
+        wanted = np.zeros(self.index.shape[1], dtype=bool)
+        wanted[columns] = True
+        return np.flatnonzero(wanted[self.probe])
+
+
+@dataclass(frozen=True)
+class Table:
+    """A linear model of some windows about ``theta``.
+
+    Attributes:
+        windows: (V,) which.
+        probes: the p columns.
+        residual: (V, G, m) in units of the noise.
+        columns: (V, G, m, p) fall of the residual per unit of each parameter.
+        theta: where.
+    """
+
+    windows: np.ndarray
+    probes: tuple[Probe, ...]
+    residual: np.ndarray
+    columns: np.ndarray
+    theta: Theta
+
+    def part(self, which: np.ndarray) -> Table:
+        """Return the model of some of the windows (numbers within it)."""
+        return dataclasses.replace(
+            self, windows=self.windows[which], residual=self.residual[which], columns=self.columns[which]
+        )
+
+    def grams(self, scorer: Scorer) -> np.ndarray:
+        """Return the Gram matrices (V, G, p+1, p+1) of columns and residual."""
+        return gram(np.concatenate([self.columns, self.residual[..., None]], axis=-1), scorer.state[self.windows])
+
+
+def differences(scorer: Scorer, y: np.ndarray, window: np.ndarray, probes: Sequence[Probe]) -> np.ndarray:
+    """Return columns (V, G, m, p) from readings (V, 1 + p, n, C, J): changes per unit of the parameters."""
+    groups = np.array(scorer.replayer.machine.groups)
+    columns = []
+    for k, probe in enumerate(probes):
+        per = scorer.unit(y[:, 1 + k] - y[:, 0], window)
+        delta = probe.delta[:1] if probe.place is None else probe.delta[groups[:, probe.place]]
+        columns.append(per / delta.astype(np.float32)[:, None])
+    shape = (*scorer.unit(y[:, 0], window).shape, 0)
+    return np.stack(columns, axis=-1) if columns else np.zeros(shape, np.float32)
+
+
+def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], dt: float) -> Table:
+    """Replay windows with every probe.
+
+    Changes are taken at the same step as residuals: at twice that they no longer cancel where they should.
+    """
+    machine, replayer = scorer.replayer.machine, scorer.replayer
+    residual = scorer.residual(variants(machine, theta, windows, []), dt)
+    y = replayer.run(variants(machine, theta, windows, probes), dt)
+    y = y.reshape(len(windows), 1 + len(probes), *scorer.windows.y.shape[1:])
+    return Table(windows, tuple(probes), residual, differences(scorer, y, windows, probes), theta)
+
+
+def predicted(grams: np.ndarray, layout: Layout, x: np.ndarray) -> np.ndarray:
+    """Return the chi2 sum (V, G) that the linear model promises for the unknowns ``x``."""
+    chi2 = np.empty(grams.shape[:2])
+    for g, at in enumerate(layout.index):
+        full = np.append(-x[at], 1.0)
+        chi2[:, g] = np.einsum("i,wij,j->w", full, grams[:, g], full)
+    return chi2

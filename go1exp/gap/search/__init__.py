@@ -1,0 +1,1 @@
+"""Which effects explain what the model cannot."""

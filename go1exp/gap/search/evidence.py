@@ -1,0 +1,96 @@
+"""What is written down of every candidate: where it acts, how large, and why it was taken or not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from go1exp.effects.tolerances import Tolerances, sizes
+from go1exp.gap.replay.rows import Key, Theta
+from go1exp.gap.result import Candidate
+from go1exp.gap.search.fit import Model
+
+RELIEF = 4.0
+"""Fall of chi2, were its tolerance wider, from which an effect is listed although the tolerances explain the data."""
+
+
+def deviation(theta: Theta, key: Key, tolerances: Tolerances) -> np.ndarray:
+    """Return how far a parameter is from null, in tolerances."""
+    p = tolerances.param(key)
+    return np.asarray(np.abs(theta.get(key, np.array([p.null])) - p.null) / p.tolerance)
+
+
+def size(effect: str, theta: Theta, tolerances: Tolerances) -> float:
+    """Return the largest deviation of an effect from null, in tolerances."""
+    return max(float(np.max(deviation(theta, key, tolerances))) for key in sizes(effect))
+
+
+def beyond(effect: str, theta: Theta, joints: Sequence[str], tolerances: Tolerances) -> np.ndarray:
+    """Return at which joints (J,) an effect leaves its tolerance."""
+    outside = np.zeros(len(joints), dtype=bool)
+    for key in sizes(effect):
+        if tolerances.param(key).per == "joint":
+            outside |= np.broadcast_to(deviation(theta, key, tolerances) > 1.0, len(joints))
+    return outside
+
+
+def candidate(model: Model, joints: Sequence[str], **judged: object) -> Candidate:
+    """Write a fitted model down; ``judged`` are the other fields of :class:`~go1exp.gap.result.Candidate`."""
+    tolerances = model.may.tolerances
+    where = beyond(model.name, model.theta, joints, tolerances)
+    params: dict[str, list[float] | float] = {}
+    for key, value in model.theta.items():
+        if key[0] == model.name:
+            per_joint = tolerances.param(key).per == "joint"
+            full = np.broadcast_to(value, len(joints)) if per_joint else value
+            params[key[1]] = [float(v) for v in full[where]] if per_joint else float(full[0])
+    names = tuple(j for j, b in zip(joints, where, strict=True) if b)
+    largest = size(model.name, model.theta, tolerances)
+    return Candidate(effect=model.name, joints=names, params=params, size_over_tolerance=largest, **judged)  # type: ignore[arg-type]
+
+
+def absorbed(
+    search_keys: Sequence[Key], relief: Mapping[str, float], theta: Theta, tolerances: Tolerances, most: int
+) -> list[Candidate]:
+    """Return, for a gap that the tolerances close, the effects that would rather leave theirs, strongest first.
+
+    None of them is claimed: all that the data ask for lies within what the model may be wrong by anyway.
+
+    Args:
+        search_keys: parameters of the box.
+        relief: effect -> fall of chi2 and priors if it may.
+        theta: fitted values within the tolerances.
+        tolerances: these.
+        most: rows.
+    """
+    order = sorted((e for e in relief if relief[e] > RELIEF), key=lambda e: -relief[e])
+    return [
+        Candidate(
+            effect=effect,
+            joints=(),
+            params={},
+            excess_after=math.nan,
+            log_gain=0.0,
+            p=math.nan,
+            size_over_tolerance=max(
+                float(np.max(deviation(theta, k, tolerances))) for k in search_keys if k[0] == effect
+            ),
+            alias_class=(effect,),
+            status="rejected",
+            reason=f"fits within its tolerance; without it chi2 would be {relief[effect]:.0f} lower",
+        )
+        for effect in order[:most]
+    ]
+
+
+def inaudible(signal: Mapping[str, float], threshold: float, seen: Sequence[str]) -> list[Candidate]:
+    """Return rows for the effects that the data cannot show."""
+    return [
+        Candidate(
+            effect, (), {}, math.nan, 0.0, 1.0, 0.0, (effect,), "not excited", "twice its tolerance would not show"
+        )
+        for effect, loud in signal.items()
+        if loud < threshold and effect not in seen
+    ]

@@ -1,0 +1,131 @@
+"""Profile likelihood of effects of the whole robot: every value is scored by initial states that suit it.
+
+Initial states that were moved to suit the nominal model hide a part of what is missing. Where feet slip or land, a fit
+at those states stops early: a payload of 2 kg on a walk comes out as 1 kg, and the truth looks worse than nothing. So
+for every value the windows begin at the states that sensors measure, which are then moved to suit that value alone.
+Where feet stick, derivatives say little. So values on a ladder are tried, and then values between the best rungs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from go1exp.effects.base import Param
+from go1exp.gap.replay.rows import Key, Theta, variants
+from go1exp.gap.score.initial_state import FARTHEST, solved
+from go1exp.gap.score.likelihood import Scorer, gram, scorer
+
+ROUNDS = 2
+"""Steps of the initial states, all by the changes that were measured at the nominal model."""
+
+SHARES = (1.0, 0.4)
+"""Shares of a step that are tried, window by window."""
+
+FIRST = 2.0
+"""Lowest rung of the ladder, in tolerances; each further one is twice as far."""
+
+CLOSER = 8
+"""Tries between the neighbours of the best rung."""
+
+
+def begun(score: Scorer, dt: float) -> Scorer:
+    """Return a scorer with the same floors whose initial states are those that sensors tell.
+
+    Args:
+        score: of a robot on its feet (``first_state.settled``), of the nominal model.
+        dt: physics step, s.
+    """
+    assert score.expected is not None
+    replayer = dataclasses.replace(score.replayer, windows=score.expected)
+    return scorer(replayer, {}, score.scale, dt, score.clock_s)
+
+
+def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndarray:
+    """Return chi2 per value (V, 1) of a model, each window's initial state moved to suit it.
+
+    What the states are away from what sensors tell counts as much as readings do.
+
+    Args:
+        score: what :func:`begun` returns.
+        theta: values of the model.
+        windows: (V,) which.
+        dt: physics step, s.
+    """
+    w = score.windows
+    joints, coordinates = len(w.joints), 2 * len(w.joints) + w.base_sd.shape[1]
+    sd = np.concatenate([w.q_sd, w.qd_sd, w.base_sd], axis=1)[windows]
+    state = score.state[windows]
+    rows = variants(score.replayer.machine, theta, windows, [])
+
+    def at(off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        moved = off * sd
+        q, qd, base = moved[:, :joints], moved[:, joints : 2 * joints], moved[:, 2 * joints :]
+        residual = score.residual(dataclasses.replace(rows, q=q, qd=qd, base=base), dt)
+        # As if the state had stayed, and the change by it were a line: then the priors are those of the metric.
+        back = residual + (state[..., :coordinates] @ off[:, None, :, None].astype(np.float32))[..., 0]
+        return residual, np.asarray(gram(back[..., None], state)[..., 0, 0] / score.size[windows][:, None])
+
+    off = np.zeros((len(windows), coordinates))
+    residual, best = at(off)
+    for _ in range(ROUNDS):
+        step = solved(state[:, 0], residual[:, 0], off)[0][:, :coordinates].clip(-FARTHEST, FARTHEST)
+        begin = off.copy()
+        for share in SHARES:
+            other, value = at(begin + share * step)
+            better = value[:, 0] < best[:, 0]
+            off[better], residual[better], best[better] = (begin + share * step)[better], other[better], value[better]
+    return best
+
+
+def cost(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> float:
+    """Return what fits make small, the mean log :func:`chi2` (arguments as there)."""
+    return float(np.log(chi2(score, theta, windows, dt)).mean())
+
+
+def fitted(
+    score: Scorer, keys: Sequence[Key], windows: np.ndarray, dt: float, nominal: float | None = None
+) -> tuple[Theta, float]:
+    """Return the values of an effect that fit best, one number for each parameter, one parameter after the other.
+
+    Args:
+        score: what :func:`begun` returns.
+        keys: the parameters; one that is best at its null value is not among those returned.
+        windows: (V,) to fit.
+        dt: physics step, s.
+        nominal: cost of the nominal model, if it is known.
+
+    Returns:
+        The values and their cost.
+    """
+    theta: Theta = {}
+    least = cost(score, {}, windows, dt) if nominal is None else nominal
+    for key in keys:
+        p = score.replayer.machine.tolerances.param(key)
+        wide = len(score.windows.joints) if p.per == "joint" else 1
+
+        def at(value: float, key: Key = key, wide: int = wide, others: Theta = theta) -> float:
+            return cost(score, {**others, key: np.full(wide, value)}, windows, dt)
+
+        rungs = ladder(p)
+        costs = [least if value == p.null else at(value) for value in rungs]
+        k = int(np.argmin(costs))
+        if rungs[k] == p.null:
+            continue
+        between = rungs[max(k - 1, 0)], rungs[min(k + 1, len(rungs) - 1)]
+        nearest = minimize_scalar(at, bounds=between, options={"maxiter": CLOSER})
+        value, least = (nearest.x, float(nearest.fun)) if nearest.fun < costs[k] else (rungs[k], costs[k])
+        theta = {**theta, key: np.full(wide, value)}
+    return theta, least
+
+
+def ladder(p: Param) -> list[float]:
+    """Return the values of a parameter that are tried first, in order, the null value among them."""
+    rungs, far = {p.null}, FIRST * p.tolerance
+    while p.null - far >= p.low or p.null + far <= p.high:
+        rungs |= {v for v in (p.null - far, p.null + far) if p.low <= v <= p.high}
+        far *= 2.0
+    return sorted(rungs)

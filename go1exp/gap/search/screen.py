@@ -1,0 +1,265 @@
+"""Which missing effects could explain what the model cannot, to first order: one pass of replays for all of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from go1exp.effects.identification import Identification, Periodic
+from go1exp.effects.tolerances import Tolerances, sizes
+from go1exp.gap.replay.machine import Machine
+from go1exp.gap.replay.rows import Key, Probe, Theta, variants
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.linear import Layout, Table, differences, predicted
+from go1exp.gap.search import strain, tolerances
+
+PROBE = 2.0
+"""Change of a parameter by which it is probed, in tolerances."""
+
+
+OUTSIDE = 0.03
+"""Fall of chi2 per value, in the windows of the screening, of which half are the worst, for an effect that the
+tolerances have no place for: at most 0.0074 in development nulls, 0.053 and 0.138 for effects of two tolerances that
+others hid."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way for an effect to be there.
+
+    Attributes:
+        effect: registered name.
+        probes: what was changed to see it; empty for one whose columns the box has.
+        shapes: values of its shapes.
+    """
+
+    effect: str
+    probes: tuple[Probe, ...] = ()
+    shapes: Theta = field(default_factory=dict)
+
+    @property
+    def quadrature(self) -> bool:
+        """Whether the two halves of the probes are amplitudes at phases 0 and pi / 2."""
+        return tolerances.identification(self.effect).periodic is not None
+
+    def start(self, theta: Theta, layout: Layout, x: np.ndarray, machine: Machine) -> Theta:
+        """Return where a fit begins: ``theta`` with this effect as large as the linear model has it."""
+        periodic = tolerances.identification(self.effect).periodic
+        if periodic:
+            sine, cosine = np.zeros(len(machine.joints)), np.zeros(len(machine.joints))
+            for i in range(layout.size):
+                (sine if layout.probe[i] < len(self.probes) // 2 else cosine)[layout.joint[i]] = x[i]
+            return {
+                **theta,
+                **{key: np.broadcast_to(value, sine.shape).copy() for key, value in self.shapes.items()},
+                (self.effect, periodic.amplitude): np.hypot(sine, cosine),
+                (self.effect, periodic.phase): np.arctan2(cosine, sine),
+            }
+        return tolerances.moved({**theta, **self.shapes}, layout, self.probes, x, machine)
+
+    @property
+    def free(self) -> tuple[Key, ...]:
+        """Parameters that a full fit changes."""
+        return (*sizes(self.effect), *free_shapes(self.effect))
+
+
+def free_shapes(effect: str) -> tuple[Key, ...]:
+    """Return the shape parameters of an effect that a full fit may change."""
+    return tuple((effect, name) for name in tolerances.identification(effect).free_shapes)
+
+
+def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -> list[Variant]:
+    """Return every way in which an effect could be missing; ``mean`` (J,) are the joints' average angles, rad."""
+    variants: list[Variant] = []
+    within = tolerances.nominal(machine)
+    for effect in tolerances.felt(machine):
+        how = tolerances.identification(effect)
+        if effect in exclude:
+            continue
+        if effect in within and not how.levels:
+            variants.append(Variant(effect))  # its columns are there
+        elif how.periodic:
+            variants += _periods(machine, effect, how.periodic)
+        else:
+            variants += _levels(machine, effect, how, mean)
+    return variants
+
+
+def _periods(machine: Machine, effect: str, periodic: Periodic) -> Iterator[Variant]:
+    """Yield a variant for each number of periods per turn, with amplitudes at phases 0 and pi / 2."""
+    key = (effect, periodic.amplitude)
+    plain = tolerances.probes(machine, [key], {}, PROBE)
+    for count in periodic.counts:
+        at: Theta = {(effect, periodic.count): np.array([count])}
+        phases = [{**at, (effect, periodic.phase): np.array([phase])} for phase in (0.0, math.pi / 2)]
+        yield Variant(effect, tuple(Probe(key, p.place, p.delta, also) for also in phases for p in plain), at)
+
+
+def _levels(machine: Machine, effect: str, how: Identification, mean: np.ndarray) -> Iterator[Variant]:
+    """Yield a variant for each choice of shapes and each level at which the effect is probed."""
+    for chosen in how.shapes or ({},):
+        shapes: Theta = {
+            (effect, name): mean.copy() if math.isnan(value) else np.array([value]) for name, value in chosen.items()
+        }
+        for level in how.levels or ({},):
+            keys = [key for key in sizes(effect) if not level or key[1] in level]
+            probes = [
+                Probe(p.key, p.place, np.full_like(p.delta, level[p.key[1]]) if level else p.delta, shapes)
+                for p in tolerances.probes(machine, keys, {}, PROBE)
+            ]
+            yield Variant(effect, tuple(probes), shapes)
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What the linear model predicts for one variant.
+
+    Attributes:
+        variant: which.
+        theta: where a fit would begin.
+        gain: mean fall of log chi2 over the windows.
+        relief: fall of chi2 and priors per value, if the effect may leave its tolerance.
+        signal: largest chi2 that twice its tolerance adds to one value of a window, on average over the window.
+    """
+
+    variant: Variant
+    theta: Theta
+    gain: float
+    relief: float
+    signal: float
+
+
+def screen(
+    scorer: Scorer,
+    theta: Theta,
+    present: Table,
+    may: tolerances.Freedom,
+    library: Sequence[Variant],
+    dt: float,
+) -> list[Screened]:
+    """Rank variants.
+
+    Args:
+        scorer: of the windows.
+        theta: present values.
+        present: the linear model of what may move already.
+        may: what may leave its tolerance.
+        library: the variants.
+        dt: physics step, s.
+    """
+    every = [p for v in library for p in v.probes]
+    columns = _columns(scorer, theta, present.windows, every, dt)
+    whole = np.concatenate([present.columns, columns], axis=-1)
+    full = Table(present.windows, (*present.probes, *every), present.residual, whole, theta)
+    ranking = _Ranking(scorer, present, full, may)
+    screened, at = [], len(present.probes)
+    for variant in library:
+        screened.append(ranking.screened(variant, at))
+        at += len(variant.probes)
+    return sorted(screened, key=lambda s: -s.gain)
+
+
+class _Ranking:
+    """The linear model of all variants together, from which each is judged by itself."""
+
+    def __init__(self, scorer: Scorer, present: Table, full: Table, may: tolerances.Freedom) -> None:
+        """Take the linear model ``own`` of what may move already, and ``full``, which adds the probes of variants."""
+        self.present, self.full, self.may, self.machine = present, full, may, scorer.replayer.machine
+        self.size = scorer.size[present.windows][:, None]
+        self.grams = full.grams(scorer)
+        self.before = self.grams[..., -1, -1] / self.size
+        self.plain, self.count = strain.cost(scorer, present)(may), strain.values(scorer, present)
+
+    def screened(self, variant: Variant, at: int) -> Screened:
+        """Judge a variant whose probes begin at column ``at``."""
+        theta, known = self.full.theta, len(self.present.probes)
+        added = list(range(at, at + len(variant.probes)))
+        pick = [*range(known), *added]
+        probes = [*self.present.probes, *variant.probes]
+        part = self.grams[:, :, [*pick, -1]][..., [*pick, -1]]
+        layout = Layout.of(self.machine, probes)
+        matrix, right = layout.total(part * (1.0 / np.maximum(self.before, 1.0))[..., None, None])
+        freed = self.may.also(variant.effect)
+        limits, strict = (tolerances.bounds(layout, probes, theta, freed, back) for back in (False, True))
+        for some in (limits, strict) if variant.quadrature else ():
+            some.low[layout.part(np.arange(known, len(probes)))] = -np.inf
+        relief = (self.plain - strain.price(matrix, right, strict)) / self.count
+        x = tolerances.solve(matrix, right, limits)
+        after = predicted(part, layout, x) / self.size
+        gain = float(np.mean(np.log(self.before.sum(1) / np.maximum(after, 0.3).sum(1))))
+        start = _start(theta, variant, self.present.probes, layout, x, self.machine)
+        mine = [*added, *(k for k, p in enumerate(self.present.probes) if p.key[0] == variant.effect)]
+        signal = _signal(self.grams, self.full.probes, mine, self.size, self.may.tolerances)
+        return Screened(variant, start, gain, relief, signal)
+
+
+def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Screened]:
+    """Return the effects to try if one that has no tolerance to move in would relieve the others most; none otherwise.
+
+    Those that would relieve nearly as much are its rivals; held-out data decide between them.
+
+    Args:
+        screened: what the linear model says of every effect.
+        within: effects that move within their tolerances already.
+    """
+    order = sorted(screened, key=lambda s: -s.relief)
+    if not order or order[0].variant.effect in within or order[0].relief < OUTSIDE:
+        return []
+    return [s for s in order if s.relief > order[0].relief / strain.LEAD]
+
+
+def _start(
+    theta: Theta, variant: Variant, known: Sequence[Probe], layout: Layout, x: np.ndarray, machine: Machine
+) -> Theta:
+    """Return where a fit begins: the present values with the variant's effect alone moved.
+
+    What else the linear model would move, it would move too far: with the effect so large, it is no longer right.
+    """
+    if variant.probes:
+        extra = Layout.of(machine, variant.probes)
+        return variant.start(theta, extra, x[layout.size - extra.size :], machine)
+    of_it = np.array([known[k].key[0] == variant.effect for k in layout.probe])
+    return tolerances.moved(theta, layout, known, np.where(of_it, x, 0.0), machine)
+
+
+def _signal(
+    grams: np.ndarray, probes: Sequence[Probe], mine: Sequence[int], size: np.ndarray, declared: Tolerances
+) -> float:
+    """Return the largest mean square, in units of the noise, that a change by twice a tolerance makes in a window."""
+    most = 0.0
+    for k in mine:
+        key = probes[k].key
+        assert isinstance(key, tuple)
+        reach = 2.0 * declared.param(key).tolerance
+        if np.abs(probes[k].delta).max() <= 1.5 * reach:  # beyond, a threshold may lie between
+            most = max(most, float((grams[..., k, k] / size).max()) * reach**2)
+    return most
+
+
+def _columns(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Probe], dt: float) -> np.ndarray:
+    """Return the columns of probes, replayed a few effects at a time: a step pays for every effect on the plant."""
+    machine, replayer = scorer.replayer.machine, scorer.replayer
+    by_effect: dict[str, list[int]] = {}
+    for k, p in enumerate(probes):
+        by_effect.setdefault(p.key[0], []).append(k)
+    lots: list[list[int]] = []
+    for mine in by_effect.values():
+        if lots and len(lots[-1]) + len(mine) <= 14:
+            lots[-1] += mine
+        else:
+            lots.append(list(mine))
+    columns = np.zeros((len(windows), len(machine.groups), *_sizes(scorer), len(probes)), dtype=np.float32)
+    for lot in lots:
+        chosen = [probes[k] for k in lot]
+        rows = variants(machine, theta, windows, chosen)
+        y = replayer.run(rows, 2.0 * dt).reshape(len(windows), 1 + len(chosen), *scorer.windows.y.shape[1:])
+        columns[..., lot] = differences(scorer, y, windows, chosen)
+    return columns
+
+
+def _sizes(scorer: Scorer) -> tuple[int]:
+    w = scorer.windows
+    return (w.t.shape[1] * len(w.quantities) * len(scorer.replayer.machine.groups[0]),)

@@ -1,0 +1,68 @@
+"""Judgement on data that no fit has seen: splits, sign flips, sets of equals, resamplings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+FLIPS = 4000
+"""Sign flips of a test: the smallest p-value is 1 / (FLIPS + 1)."""
+
+SAME = 0.02
+"""Gains of log chi2 that differ by less mean the same: 2 % of the floor, or of the larger of the gains."""
+
+WORSE = 0.05
+"""A model with a p-value below this is worse than another."""
+
+LEAST = 0.7
+"""A model with less than this share of the best one's gain is no equal, however uncertain."""
+
+
+def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the fall of log chi2 (M, V G) of models in every window and group of joints.
+
+    Groups do not feel each other, so each is a judgement of its own; an effect that few windows show needs them all.
+
+    Args:
+        before: chi2 per value (V, G).
+        after: the same of each model (M, V, G).
+    """
+    return np.asarray(np.log(before) - np.log(after)).reshape(len(after), -1)
+
+
+def max_t(gain: np.ndarray, rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
+    """Return a p-value (M,) for each of M models' mean gain (M, V), right for all of them together.
+
+    Under the hypothesis that a model gains nothing, a window's gain is as likely negative. All models' signs are
+    flipped together, window by window, and each is compared with the largest statistic of all.
+    """
+    count = gain.shape[1]
+    scale = np.sqrt(np.mean(gain**2, axis=1)) / np.sqrt(count) + 1e-12
+    signs = rng.choice([-1.0, 1.0], size=(flips, count))
+    largest = ((signs @ gain.T) / count / scale).max(axis=1)
+    seen = gain.mean(axis=1) / scale
+    return np.asarray([(1 + np.sum(largest >= s - 1e-12)) / (flips + 1) for s in seen])
+
+
+def same(gain: float) -> float:
+    """Return by how much the mean of another model's gain may be smaller and still mean the same."""
+    return SAME * max(1.0, gain)
+
+
+def equals(gain: np.ndarray, best: int, rng: np.random.Generator) -> np.ndarray:
+    """Return which models (M,) do as well as ``best`` by their gains (M, V): all but so, or not significantly worse."""
+    mean = gain.mean(axis=1)
+    equal = mean >= mean[best] - same(mean[best])
+    for k in np.flatnonzero(~equal & (mean > LEAST * mean[best])):
+        equal[k] = max_t((gain[best] - gain[k])[None], rng)[0] > WORSE
+    equal[best] = True
+    return np.asarray(equal)
+
+
+def resampled(episode: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a bootstrap sample of windows (numbers): episodes, then their windows."""
+    units = np.unique(episode)
+    picked = []
+    for unit in rng.choice(units, len(units)):
+        mine = np.flatnonzero(episode == unit)
+        picked.append(rng.choice(mine, len(mine)))
+    return np.concatenate(picked)

@@ -1,0 +1,133 @@
+"""One effect of the whole robot against a hundred tolerances: what a robot on its feet hides from the stepwise search.
+
+A payload makes every leg bear more; so does every drive that is a little weak, each within its tolerance. On the ground
+the tolerances of twelve joints together imitate any effect on the trunk up to several times its own tolerance, so a
+search that lets them move first finds no gap. An effect of the whole robot has a few numbers. If one of them alone, all
+else at its nominal value, removes nearly all of the error, and no common weakness of the drives does as well, then it
+is the explanation, not a hundred numbers that happen to agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from go1exp.effects.tolerances import sizes
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.linear import table
+from go1exp.gap.search import profile_likelihood, significance, tolerances
+from go1exp.gap.search.fit import Model, fit, scores
+from go1exp.gap.search.state import State
+from go1exp.gap.search.trial import excess, removed
+from go1exp.schema.registry import members
+
+ITERATIONS = 4
+"""Gauss-Newton steps of a fit: joints that stick make a payload's first ones short."""
+
+STRETCHES = (1.0, 0.85, 1.15, 1.4)
+"""Factors on fitted values that are tried after a fit: where joints stick, small changes tell less than large ones."""
+
+TURNS = 2
+"""Times that initial states are moved to suit the best effect, and it is fitted again."""
+
+NEARLY_ALL = 0.8
+"""Share of the held-out excess that an effect must remove alone."""
+
+
+def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Model:
+    """Return a model with all that it departs from the null made as much larger or smaller as fits best."""
+    if not model.theta:
+        return model
+    for _ in range(2):
+        tries = []
+        for factor in STRETCHES:
+            theta = {}
+            for key, value in model.theta.items():
+                p = model.may.tolerances.param(key)
+                theta[key] = (p.null + factor * (value - p.null)).clip(p.low, p.high)
+            tries.append(theta)
+        chi2 = scores(scorer, tries, windows, dt)
+        k = int(np.log(chi2).mean(axis=(1, 2)).argmin())
+        model = replace(model, theta=tries[k], chi2=chi2[k])
+        if k == 0:
+            break
+    return model
+
+
+def refitted(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Model:
+    """Return a model fitted from where it is, by initial states that suit it."""
+    empty = table(scorer, {}, windows, [], dt)
+    (fitted,) = fit(scorer, [model], empty, ITERATIONS, dt)
+    return stretched(scorer, fitted, windows, dt)
+
+
+def clearest(begun: Scorer, state: State) -> Model | None:
+    """Return the effect of the whole robot that does best, every model by initial states of its own.
+
+    Args:
+        begun: scores from the initial states that sensors tell (``profile_likelihood.py``).
+        state: of the search, whose windows count.
+
+    Returns:
+        None unless, on windows that no fit has seen, it does clearly better than all others, joints that are all off
+        alike, and nothing at all.
+    """
+    train, select, dt = state.splits.train, state.splits.select, state.dt
+    fitted = profile_likelihood.fitted
+    none = profile_likelihood.cost(begun, {}, train, dt)
+    machine = begun.replayer.machine
+    fits = {
+        name: fitted(begun, sizes(name), train, dt, none)
+        for name in tolerances.nominal(machine)
+        if tolerances.identification(name).needs_ground
+    }
+    name = min(fits, key=lambda n: fits[n][1])
+    best = fits.pop(name)[0]
+    if not best:
+        return None
+    chi2 = profile_likelihood.chi2(begun, best, select, dt)
+
+    def loses(rival: Theta) -> bool:
+        other = profile_likelihood.chi2(begun, rival, select, dt)
+        return bool(significance.gains(chi2, other[None]).mean() < -significance.SAME)
+
+    # In the order of what they cost: the first that does as well ends it.
+    if not loses({}) or not all(loses(rival) for rival, _ in fits.values() if rival):
+        return None
+    weights = [effect for effect in members("effect") if tolerances.identification(effect).weighs_on_legs]
+    clear = all(loses(fitted(begun, sizes(effect), train, dt, none)[0]) for effect in weights)
+    return Model(name, best, state.may.also(name), sizes(name)) if clear else None
+
+
+Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model | None, Model | None]]
+"""Tests fitted candidates on held-out windows and notes the evidence (``Search._judged``)."""
+
+
+def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -> Model | None:
+    """Return the effect of the whole robot that explains nearly everything by itself, if there is one.
+
+    Initial states that suit the nominal model hide a part of what is missing. So effects are compared by initial states
+    of their own, and the best is fitted again at states that suit it.
+
+    Args:
+        state: of a search that has not begun.
+        progress: called with what is being done, and which share of all is finished.
+        judged: tests the best effect.
+    """
+    train, select, dt, settings = state.splits.train, state.splits.select, state.dt, state.settings
+    plain, now = (scores(state.scorer, [{}], part, dt)[0] for part in (train, select))
+    if excess(now) < settings.material:
+        return None
+    progress("looking for one cause alone", 0.08)
+    best = clearest(profile_likelihood.begun(state.scorer, dt), state)
+    if best is None or (settings.effects and best.name not in settings.effects):
+        return None
+    for _ in range(TURNS):
+        state = replace(state, theta=best.theta).renewed()
+        best = refitted(state.scorer, best, train, dt)
+    share = removed(excess(now), excess(state.held_out(best.theta)))
+    accepted, _ = judged([best], state, plain, now)
+    return best if accepted is not None and share >= NEARLY_ALL else None

@@ -1,0 +1,150 @@
+"""The present model of a search: which effects may move, their values, and how well they fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from go1exp.effects.tolerances import Tolerances, sizes
+from go1exp.gap.data.splits import Splits
+from go1exp.gap.replay.machine import Machine
+from go1exp.gap.replay.rows import Key, Theta
+from go1exp.gap.result import GapSettings
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.linear import Table, table
+from go1exp.gap.search import tolerances
+from go1exp.gap.search.fit import Model, fit, scores
+from go1exp.gap.search.screen import free_shapes
+from go1exp.gap.search.tolerances import Freedom
+
+SETTLED = 0.01
+"""Fall of log chi2 in a round of fitting, and log chi2 itself, below which more rounds are not worth their time."""
+
+STEPS_PER_ROUND = 2
+"""Gauss-Newton steps before the linear model is measured again."""
+
+
+@dataclass(frozen=True)
+class State:
+    """A model with terms, and its fit.
+
+    Attributes:
+        scorer: of the windows.
+        splits: which windows are for what.
+        settings: the user's.
+        dt: physics step, s.
+        theta: values of the model.
+        terms: accepted effects.
+        loosened: effects that may move within their tolerances beside those of the tolerance box.
+        kept: effects and joints that stay within tolerance although their effect is a term.
+        fitted: the linear model of what may move about ``theta``; None before the first fit.
+        chi2: (V, G) per value on the windows of the fit; None before it.
+    """
+
+    scorer: Scorer
+    splits: Splits
+    settings: GapSettings
+    dt: float
+    theta: Theta = field(default_factory=dict)
+    terms: tuple[str, ...] = ()
+    loosened: tuple[str, ...] = ()
+    kept: frozenset[tuple[str, int]] = frozenset()
+    fitted: Table | None = None
+    chi2: np.ndarray | None = None
+
+    @property
+    def machine(self) -> Machine:
+        """The robot that is compared."""
+        return self.scorer.replayer.machine
+
+    @property
+    def tolerances(self) -> Tolerances:
+        """Tolerances of that robot."""
+        return self.machine.tolerances
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """All parameters that may move: those of the tolerance box, and of the terms."""
+        effects = dict.fromkeys([*tolerances.nominal(self.machine), *self.loosened, *self.terms])
+        shapes = [key for effect in self.terms for key in free_shapes(effect)]
+        return (*(key for effect in effects for key in sizes(effect)), *shapes)
+
+    @property
+    def may(self) -> Freedom:
+        """What may leave its tolerance."""
+        return Freedom(self.tolerances, frozenset(self.terms), self.kept, not self.settings.calibrate)
+
+    @property
+    def table(self) -> Table:
+        """The linear model of what may move about the fitted values."""
+        assert self.fitted is not None
+        return self.fitted
+
+    @property
+    def train_chi2(self) -> np.ndarray:
+        """(V, G) chi2 per value on the windows of the fit."""
+        assert self.chi2 is not None
+        return self.chi2
+
+    def linear(self, theta: Theta, windows: np.ndarray) -> Table:
+        """Return the linear model of what may move about some values, on some windows (V,)."""
+        probes = tolerances.probes(self.machine, self.keys, theta)
+        return table(self.scorer, theta, windows, probes, self.dt)
+
+    def model(self, theta: Theta) -> Model:
+        """Return a model with all terms, to fit."""
+        return Model("", theta, self.may, ())
+
+    def settled(self, rounds: int) -> State:
+        """Return the state with all that may move fitted on the windows for training."""
+        theta, reached = self.theta, np.inf
+        for _ in range(rounds):
+            linear = self.linear(theta, self.splits.train)
+            (best,) = fit(self.scorer, [self.model(theta)], linear, STEPS_PER_ROUND, self.dt)
+            theta = best.theta
+            assert best.chi2 is not None
+            before, reached = reached, float(np.log(best.chi2).mean())
+            if reached > before - SETTLED or (reached < SETTLED and not self.terms):
+                break
+        assert best.residual is not None
+        fitted = replace(linear, residual=best.residual, theta=theta)
+        return replace(self, theta=theta, fitted=fitted, chi2=best.chi2)
+
+    def at(self, theta: Theta) -> State:
+        """Return the state with other values, as they are."""
+        fitted = self.linear(theta, self.splits.train)
+        chi2 = self.scorer.chi2(fitted.residual, fitted.windows)
+        return replace(self, theta=theta, fitted=fitted, chi2=chi2)
+
+    def renewed(self) -> State:
+        """Return the state with floors and initial states that suit its values."""
+        assert self.scorer.renewed is not None
+        return replace(self, scorer=self.scorer.renewed(self.theta))
+
+    def without(self, term: str, instead: str = "") -> State:
+        """Return the state without a term, or with another in its place, not fitted; its effect is within tolerance."""
+        names = (instead if name == term else name for name in self.terms)
+        theta = tolerances.without(self.theta, term, self.tolerances)
+        return replace(self, terms=tuple(filter(None, names)), theta=theta)
+
+    def keeping(self, kept: frozenset[tuple[str, int]]) -> State:
+        """Return the state, not fitted, with terms' effects within tolerance at the joints of ``kept``."""
+        theta = {key: self._within(key, value, kept) for key, value in self.theta.items()}
+        return replace(self, kept=kept, theta=theta)
+
+    def _within(self, key: Key, value: np.ndarray, kept: frozenset[tuple[str, int]]) -> np.ndarray:
+        """Return values of which those at ``kept`` joints are within tolerance."""
+        p = self.tolerances.param(key)
+        joints = [j for name, j in kept if name == key[0]]
+        if not joints or not math.isfinite(p.tolerance):
+            return value
+        values = np.broadcast_to(value, (len(self.machine.joints),)).copy()
+        values[joints] = values[joints].clip(p.null - p.tolerance, p.null + p.tolerance)
+        return values
+
+    def held_out(self, theta: Theta | None = None, windows: np.ndarray | None = None) -> np.ndarray:
+        """Return chi2 (V, G) of some values, or the present ones, on windows no fit has seen."""
+        theta = self.theta if theta is None else theta
+        return scores(self.scorer, [theta], self.splits.select if windows is None else windows, self.dt)[0]

@@ -1,0 +1,384 @@
+"""The stepwise search: fit what may move, screen, fit the best, judge, accept, and again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from go1exp.effects.tolerances import sizes
+from go1exp.gap.data.splits import Splits
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.result import Candidate, GapSettings
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.search import evidence, significance, single_cause, strain, tolerances
+from go1exp.gap.search.fit import Model, fit, misfit
+from go1exp.gap.search.screen import Screened, library, outside, screen
+from go1exp.gap.search.state import State
+from go1exp.gap.search.trial import Trial, excess, removed, tried
+
+SILENT = 0.02
+"""An effect that adds less than this to the chi2 of every window, at twice its tolerance, is not excited."""
+
+SCREENED = 20
+"""Windows in which candidates are screened, at most."""
+
+LOOSENED = 3
+"""Most effects that join the tolerance box because the data ask for some of them, within their tolerances."""
+
+NEEDED = 12.0
+"""Fall of chi2 that a joint must bring before it may leave the tolerance of a term's effect."""
+
+
+@dataclass
+class Search:
+    """A search in progress, and its result.
+
+    Attributes:
+        scorer: of the windows, as the search begins.
+        splits: which windows are for what.
+        settings: the user's.
+        dt: physics step, s.
+        rng: of tests and bootstraps.
+        progress: called with what is being done, and which share of all is finished.
+        state: the present model.
+        select_chi2: (V, G) chi2 per value of the present model on held-out windows.
+        nominal: values of the model within its tolerances, before any term.
+        first: held-out excess with these.
+        aliases: effect -> effects that do as well.
+        shares: effect -> share of bootstraps in which it wins.
+        candidates: the evidence.
+        signal: effect -> chi2 that it would add at twice its tolerance.
+        steps: (what, held-out excess) after every accepted term.
+        single: the term that explains nearly everything alone, if there is one (``gap/search/single_cause.py``).
+        strained: whether the first term was accepted although the tolerances explain the data nearly as well.
+    """
+
+    scorer: Scorer
+    splits: Splits
+    settings: GapSettings
+    dt: float
+    rng: np.random.Generator
+    progress: Callable[[str, float], None]
+    state: State = field(init=False)
+    select_chi2: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    nominal: Theta = field(default_factory=dict)
+    first: float = math.nan
+    aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    shares: dict[str, float] = field(default_factory=dict)
+    candidates: list[Candidate] = field(default_factory=list)
+    signal: dict[str, float] = field(default_factory=dict)
+    steps: list[tuple[str, float]] = field(default_factory=list)
+    single: str = ""
+    strained: bool = False
+
+    def __post_init__(self) -> None:
+        """Begin with a model without terms at its nominal values."""
+        self.state = State(self.scorer, self.splits, self.settings, self.dt)
+
+    # ------------------------------------------------------------------ the search
+
+    def run(self) -> None:
+        """Search."""
+        cause = self.single_cause() if self.state.machine.base_probe else None
+        self._fit_nominal()
+        if cause is not None:
+            self.progress(f"fitting the model with {cause.name}", 0.2)
+            self.state, self.select_chi2 = self._with_term(cause)
+        while len(self.state.terms) < self.settings.max_terms and self._advance():
+            pass
+        if self.state.terms:
+            self.progress("is all of it needed", 0.85)
+            self._eliminate()
+            self._simplify()
+            self._prune()
+        if self.strained and self.state.terms and max(map(self._size, self.state.terms)) <= strain.CLEAR:
+            self.withdraw("it leaves its tolerance by too little to be called missing")
+
+    def single_cause(self) -> Model | None:
+        """Return the effect of the whole robot that explains nearly everything alone, if there is one."""
+        cause = single_cause.cause(self.state, self.progress, self._judged)
+        self.single = cause.name if cause else ""
+        return cause
+
+    def measure_signals(self) -> None:
+        """Only measure how much each effect would show (``signal``)."""
+        self.state = self.state.settled(1)
+        self._note_signals(self._screened())
+
+    def confirmed(self) -> bool:
+        """Return whether the terms help on the episodes kept for a last check, or there is nothing to help there."""
+        kept = self.splits.confirm
+        if not len(kept):
+            return True
+        before, after = (self.state.held_out(theta, kept) for theta in (self.nominal, self.state.theta))
+        least = 0.0 if excess(before) > self.settings.material else -significance.SAME
+        return bool(significance.gains(before, after[None]).mean() > least)
+
+    def withdraw(self, why: str) -> None:
+        """Take back all terms."""
+        self._reject(self.state.terms, why)
+        self.state = replace(self.state, terms=(), theta=self.nominal)
+        self.steps.append(("withdrawn", self.first))
+
+    # ------------------------------------------------------------------ one term
+
+    def _fit_nominal(self) -> None:
+        """Fit the model within its tolerances."""
+        self.progress("fitting the model within its tolerances", 0.1)
+        self.state = self.state.settled(3)
+        self.select_chi2 = self.state.held_out()
+        self.nominal, self.first = self.state.theta, excess(self.select_chi2)
+        self.steps.append(("within tolerances", self.first))
+
+    def _advance(self) -> bool:
+        """Look for one more term, or one more effect to move within its tolerance; return whether to go on."""
+        term = len(self.state.terms) + 1
+        share = 0.15 + 0.7 * (term - 1) / self.settings.max_terms
+        small = excess(self.select_chi2) < self.settings.material
+        fitted = self._proposals(term, share, small)
+        accepted, inside = self._judged(fitted, self.state, self.state.train_chi2, self.select_chi2, small)
+        if accepted is not None:
+            self.progress(f"fitting the model with {accepted.name}", share + 0.12)
+            self.strained |= small and not self.state.terms
+            return self._accept(accepted)
+        if inside is None or len(self.state.loosened) == LOOSENED:
+            return False
+        self.progress(f"fitting the model with {inside.name}", share + 0.12)
+        self._loosen(inside)
+        return True
+
+    def _proposals(self, term: int, share: float, small: bool) -> list[Model]:
+        """Return fitted candidates for a term; none where the tolerances close the gap and nothing strains them."""
+        screened: list[Screened] = []
+        if not small or not self.signal:
+            self.progress(f"screening for term {term}", share)
+            screened = self._screened()
+            self._note_signals(screened)
+        straining = None
+        if small:
+            relief = strain.relief(self.state.scorer, self.state.table, self.state.may)
+            values = strain.values(self.state.scorer, self.state.table)
+            straining = strain.straining(relief, values, [*self.state.terms, *self._unasked()])
+            screened = outside(screened, tolerances.nominal(self.state.machine))
+            if straining is None and not screened:
+                self._note_absorbed(relief)
+                return []
+        self.progress(f"fitting candidates for term {term}", share + 0.06)
+        return self._fitted(screened) if straining is None else self._freed(straining)
+
+    def _accept(self, model: Model) -> bool:
+        """Make a candidate a term, unless the model is worse with all else fitted again; return whether it is one."""
+        first = self.first
+        state, chi2 = self._with_term(model)
+        if excess(chi2) <= excess(state.held_out(self.state.theta)) + significance.SAME:  # by the same floors
+            self.state, self.select_chi2 = state, chi2
+            return True
+        self.first = first
+        self.steps.pop()
+        self._reject([model.name], "with all else fitted again the held-out error grows")
+        return False
+
+    def _with_term(self, model: Model) -> tuple[State, np.ndarray]:
+        """Return the state with a candidate as a term and all else fitted again, and chi2 of held-out windows."""
+        terms = (*self.state.terms, model.name)
+        loosened = tuple(name for name in self.state.loosened if name != model.name)
+        # What the box had taken on in place of the effect it gives back: it starts from the nominal values.
+        theta = {key: value for key, value in model.theta.items() if key[0] in (*terms, *loosened)}
+        state = replace(self.state, terms=terms, loosened=loosened, theta=theta)
+        renews = state.scorer.renewed is not None
+        if renews and model.name == self.single:
+            state = state.renewed()
+        state = state.settled(4)
+        if renews:
+            state = state.renewed().settled(1)
+        chi2, plain = state.held_out(), state.held_out(model.theta)
+        # With little data, what was fitted from scratch can be a poorer optimum.
+        if excess(plain) < excess(chi2) - significance.SAME:
+            state, chi2 = state.at(model.theta), plain
+        self.first = excess(state.held_out(self.nominal))  # by the same floors
+        self.steps.append((model.name, excess(chi2)))
+        return state, chi2
+
+    def _loosen(self, model: Model) -> None:
+        """Let an effect move within its tolerance."""
+        loosened = (*self.state.loosened, model.name)
+        self.state = replace(self.state, loosened=loosened, theta=model.theta).settled(2)
+        self.select_chi2 = self.state.held_out()
+        if not self.state.terms:
+            self.nominal, self.first = self.state.theta, excess(self.select_chi2)
+        self.steps.append((f"{model.name} within its tolerance", excess(self.select_chi2)))
+
+    # ------------------------------------------------------------------ candidates
+
+    def _screened(self) -> list[Screened]:
+        """Rank all ways in which an effect could be missing, on some of the windows of the fit."""
+        linear, machine = self.state.table, self.state.machine
+        mean = self.state.scorer.windows.y[:, :, 0].mean((0, 1))
+        variants = library(machine, mean, [*self.state.terms, *self.state.loosened])
+        if self.settings.effects:
+            variants = [v for v in variants if v.effect in self.settings.effects]
+        count = len(linear.windows)
+        # Half of the windows that are looked at are the worst, half are spread evenly.
+        worst = np.argsort(-self.state.scorer.chi2(linear.residual, linear.windows).sum(1))[: SCREENED // 2]
+        evenly = np.linspace(0, count - 1, min(SCREENED // 2, count)).astype(int)
+        some = linear.part(np.unique([*worst, *evenly]))
+        return screen(self.state.scorer, self.state.theta, some, self.state.may, variants, self.dt)
+
+    def _note_signals(self, screened: Sequence[Screened]) -> None:
+        for s in screened:
+            self.signal[s.variant.effect] = max(self.signal.get(s.variant.effect, 0.0), s.signal)
+
+    def _note_absorbed(self, relief: dict[str, float]) -> None:
+        """Note which effects of the tolerance box the data would rather have outside it."""
+        if not self.state.terms:  # beside a term they are no rivals of it
+            state, most = self.state, self.settings.shortlist
+            self.candidates += evidence.absorbed(state.keys, relief, state.theta, state.tolerances, most)
+
+    def _unasked(self) -> list[str]:
+        """Return the effects that the user does not want to be considered."""
+        wanted = self.settings.effects
+        return [e for e in tolerances.nominal(self.state.machine) if wanted and e not in wanted]
+
+    def _freed(self, effect: str) -> list[Model]:
+        """Return the model in which an effect of the tolerance box may leave its tolerance, fitted."""
+        model = Model(effect, self.state.theta, self.state.may.also(effect), sizes(effect))
+        return fit(self.state.scorer, [model], self.state.table, self.settings.iterations, self.dt)
+
+    def _fitted(self, screened: Sequence[Screened]) -> list[Model]:
+        """Return models of the best candidates, fitted.
+
+        They start from what screening made of a few windows, and what looks hopeless after a step is given up. Where
+        the model is near the data both may mislead: effects of the tolerance box are also fitted each on its own, from
+        where they are, and the better fit counts.
+        """
+        chosen: dict[str, Screened] = {}
+        for s in screened:
+            if len(chosen) < self.settings.shortlist and s.gain > 0.0:
+                chosen.setdefault(s.variant.effect, s)
+        may = self.state.may
+        models = [Model(effect, s.theta, may.also(effect), s.variant.free) for effect, s in chosen.items()]
+        fitted = fit(self.state.scorer, models, self.state.table, self.settings.iterations, self.dt) if models else []
+        near = excess(self.select_chi2) <= self.settings.adequate
+        movable = {key[0] for key in self.state.keys} if near else set()
+        again = [self._freed(m.name)[0] if m.name in movable else m for m in fitted]
+        return [min(pair, key=misfit) for pair in zip(fitted, again, strict=True)]
+
+    # ------------------------------------------------------------------ judgement
+
+    def _judged(
+        self, fitted: Sequence[Model], state: State, train: np.ndarray, select: np.ndarray, small: bool = False
+    ) -> tuple[Model | None, Model | None]:
+        """Test fitted candidates on held-out windows and note the evidence.
+
+        Args:
+            fitted: the candidates.
+            state: with the scorer that counts.
+            train: (V, G) chi2 of the present model on the windows of the fit.
+            select: the same on held-out windows.
+            small: whether the gap is small, so that which share of it a candidate removes means nothing.
+
+        Returns:
+            The one to accept, and the best of those that help within their tolerances.
+        """
+        if not fitted:
+            return None, None
+        windows = self.splits.select
+        trial = tried(state.scorer, self.settings, fitted, train, select, windows, self.dt, self.rng, small)
+        names = tuple(
+            fitted[k].name for k in sorted(np.flatnonzero(trial.alias).tolist(), key=lambda k: -trial.mean[k])
+        )
+        self._note_trial(trial, fitted, names)
+        helps = [k for k in range(len(fitted)) if trial.helps[k] and trial.sizes[k] <= 1.0]
+        inside = fitted[max(helps, key=lambda k: trial.mean[k])] if helps else None
+        if trial.chosen is None:
+            return None, inside
+        accepted = fitted[trial.chosen]
+        self.aliases[accepted.name] = (accepted.name, *(n for n in names if n != accepted.name))
+        on_train = significance.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None]))
+        every = np.concatenate([on_train, trial.gain], axis=1)
+        self.shares[accepted.name] = self._bootstrap_share(every[~trial.aside], trial.alias[~trial.aside])
+        return accepted, inside
+
+    def _note_trial(self, trial: Trial, fitted: Sequence[Model], aliases: tuple[str, ...]) -> None:
+        """Add the candidates of a trial to the evidence, best first."""
+        for k in np.argsort(-trial.mean):
+            status, reason = trial.reason(int(k))
+            self.candidates.append(
+                evidence.candidate(
+                    fitted[k],
+                    self.scorer.windows.joints,
+                    excess_after=trial.after[k],
+                    log_gain=float(trial.mean[k]),
+                    p=float(trial.p[k]),
+                    alias_class=aliases if trial.alias[k] else (fitted[k].name,),
+                    status=status,
+                    reason=reason,
+                    stage=len(self.state.terms) + 1,
+                )
+            )
+
+    def _bootstrap_share(self, gain: np.ndarray, alias: np.ndarray) -> float:
+        """Return the share of bootstraps in which the chosen candidate, or its equal (``alias``), gains most."""
+        episode = self.scorer.windows.episode[np.concatenate([self.splits.train, self.splits.select])]
+        episode = np.repeat(episode, len(self.state.machine.groups))
+        wins = 0
+        for _ in range(self.settings.bootstraps):
+            picked = significance.resampled(episode, self.rng)
+            mean = gain[:, picked].mean(axis=1)
+            close = mean >= mean.max() - significance.same(mean.max())
+            wins += bool(close[alias].any())
+        return wins / max(self.settings.bootstraps, 1)
+
+    def _reject(self, names: Sequence[str], why: str) -> None:
+        for k, c in enumerate(self.candidates):
+            if c.status == "accepted" and c.effect in names:
+                self.candidates[k] = replace(c, status="rejected", reason=why)
+
+    # ------------------------------------------------------------------ fewer and simpler terms
+
+    def _size(self, effect: str) -> float:
+        return evidence.size(effect, self.state.theta, self.state.tolerances)
+
+    def _eliminate(self) -> None:
+        """Drop terms without which the rest does as well."""
+        for name in [t for t in self.state.terms if t != self.single and len(self.state.terms) > 1]:
+            rest = self.state.without(name).settled(1)
+            without = rest.held_out()
+            gain = significance.gains(without, self.select_chi2[None])
+            needed = removed(excess(without), excess(self.select_chi2)) > self.settings.min_share
+            if not needed or significance.max_t(gain, self.rng)[0] >= self.settings.alpha:
+                self.state, self.select_chi2 = rest, without
+                self.steps.append((f"without {name}", excess(without)))
+
+    def _simplify(self) -> None:
+        """Replace terms by effects that explain as much with fewer numbers, where they do."""
+        for name in self.state.terms:
+            simpler = tolerances.identification(name).simpler
+            if not simpler or simpler in self.state.terms:
+                continue
+            rest = self.state.without(name, simpler).settled(2)
+            before, after = self.state.held_out(self.nominal), self.state.held_out()
+            gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
+            large = evidence.size(simpler, rest.theta, rest.tolerances) > 1.0
+            if less > gain - significance.same(gain) and large:
+                self.state = rest
+                self.aliases[simpler], self.shares[simpler] = (simpler,), self.shares[name]
+                self.steps.append((f"{simpler} in place of {name}", excess(self.state.held_out())))
+
+    def _prune(self) -> None:
+        """Bring back within tolerance what leaves it at a joint for next to nothing."""
+        cost, may, kept = strain.cost(self.state.scorer, self.state.table), self.state.may, self.state.kept
+        for name in self.state.terms:
+            theta, joints = self.state.theta, self.state.machine.joints
+            out = np.flatnonzero(evidence.beyond(name, theta, joints, self.state.tolerances))
+            without = {int(j): cost(replace(may, kept=kept | {(name, int(j))})) for j in out}
+            for j in sorted(without, key=lambda j: without[j])[: len(out) - 1]:  # where it brings most, it stays
+                more = kept | {(name, j)}
+                if cost(replace(may, kept=more)) - cost(replace(may, kept=kept)) < NEEDED:
+                    kept = more
+        if kept != self.state.kept:
+            self.state = self.state.keeping(kept).settled(2)
+            self.steps.append(("at fewer joints", excess(self.state.held_out())))

@@ -1,0 +1,66 @@
+"""How hard the tolerances are leant on: what would be gained if the model might leave them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+
+import numpy as np
+
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.linear import Layout, Table
+from go1exp.gap.search import tolerances
+
+STRAIN = 0.0125
+"""Fall of chi2 per value, were the tolerance of one effect wider, from which that effect is tried although the
+tolerances close the gap: at most 0.0054 in 45 development nulls, 0.046 to 0.07 for effects of two tolerances. With much
+less, masses of links that hardly matter get names: at 300 in all, in 2 of 8 nulls."""
+
+LEAD = 3.0
+"""The same over that of the next effect."""
+
+CLEAR = 1.5
+"""Tolerances that an effect must reach to be named where the tolerances close the gap."""
+
+
+def values(scorer: Scorer, linear: Table) -> float:
+    """Return how many values are compared in the windows of ``own``."""
+    return float(scorer.size[linear.windows].sum()) * len(scorer.replayer.machine.groups)
+
+
+def cost(scorer: Scorer, linear: Table) -> Callable[[tolerances.Freedom], float]:
+    """Return a function that says how small chi2 and priors can be, to first order about ``own``, with some freedom."""
+    layout = Layout.of(scorer.replayer.machine, linear.probes)
+    chi2 = scorer.chi2(linear.residual, linear.windows)
+    matrix, right = layout.total(linear.grams(scorer) / np.maximum(chi2, 1.0)[..., None, None])
+
+    def smallest(may: tolerances.Freedom) -> float:
+        limits = tolerances.bounds(layout, linear.probes, linear.theta, may, back=True)
+        return price(matrix, right, limits)
+
+    return smallest
+
+
+def price(matrix: np.ndarray, right: np.ndarray, limits: tolerances.Bounds) -> float:
+    """Return the bounded minimum that :func:`go1exp.gap.search.tolerances.solve` reaches."""
+    x = tolerances.solve(matrix, right, limits)
+    return float(x @ matrix @ x - 2.0 * right @ x + (limits.weight * (x - limits.centre) ** 2).sum())
+
+
+def relief(scorer: Scorer, linear: Table, may: tolerances.Freedom) -> dict[str, float]:
+    """Return by how much chi2 and priors would fall if an effect of ``own`` might leave its tolerance."""
+    effects = dict.fromkeys(p.key[0] for p in linear.probes)
+    price = cost(scorer, linear)
+    return {effect: price(may) - price(may.also(effect)) for effect in effects}
+
+
+def straining(relieved: Mapping[str, float], count: float, but: Collection[str]) -> str | None:
+    """Return the one effect that would leave its tolerance if it might, far more than any other; None if none would.
+
+    Args:
+        relieved: what :func:`relief` found.
+        count: of values that were compared.
+        but: effects that are out of the question.
+    """
+    order = sorted((e for e in relieved if e not in but), key=lambda e: -relieved[e])
+    second = relieved[order[1]] if len(order) > 1 else 0.0
+    return order[0] if order and relieved[order[0]] > max(STRAIN * count, LEAD * second) else None

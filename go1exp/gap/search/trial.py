@@ -1,0 +1,176 @@
+"""Candidates before the judge: fitted models on windows that no fit has seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.gap.result import GapSettings
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.linear import Layout
+from go1exp.gap.search import evidence, significance, tolerances
+from go1exp.gap.search.fit import Model, scores
+from go1exp.gap.search.strain import CLEAR
+
+FEW = 0.5
+"""A candidate that removes more than this share of the excess without being significant is seen in too few windows."""
+
+MOSTLY = 0.7
+"""Share of a small excess, of a model that is adequate already, that a term must remove: the right one leaves none."""
+
+
+def excess(chi2: np.ndarray) -> float:
+    """Return the mean excess of chi2 per value (V, G)."""
+    return float(chi2.mean() - 1.0) if chi2.size else math.nan
+
+
+def removed(before: float, after: float) -> float:
+    """Return the share of an excess that is gone; what lies below the floor counts as nothing."""
+    return 1.0 - max(after, 0.0) / before if before > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Fitted candidates on held-out windows.
+
+    Attributes:
+        names: of the M candidates.
+        after: their excess.
+        gain: (M, V G) fall of log chi2.
+        p: (M,) of all together.
+        share: (M,) of the excess that is gone.
+        sizes: (M,) in tolerances.
+        needed: share that one must remove.
+        alpha: significance that one must have.
+        helps: (M,) which are significant and remove enough.
+        alias: (M,) which do as well as the best of those that also leave their tolerances.
+        aside: (M,) which do as well too, with more numbers.
+        chosen: the one of these to accept; None if there is none, or if one within its tolerance does as well.
+    """
+
+    names: list[str]
+    after: list[float]
+    gain: np.ndarray
+    p: np.ndarray
+    share: np.ndarray
+    sizes: np.ndarray
+    needed: float
+    alpha: float
+    helps: np.ndarray
+    alias: np.ndarray
+    aside: np.ndarray
+    chosen: int | None
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(M,) mean gain."""
+        return np.asarray(self.gain.mean(axis=1))
+
+    def reason(self, k: int) -> tuple[str, str]:
+        """Return what becomes of a candidate, and why."""
+        share, p, chosen = self.share[k], self.p[k], self.chosen
+        if k == chosen:
+            if self.needed < 0.0:  # a small gap
+                return "accepted", f"held-out log chi2 falls by {self.mean[k]:.2g}, p = {p:.2g}"
+            return "accepted", f"removes {share:.1%} of the excess on held-out windows, p = {p:.2g}"
+        if chosen is not None and self.alias[k]:
+            return "alias", f"does as well as {self.names[chosen]}: these data cannot tell them apart"
+        if self.needed < 0.0 and 1.0 < self.sizes[k] <= CLEAR:
+            return "rejected", f"leaves its tolerance by too little ({self.sizes[k]:.2g} of it) to be called missing"
+        if self.sizes[k] <= 1.0:
+            return "rejected", f"fits within its tolerance ({self.sizes[k]:.2g} of it)"
+        if p >= self.alpha and share > FEW and self.mean[k] > 0:
+            return "rejected", f"removes {share:.1%} of the excess, but too few windows show it (p = {p:.2g})"
+        if p >= self.alpha or self.mean[k] <= 0:
+            return "rejected", f"no significant gain on held-out windows (p = {p:.2g})"
+        if chosen is None and self.helps[k]:
+            return "rejected", "another effect does as well within its tolerance"
+        if share <= self.needed:
+            return "rejected", f"removes only {max(share, 0.0):.1%} of the excess on held-out windows"
+        assert chosen is not None
+        if self.mean[k] >= self.mean[chosen] - significance.same(self.mean[chosen]):
+            return "rejected", f"does no better than {self.names[chosen]}, which needs fewer numbers"
+        return "rejected", f"explains less than {self.names[chosen]} (excess falls by {share:.1%})"
+
+
+def tried(
+    scorer: Scorer,
+    settings: GapSettings,
+    fitted: Sequence[Model],
+    train: np.ndarray,
+    now: np.ndarray,
+    windows: np.ndarray,
+    dt: float,
+    rng: np.random.Generator,
+    small: bool = False,
+) -> Trial:
+    """Compare fitted candidates with the present model, whose chi2 on ``windows`` is ``now`` (V, G).
+
+    Args:
+        scorer: of the windows.
+        settings: the user's.
+        fitted: the candidates.
+        train: (T, G) chi2 of the present model on the windows of the fit.
+        now: the same on ``windows``.
+        windows: which no fit has seen.
+        dt: physics step, s.
+        rng: of the sign flips.
+        small: the gap is within the tolerances; which share of it a candidate removes means nothing.
+    """
+    chi2 = scores(scorer, [m.theta for m in fitted], windows, dt)
+    gain = significance.gains(now, chi2)
+    p = significance.max_t(gain, rng) if settings.judge == "max_t" else np.zeros(len(fitted))
+    if settings.judge == "bic":
+        p = (_bic(scorer, fitted, train) >= 0).astype(float)
+    before, after = excess(now), [excess(one) for one in chi2]
+    share = np.array([removed(before, a) for a in after])
+    needed = settings.min_share if before > settings.adequate else max(MOSTLY, settings.min_share)
+    needed = -math.inf if small else needed
+    sizes = np.array([evidence.size(m.name, m.theta, m.may.tolerances) for m in fitted])
+    helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
+    outside = helps & (sizes > (CLEAR if small else 1.0))
+    numbers = np.array([len(m.keys) for m in fitted])
+    chosen, alias, aside = _choice(gain, outside, helps & (sizes <= 1.0), numbers, rng)
+    names = [m.name for m in fitted]
+    return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, aside, chosen)
+
+
+def _choice(
+    gain: np.ndarray, outside: np.ndarray, inside: np.ndarray, numbers: np.ndarray, rng: np.random.Generator
+) -> tuple[int | None, np.ndarray, np.ndarray]:
+    """Return the candidate to accept (or None), which do as well (M,), and which do so with more numbers (M,).
+
+    Args:
+        gain: (M, V G) fall of log chi2 of each candidate.
+        outside: (M,) which help and leave their tolerances.
+        inside: (M,) which help within their tolerances.
+        numbers: (M,) how many parameters each has.
+        rng: of the tests.
+    """
+    none = np.zeros(len(gain), dtype=bool)
+    if not outside.any():
+        return None, none, none
+    mean = np.asarray(gain.mean(axis=1))
+    best = int(max(np.flatnonzero(outside), key=lambda k: mean[k]))
+    alias = significance.equals(gain, best, rng) & outside
+    aside = alias & (numbers > numbers[alias].min())  # what explains the same with more numbers is no rival
+    alias &= ~aside
+    chosen = int(max(np.flatnonzero(alias), key=lambda k: mean[k]))
+    if inside.any() and mean[inside].max() >= mean[chosen] - significance.same(mean[chosen]):
+        return None, none, aside  # a tolerance does as well: nothing must leave its tolerance
+    return chosen, alias, aside
+
+
+def _bic(scorer: Scorer, fitted: Sequence[Model], train: np.ndarray) -> np.ndarray:
+    """Return by how much Schwarz's criterion grows (M,) with each candidate; its errors are independent, as usual."""
+    machine = scorer.replayer.machine
+    values = train.size * float(scorer.size.mean())
+    growth = []
+    for model in fitted:
+        assert model.chi2 is not None
+        unknowns = Layout.of(machine, tolerances.probes(machine, model.keys, model.theta)).size
+        growth.append(values * np.log(model.chi2.mean() / train.mean()) + unknowns * np.log(values))
+    return np.array(growth)

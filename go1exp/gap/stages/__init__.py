@@ -1,0 +1,1 @@
+"""The stages of ``go1exp gap``, one file each."""

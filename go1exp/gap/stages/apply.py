@@ -1,0 +1,279 @@
+"""The stage ``apply``: an answer written as a choice of ``effect`` for training, and the proof that it holds there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from go1exp.config import parse_parts
+from go1exp.effects.base import Effect, Param
+from go1exp.effects.tolerances import Tolerances
+from go1exp.files import write_text
+from go1exp.gap.comparison import Comparison, compare, robot_from
+from go1exp.gap.data.fingerprint import fingerprint
+from go1exp.gap.files import GapFileError
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.result import GapResult, GapSettings, NamedEffect
+from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.search.fit import scores
+from go1exp.gap.search.trial import excess, removed
+from go1exp.recording import Recording
+from go1exp.robot import RobotConfig
+from go1exp.schema.joint_values import spread
+from go1exp.schema.registry import Term, members
+from go1exp.tensors.threads import one_thread
+
+EFFECT, CALIBRATION, COMPENSATING = "effect.yaml", "calibration.yaml", "compensating.yaml"
+"""What is missing; the nominal parameters within their tolerances; what only makes up for something unknown."""
+
+ROBOT = "robot"
+"""Key of a value that belongs to no joint."""
+
+Values = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""Effect -> parameter -> joint or ``robot`` -> value."""
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What the written files do in replay at the step of training.
+
+    Attributes:
+        files: that were written.
+        physics_dt: the step, s.
+        before: held-out excess of the plain model at that step.
+        after: with ``effect.yaml`` and ``calibration.yaml`` as training reads them.
+        effect_only: with ``effect.yaml`` alone.
+        reported: excess that the search had at its own step with what ``effect.yaml`` holds.
+        closed: share of the excess that the files remove.
+        holds: whether the model with the files is as good at this step as was reported.
+    """
+
+    files: tuple[Path, ...]
+    physics_dt: float
+    before: float
+    after: float
+    effect_only: float
+    reported: float
+    closed: float
+    holds: bool
+
+
+def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
+    """Write the effect files of a result and return those that there are.
+
+    Raises:
+        GapFileError: if the result names an effect or a parameter that is not in the library.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    certified = [n for n in result.named if n.status == "certified"]
+    rest = [n for n in result.named if n.status != "certified"]
+    written = []
+    for name, about, lines in (
+        (EFFECT, "What the model lacks.", _named_lines(certified)),
+        (
+            CALIBRATION,
+            "The model's own parameters, within their tolerances.",
+            _box_lines(result.box, Tolerances.of(result.tolerances)),
+        ),
+        (COMPENSATING, "Makes up for something that no effect describes. Not for training.", _named_lines(rest)),
+    ):
+        path = folder / name
+        path.unlink(missing_ok=True)
+        if lines or name == EFFECT:
+            head = [f"# {about}", *_provenance(result)]
+            write_text(path, "\n".join([*head, *(lines or ["{}"])]) + "\n")
+            written.append(path)
+    return tuple(written)
+
+
+def _named_lines(named: Sequence[NamedEffect]) -> list[str]:
+    lines = []
+    for n in named:
+        params = _params(n.effect, n.params)
+        others = [a for a in n.alias_set if a != n.effect]
+        known = f"; these logs cannot tell it from {', '.join(others)}" if others else ""
+        lines += [f"{n.effect}:  # {n.status}{known}"]
+        widths: dict[str, float] = {}
+        for name, places in n.params.items():
+            lines.append(f"  {name}: {_value(places, params[name])}  # {params[name].unit}")
+            for place, (low, high) in n.interval.get(name, {}).items():
+                lines.append(
+                    f"    # {place}: {places.get(place, params[name].null):.4g}, 95 % within {low:.4g} to {high:.4g}"
+                )
+            halves = [0.5 * (high - low) for low, high in n.interval.get(name, {}).values() if np.isfinite(high - low)]
+            if halves:  # an alias may be the truth: twice as wide
+                widths[name] = float(f"{max(halves) * (2.0 if others else 1.0):.3g}")
+        if widths:
+            lines.append(f"  spread: {json.dumps(widths)}  # each robot's own, from the bootstrap")
+    return lines
+
+
+def _box_lines(box: Values, tolerances: Tolerances) -> list[str]:
+    lines = []
+    for effect, params in box.items():
+        kind = {name: tolerances.param((effect, name)) for name in _params(effect, params)}
+        body = [
+            f"  {name}: {_value(places, kind[name])}  # {kind[name].unit}"
+            for name, places in params.items()
+            if any(abs(v - kind[name].null) > 1e-3 * kind[name].tolerance for v in places.values())
+        ]
+        lines += [f"{effect}:", *body] if body else []
+    return lines
+
+
+def _value(places: Mapping[str, float], param: Param) -> str:
+    """Write values per joint, or one number; rounding must not carry them out of their range (3.1416 > pi)."""
+    rounded = {place: min(max(float(f"{value:.5g}"), param.low), param.high) for place, value in places.items()}
+    if set(places) == {ROBOT}:
+        return json.dumps(rounded[ROBOT])
+    return json.dumps(rounded)
+
+
+def _params(effect: str, names: Collection[str]) -> dict[str, Param]:
+    """Return the declarations of an effect by name, of which ``names`` must be some."""
+    registered = effect in members("effect")
+    known = {p.name: p for p in _kind(effect).params} if registered else {}
+    strange = [f"{effect}.{name}" for name in names if name not in known] if registered else [effect]
+    if strange:
+        raise GapFileError(f"{strange[0]}: not in the library; the result is of another version of go1exp")
+    return known
+
+
+def _kind(effect: str) -> type[Effect]:
+    kind = members("effect")[effect].target
+    assert isinstance(kind, type)
+    return kind
+
+
+def _provenance(result: GapResult) -> list[str]:
+    about = result.provenance
+    lines = [f"# Found by go1exp gap, {date.today().isoformat()}: {result.verdict}.", f"# {result.sentence}"]
+    lines.append(f"# versions {json.dumps(about.get('versions', {}))}")
+    lines.append(f"# seed {about.get('seed')}, step {about.get('physics_dt')} s")
+    return lines + [f"# log {name}: sha256 {digest}" for name, digest in about.get("logs", {}).items()]
+
+
+# ---------------------------------------------------------------------- the proof
+
+
+def terms_of(plain: Mapping[str, Any]) -> tuple[Term, ...]:
+    """Return the effects of a file's content, as training reads them.
+
+    Raises:
+        ValueError: if training would refuse it.
+    """
+    parts, problems = parse_parts({"effect": plain}, ("effect",))
+    if problems:
+        raise ValueError("\n".join(problems))
+    terms: tuple[Term, ...] = parts["effect"]
+    return terms
+
+
+def composed(*contents: Mapping[str, Any]) -> dict[str, Any]:
+    """Return files' contents as one: later ones win, joint by joint, as when training composes them."""
+    whole: dict[str, Any] = {}
+    for effect, params in (item for content in contents for item in content.items()):
+        mine = whole.setdefault(effect, {})
+        for name, value in params.items():
+            both = isinstance(value, Mapping) and isinstance(mine.get(name), Mapping)
+            mine[name] = {**mine[name], **value} if both else value
+    return whole
+
+
+def theta_of(terms: Sequence[Term], joints: Sequence[str]) -> Theta:
+    """Return the values of effects per joint (J,), or (1,) for one of the robot, by (effect, parameter)."""
+    theta: Theta = {}
+    for term in terms:
+        for p in _kind(term.entry.name).params:
+            given = term.parameters[p.name]
+            full = np.array([float(given)]) if p.per == ROBOT else np.nan_to_num(spread(given, joints), nan=p.null)
+            theta[term.entry.name, p.name] = full
+    return theta
+
+
+def _reported(result: GapResult) -> float:
+    """Return the excess that the search had with the certified effects alone; NaN if it did not say."""
+    certified = [n.effect for n in result.named if n.status == "certified"]
+    if len(certified) == len(result.named):
+        return result.excess.get("final", float("nan"))
+    steps = dict(result.waterfall)  # terms in the order in which they were found, the certified ones first
+    return steps.get(certified[-1], float("nan")) if certified else result.excess.get("box", float("nan"))
+
+
+def _same_search(
+    recordings: Sequence[Recording], settings: GapSettings, result: GapResult, tolerances: Tolerances
+) -> None:
+    """Raise a ``GapFileError`` unless a result is of a search in these recordings with these settings."""
+    before, now = result.provenance.get("settings", {}), asdict(settings)
+    changed = [f"search.{k}" for k in SPLITTING if k in before and before[k] != now[k]]
+    if changed:
+        raise GapFileError(f"{', '.join(changed)}: not as in the search that found this; run go1exp gap explain again")
+    searched = Tolerances.of(result.tolerances)
+    for key, value in tolerances.replaced.items():
+        if value != searched.param(key).tolerance:
+            raise GapFileError(
+                f"model.tolerances.{'.'.join(key)} = {value:g}: not as in the search that found this "
+                f"({searched.param(key).tolerance:g}); run go1exp gap explain again"
+            )
+    logs = result.provenance.get("logs")
+    if logs and logs != {r.meta.episode: fingerprint(r) for r in recordings}:
+        raise GapFileError("logs: not those of the search that found this; run go1exp gap explain again")
+
+
+SPLITTING = ("window_s", "burn_s", "stride_s", "confirm_fraction", "seed", "torque")
+"""Settings that decide which windows were held out."""
+
+
+def prove(
+    recordings: Sequence[Recording],
+    robot: RobotConfig | Robot,
+    settings: GapSettings,
+    result: GapResult,
+    contents: Mapping[str, Mapping[str, Any]],
+    physics_dt: float,
+) -> Applied:
+    """Score written files at the step of training, on the windows kept for a last check (if none, the held-out ones).
+
+    Args:
+        recordings: those of the search.
+        robot: the nominal Go1, or another one.
+        settings: those of the search.
+        result: its outcome.
+        contents: file name -> content, as read back from the files.
+        physics_dt: training's step, s.
+
+    Raises:
+        GapFileError: if logs or settings are not those of the search: what it held out would not be known.
+        NotComparable: if the recordings do not suit the robot.
+    """
+    robot = robot_from(robot)
+    _same_search(recordings, settings, result, robot.tolerances)
+    with one_thread():
+        comparison = compare(recordings, robot, settings, physics_dt=physics_dt, fewest=1)
+        plain, effect_only, both = (excess(_held_out(comparison, theta)) for theta in _proposals(contents, robot))
+    reported = _reported(result)
+    holds = both <= max(settings.adequate, 1.5 * reported + 0.1)
+    closed = removed(plain, both)
+    return Applied((), comparison.dt, plain, both, effect_only, reported, closed, bool(holds))
+
+
+def _proposals(contents: Mapping[str, Mapping[str, Any]], robot: Robot) -> tuple[Theta, Theta, Theta]:
+    """Return the values of the plain model, with ``effect.yaml``, and with ``calibration.yaml`` as well."""
+    calibration, lacking = contents.get(CALIBRATION, {}), contents.get(EFFECT, {})
+    effect, both = (theta_of(terms_of(c), robot.joints) for c in (lacking, composed(calibration, lacking)))
+    return {}, effect, both
+
+
+def _held_out(comparison: Comparison, theta: Theta) -> np.ndarray:
+    """Return chi2 (V, G) of a model, by floors and initial states that suit it, on windows of the last check if any."""
+    parts = comparison.split(np.random.default_rng(comparison.settings.seed))
+    windows = parts.confirm if len(parts.confirm) else parts.select  # values were fitted on all but the former
+    renewed = comparison.scorer.renewed
+    scorer = comparison.scorer if renewed is None or not theta else renewed(theta)
+    return scores(scorer, [theta], windows, comparison.dt)[0]

@@ -1,0 +1,196 @@
+"""The stage ``explain``: from recordings and a model to an answer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from go1exp import __version__
+from go1exp.effects.tolerances import declared
+from go1exp.gap.answer import Answer, advice, concluded, evidence, not_excited, sentence
+from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from
+from go1exp.gap.data.fingerprint import fingerprint
+from go1exp.gap.replay.rows import Theta, variants
+from go1exp.gap.result import GapResult, GapSettings, NamedEffect, Overlay
+from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.localise import localise
+from go1exp.gap.search.fit import residuals
+from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.trial import excess
+from go1exp.recording import Recording
+from go1exp.robot import RobotConfig
+from go1exp.tensors.threads import one_thread
+
+
+def explain(
+    recordings: Sequence[Recording],
+    robot: RobotConfig | Robot,
+    settings: GapSettings | None = None,
+    on_progress: Progress = lambda what, share: None,
+) -> GapResult:
+    """Compare recordings of a robot with its model, and name what is missing.
+
+    Args:
+        recordings: of one robot.
+        robot: the nominal Go1, or another :class:`~go1exp.gap.robots.protocol.Robot`.
+        settings: how; the defaults if None.
+        on_progress: called with what is being done, and which share of the work is finished.
+    """
+    start = time.perf_counter()
+    settings, robot = settings or GapSettings(), robot_from(robot)
+    rng, warnings = np.random.default_rng(settings.seed), list[str]()
+    with one_thread():
+        try:
+            comparison = compare(recordings, robot, settings, on_progress)
+        except NotComparable as error:
+            seconds = time.perf_counter() - start
+            return GapResult("bad log", str(error), warnings=error.warnings, seconds=seconds)
+        warnings += comparison.ready.warnings
+        search = searched(comparison, rng, warnings, on_progress)
+        on_progress("intervals", 0.88)
+        answer = concluded(search, warnings)
+        on_progress("where it is wrong", 0.93)
+        about = provenance(comparison, search, recordings, settings)
+        result = written(comparison, search, answer, about, warnings, start)
+    on_progress("done", 1.0)
+    return result
+
+
+def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[str], on_progress: Progress) -> Search:
+    """Search for what is missing; episodes kept for a last check join where they show a gap that others do not."""
+    settings, parts = comparison.settings, comparison.split(rng)
+    if parts.alone:
+        warnings.append(
+            f"Of {len(parts.alone)} episodes there is no other with the same motion and gains; stretches of them judge "
+            "what was fitted on the rest of them."
+        )
+    if not len(parts.confirm):
+        warnings.append("Too few episodes to keep some for a last check.")
+    search = Search(comparison.scorer, parts, settings, comparison.dt, rng, on_progress)
+    search.run()
+    if not len(parts.confirm) or search.state.terms or search.first > settings.adequate:
+        return search
+    unseen = excess(search.state.held_out(windows=parts.confirm))
+    if unseen <= settings.adequate:
+        return search
+    warnings.append(
+        f"Episodes kept for a last check show an error of {1 + unseen:.3g} times the floor, others do not: "
+        "they were taken into the search, with nothing left for a last check."
+    )
+    search = Search(comparison.scorer, comparison.split(rng, confirm=0.0), settings, comparison.dt, rng, on_progress)
+    search.run()
+    return search
+
+
+def written(
+    comparison: Comparison,
+    search: Search,
+    answer: Answer,
+    about: dict[str, Any],
+    warnings: Sequence[str],
+    start: float,
+) -> GapResult:
+    """Return the result: the answer, the evidence behind it, and where the model is wrong with and without it."""
+    score, parts, settings, dt = search.state.scorer, search.splits, search.settings, search.dt
+    shown = np.sort(np.concatenate([parts.select, parts.confirm]))
+    before, after = residuals(score, [{}, search.state.theta], shown, dt)
+    silent = not_excited(search.signal, held=not comparison.robot.base_probe)
+    more = advice({n.effect: n.alias_set for n in answer.named})
+    named = {n.effect: n for n in answer.named}
+    return GapResult(
+        verdict=answer.verdict,
+        sentence=sentence(answer, search, silent, more),
+        named=answer.named,
+        candidates=evidence(search),
+        floors=comparison.floors(),
+        excess=answer.excess,
+        closed=answer.closed,
+        before=localise(score, before, shown, search.rng),
+        after=localise(score, after, shown, search.rng),
+        not_excited=silent,
+        advice=more,
+        bootstrap_share=dict(search.shares),
+        waterfall=(("model as it is", answer.excess["null"]), *search.steps),
+        overlays=overlays(score, comparison.recordings, search.state.theta, parts.select, settings.overlays, dt),
+        tolerances=comparison.robot.tolerances.by_effect(),
+        box=_nested(answer.theta, score.windows.joints, named),
+        provenance={**about, "simulation_steps": score.replayer.made},
+        warnings=tuple(warnings),
+        seconds=time.perf_counter() - start,
+    )
+
+
+def provenance(
+    comparison: Comparison, search: Search, logs: Sequence[Recording], settings: GapSettings
+) -> dict[str, Any]:
+    """Return hashes of the logs, versions, the user's settings, and which episodes were for what."""
+    recordings, episode, parts = comparison.recordings, comparison.windows.episode, search.splits
+    kinds = {"train": parts.train, "select": parts.select, "confirm": parts.confirm}
+    return {
+        "logs": {r.meta.episode: fingerprint(r) for r in logs},
+        "versions": {"go1exp": __version__, "mujoco": version("mujoco-core"), "numpy": np.__version__},
+        "settings": asdict(settings),
+        "seed": settings.seed,
+        "physics_dt": comparison.dt,
+        "windows": len(comparison.windows),
+        "split": {name: sorted({recordings[e].meta.episode for e in episode[w]}) for name, w in kinds.items()},
+    }
+
+
+def overlays(
+    score: Scorer, recordings: Sequence[Recording], theta: Theta, windows: np.ndarray, count: int, dt: float
+) -> tuple[Overlay, ...]:
+    """Return curves of some held-out windows, from the worst to the median of the plain model."""
+    w, machine = score.windows, score.replayer.machine
+    if not count or not len(windows):
+        return ()
+    before = score.replayer.run(variants(machine, {}, windows, []), dt)
+    off = (((before - w.y[windows]) / w.scale[windows][:, None]) ** 2).mean((1, 2, 3))
+    order = np.argsort(-off)
+    picked = order[np.unique(np.linspace(0, len(order) // 2, count).astype(int))]
+    after = score.replayer.run(variants(machine, theta, windows[picked], []), dt)
+    drawn = []
+    compared = [at for at in w.channels if np.isfinite(w.scale[windows[0]][at[1:]])]
+    for row, k in enumerate(picked):
+        window = windows[k]
+        valid = w.valid[window]
+
+        def curves(y: np.ndarray, valid: np.ndarray = valid) -> dict[str, np.ndarray]:
+            return {name: y[valid, c, i] for name, c, i in compared}
+
+        noise = {name: float(w.scale[window, c, i]) for name, c, i in compared}
+        drawn.append(
+            Overlay(
+                recordings[w.episode[window]].meta.episode,
+                w.begin[window] + w.t[window, valid],
+                curves(w.y[window]),
+                curves(before[k]),
+                curves(after[row]),
+                noise,
+            )
+        )
+    return tuple(drawn)
+
+
+def _nested(
+    theta: Theta, joints: Sequence[str], named: Mapping[str, NamedEffect]
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Return what stays within tolerance, by effect, parameter and joint: all but what is named, where it is."""
+    nested: dict[str, dict[str, dict[str, float]]] = {}
+    for (effect, name), value in theta.items():
+        claim = named.get(effect)
+        if declared((effect, name)).per == "robot":
+            left = {} if claim else {"robot": float(value[0])}
+        else:
+            full = zip(joints, np.broadcast_to(value, (len(joints),)), strict=True)
+            away = claim is not None and (claim.status != "certified" or not claim.joints)
+            left = {} if away else {n: float(v) for n, v in full if claim is None or n not in claim.joints}
+        if left:
+            nested.setdefault(effect, {})[name] = left
+    return nested

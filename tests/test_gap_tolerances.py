@@ -1,0 +1,196 @@
+"""Tolerances are data: of the robot, given by a user, and written down with what was found."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from go1exp.cli.app import App
+from go1exp.cli.files import choices_from_files
+from go1exp.cli.gap import APP
+from go1exp.compose import compose
+from go1exp.config import parse_parts
+from go1exp.effects.tolerances import DECLARED, Tolerances, declared, sizes
+from go1exp.gap import files
+from go1exp.gap.report import tables, text, write_report
+from go1exp.gap.result import GapResult, GapSettings, NamedEffect
+from go1exp.gap.robots.choice import robot_of
+from go1exp.gap.robots.description import parse_model
+from go1exp.gap.robots.hung import hung
+from go1exp.gap.search import evidence, tolerances
+from go1exp.gap.stages.apply import prove, write
+from go1exp.gap.stages.explain import explain
+from go1exp.recording import Recording
+from go1exp.robot import JOINTS
+from go1exp.schema.registry import members
+from tests.laboratory import recorded
+
+ADDED = ("armature", "added")
+JOINT = "FR_calf"
+
+
+def robot_given(*overrides: str) -> Any:
+    """Return the robot of a command line of ``go1exp gap``."""
+    container = compose("gap", choices_from_files(["logs=x", *overrides], "gap"))
+    parts, problems = parse_parts(container, ("robot",))
+    assert problems == []
+    return robot_of(parse_model(container["model"]), parts["robot"])
+
+
+def answer(**changes: Any) -> GapResult:
+    """Return a made-up answer that names 0.004 kg m2 of rotor inertia."""
+    named = NamedEffect(
+        "armature", (JOINT,), {"added": {JOINT: 0.004}}, {"added": {JOINT: (0.003, 0.005)}}, ("armature",), "certified"
+    )
+    usual: dict[str, Any] = {"named": (named,), "box": {"armature": {"added": {"FR_hip": 0.0006}}}}
+    return GapResult("explained", "The model lacks rotor inertia.", **{**usual, **changes})
+
+
+# ---------------------------------------------------------------------- what counts
+
+
+def test_what_no_robot_replaces_is_as_declared() -> None:
+    for effect in members("effect"):
+        for key in sizes(effect):
+            assert DECLARED.param(key) == declared(key)
+    assert Tolerances.of(DECLARED.by_effect()).by_effect() == DECLARED.by_effect()
+    changed = Tolerances.of({"armature": {"added": 0.003}})
+    assert changed.param(ADDED) == replace(declared(ADDED), tolerance=0.003)
+    assert changed.param(("coulomb", "bound")) == declared(("coulomb", "bound"))
+    assert changed.by_effect()["armature"] == {"added": 0.003}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "tolerance"),
+    [
+        (["model.tolerances.coulomb.bound=0.2"], ("coulomb", "bound"), 0.2),
+        (["+model.tolerances.coulomb={bound: 0.2}"], ("coulomb", "bound"), 0.2),
+        (["model.tolerances={coulomb: {bound: 0.2}}"], ("coulomb", "bound"), 0.2),
+        (["model=go2"], ADDED, 0.003),
+        (["model=go2", "model.tolerances.armature.added=0.002"], ADDED, 0.002),
+        (["model=go2", "model.tolerances.coulomb.bound=0.2"], ("coulomb", "bound"), 0.2),
+        (["model=go2", "model.tolerances.coulomb.bound=0.2"], ADDED, 0.003),
+    ],
+)
+def test_a_user_gives_tolerances_on_the_command_line(
+    overrides: list[str], key: tuple[str, str], tolerance: float
+) -> None:
+    robot = robot_given(*overrides)
+    assert robot.tolerances.param(key).tolerance == tolerance
+    may = tolerances.Freedom(robot.tolerances)
+    assert may.reach(key, 0) == tolerance
+    assert may.also(key[0]).reach(key, 0) == math.inf
+    theta = {key: robot.tolerances.param(key).null + 2.0 * tolerance * np.ones(1)}
+    assert evidence.size(key[0], theta, robot.tolerances) == pytest.approx(2.0)
+
+
+def test_a_user_gives_tolerances_of_the_go1_in_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "known_worse.yaml"
+    file.write_text("mjcf: null\ntolerances:\n  armature: {added: 0.004}\n")
+    robot = robot_given(f"model={file}")
+    assert robot.tolerances.replaced == {ADDED: 0.004}
+    assert robot == replace(robot_given(), tolerances=robot.tolerances)
+
+
+def test_a_robot_on_its_feet_keeps_its_tolerances() -> None:
+    (log, *_) = recorded(["seconds=1.0", "excitation=[squat]"])[1]
+    robot = robot_given("model.tolerances.payload.mass=0.5").suited([log])
+    assert robot.base_probe
+    assert robot.tolerances.param(("payload", "mass")).tolerance == 0.5
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        (
+            "model.tolerances.colomb.bound=0.2",
+            "model.tolerances.colomb: unknown effect 'colomb'; did you mean 'coulomb'",
+        ),
+        (
+            "model.tolerances.coulomb.bund=0.2",
+            "model.tolerances.coulomb.bund: unknown parameter 'bund'; did you mean 'bound'",
+        ),
+        ("model.tolerances.stribeck.speed=0.2", "model.tolerances.stribeck.speed: is a shape, which has no tolerance"),
+        ("model.tolerances.coulomb.bound=-1", "model.tolerances.coulomb.bound = -1: input should be greater than 0"),
+        ("model.tolerances.coulomb=0.2", "model.tolerances.coulomb = 0.2: input should be an object"),
+    ],
+)
+def test_a_wrong_tolerance_is_refused_in_one_line(override: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert App("gap", APP.task).run(["logs=x", override]) == 2
+    assert line in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------------- what is written down
+
+
+@pytest.mark.parametrize(("given", "shown"), [({}, "4"), ({"armature": {"added": 0.003}}, "1.3")])
+def test_the_report_counts_in_the_tolerances_of_the_search(
+    tmp_path: Path, given: dict[str, dict[str, float]], shown: str
+) -> None:
+    files.save(answer(tolerances=given), tmp_path)
+    result = files.load(tmp_path)
+    (row,) = tables.values(result)
+    assert row.over == shown
+    page = next(f for f in write_report(result, tmp_path) if f.suffix == ".html").read_text()
+    label = {"4": "armature added (± 0.001 kg m2)", "1.3": "armature added (± 0.003 kg m2)"}[shown]
+    assert label in page
+    assert text(result)
+
+
+def test_a_result_of_an_older_version_has_the_declared_tolerances(tmp_path: Path) -> None:
+    file = files.save(answer(), tmp_path)
+    content = json.loads(file.read_text())
+    assert content.pop("tolerances") == {}
+    file.write_text(json.dumps(content))
+    (row,) = tables.values(files.load(tmp_path))
+    assert row.over == "4"
+
+
+def test_a_calibration_leaves_out_what_is_next_to_nothing_in_the_tolerances_of_the_search(tmp_path: Path) -> None:
+    box = {"armature": {"added": {"FR_hip": 1e-5}}}
+    assert (tmp_path / "calibration.yaml") in write(answer(box=box), tmp_path)
+    wide = answer(box=box, tolerances={"armature": {"added": 0.05}})
+    assert (tmp_path / "calibration.yaml") not in write(wide, tmp_path)
+
+
+def test_a_proof_refuses_other_tolerances_than_those_of_the_search() -> None:
+    found = answer(tolerances=DECLARED.by_effect())
+    logs: list[Recording] = []
+    with pytest.raises(files.GapFileError, match=r"model.tolerances.coulomb.bound = 0.2: not as in the search .*0.05"):
+        prove(logs, robot_given("model.tolerances.coulomb.bound=0.2"), GapSettings(), found, {}, 0.002)
+
+
+# ---------------------------------------------------------------------- what is found
+
+QUICK = GapSettings(
+    stride_s=0.4,
+    window_s=0.2,
+    effects=("coulomb", "viscous"),
+    shortlist=2,
+    iterations=2,
+    max_terms=1,
+    bootstraps=0,
+    overlays=0,
+)
+
+
+def test_friction_that_is_within_the_users_tolerance_is_no_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = ("armature", "coulomb", "viscous")  # a replay has 10 variants then, and not 36
+    monkeypatch.setattr(tolerances, "nominal", lambda robot: few)
+    rig, logs = recorded(
+        ["physics_dt=0.0005", "seconds=3.0", "excitation=[chirp]", "gains=[[20,0.5],[35,0.6],[35,1.2]]"],
+        {"coulomb": {"bound": {"calf": 0.3}}},
+    )
+    worse_known = hung(rig.robot, Tolerances.of({"coulomb": {"bound": 0.5}}))
+    result = explain(logs, worse_known, QUICK)
+    assert result.verdict == "no gap"
+    assert result.tolerances["coulomb"] == {"bound": 0.5}
+    assert result.tolerances["armature"] == DECLARED.by_effect()["armature"]
+    for joint in (j for j in JOINTS if j.endswith("calf")):
+        assert result.box["coulomb"]["bound"][joint] == pytest.approx(0.3, abs=0.05)
