@@ -9,6 +9,8 @@ from go1exp.cli import ONE_BLAS_THREAD
 os.environ.setdefault(*ONE_BLAS_THREAD)  # before NumPy is imported; tests run side by side
 
 from collections.abc import Callable
+from copy import deepcopy
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -65,10 +67,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=dropped)
 
 
+@cache
+def composed(overrides: tuple[str, ...], folder: str) -> dict[str, Any]:
+    """Compose once what many tests begin with; paths among the overrides begin at ``folder``."""
+    return compose("train", overrides)
+
+
 @pytest.fixture(scope="session")
 def make_task() -> Callable[..., TaskConfig]:
     """Parse the environment's configuration from command-line overrides."""
-    return lambda *overrides: parse_task(compose("train", overrides))
+    return lambda *overrides: parse_task(deepcopy(composed(overrides, os.getcwd())))
 
 
 @pytest.fixture
