@@ -13,11 +13,11 @@ LOCK_VENV := build/lock-venv
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check sanitise bench runtime image lock clean
+.PHONY: help setup demo quick test test-all check sanitise bench runtime image lock clean
 
 help: ## list the verbs
 	@echo "usage: make VERB"
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 setup: $(OK) ## make .venv with the locked packages and go1exp in it (redone when pyproject.toml, the lock or C++ changes)
 
@@ -49,9 +49,25 @@ demo: setup ## train for some minutes, judge the policy, film it, find what a lo
 	@echo "demo 4/4: go1exp gap, on recordings of a robot that is not quite like its model"
 	@$(BIN)/go1exp gap logs=assets/demo/hung_go1 out=runs/demo/gap || [ $$? -eq 10 ]
 
-test: setup ## run the tests
+# SLOW: none, all, or a commit: then the slow tests that are about a file changed since (tests/selection.py).
+SLOW ?= none
+PYTEST = $(BIN)/python -m pytest -n $(or $(JOBS),2) --dist worksteal -q
+
+# Files that need neither a training nor another process nor a search. Others: make quick T=tests/test_ppo.py
+T ?= $(addprefix tests/,contracts/test_actuators.py contracts/test_terms.py $(addprefix test_,$(addsuffix .py, \
+  clearance configs delay_line excitations foot_timers gap_box gap_score help layering logging randomness recording \
+  rewards selection)))
+
+quick: setup ## run tests that take seconds, while working; of certain files: make quick T=tests/test_ppo.py
+	@echo "quick: pytest"
+	@$(PYTEST) --slow=none $(T)
+
+test: setup ## run the tests that must hold
 	@echo "test: pytest"
-	@$(BIN)/python -m pytest -n 2 --dist worksteal -q --durations=15
+	@$(PYTEST) --slow=$(SLOW) --durations=15
+
+test-all: SLOW := all
+test-all: test ## run every test
 
 check: setup ## formatting, lint and types; changes nothing
 	@echo "check 1/3: ruff format"

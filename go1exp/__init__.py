@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from go1exp.env.core import Go1Core
 
 # Torch's idle OpenMP threads would spin on the cores that MuJoCo's threads need between two policy steps: on two cores
 # that costs a third of the environment's speed. Read by OpenMP when torch is first imported; a user's choice stands.
@@ -25,3 +30,10 @@ def data_root() -> Path:
     if (root / "conf").is_dir() and (root / "pyproject.toml").is_file():
         return root
     raise FileNotFoundError(f"go1exp: no conf/ in {_PACKAGE} and no checkout around it")
+
+
+def make(overrides: Sequence[str] = (), num_envs: int = 1024, seed: int = 0, **options: Any) -> Go1Core:
+    """Return N robots that step together on torch tensors: see ``go1exp.env.batch.make``."""
+    from go1exp.env.batch import make as batched
+
+    return batched(overrides, num_envs, seed, **options)

@@ -1,7 +1,7 @@
 """Hydra in, plain frozen dataclasses out. Nothing below this module sees a YAML or an OmegaConf.
 
-``compose`` turns overrides into a plain dict; ``parse`` turns that dict into a ``TrainConfig`` or raises one
-``ConfigError`` that lists everything wrong with it. Neither imports torch's machinery nor builds anything.
+``compose.compose`` turns overrides into a plain dict. ``parse_train`` turns that dict into a ``TrainConfig``, or raises
+one ``ConfigError`` that lists everything wrong with it. Neither imports torch's machinery nor builds anything.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
 from go1exp.effects.rules import drive_problems
 from go1exp.robot import RobotConfig
+from go1exp.schema import plugins
 from go1exp.schema.backends import BACKENDS, BackendConfig, CpuBackend
 from go1exp.schema.learner import CheckpointConfig as CheckpointConfig
 from go1exp.schema.learner import LoggerConfig as LoggerConfig
@@ -115,6 +116,7 @@ class ProcessConfig:
         torch_threads: threads of torch, 0 for its own choice.
         resume: run folder to continue; nothing but iterations, checkpoints, threads, device and backend may change.
         start_from: run folder, or name of a shipped policy, whose weights a new run begins with.
+        plugins: files and packages with terms of your own, such as [my_terms.py] (docs/extending.md).
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -123,7 +125,8 @@ class ProcessConfig:
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     torch_threads: CountOrZero
     resume: str | None
-    start_from: str | None = None  # runs of older versions have no such key
+    start_from: str | None = None  # runs of older versions have neither key
+    plugins: str | tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -246,14 +249,14 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
                     problems.append(unknown_name("backend.name", str(settings["name"]), BACKENDS, "engine"))
                     continue
                 kind = BACKENDS[settings["name"]]
-            parts[name], found = _section(kind, settings, name)
+            parts[name], complaints = _section(kind, settings, name)
         elif name in MANY_TERMS:
-            parts[name], found = _terms(name, settings)
+            parts[name], complaints = _terms(name, settings)
         elif not isinstance(settings, Mapping) or "term" not in settings:
-            found = [f"{name}.term: required, but not given"]
+            complaints = [f"{name}.term: required, but not given"]
         else:
-            parts[name], found = bind(name, str(settings["term"]), settings, name)
-        problems += found
+            parts[name], complaints = bind(name, str(settings["term"]), settings, name)
+        problems += complaints
     return parts, problems
 
 
@@ -290,7 +293,7 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
         problems.append("observation: at least one term is required")
     terrain: Any = parts.get("terrain")
     for rule in (parts.get("curriculum") or ()) if terrain else ():
-        top, start = terrain.rows - 1, rule.parameters["start_level_max"]
+        top, start = terrain.rows - 1, rule.parameters.get("start_level_max", 0)
         if terrain.kind == "flat":
             problems.append(f"curriculum.{rule.key}: needs graded ground; use terrain=rough, or curriculum=none")
         elif start > top:
@@ -306,7 +309,8 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
 
 
 def parse_task(container: Mapping[str, Any]) -> TaskConfig:
-    """Validate the environment's part of a composed configuration; raise ConfigError with every problem."""
+    """Load the plugins of a composed configuration, validate its task; raise ConfigError with every problem."""
+    plugins.use(container.get(plugins.KEY))
     wanted = tuple(f.name for f in fields(TaskConfig))
     parts, problems = parse_parts(container, wanted)
     problems += _cross_rules(parts)
@@ -316,7 +320,8 @@ def parse_task(container: Mapping[str, Any]) -> TaskConfig:
 
 
 def parse_train(container: Mapping[str, Any]) -> TrainConfig:
-    """Validate a composed training configuration; raise ConfigError with every problem."""
+    """Load the plugins of a training configuration and validate it; raise ConfigError with every problem."""
+    plugins.use(container.get(plugins.KEY))
     task_names = tuple(f.name for f in fields(TaskConfig))
     others = ("ppo", "logger", "checkpoint")
     top = tuple(f.name for f in fields(ProcessConfig))
@@ -326,9 +331,9 @@ def parse_train(container: Mapping[str, Any]) -> TrainConfig:
         for key, value in container.items()
         if key not in known
     ]
-    parts, found = parse_parts(container, (*task_names, *others))
-    process, complaints = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
-    problems += found + complaints + _cross_rules(parts)
+    parts, of_parts = parse_parts(container, (*task_names, *others))
+    process, of_process = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
+    problems += of_parts + of_process + _cross_rules(parts)
     if problems:
         raise ConfigError(problems)
     task = TaskConfig(**{name: parts[name] for name in task_names})

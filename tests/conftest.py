@@ -9,6 +9,8 @@ from go1exp.cli import ONE_BLAS_THREAD
 os.environ.setdefault(*ONE_BLAS_THREAD)  # before NumPy is imported; tests run side by side
 
 from collections.abc import Callable
+from copy import deepcopy
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,14 +26,57 @@ from go1exp.drive import DriveSetup
 from go1exp.env.core import Go1Core
 from go1exp.fit.net import ActuatorNet, NetInfo, Provenance, group_names
 from go1exp.tensors.randomness import EnvRandom
+from tests.selection import changed_since, chosen
 
 torch.set_num_threads(1)
+
+CHANGED = pytest.StashKey[frozenset[str] | None]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the choice of slow tests: tests/selection.py."""
+    text = "slow tests: all, none, or those about files that changed since a commit (default: all)"
+    parser.addoption("--slow", default="all", metavar="WHICH", help=text)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Ask git once."""
+    slow = str(config.getoption("--slow"))
+    config.stash[CHANGED] = None if slow in ("all", "none") else changed_since(slow, config.rootpath)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Say which slow tests ran where that depends on something."""
+    slow, changed = config.getoption("--slow"), config.stash[CHANGED]
+    if slow not in ("all", "none"):
+        about = "all, as git cannot tell what changed" if changed is None else f"about the {len(changed)} files changed"
+        terminalreporter.write_line(f"slow tests: {about} since {slow}")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the slow tests that were not chosen."""
+    slow, changed = str(config.getoption("--slow")), config.stash[CHANGED]
+    kept, dropped = [], []
+    for item in items:
+        mark = item.get_closest_marker("slow")
+        itself = item.path.relative_to(config.rootpath).as_posix()
+        keep = mark is None or chosen(slow, (*mark.args, itself), changed)
+        (kept if keep else dropped).append(item)
+    if dropped:
+        items[:] = kept
+        config.hook.pytest_deselected(items=dropped)
+
+
+@cache
+def composed(overrides: tuple[str, ...], folder: str) -> dict[str, Any]:
+    """Compose once what many tests begin with; paths among the overrides begin at ``folder``."""
+    return compose("train", overrides)
 
 
 @pytest.fixture(scope="session")
 def make_task() -> Callable[..., TaskConfig]:
     """Parse the environment's configuration from command-line overrides."""
-    return lambda *overrides: parse_task(compose("train", overrides))
+    return lambda *overrides: parse_task(deepcopy(composed(overrides, os.getcwd())))
 
 
 @pytest.fixture

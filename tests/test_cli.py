@@ -24,17 +24,9 @@ from go1exp.config import parse_train
 from go1exp.evaluate.camera import RenderingUnavailable, choose_gl
 from go1exp.schema import registry
 from go1exp.train import run_folder, trainer
+from tests.command import LIGHT, WITH_MODULES, run_alone
+from tests.command import run as cli
 
-COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
-WITH_MODULES = """
-import json, os, sys
-from go1exp.cli import main
-try:
-    sys.exit(main())
-finally:
-    with open(os.environ["MODULES"], "w") as file:
-        json.dump(list(sys.modules), file)
-"""
 SMALL = (
     "ppo=paper",
     "ppo.num_envs=4",
@@ -50,23 +42,11 @@ SMALL = (
 HEAVY = {"mujoco", "stable_baselines3", "gymnasium", "torch.nn", "wandb", "tensorboard", "matplotlib", "scipy"}
 
 
-def cli(cwd: Path, *arguments: str, code: str = COMMAND_LINE, **environment: str) -> subprocess.CompletedProcess[str]:
-    inherited = {k: v for k, v in os.environ.items() if k not in ("HYDRA_FULL_ERROR", "DISPLAY", "WAYLAND_DISPLAY")}
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=cwd,
-        env={**inherited, "PYTHONPATH": str(data_root()), **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
 def assert_refused(tmp_path: Path, arguments: list[str], *said: str) -> None:
     """Status 2, one message with everything of ``said``, nothing heavy loaded, nothing left behind."""
     here, modules = tmp_path / "here", tmp_path / "modules.json"
     here.mkdir()
-    done = cli(here, *arguments, code=WITH_MODULES, MODULES=str(modules))
+    done = cli(here, *arguments, code=WITH_MODULES, preload=LIGHT, MODULES=str(modules))
     first, *others = done.stderr.splitlines()
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
@@ -273,7 +253,7 @@ def test_a_traceback_is_there_for_who_asks_for_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]])
 def test_the_general_help_names_every_verb_and_loads_nothing(arguments: list[str], tmp_path: Path) -> None:
-    done = cli(tmp_path, *arguments, code=WITH_MODULES, MODULES=str(tmp_path / "modules.json"))
+    done = run_alone(tmp_path, *arguments, code=WITH_MODULES, MODULES=str(tmp_path / "modules.json"))
     assert done.returncode == 0
     for verb, text in VERBS.items():
         assert re.search(rf"^  {verb} +{re.escape(text)}$", done.stdout, re.MULTILINE)
@@ -359,14 +339,22 @@ def leaves(settings: dict[str, Any], path: str = "") -> list[tuple[str, Any]]:
 @pytest.mark.parametrize("verb", [name(v) for v in EVERY if v != "train"])
 def test_every_setting_of_a_verb_can_be_given_on_the_command_line(verb: str) -> None:
     """A folder of conf/ with the name of a key would make Hydra take the key for a choice of files."""
-    refused = []
-    for key, value in leaves(compose(verb)):
-        given = "x" if value == "???" else value
-        try:
-            assert dict(leaves(compose(verb, [f"{key}={json.dumps(given)}"])))[key] == given
-        except (HydraException, ValueError) as error:
-            refused.append(f"{key}: {error}")
-    assert refused == []
+    given = {key: "x" if value == "???" else value for key, value in leaves(compose(verb))}
+    words = [f"{key}={json.dumps(value)}" for key, value in given.items()]
+    try:
+        assert dict(leaves(compose(verb, words))) == given
+    except (HydraException, ValueError):
+        assert [word for word in words if not accepted(verb, word)] == []
+        raise
+
+
+def accepted(verb: str, word: str) -> bool:
+    """Whether a verb takes one setting."""
+    try:
+        compose(verb, [word])
+    except (HydraException, ValueError):
+        return False
+    return True
 
 
 def test_cfg_job_prints_the_configuration_and_runs_nothing(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
@@ -22,15 +22,16 @@ import go1exp.record.policy  # noqa: F401  (registers every importer and excitat
 from go1exp import cli, data_root
 from go1exp.cli import listing, settings
 from go1exp.cli.files import choices_from_files
+from go1exp.cli.plugins import begin
 from go1exp.cli.record import RIG
 from go1exp.cli.record import _motions as motions
 from go1exp.compose import compose, hydra_for
 from go1exp.config import TrainConfig, parse_parts, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.gap.robots.description import parse_model
-from go1exp.mdp import rewards
-from go1exp.schema import registry
+from go1exp.schema import plugins, registry
 from go1exp.schema.registry import Term
+from tests.test_extending import files as files_of_extending
 
 CONF = data_root() / "conf"
 DOCS = Path(__file__).parents[1] / "docs"
@@ -360,6 +361,7 @@ def test_the_page_on_the_paper_has_every_row() -> None:
 
 def parse(verb: str, container: dict[str, Any]) -> None:
     """Raise if the verb would refuse its settings."""
+    container = begin(verb, container)
     if verb == "train":
         parse_train(container)
         return
@@ -380,7 +382,9 @@ def parse(verb: str, container: dict[str, Any]) -> None:
 
 
 @pytest.fixture
-def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_net: Callable[..., Path]) -> Callable[[str], None]:
+def beside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_net: Callable[..., Path]
+) -> Iterator[Callable[[str], None]]:
     """Puts the files that a command names into the folder that it is typed in."""
     monkeypatch.chdir(tmp_path)
 
@@ -389,8 +393,12 @@ def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_net: Callable[.
             file = tmp_path / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(make_net().read_bytes() if file.suffix == ".npz" else b"coulomb: {bound: 0.3}")
+        for name, text in files_of_extending().items():
+            if name in command:
+                (tmp_path / name).write_text(text)
 
-    return lay
+    yield lay
+    plugins.begin([])
 
 
 def test_the_pages_show_every_verb() -> None:
@@ -423,17 +431,3 @@ def test_complaints_in_the_documentation_are_true(
     monkeypatch.setattr(sys, "argv", shlex.split(typed)[1:])
     assert cli.main() == 2
     assert capsys.readouterr().err.splitlines() == message
-
-
-def test_the_documented_reward_works(monkeypatch: pytest.MonkeyPatch, make_core: Callable[..., Go1Core]) -> None:
-    members = {group: dict(registry.members(group)) for group in registry.groups()}
-    monkeypatch.setattr(registry, "_REGISTRY", members)
-    (code,) = (block for block in fences("python") if "joint_power" in block)
-    (line,) = (block for block in fences("yaml") if block.startswith("joint_power"))
-    exec(code, dict(vars(rewards)))
-    settings = line.split("#")[0].partition(":")[2].strip()
-    core = make_core(f"+reward.joint_power={settings}", num_envs=1)
-    core.reset()
-    for _ in range(3):
-        core.step(torch.full((1, 12), 3.0))
-    assert core.drain_metrics(3)["reward/joint_power"] < 0

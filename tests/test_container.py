@@ -160,7 +160,7 @@ def replay(root: Path) -> str:
     return said
 
 
-@pytest.mark.slow
+@pytest.mark.slow("deploy/", "go1exp/deploy/", "go1exp/estimation/", "hatch_build.py", ".dockerignore")
 def test_the_lines_of_the_dockerfile_make_a_runtime_that_walks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = tmp_path / "image"
     root.mkdir()

@@ -64,10 +64,12 @@ def test_advantages_and_returns_are_those_of_sb3(learner: Callable[..., DevicePP
 
 def test_advantages_and_returns_on_the_cpu_are_those_of_sb3(learner: Callable[..., AdaptivePPO]) -> None:
     ppo = learner(AdaptivePPO)
+    env = ppo.get_env()
+    assert env is not None
     _, callback = ppo._setup_learn(48, None)
     callback.on_training_start({}, {})
     for _ in range(2):  # episodes of 10 steps end in the second rollout of 6
-        ppo.collect_rollouts(ppo.get_env(), callback, ppo.rollout_buffer, 6)
+        ppo.collect_rollouts(env, callback, ppo.rollout_buffer, 6)
     ours = ppo.rollout_buffer
     assert ours.episode_starts.any()
     last, ended = torch.randn(8), np.arange(8) % 2 == 0

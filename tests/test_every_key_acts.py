@@ -19,11 +19,11 @@ import re
 import sys
 import types
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import closing, redirect_stdout
-from dataclasses import dataclass, fields
+from contextlib import closing, contextmanager, redirect_stdout
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pyarrow.parquet as parquet
@@ -55,7 +55,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is n
 CONF = data_root() / "conf"
 
 Trace = Generator[tuple[str, Any], None, None]
-"""What can be observed, in order, each with a name; lazy, so that a comparison stops at the first difference."""
+"""What can be observed, in order, each with a name; lazy, so that a comparison stops at the first difference.
+
+Two traces are run in turns: while one waits, it has changed nothing that the other could see.
+"""
 
 EXEMPT = {
     "backend/cpu.yaml:backend.name": "the other engine is an extra: tests/contracts/test_backends.py",
@@ -65,6 +68,21 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     "deploy.yaml:hydra": "Hydra's own settings",
+    **{
+        f"{verb}.yaml:plugins": "tests/test_plugins.py shows what it does"
+        for verb in (
+            "train",
+            "eval",
+            "play",
+            "record",
+            "record_import",
+            "fit-actuator",
+            "gap",
+            "export",
+            "list",
+            "bench",
+        )
+    },
     "model/go1.yaml:model": "the Go1 is that of the group robot; test_gap_tolerances.py shows what its tolerances do",
     **{
         f"model/{name}.yaml:model": "a robot that is not simulated here; test_gap_machines.py shows what its keys do"
@@ -340,7 +358,7 @@ def parse(program: str, container: dict[str, Any]) -> Any:
         if problems:
             raise ConfigError(problems)
     kind, elsewhere = SETTINGS[program]
-    return settings.parse(kind, {k: v for k, v in container.items() if k not in elsewhere})
+    return settings.parse(kind, {k: v for k, v in container.items() if k not in (*elsewhere, "plugins")})
 
 
 SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
@@ -435,7 +453,26 @@ def same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def difference(base: list[tuple[str, Any]], other: Iterable[tuple[str, Any]]) -> str | None:
+class Kept:
+    """What a trace has shown, kept for the next comparison; it goes on only as far as somebody looks.
+
+    Most keys show within the first steps, and then the training and the walks that follow need not be run at all.
+    """
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace, self._seen = trace, list[tuple[str, Any]]()
+
+    def __iter__(self) -> Iterator[tuple[str, Any]]:
+        for k in itertools.count():
+            if k == len(self._seen):
+                try:
+                    self._seen.append(next(self._trace))
+                except StopIteration:
+                    return
+            yield self._seen[k]
+
+
+def difference(base: Iterable[tuple[str, Any]], other: Iterable[tuple[str, Any]]) -> str | None:
     """Name of the first thing that is not the same, or None."""
     for (name, a), found in itertools.zip_longest(base, other, fillvalue=("end", None)):
         if name != found[0] or not same(a, found[1]):
@@ -449,7 +486,7 @@ class Walk:
     def __init__(self, scratch: Path, make_net: Callable[..., Path]) -> None:
         self._scratch, self._make_net = scratch, make_net
         self._count = itertools.count()
-        self._bases: dict[str, list[tuple[str, Any]]] = {}
+        self._bases: dict[str, Kept] = {}
         self._runs: dict[str, Path] = {}
         self._nets: dict[int, Path] = {}
 
@@ -549,10 +586,10 @@ class Walk:
         how = verb_trace if key in THE_VERBS else TRACES[program]
         return how(resolved(container), self)
 
-    def base(self, program: str, container: dict[str, Any], key: str) -> list[tuple[str, Any]]:
+    def base(self, program: str, container: dict[str, Any], key: str) -> Kept:
         identity = f"{program} {key in THE_VERBS} {json.dumps(container, sort_keys=True)}"
         if identity not in self._bases:
-            self._bases[identity] = list(self.trace(program, container, key))
+            self._bases[identity] = Kept(self.trace(program, container, key))
         return self._bases[identity]
 
     def effect(self, program: str, before: dict[str, Any], after: dict[str, Any], key: str) -> str | None:
@@ -649,40 +686,55 @@ def everything(core: Go1Core) -> Trace:
 
 def train_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """Build learner and environment, provoke the environment; then a short training run."""
-    config, run = parse_train(container), walk.folder()
-    with pytest.MonkeyPatch.context() as patch:
-        asked: list[str] = []  # a machine without a GPU has no other device to go to
+    config = parse_train(container)
+    with stand_ins() as (asked, _):
+        # Without this the other device is refused: a test of its own.
+        with pytest.MonkeyPatch.context() as pretend:
+            pretend.setattr(torch.cuda, "is_available", lambda: True)
+            ppo = trainer.build(config)
+        threads = torch.get_num_threads()
+    core = ppo.get_env().core  # type: ignore[union-attr]
+    yield "first weights", {name: weight.clone() for name, weight in ppo.policy.state_dict().items()}
+    yield "threads of torch", threads
+    yield "threads of MuJoCo", core.backend._batch.nthread
+    yield "device", asked[0]
+    yield "ground", {"heights": core.terrain.heights, "origins": core.terrain.tile_origins}
+    yield from provoked(core)
+    yield from trained(config, container, walk.folder())
 
-        def get_device(device: Any) -> torch.device:
-            asked.append(str(device))
-            return torch.device("cpu")
 
-        patch.setattr("stable_baselines3.common.base_class.get_device", get_device)
-        told: list[Any] = []
-        patch.setitem(sys.modules, "wandb", wandb_stub(told))
-        torch.set_num_threads(1)
-        try:
-            with pytest.MonkeyPatch.context() as pretend:  # without it the other device is refused: a test of its own
-                pretend.setattr(torch.cuda, "is_available", lambda: True)
-                ppo = trainer.build(config)
-            core = ppo.get_env().core  # type: ignore[union-attr]
-            yield "first weights", dict(ppo.policy.state_dict())
-            yield "threads of torch", torch.get_num_threads()
-            yield "threads of MuJoCo", core.backend._batch.nthread
-            yield "device", asked[0]
-            yield "ground", {"heights": core.terrain.heights, "origins": core.terrain.tile_origins}
-            yield from provoked(core)
-            ppo = trainer.train(config, container, run)
-            yield "weights", dict(ppo.policy.state_dict())
-            yield "learning rate", ppo.policy.optimizer.param_groups[0]["lr"]
-        finally:
-            torch.set_num_threads(1)
+def trained(config: TrainConfig, container: dict[str, Any], run: Path) -> Trace:
+    """What a training run leaves."""
+    with stand_ins() as (_, told):
+        ppo = trainer.train(config, container, run)
+    yield "weights", dict(ppo.policy.state_dict())
+    yield "learning rate", ppo.policy.optimizer.param_groups[0]["lr"]
     yield "steps", ppo.num_timesteps
     yield "files", sorted(str(p.relative_to(run)) for p in run.rglob("*") if "tfevents" not in p.name)
     if (run / "metrics.csv").exists():
         with (run / "metrics.csv").open(newline="") as file:
             yield "metrics", [{k: float(v) if v else None for k, v in row.items()} for row in csv.DictReader(file)]
     yield "Weights & Biases", told
+
+
+@contextmanager
+def stand_ins() -> Iterator[tuple[list[str], list[Any]]]:
+    """For a GPU and for Weights & Biases; yield which devices were asked for, and what was reported."""
+    asked: list[str] = []  # a machine without a GPU has no other device to go to
+    told: list[Any] = []
+
+    def get_device(device: Any) -> torch.device:
+        asked.append(str(device))
+        return torch.device("cpu")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stable_baselines3.common.base_class.get_device", get_device)
+        patch.setitem(sys.modules, "wandb", wandb_stub(told))
+        torch.set_num_threads(1)
+        try:
+            yield asked, told
+        finally:
+            torch.set_num_threads(1)
 
 
 def wandb_stub(told: list[Any]) -> types.ModuleType:
@@ -902,12 +954,15 @@ def deploy_trace(container: dict[str, Any], walk: Walk) -> Trace:
     from go1exp.cli.deploy import APP
 
     for silent_from in (np.inf, 0.08, 0.0):
+        refused, files = "", dict[str, bytes]()
         with lockstep(lambda state, begin=silent_from: state if state.clock < begin else None) as world:  # type: ignore[misc]
             try:
                 _, files = outcome(APP, container, walk, (0, *STATUS.values()))
             except Expected as error:
-                yield "refused", str(error)
-                return
+                refused = str(error)
+        if refused:
+            yield "refused", refused
+            return
         yield "clock", world.spins
         yield "folders", sorted({Path(name).parent.as_posix() for name in files})
         for name, content in sorted(files.items()):
@@ -981,9 +1036,62 @@ def walk(tmp_path_factory: pytest.TempPathFactory, make_net: Callable[..., Path]
     return Walk(tmp_path_factory.mktemp("keys"), make_net)
 
 
-@pytest.mark.parametrize("leaf", WALKED, ids=[leaf.name for leaf in WALKED])
+SLOW = {
+    "gap": ("conf/gap.yaml", "go1exp/gap/", "go1exp/effects/", "go1exp/cli/gap.py", "go1exp/cli/settings.py"),
+    "export": ("conf/export.yaml", "go1exp/export/", "go1exp/cli/export.py", "go1exp/cli/settings.py"),
+}
+"""Programs of which a trace takes seconds, and what they are made of. ``make test`` asks of their keys only that each
+is read, in one trace for all of them; ``make test-all`` that each acts."""
+
+
+@pytest.mark.parametrize(
+    "leaf",
+    [
+        pytest.param(leaf, id=leaf.name, marks=[pytest.mark.slow(*SLOW[leaf.program])] if leaf.program in SLOW else [])
+        for leaf in WALKED
+    ],
+)
 def test_every_key_acts(leaf: Leaf, walk: Walk) -> None:
     assert not (dead := walk.dead(leaf)), f"{leaf.file}.yaml: nothing changes with {', '.join(dead)}"
+
+
+def unread(kinds: Iterable[type], work: Callable[[], object]) -> list[str]:
+    """Fields of dataclasses that nothing reads while ``work`` is done; checks and copies of them do not count."""
+    read: set[tuple[type, str]] = set()
+
+    def noted(self: Any, name: str) -> Any:
+        reader = sys._getframe(1)
+        if reader.f_globals.get("__name__") != "dataclasses" and reader.f_code.co_name != "__post_init__":
+            read.add((type(self), name))
+        return object.__getattribute__(self, name)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in kinds:
+            patch.setattr(kind, "__getattribute__", noted)
+        work()
+    return [
+        f"{kind.__name__}.{field.name}" for kind in kinds for field in fields(kind) if (kind, field.name) not in read
+    ]
+
+
+@pytest.mark.parametrize("program", SLOW)
+def test_every_key_of_a_slow_program_is_read(program: str, walk: Walk) -> None:
+    whole = SETTINGS[program][0]
+    parts = [kind for kind in get_type_hints(whole).values() if is_dataclass(kind) and isinstance(kind, type)]
+    container = walk.setup(Leaf(program, "", None))
+    assert unread([whole, *parts], lambda: list(walk.base(program, container, ""))) == []
+
+
+def test_a_field_that_is_only_checked_and_copied_is_unread() -> None:
+    @dataclass(frozen=True)
+    class Two:
+        used: int = 1
+        unused: int = 2
+
+        def __post_init__(self) -> None:
+            assert self.unused
+
+    assert unread([Two], lambda: asdict(replace(Two(), used=3)) and Two().used) == ["Two.unused"]
 
 
 def test_exemptions_are_needed() -> None:
@@ -1002,7 +1110,7 @@ def test_the_tables_hold_no_keys_that_are_gone() -> None:
 @pytest.mark.parametrize("program", TRACES)
 def test_a_trace_repeats(program: str, walk: Walk) -> None:
     container = walk.setup(Leaf(program, "", None))
-    assert walk.base(program, container, "")
+    assert list(walk.base(program, container, ""))
     assert difference(walk.base(program, container, ""), walk.trace(program, container, "")) is None
 
 

@@ -7,8 +7,6 @@ import json
 import math
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -17,7 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from go1exp import data_root, files
+from go1exp import files
 from go1exp.compose import compose
 from go1exp.config import TrainConfig, parse_train
 from go1exp.env.core import Go1Core
@@ -28,6 +26,7 @@ from go1exp.schema.registry import Expected
 from go1exp.train import checkpoint, run_folder, trainer
 from go1exp.train.metrics import CsvWriter
 from go1exp.train.ppo import AdaptivePPO
+from tests.command import run as cli
 
 SMALL = (
     "ppo=paper",
@@ -210,13 +209,7 @@ def broken(self, s):
 Go1Core._reward = broken
 sys.exit(main())
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code, "train", *SMALL, f"hydra.run.dir={run}"],
-        env={**os.environ, "PYTHONPATH": str(data_root())},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    done = cli(Path.cwd(), "train", *SMALL, f"hydra.run.dir={run}", code=code)
     assert done.returncode == 1
     assert re.search(r"^go1exp train: \S*torque is not finite in environment 3 at step 12$", done.stderr, re.MULTILINE)
     assert "Traceback" not in done.stderr

@@ -165,7 +165,7 @@ def test_the_public_face_of_gap_has_every_name_that_it_promises() -> None:
 
 def task(file: Path, *overrides: str) -> Any:
     """What ``go1exp train effect=FILE`` makes of a file."""
-    return parse_task(compose("train", choices_from_files([f"effect={file}", *overrides])))
+    return parse_task(compose("train", choices_from_files([f"effect={file}", *overrides], "train")))
 
 
 def test_training_reads_what_was_named(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_training_reads_what_was_named(tmp_path: Path) -> None:
     (nominal,) = task(written[1]).effect
     assert (nominal.key, nominal.parameters["added"]) == ("armature", dict.fromkeys(JOINTS, 5e-4))
     assert nominal.slots["spread"] == {}
-    both = parse_task(compose("train", choices_from_files([f"effect=[{written[0]},{written[1]}]"])))
+    both = parse_task(compose("train", choices_from_files([f"effect=[{written[0]},{written[1]}]"], "train")))
     assert {t.key for t in both.effect} == {*terms, "armature"}
 
 
@@ -198,7 +198,7 @@ def test_a_calibration_of_other_joints_joins_the_effect_in_training_as_in_the_pr
     written = write(result(FRICTION, box={"coulomb": {"bound": left}}), tmp_path)
     contents: dict[str, Any] = {path.name: OmegaConf.to_container(OmegaConf.load(path)) for path in written}
     files = f"effect=[{tmp_path / CALIBRATION},{tmp_path / EFFECT}]"
-    (trained,) = parse_task(compose("train", choices_from_files([files]))).effect
+    (trained,) = parse_task(compose("train", choices_from_files([files], "train"))).effect
     (proved,) = terms_of(composed(contents[CALIBRATION], contents[EFFECT]))
     assert trained.parameters == proved.parameters
     assert trained.parameters["bound"] == pytest.approx(left | FRICTION.params["bound"])
@@ -231,7 +231,7 @@ def test_an_answer_without_certified_effects_changes_nothing(names: tuple[NamedE
     assert given == plain
     small = ["backend.threads=1", "terrain=flat"]
     cores = [
-        Go1Core(parse_task(compose("train", [*choices_from_files([choice]), *small])), 2)
+        Go1Core(parse_task(compose("train", [*choices_from_files([choice], "train"), *small])), 2)
         for choice in ("effect=none", f"effect={file}")
     ]
     for core in cores:

@@ -18,7 +18,14 @@ SLICE = (("null", 1), ("single", 2 * len(cases.HUNG) + cases.HUNG.index("lag")),
 """Kind and index: a background within tolerances, lag at 5 tolerances, one beyond the library, lost samples."""
 
 
-@pytest.mark.parametrize(("kind", "index"), SLICE, ids=[kind for kind, _ in SLICE])
+FAST = ("single", "damaged")
+ABOUT = ("benchmarks/gap/", "benchmarks/gap_solve.py", "go1exp/gap/", "go1exp/effects/", "go1exp/physics/")
+
+
+@pytest.mark.parametrize(
+    ("kind", "index"),
+    [pytest.param(*case, id=case[0], marks=[] if case[0] in FAST else [pytest.mark.slow(*ABOUT)]) for case in SLICE],
+)
 def test_a_sealed_case(kind: str, index: int, tmp_path: Path) -> None:
     case = cases.make(kind, index, SEED, count=6, seconds=3.0)
     generate.write_case(case, out=tmp_path / "cases")

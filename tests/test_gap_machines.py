@@ -339,6 +339,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few")
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/", "conf/model/")
 def test_friction_hidden_in_a_servo_is_named() -> None:
     robot = machine("xl330_pendulum", tolerances={})
     steps, logs = np.arange(0.0, 6.0, 0.0005), []

@@ -240,6 +240,7 @@ def test_what_strains_by_far_the_most_is_tried_and_nothing_else() -> None:
     assert strain.straining({}, values, []) is None
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_hidden_friction_is_named_where_it_is() -> None:
     rig, recordings = robot("effect=coulomb", "effect.coulomb.bound=[0.0,0.0,0.3]")
     plain, _ = parse_parts(compose("record", []), RIG)

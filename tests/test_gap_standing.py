@@ -197,6 +197,7 @@ def search_in(*overrides: str) -> Search:
     return Search(score, parts, QUICK, dt, rng, lambda what, share: None)
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it() -> None:
     search = search_in("+effect.payload.mass=1.0")
     plain = excess(search.state.held_out({}))
@@ -238,5 +239,6 @@ def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
     assert excess(search.state.held_out({})) < search.settings.material
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_drives_that_are_all_a_little_weak_are_no_payload() -> None:
     assert search_in("+effect.strength.scale=0.93").single_cause() is None

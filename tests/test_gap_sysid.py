@@ -62,6 +62,7 @@ def test_one_replay_for_four_legs_gives_the_jacobian() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
 
 
+@pytest.mark.slow("benchmarks/")
 def test_a_large_armature_is_found_and_the_verdict_can_be_scored(tmp_path: Path) -> None:
     case = cases.make("null", 0, 5, count=3, seconds=1.5)  # a clean robot, to which one effect is added
     joint = robot.JOINTS.index("FL_thigh")

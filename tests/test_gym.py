@@ -15,6 +15,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
+import go1exp
 from go1exp import data_root
 from go1exp.config import TaskConfig
 from go1exp.env import register
@@ -348,3 +349,57 @@ def test_a_fault_stops_the_batch(make_core: Make, elsewhere: None) -> None:
     action[1, 0] = np.nan
     with pytest.raises(NumericalFault, match="action is not finite in environment 1"):
         env.step(action)
+
+
+# What a step was made of
+
+
+def test_the_info_of_a_step_splits_the_reward_into_its_terms() -> None:
+    env = Go1Env([ONE_THREAD, "reward.gait.weight=0.0"])
+    env.reset(seed=2)
+    keys = {t.key for t in env.core.task.reward} - {"gait"}
+    for action in actions(1, 5)[:, 0]:
+        _, reward, _, _, info = env.step(action)
+        assert info["reward_terms"].keys() == keys
+        assert sum(info["reward_terms"].values()) == pytest.approx(reward, rel=1e-5, abs=1e-6)
+        assert "episode_end" not in info
+    foot = info["reward_terms"]["foot_force"]
+    env.core.terms.weights.mul_(2.0)
+    assert foot < 0.0
+    assert env.core.reward_terms()["foot_force"][0] == pytest.approx(2.0 * foot)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "end"),
+    [
+        (["sim.episode_s=0.06"], "time limit"),
+        (["termination.tilt.max_angle=0.0001", "~termination.trunk_contact"], "tilt"),
+        (["+termination.leant={term: tilt, max_angle: 0.0001}", "termination.tilt.max_angle=3.0"], "leant"),
+        (["terrain=rough", "terrain.rows=1", "terrain.cols=1", "rand.body_position.range=[60.0,60.0]"], "left the map"),
+    ],
+)
+def test_the_info_of_the_last_step_names_what_ended_the_episode(overrides: list[str], end: str) -> None:
+    env = Go1Env([ONE_THREAD, *overrides])
+    env.reset(seed=2)
+    for action in actions(1, 3, scale=3.0)[:, 0]:
+        _, _, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            break
+    assert info["episode_end"] == end
+    assert terminated == (end in ("tilt", "leant"))
+
+
+def test_a_batch_is_made_from_overrides_and_says_why_each_episode_ended() -> None:
+    robots = go1exp.make([*LIVELY, "sim.episode_s=0.06"], num_envs=5, seed=3)
+    assert robots.reset().shape == (5, 48)
+    for k in range(1, 7):
+        result = robots.step(torch.zeros(5, 12))
+        ends = [robots.episode_end(result, i) for i in range(5)]
+        assert ends == ["time limit" if k % 3 == 0 else None] * 5
+        total = sum(robots.reward_terms().values())
+        torch.testing.assert_close(total, result.reward, rtol=1e-5, atol=1e-6)
+    twin = Go1Core(robots.task, 5, 3)
+    again = go1exp.make([*LIVELY, "sim.episode_s=0.06"], num_envs=5, seed=3)
+    assert torch.equal(twin.reset(), again.reset())
+    with pytest.raises(ConfigError, match=r"reward\.gaitt"):
+        go1exp.make(["+reward.gaitt={weight: 1.0}"])

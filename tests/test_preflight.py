@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from go1exp import data_root
 from go1exp.compose import compose
 from go1exp.config import LoggerConfig, TrainConfig, WandbConfig, parse_train
 from go1exp.schema.registry import ConfigError
 from go1exp.train import memory_need, metrics, preflight
+from tests.command import run as cli
 
-COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
 CPU = torch.device("cpu")
 
 
@@ -26,14 +22,7 @@ def config(*overrides: str) -> TrainConfig:
 
 
 def test_on_the_command_line_nothing_is_left_behind(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", COMMAND_LINE, "train", "ppo.num_envs=100000000"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(data_root())},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    done = cli(tmp_path, "train", "ppo.num_envs=100000000")
     assert done.returncode == 2, done.stdout
     assert done.stderr.startswith("go1exp train: ppo.num_envs = 100000000: with ppo.steps = ")
     assert len(done.stderr.splitlines()) == 1

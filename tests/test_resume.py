@@ -24,6 +24,8 @@ from go1exp import data_root
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.train import checkpoint, metrics, run_folder, trainer
+from tests.command import COMMAND_LINE, run_alone
+from tests.command import run as cli
 
 SMALL = (
     "ppo.num_envs=8",
@@ -56,7 +58,6 @@ ROUGH = (
 )
 SIX = "ppo.iterations=6"
 
-COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
 SIGNALLED = """
 import os, signal, sys
 from go1exp.cli import main
@@ -69,13 +70,6 @@ def signalled(self, values, excluded, step=0):
 CsvWriter.write = signalled
 sys.exit(main())
 """
-
-
-def cli(cwd: Path, *arguments: str, code: str = COMMAND_LINE) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(data_root())}
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
-    )
 
 
 def train_here(run: Path, overrides: Sequence[str]) -> None:
@@ -213,7 +207,7 @@ def test_a_run_stopped_by_ctrl_c_goes_on_with_resume(flat: Path, folder: Path) -
     assert iterations(run / "metrics.csv") == [1, 2, 3]
     assert checkpoint.checkpoints(run)[-1].name == "000003.pt"
 
-    resumed = cli(folder, "train", f"resume={run}", SIX)
+    resumed = run_alone(folder, "train", f"resume={run}", SIX)
     assert resumed.returncode == 0, resumed.stderr
     assert "000003.pt" in resumed.stdout
     assert_the_same_run(run, flat)

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
-from go1exp import data_root
 from go1exp.train import run_state
+from tests.command import run as cli
 from tests.small_run import SMALL
 
-COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
 BAD_DAY = """
 import errno, os, signal, sys
 from go1exp.cli import main
@@ -32,13 +28,6 @@ def train_or_fail(config, *rest):
 trainer.train = train_or_fail
 sys.exit(main())
 """
-
-
-def cli(cwd: Path, *arguments: str, code: str = COMMAND_LINE) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(data_root())}
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
-    )
 
 
 def table(text: str) -> dict[int, str]:

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -273,7 +273,7 @@ def test_flat_ground_is_a_plane_and_the_floor_takes_contacts_as_agreed(terrain: 
 
 
 @pytest.mark.parametrize("kind", ["flat", "tiles"])
-def test_level_ground_of_either_kind_lies_at_zero(kind: str) -> None:
+def test_level_ground_of_either_kind_lies_at_zero(kind: Literal["flat", "tiles"]) -> None:
     """With one row all difficulty is 0 and the field is level: it must compile, and lie at height 0."""
     config = TerrainConfig(kind=kind, rows=1, cols=2, border=1.0)
     model, data = compiled(build_terrain(config))

@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from go1exp.choices import CONFIG_DIR, given_folders
+from go1exp.cli import plugins
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.quoting import protected
 from go1exp.cli.verbs import FLAGS, VALUED
@@ -60,7 +61,7 @@ class App:
 
         def task(config: DictConfig) -> None:
             try:
-                status.append(self.task(as_container(config)))
+                status.append(self.task(plugins.begin(self.name, as_container(config))))
             except Exception as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
                     status.append(self._failed_in_sweep(error))

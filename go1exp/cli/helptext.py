@@ -92,11 +92,13 @@ def _slots(group: str) -> list[str]:
 
 def texts_of(verb: str) -> dict[str, str]:
     """Return what each setting of a verb means, by key path, groups left out."""
+    from go1exp.cli.plugins import MEANING
     from go1exp.cli.settings import SETTINGS
+    from go1exp.schema.plugins import KEY
     from go1exp.schema.settings import lines
 
     if verb != "train":
-        return lines(SETTINGS[verb])
+        return {**lines(SETTINGS[verb]), KEY: MEANING}
     from go1exp.config import SECTIONS, ProcessConfig
 
     sections = [name for name in SECTIONS if name not in groups_of(verb)]

@@ -16,8 +16,9 @@ def _task(container: dict[str, Any]) -> None:
     import go1exp.importers
     import go1exp.record.policy  # noqa: F401  (registers every member)
     from go1exp.cli.settings import ListSettings, parse
-    from go1exp.schema import registry
+    from go1exp.schema import plugins, registry
 
+    plugins.installed()
     settings = parse(ListSettings, container)
     choices = _choices()
     known = [*registry.groups(), *(g for g in choices if g not in registry.groups())]
@@ -32,7 +33,7 @@ def _task(container: dict[str, Any]) -> None:
 
 
 def _print_group(group: str, choices: list[tuple[str, str]], what: str) -> None:
-    from go1exp.schema import registry
+    from go1exp.schema import plugins, registry
 
     terms = registry.members(group)
     print(group)
@@ -41,7 +42,8 @@ def _print_group(group: str, choices: list[tuple[str, str]], what: str) -> None:
             print(f"  {group}={name:26} {about}")
     if what != "groups":
         for entry in terms.values():
-            print(f"  {entry.name:{len(group) + 27}} {entry.doc}")
+            source = plugins.origin(entry)
+            print(f"  {entry.name:{len(group) + 27}} {entry.doc}{f'  [{source}]' if source else ''}")
             if entry.parameters:
                 print(f"  {'':{len(group) + 27}}   {', '.join(_parameter(p) for p in entry.parameters.values())}")
     print()

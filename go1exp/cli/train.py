@@ -55,7 +55,7 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
 
 def _refuse_other(run: Path, container: dict[str, Any]) -> None:
     """Raise ConfigError if ``run`` holds a run with another configuration: it would be neither one nor the other."""
-    from go1exp.train import run_folder
+    from go1exp.train import kept_plugins, run_folder
 
     if not (run / "config.yaml").is_file():
         return
@@ -64,6 +64,7 @@ def _refuse_other(run: Path, container: dict[str, Any]) -> None:
         OmegaConf.update(old, key, OmegaConf.select(new, key), merge=False)
     before, after = (key_values(OmegaConf.to_container(c)) for c in (old, new))
     differ = sorted(k for k in {*before, *after} if before.get(k) != after.get(k))
+    differ += [f"plugins ({name} has changed)" for name in kept_plugins.differing(run, container)]
     if differ:
         raise ConfigError([f"{run}: holds a run with other settings of {', '.join(differ)}; use another folder"])
 
@@ -105,9 +106,11 @@ def _resolved(container: dict[str, Any], overrides: list[str], run: Path) -> Tra
 
     config = parse_train(container)
     if config.process.resume:
+        from go1exp.train import kept_plugins
+
         run = existing(config.process.resume, "resume")
         container = _resumed(run, overrides)
-        return TrainJob(run, parse_train(container), container, resumed=True)
+        return TrainJob(run, parse_train(kept_plugins.with_copies(run, container)), container, resumed=True)
     _refuse_other(run, container)
     return TrainJob(run, config, container, resumed=False)
 

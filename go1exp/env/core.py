@@ -7,7 +7,6 @@ makes environment i of a batch compute exactly what it would compute alone.
 
 from __future__ import annotations
 
-from functools import reduce
 from typing import Any
 
 import torch
@@ -18,6 +17,7 @@ from go1exp.config import TaskConfig
 from go1exp.env.engine import CapturedStep, make_backend
 from go1exp.env.evidence import Evidence, accuse
 from go1exp.env.plant import Plant, drive_setup
+from go1exp.env.terms import StepTerms
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.clearance import lift
 from go1exp.mdp.foot_timers import FootTimers
@@ -72,7 +72,7 @@ class Go1Core:
         self.device = self.backend.qpos.device
         self.random = EnvRandom(seed, num_envs, first_env, self.device, units=self.backend.units)
         self._held = held
-        self._state = KinematicState.of(self.backend.qpos, self.backend.qvel, held)
+        self._state = KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
         self._build_terms(EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random)
 
@@ -88,8 +88,7 @@ class Go1Core:
         self._first_step = zeros(dtype=torch.int64)
         self.episode_return = zeros()
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
-        self.reward_sums = torch.zeros(len(self._rewards), dtype=torch.float64, device=self.device)
-        self.term_values = zeros(len(self._rewards))
+        self.reward_sums = self.terms.sums
         self.feet = FootTimers(num_envs, task.sim.physics_dt, self.device)
         self._touched = torch.zeros_like(self._link_contacts)
         self._calf_touched = torch.zeros_like(self._foot_contact[..., 0])
@@ -119,7 +118,8 @@ class Go1Core:
         self._bounded = t.config.kind != "flat"
         extent = to_device(t.extent)
         self._map = extent[[0, 2]] + MAP_MARGIN, extent[[1, 3]] - MAP_MARGIN
-        start = self.task.curriculum[0]().start_level_max if self.task.curriculum else self._max_level
+        rules = [t() for t in self.task.curriculum]
+        start = getattr(rules[0], "start_level_max", self._max_level) if rules else self._max_level
         self._start_levels = min(start, self._max_level) + 1
 
     def _build_terms(self, drives: EnvRandom) -> None:
@@ -130,13 +130,8 @@ class Go1Core:
         self.command = task.command(self.random.stream("command"))
         self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}
         self._curriculum = [t() for t in task.curriculum]
-        self._rewards = [t for t in task.reward if t.slots["weight"] != 0.0]
-        weights = [t.slots["weight"] * sim.policy_dt for t in self._rewards]
-        self._weights = torch.tensor(weights, dtype=torch.float32, device=self.device)
-        widths = [t.entry.traits["size"] for t in task.observation]
-        self.observation_size = sum(widths)
-        noise = [t.slots["noise"] for t in task.observation]
-        self._noise = torch.tensor(noise).repeat_interleave(torch.tensor(widths)).float().to(self.device)
+        self.terms = StepTerms(task, self.num_envs, self.device)
+        self.observation_size = self.terms.observation_size
         self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
         self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
         for term in self._model_terms:
@@ -188,7 +183,7 @@ class Go1Core:
         rows = mask.unsqueeze(1)
         self.spawn.copy_(torch.where(rows, self._origins[self.level, self.tile_column], self.spawn))
         qpos, qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
-        fresh = KinematicState.of(qpos, qvel, self._held)
+        fresh = KinematicState.view(qpos, qvel, self._held)
         fresh.base_pos_w.copy_(self.spawn)
         fresh.base_pos_w[:, 2] += robot.NOMINAL_HEIGHT
         fresh.base_quat_w[:, 0] = 1.0
@@ -199,6 +194,7 @@ class Go1Core:
             lift(fresh, self._ground if self._bounded else None)
         self.backend.reset(mask, qpos, qvel)
         self.feet.reset(mask)
+        self.terms.reset(mask)
         for tensor in (self.action, self.previous_action, self.joint_acc):
             tensor.masked_fill_(rows, 0.0)  # and not a product: zero times NaN is NaN
         self.target.copy_(torch.where(rows, self._nominal, self.target))
@@ -226,11 +222,12 @@ class Go1Core:
         self._advance_physics(action)
         self.steps += 1
         s = self.snapshot()
-        terminated = reduce(torch.logical_or, [t(s) for t in self.task.termination], self._nobody())
-        truncated = ((self.steps >= self.task.sim.episode_steps) | self._off_map()) & ~terminated
-        reward = self._reward(s)
+        terminated = self.terms.terminated(s)
+        self.terms.left_map.copy_(self._off_map())
+        truncated = ((self.steps >= self.task.sim.episode_steps) | self.terms.left_map) & ~terminated
+        reward = self.terms.reward(s)
         self.episode_return += reward
-        final_observation = self._observe(s)
+        final_observation = self._observe(s, advance=True)
         episode_return, episode_length = self.episode_return.clone(), self.steps - self._first_step
         self._last_qpos.copy_(self.backend.qpos)
         self._last_qvel.copy_(self.backend.qvel)
@@ -270,24 +267,13 @@ class Go1Core:
         for happening in self.events.values():
             happening.advance(self._state, dt, restart)
 
-    def _nobody(self) -> Tensor:
-        return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-
     def _off_map(self) -> Tensor:
         """(N,) bool: at the edge of a height field, beyond which there is no ground."""
         if not self._bounded:
-            return self._nobody()
+            return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         xy = self._state.base_pos_w[:, :2]
         low, high = self._map
         return ((xy < low) | (xy > high)).any(-1)
-
-    def _reward(self, s: Snapshot) -> Tensor:
-        """(N,) sum of weight x term x policy period."""
-        for k, term in enumerate(self._rewards):
-            self.term_values[:, k] = term(s)
-        weighted = self.term_values * self._weights
-        self.reward_sums += weighted.sum(0)
-        return weighted.sum(-1)
 
     def _move_levels(self, ended: Tensor) -> None:
         """Apply the curriculum to the episodes that ended."""
@@ -339,13 +325,25 @@ class Go1Core:
             episode_time=self.steps * self.task.sim.policy_dt,
         )
 
-    def _observe(self, s: Snapshot) -> Tensor:
-        """(N, O) the configured observation of a snapshot, with its noise if that is on."""
+    def _observe(self, s: Snapshot, *, advance: bool = False) -> Tensor:
+        """(N, O) the configured observation of a snapshot, with its noise if that is on; ``advance`` once a step."""
         s = self.plant.sense(s) if self.plant.effects.senses else s
-        clean = torch.cat([t(s) for t in self.task.observation], dim=-1)
+        if advance:
+            self.terms.advance(s)
+        clean = self.terms.observation(s)
         if not self.noise:
             return clean
-        return clean + self._noise * self.random.stream("noise").uniform(self.observation_size, low=-1.0)
+        return clean + self.terms.noise * self.random.stream("noise").uniform(self.observation_size, low=-1.0)
+
+    # ------------------------------------------------------------------ what a step was made of
+
+    def reward_terms(self) -> dict[str, Tensor]:
+        """Return what each reward term added to the last step's reward, (N,) each; they sum up to it."""
+        return self.terms.reward_terms()
+
+    def episode_end(self, result: StepResult, env: int) -> str | None:
+        """Return the termination that ended an episode, ``left the map``, ``time limit``, or None if it goes on."""
+        return self.terms.end(env, bool(result.terminated[env]), bool(result.truncated[env]))
 
     # ------------------------------------------------------------------ faults, metrics, state
 
@@ -361,14 +359,14 @@ class Go1Core:
     def _suspects(self, observation: Tensor) -> dict[str, Tensor]:
         """What may not be finite after a step, causes first."""
         named = {"action": self._last_action, "qpos": self._last_qpos, "qvel": self._last_qvel}
-        named |= {f"reward.{t.key}": self.term_values[:, k] for k, t in enumerate(self._rewards)}
+        named |= {f"reward.{t.key}": self.terms.values[:, k] for k, t in enumerate(self.terms.rewards)}
         return {**named, "observation": observation}
 
     def drain_metrics(self, steps: int) -> dict[str, float]:
         """Return means since the last call, ``steps`` policy steps ago: reward terms per second, the level, ..."""
         rates = (self.reward_sums / (steps * self.num_envs * self.task.sim.policy_dt)).tolist()
         self.reward_sums.zero_()
-        metrics = {f"reward/{t.key}": rate for t, rate in zip(self._rewards, rates, strict=True)}
+        metrics = {f"reward/{t.key}": rate for t, rate in zip(self.terms.rewards, rates, strict=True)}
         if self._bounded:
             metrics["curriculum/terrain_level"] = float(self.level.float().mean())
         return metrics | self.backend.drain_metrics()
@@ -382,12 +380,12 @@ class Go1Core:
         """Everything with a state of its own."""
         events = {f"event.{name}": part for name, part in self.events.items()}
         named = {"backend": self.backend, "random": self.random, "plant": self.plant}
-        return {**named, "command": self.command, "feet": self.feet, **events}
+        return {**named, "command": self.command, "feet": self.feet, **events, **self.terms.parts()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything needed to continue bit for bit."""
-        own = {name: getattr(self, name).clone() for name in self._BUFFERS}
-        return {"core": own, "started": self._started, **{k: p.state_dict() for k, p in self._parts().items()}}
+        buffers = {name: getattr(self, name).clone() for name in self._BUFFERS}
+        return {"core": buffers, "started": self._started, **{k: p.state_dict() for k, p in self._parts().items()}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``, bit for bit, in an environment of the same configuration and size."""

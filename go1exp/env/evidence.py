@@ -30,23 +30,23 @@ class Evidence:
 
     def __init__(self) -> None:
         self._kept: dict[str, Tensor] = {}
-        self._found: Tensor | None = None
+        self._fault: Tensor | None = None
 
     def note(self, named: Mapping[str, Tensor], steps: Tensor) -> None:
         """Look at the values of a step, as ``accuse`` takes them; their shapes are those of the first call."""
         values = {**named, "steps": steps}
-        if self._found is None:
+        if self._fault is None:
             self._kept = {name: torch.zeros_like(value) for name, value in values.items()}
-            self._found = torch.zeros((), dtype=torch.bool, device=steps.device)
+            self._fault = torch.zeros((), dtype=torch.bool, device=steps.device)
         total = torch.stack([value.sum() for value in named.values()]).sum()
-        now = ~torch.isfinite(total) & ~self._found
+        now = ~torch.isfinite(total) & ~self._fault
         for name, value in values.items():
             self._kept[name].copy_(torch.where(now, value, self._kept[name]))
-        self._found.logical_or_(now)
+        self._fault.logical_or_(now)
 
     def check(self) -> None:
         """Raise NumericalFault if a step had a value that was not finite. Waits for the device."""
-        if self._found is not None and self._found:
+        if self._fault is not None and self._fault:
             named = {name: value for name, value in self._kept.items() if name != "steps"}
-            self._found.zero_()
+            self._fault.zero_()
             accuse(named, self._kept["steps"])

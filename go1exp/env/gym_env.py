@@ -19,9 +19,12 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
 
     ``gymnasium.make("go1exp.gym:Go1-v0", overrides=["reward=paper", "rand=none"])`` takes the command line's overrides.
 
+    The info of a step has ``reward_terms``, what each term added to the reward (weight and period included), and where
+    an episode ends ``episode_end``: the key of the termination that was true, ``left the map`` or ``time limit``.
+
     Args:
-        overrides: as after ``go1exp train``; the run-time settings among them are ignored.
-        task: a parsed configuration instead.
+        overrides: as after ``go1exp train``; those of the learner and the run are ignored.
+        task: a parsed configuration in their place.
         noise: add the configured observation noise.
         env_index: behave like this environment of a batch with the same seed, in the first episode.
         render_mode: ``rgb_array`` or None.
@@ -66,7 +69,10 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         self.core.check(result)
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         last = result.final_observation if terminated or truncated else result.observation
-        return last[0].cpu().numpy().copy(), float(result.reward[0]), terminated, truncated, {}
+        info: dict[str, Any] = {"reward_terms": {k: float(v[0]) for k, v in self.core.reward_terms().items()}}
+        if end := self.core.episode_end(result, 0):
+            info["episode_end"] = end
+        return last[0].cpu().numpy().copy(), float(result.reward[0]), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """Return a picture (480, 640, 3) uint8 if the render mode is ``rgb_array``."""

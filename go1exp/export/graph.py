@@ -127,10 +127,14 @@ def required_inputs(terms: Sequence[Term]) -> tuple[Port, ...]:
     """Return the readings that the terms need, in the order of ``READINGS``.
 
     Raises:
-        ExportError: if a term reads what the robot does not measure.
+        ExportError: if a term reads what the robot does not measure, or remembers the past.
     """
     read: set[str] = set()
     for term in terms:
+        if term.entry.remembers:
+            raise ExportError(
+                f"observation.{term.key}: remembers the past; what a policy sees on the robot must be of the present"
+            )
         # Two rows of zeros: only which fields a term reads matters here.
         sensed = Sensed({port.name: torch.zeros(2, port.size) for port in READINGS}, term.key)
         term(cast(Snapshot, sensed))

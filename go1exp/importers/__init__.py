@@ -21,7 +21,7 @@ from go1exp.importers import (
     so101_arm,
 )
 from go1exp.recording import Recording
-from go1exp.schema.registry import ConfigError, members, unknown_name
+from go1exp.schema.registry import ConfigError, find, members, unknown_name
 
 __all__ = [
     "ak80_double_pendulum",
@@ -47,7 +47,7 @@ def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list
         ConfigError: if there is no such importer, or it has no such option or value.
         RecordingError: if a file is missing or damaged, or lacks data.
     """
-    entry = members("importer").get(name)
+    entry = find("importer", name)
     if entry is None:
         raise ConfigError([unknown_name("importer", name, members("importer"), "importer")])
     values, problems = entry.check(options, f"importer.{name}")

@@ -32,7 +32,7 @@ class KinematicState:
     """(N, 12) rad/s."""
 
     @classmethod
-    def of(cls, qpos: Tensor, qvel: Tensor, held: tuple[float, float, float, float] | None = None) -> KinematicState:
+    def view(cls, qpos: Tensor, qvel: Tensor, held: tuple[float, float, float, float] | None = None) -> KinematicState:
         """View MuJoCo's qpos (N, 19) and qvel (N, 18): writing here writes there.
 
         The state of a robot whose trunk is ``held`` at an attitude w-x-y-z is its joints' alone, (N, 12); its trunk

@@ -1,12 +1,33 @@
-"""What the MDP sees of one moment, ``Snapshot``, and what a step of the environment returns, ``StepResult``."""
+"""What the MDP sees of one moment, ``Snapshot``, and what a step of the environment returns, ``StepResult``.
+
+``TermSetup`` is what a term with a memory is built from.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import torch
+
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+@dataclass(frozen=True)
+class TermSetup:
+    """What a reward, observation or termination term that is a class is told when it is built."""
+
+    num_envs: int
+    """N."""
+    device: torch.device
+    """Of its tensors."""
+    dt: float
+    """Time from one call to the next, the policy's period, s."""
+
+    def zeros(self, *shape: int) -> Tensor:
+        """Return (N, *shape) float32 of zeros."""
+        return torch.zeros(self.num_envs, *shape, device=self.device)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Annotated, Any, TypeVar, get_type_hints
@@ -55,6 +56,10 @@ class ConfigError(ValueError):
         super().__init__("\n".join(self.problems))
 
 
+class DuplicateError(ValueError):
+    """A name that a group has already; the message names both places."""
+
+
 def nearest(name: str, known: Iterable[str], most: int = 3) -> list[str]:
     """Return up to ``most`` names of ``known`` that look like ``name``, best first."""
     return difflib.get_close_matches(name, list(known), n=most, cutoff=0.5)
@@ -84,11 +89,11 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
         places = [str(place) for place in e["loc"]]
         unknown = e["type"] in ("extra_forbidden", "unexpected_keyword_argument")
         last = len(places) - 1
-        own = [p for i, p in enumerate(places) if (unknown and i == last) or not _UNION_MEMBER.match(p)]
-        key = ".".join([path, *own]).strip(".")
+        keys = [p for i, p in enumerate(places) if (unknown and i == last) or not _UNION_MEMBER.match(p)]
+        key = ".".join([path, *keys]).strip(".")
         if unknown:
             lines.append(unknown_name(key, str(e["loc"][-1]), known, "key") + f" (given: {e['input']!r})")
-        elif e["type"] == "value_error" and not e["loc"]:  # a dataclass's own rules, one "key: rule" per line
+        elif e["type"] == "value_error" and not e["loc"]:  # rules of a dataclass, one "key: rule" per line
             lines += [f"{path}.{line}".strip(".") for line in e["msg"].removeprefix("Value error, ").splitlines()]
         elif e["type"] == "problems":  # a term inside this one: one line each, from that parameter's name on
             lines += [".".join([path, *map(str, e["loc"][:-1]), line]).strip(".") for line in e["msg"].splitlines()]
@@ -96,7 +101,7 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
             lines.append(f"{key}: required, but not given")
         else:
             value, what = f"{key} = {e['input']!r}: ", e["msg"].removeprefix("Value error, ").lower()
-            if len(own) < len(places) and lines and lines[-1].startswith(value):  # the next type that it may be of
+            if len(keys) < len(places) and lines and lines[-1].startswith(value):  # the next type that it may be of
                 lines[-1] += f" or {what.removeprefix('input should be ')}"
             else:
                 lines.append(value + what)
@@ -120,8 +125,22 @@ class Entry:
     @cached_property
     def parameters(self) -> dict[str, inspect.Parameter]:
         """The keyword-only parameters, which the YAML may set."""
-        found = inspect.signature(self.target).parameters.values()
-        return {p.name: p for p in found if p.kind is inspect.Parameter.KEYWORD_ONLY}
+        every = inspect.signature(self.target).parameters.values()
+        return {p.name: p for p in every if p.kind is inspect.Parameter.KEYWORD_ONLY}
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the member is a class, whose objects carry state from one step to the next."""
+        return inspect.isclass(self.target)
+
+    @property
+    def place(self) -> str:
+        """File and line of the definition."""
+        file = getattr(sys.modules.get(self.target.__module__), "__file__", None) or self.target.__module__
+        try:
+            return f"{file}:{inspect.getsourcelines(self.target)[1]}"
+        except (OSError, TypeError):  # typed in at a prompt
+            return file
 
     @cached_property
     def schema(self) -> type[BaseModel]:
@@ -136,7 +155,7 @@ class Entry:
         return create_model(self.name, __config__=STRICT, **fields)
 
     def check(self, parameters: Mapping[str, Any], path: str) -> tuple[dict[str, Any], list[str]]:
-        """Validate ``parameters``; return them with defaults filled in, and the problems found."""
+        """Validate ``parameters``; return them with defaults filled in, and the problems."""
         try:
             values = self.schema.model_validate_json(as_json(parameters)).model_dump()
         except ValidationError as error:
@@ -146,18 +165,59 @@ class Entry:
 
 _REGISTRY: dict[str, dict[str, Entry]] = {}
 
+MORE: list[Callable[[], None]] = []
+"""Called when a name is not known, to register what else is installed (``schema/plugins.py``)."""
+
 
 def register(group: str, name: str, **traits: Any) -> Callable[[F], F]:
-    """Class or function decorator: make the target known to ``group`` as ``name``."""
+    """Class or function decorator: make the target known to ``group`` as ``name``.
+
+    Raises:
+        DuplicateError: if the group has a member of that name.
+    """
 
     def decorate(target: F) -> F:
-        members = _REGISTRY.setdefault(group, {})
-        if name in members:
-            raise ValueError(f"{group} term {name!r} is registered twice")
-        members[name] = Entry(group, name, target, traits)
+        add(Entry(group, name, target, traits))
         return target
 
     return decorate
+
+
+def add(entry: Entry) -> None:
+    """Make a member known; raise DuplicateError if its group has one of that name."""
+    members = _REGISTRY.setdefault(entry.group, {})
+    other = members.get(entry.name)
+    if other is not None:
+        raise DuplicateError(
+            f"{entry.group} term {entry.name!r} of {entry.place} exists already, in {other.place}; choose another name"
+        )
+    members[entry.name] = entry
+
+
+def remove(entry: Entry) -> None:
+    """Make a member unknown again."""
+    if _REGISTRY.get(entry.group, {}).get(entry.name) is entry:
+        del _REGISTRY[entry.group][entry.name]
+
+
+@contextmanager
+def collected() -> Iterator[list[Entry]]:
+    """Yield a list that holds, at the end, the foreign members registered in between; an error makes them unknown."""
+    before = {id(entry) for entry in foreign()}
+    new: list[Entry] = []
+    try:
+        yield new
+    except BaseException:
+        for entry in [e for e in foreign() if id(e) not in before]:
+            remove(entry)
+        raise
+    new += [e for e in foreign() if id(e) not in before]
+
+
+def foreign() -> list[Entry]:
+    """Return the members that this package did not register."""
+    every = [entry for members in _REGISTRY.values() for entry in members.values()]
+    return [entry for entry in every if entry.target.__module__.split(".")[0] != "go1exp"]
 
 
 reward = partial(register, "reward")
@@ -178,9 +238,17 @@ def members(group: str) -> dict[str, Entry]:
     return dict(_REGISTRY.get(group, {}))
 
 
+def find(group: str, name: Any) -> Entry | None:
+    """Return a member, or None; a name that is not known has the installed packages searched for it (``MORE``)."""
+    if name not in _REGISTRY.get(group, {}):
+        for search in MORE:
+            search()
+    return _REGISTRY.get(group, {}).get(name)
+
+
 def groups() -> list[str]:
     """The names of all groups that have members."""
-    return list(_REGISTRY)
+    return [group for group, members in _REGISTRY.items() if members]
 
 
 @dataclass(frozen=True)
@@ -204,7 +272,7 @@ class Term:
 def bind(
     group: str, key: str, settings: Any, path: str, slots: type[BaseModel] | None = None
 ) -> tuple[Term | None, list[str]]:
-    """Resolve one YAML item ``key: settings`` of ``group``; return the term (None if bad) and the problems found.
+    """Resolve one YAML item ``key: settings`` of ``group``; return the term (None if bad) and the problems.
 
     ``settings`` holds the term's parameters beside the group's own ``slots``; an item named differently from its
     term says ``term: name``.
@@ -215,11 +283,11 @@ def bind(
         return None, [f"{path} = {settings!r}: must be a mapping of parameters, such as {{}}"]
     settings = dict(settings)
     name = settings.pop("term", key)
-    entry = members(group).get(name)
+    entry = find(group, name)
     if entry is None:
         return None, [unknown_name(path, str(name), members(group), f"{group} term")]
     slot_names = set(slots.model_fields) if slots else set()
-    own = {k: v for k, v in settings.items() if k in slot_names}
+    of_group = {k: v for k, v in settings.items() if k in slot_names}
     rest = {k: v for k, v in settings.items() if k not in slot_names}
     values, problems = entry.check(rest, path)
     if problems and slot_names:  # so that a misspelt slot finds its name too
@@ -231,7 +299,7 @@ def bind(
     checked: dict[str, Any] = {}
     if slots:
         try:
-            checked = slots.model_validate_json(as_json(own)).model_dump()
+            checked = slots.model_validate_json(as_json(of_group)).model_dump()
         except ValidationError as error:
             problems += explain(error, path, slot_names)
     return (None, problems) if problems else (Term(key, entry, values, checked), [])

@@ -30,6 +30,14 @@ from go1exp.sim_robot.machine import Robot
 from go1exp.sim_robot.server import TRUTH, Server
 from go1exp.sim_robot.settings import SimConfig
 
+WITHOUT_POLICY: dict[str, Any] = {
+    **{group: {} for group in ("reward", "rand", "event", "termination", "curriculum")},
+    "observation": {"joint_position": {}},
+    "command": {"term": "fixed_velocity"},
+    "plugins": [],
+}
+"""What the robot does not need of a bundle: it may name terms of a plugin, which a bundle does not carry."""
+
 
 def bundle_task(bundle: str, other: dict[str, Any]) -> TaskConfig:
     """Return the task that a bundle's policy was trained in, with other choices of actuator and effects if given.
@@ -41,7 +49,7 @@ def bundle_task(bundle: str, other: dict[str, Any]) -> TaskConfig:
     import dataclasses
 
     members = unpack(Path(bundle).read_bytes(), MEMBERS, bundle)
-    task = parse_train(json.loads(members[CONFIG])).task
+    task = parse_train({**json.loads(members[CONFIG]), **WITHOUT_POLICY}).task
     chosen = {name: value for name, value in other.items() if value is not None}
     parts, problems = parse_parts(chosen, tuple(chosen))
     if not problems:

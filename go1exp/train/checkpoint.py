@@ -6,6 +6,7 @@ One file per checkpoint, written beside its final name and renamed when complete
 from __future__ import annotations
 
 import errno
+import io
 import random
 import warnings
 from collections import deque
@@ -83,11 +84,9 @@ def read(path: Path) -> dict[str, Any]:
         DamagedCheckpoint: if it is not whole, no checkpoint, or one of a version that is not known here.
         OSError: if the file cannot be opened.
     """
+    data = io.BytesIO(path.read_bytes())  # first: torch's reader has an OSError for a file that is cut off, too
     try:
-        with path.open("rb") as file:
-            state: Any = torch.load(file, map_location="cpu", weights_only=True)
-    except OSError:
-        raise
+        state: Any = torch.load(data, map_location="cpu", weights_only=True)
     except Exception:  # in many ways, and torch's own words advise to run the code that the file may hold
         raise DamagedCheckpoint(f"{path}: damaged checkpoint (not whole, or not written by go1exp)") from None
     known = state.get("format") if isinstance(state, dict) else None

@@ -57,8 +57,14 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
         """
         d = self.data
         write_advantages(
-            *(d[name] for name in ("advantages", "rewards", "values", "starts")),
-            *(last_values, last_ended, self.gamma, self.gae_lambda),
+            advantages=d["advantages"],
+            rewards=d["rewards"],
+            values=d["values"],
+            starts=d["starts"],
+            last_values=last_values,
+            last_ended=last_ended,
+            gamma=self.gamma,
+            gae_lambda=self.gae_lambda,
         )
         torch.add(d["advantages"], d["values"], out=d["returns"])
 

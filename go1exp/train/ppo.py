@@ -128,8 +128,14 @@ class MeanRolloutBuffer(RolloutBuffer):
     def compute_returns_and_advantage(self, last_values: Tensor, dones: np.ndarray) -> None:
         """Compute advantages and returns, (T, N), from the values (N,) after the rollout and whether it ended there."""
         write_advantages(
-            *(torch.as_tensor(a) for a in (self.advantages, self.rewards, self.values, self.episode_starts)),
-            *(last_values.detach().cpu().flatten(), torch.as_tensor(dones), self.gamma, self.gae_lambda),
+            advantages=torch.as_tensor(self.advantages),  # shares the buffer's memory, in which it is written
+            rewards=torch.as_tensor(self.rewards),
+            values=torch.as_tensor(self.values),
+            starts=torch.as_tensor(self.episode_starts),
+            last_values=last_values.detach().cpu().flatten(),
+            last_ended=torch.as_tensor(dones),
+            gamma=self.gamma,
+            gae_lambda=self.gae_lambda,
         )
         self.returns = self.advantages + self.values
 

@@ -1,8 +1,8 @@
 """The run folder: what was run, with what, and where its results are.
 
 ``config.yaml`` (resolved), ``meta.json`` (git commit, versions, machine, hashes of assets), ``metrics.csv``,
-``timing.csv``, ``checkpoints/``, ``actuator.npz`` (a copy of the actuator net, if there is one). Whatever comes later
-reads the run's own configuration, never today's ``conf/``.
+``timing.csv``, ``checkpoints/``, ``actuator.npz`` (a copy of the actuator net, if there is one), ``plugins/`` (copies
+of the user's files with terms). Whatever comes later reads the run's own configuration, never today's ``conf/``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from omegaconf import OmegaConf
 from go1exp import __version__, data_root
 from go1exp.actuator.net import find
 from go1exp.files import write_bytes, write_json, write_text
+from go1exp.train import kept_plugins
 
 NET = "actuator.npz"
 """A run's own copy of its actuator net."""
@@ -36,8 +37,9 @@ def write(run: Path, container: dict[str, Any]) -> None:
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
+        meta = {**_meta(container), "plugins": kept_plugins.keep(run, container)}
         write_text(run / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(container)))
-        write_json(run / "meta.json", _meta(container))
+        write_json(run / "meta.json", meta)
         for settings in _with_files(container.get("actuator")):
             source = find(settings["file"])
             if not (run / NET).exists() or not (run / NET).samefile(source):
@@ -56,12 +58,13 @@ def _with_files(actuator: Any) -> Iterator[dict[str, Any]]:
 
 
 def read_config(run: Path) -> dict[str, Any]:
-    """Return the run's own resolved configuration; an actuator's file is the run's own copy.
+    """Return the run's own resolved configuration; an actuator's file and plugins are the run's own copies.
 
     Raises:
         FileNotFoundError: if ``run`` is not a run folder.
+        go1exp.schema.registry.ConfigError: if a plugin that it was trained with is missing.
     """
-    container = read_as_written(run)
+    container = kept_plugins.with_copies(run, read_as_written(run))
     for settings in _with_files(container.get("actuator")):
         if (run / NET).is_file():
             settings["file"] = str(run / NET)

@@ -10,6 +10,7 @@ from typing import Any
 
 from go1exp.config import TrainConfig, parse_train
 from go1exp.files import write_json
+from go1exp.schema import plugins
 from go1exp.schema.registry import ConfigError
 from go1exp.train import checkpoint, run_folder
 from go1exp.train.ppo import AdaptivePPO
@@ -37,7 +38,8 @@ def read(config: TrainConfig, source: Path) -> Weights:
         ConfigError: if a policy of the new run is another function than one of ``source``.
         FileNotFoundError: if ``source`` holds no checkpoint.
     """
-    theirs = parse_train(run_folder.read_config(source))
+    with plugins.restored():
+        theirs = parse_train(run_folder.read_config(source))
     differ = [
         f"{name} is {new} here and {old} there"
         for name, new, old in (

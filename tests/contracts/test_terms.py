@@ -1,4 +1,4 @@
-"""What every registered term promises, whichever it is; a new one is picked up from the registry."""
+"""What the terms of this package promise beyond what every term does (``test_members.py``), and their laws."""
 
 from __future__ import annotations
 
@@ -16,16 +16,13 @@ from torch import Tensor
 
 from go1exp import robot
 from go1exp.config import TaskConfig
-from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.types import Snapshot
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
-from go1exp.schema.registry import Entry, groups, members
-from go1exp.tensors.randomness import EnvRandom, Stream
+from go1exp.schema.registry import Entry, members
 from go1exp.terrain import build_terrain
-
-ODD = 37
-"""Size of a batch that no vector register divides."""
+from go1exp.testing.randomness import everyone, model_fields, parts, start_states, stream, with_fields
+from go1exp.testing.snapshots import ODD, random_snapshot, rows
 
 
 def each(group: str, **traits: Any) -> Any:
@@ -35,77 +32,7 @@ def each(group: str, **traits: Any) -> Any:
     return pytest.mark.parametrize("entry", found.values(), ids=found.keys())
 
 
-# All groups
-
-EVERY = [entry for group in groups() for entry in members(group).values()]
-
-
-@pytest.mark.parametrize("entry", EVERY, ids=[f"{e.group}.{e.name}" for e in EVERY])
-def test_a_term_is_described_by_one_sentence(entry: Entry) -> None:
-    assert entry.doc.endswith("."), entry.doc
-    assert entry.doc[0].isupper()
-
-
-@pytest.mark.parametrize("entry", EVERY, ids=[f"{e.group}.{e.name}" for e in EVERY])
-def test_the_defaults_of_a_term_pass_its_own_schema(entry: Entry) -> None:
-    defaults = {name: p.default for name, p in entry.parameters.items() if p.default is not p.empty}
-    required = [name for name in entry.parameters if name not in defaults]
-    checked, problems = entry.check(defaults, entry.name)
-    assert problems == [f"{entry.name}.{name}: required, but not given" for name in required]
-    assert required or {k: checked[k] for k in defaults} == defaults
-
-
-@pytest.mark.parametrize("entry", EVERY, ids=[f"{e.group}.{e.name}" for e in EVERY])
-def test_a_term_refuses_a_parameter_it_does_not_have(entry: Entry) -> None:
-    _, problems = entry.check({"no_such_thing": 1.0}, entry.name)
-    assert any("no_such_thing" in p for p in problems)
-
-
 # Functions of a snapshot
-
-
-def random_snapshot(n: int, seed: int = 0) -> Snapshot:
-    """Robots in the middle of something: every quantity of a plausible size, phases consistent."""
-    rng = np.random.default_rng(seed)
-    low, high = robot.JOINT_POS_LIMITS.T
-    quat = Rotation.random(n, random_state=seed)
-    touching = rng.random((n, 4)) < 0.5
-    phase = rng.uniform(0.002, 0.4, (n, 4))
-    values: dict[str, Any] = {
-        "base_pos_w": rng.normal(0.0, 3.0, (n, 3)),
-        "base_quat_w": quat.as_quat(scalar_first=True),
-        "base_lin_vel_b": rng.normal(0.0, 0.7, (n, 3)),
-        "base_ang_vel_b": rng.normal(0.0, 1.0, (n, 3)),
-        "projected_gravity_b": quat.inv().apply([0.0, 0.0, -1.0]),
-        "joint_pos": rng.uniform(1.02 * low, 1.02 * high, (n, 12)),
-        "joint_vel": rng.normal(0.0, 15.0, (n, 12)),
-        "joint_acc": rng.normal(0.0, 300.0, (n, 12)),
-        "joint_torque": rng.normal(0.0, 10.0, (n, 12)),
-        "joint_target": rng.uniform(low, high, (n, 12)),
-        "action": rng.normal(0.0, 1.0, (n, 12)),
-        "previous_action": rng.normal(0.0, 1.0, (n, 12)),
-        "command": rng.normal(0.0, 1.0, (n, 3)) * (rng.random((n, 1)) < 0.7),
-        "foot_height": rng.uniform(0.02, 0.2, (n, 4)),
-        "foot_vel_w": rng.normal(0.0, 1.0, (n, 4, 3)),
-        "foot_force": touching * rng.uniform(0.0, 100.0, (n, 4)),
-        "foot_contact": touching,
-        "foot_air_time": ~touching * phase,
-        "foot_contact_time": touching * phase,
-        "foot_last_air_time": rng.uniform(0.0, 0.7, (n, 4)),
-        "foot_last_contact_time": rng.uniform(0.0, 0.7, (n, 4)),
-        "foot_touchdown": touching & (phase < 0.02),
-        "thigh_contact": rng.random((n, 4)) < 0.3,
-        "calf_contact": rng.random((n, 4)) < 0.3,
-        "trunk_contact": rng.random(n) < 0.3,
-        "episode_time": rng.uniform(0.0, 20.0, n),
-    }
-    assert values.keys() == {f.name for f in fields(Snapshot)}
-    tensors = {k: torch.as_tensor(v) for k, v in values.items()}
-    return Snapshot(**{k: v if v.dtype == torch.bool else v.float() for k, v in tensors.items()})
-
-
-def rows(s: Snapshot, which: slice) -> Snapshot:
-    return Snapshot(**{f.name: getattr(s, f.name)[which].clone() for f in fields(Snapshot)})
 
 
 def mirrored(s: Snapshot) -> Snapshot:
@@ -155,15 +82,6 @@ ONE_SIDED = {
 
 
 @each("reward")
-def test_a_reward_is_one_finite_number_per_robot(entry: Entry) -> None:
-    for n in (1, ODD):
-        value = entry.target(random_snapshot(n))
-        assert value.shape == (n,)
-        assert value.dtype == torch.float32
-        assert torch.isfinite(value).all()
-
-
-@each("reward")
 def test_a_reward_tells_robots_apart(entry: Entry) -> None:
     if entry.name != "air_time_variance_literal":  # identically zero
         assert entry.target(random_snapshot(500)).unique().numel() > 1
@@ -180,15 +98,6 @@ def test_a_robot_gets_the_same_alone_and_in_a_batch_bit_for_bit(group: str) -> N
             assert torch.equal(entry.target(rows(s, slice(0, size))), together[:size]), (name, size)
 
 
-@pytest.mark.parametrize("group", ["reward", "observation", "termination"])
-def test_a_term_leaves_the_snapshot_alone(group: str) -> None:
-    s, before = random_snapshot(ODD), random_snapshot(ODD)
-    for name, entry in members(group).items():
-        entry.target(s)
-        for f in fields(Snapshot):
-            assert torch.equal(getattr(s, f.name), getattr(before, f.name)), (name, f.name)
-
-
 @each("reward")
 def test_a_reward_is_the_same_in_the_mirror_unless_it_is_known_not_to_be(entry: Entry) -> None:
     s = random_snapshot(500)
@@ -202,14 +111,6 @@ def test_a_penalty_or_reward_is_not_negative_unless_it_is_signed(entry: Entry) -
     signed = {"feet_air_time", "feet_air_time_touchdown", "feet_air_time_literal", "joint_deviation_literal"}
     if entry.name not in signed | {"air_time_variance_literal"}:
         assert entry.target(random_snapshot(500)).min() >= 0.0
-
-
-@each("observation")
-def test_an_observation_is_as_wide_as_it_says(entry: Entry) -> None:
-    for n in (1, ODD):
-        value = entry.target(random_snapshot(n))
-        assert value.shape == (n, entry.traits["size"])
-        assert value.dtype == torch.float32
 
 
 @each("termination")
@@ -249,25 +150,6 @@ def make_backend(make_task: Callable[..., TaskConfig]) -> Callable[[int], Mujoco
     return lambda n: MujocoCpu(model, sensors, n, threads=1)
 
 
-def stream(n: int, seed: int = 0, first_env: int = 0) -> Stream:
-    return EnvRandom(seed, n, first_env).stream("here")
-
-
-def everyone(n: int) -> Tensor:
-    return torch.ones(n, dtype=torch.bool)
-
-
-def model_fields(backend: MujocoCpu) -> dict[str, Tensor]:
-    """Copies of all fields that differ between environments."""
-    return backend.state_dict()["fields"]
-
-
-def start_from(backend: MujocoCpu, entry: Entry) -> dict[str, Tensor]:
-    for name in entry.traits["fields"]:
-        backend.field(name)
-    return model_fields(backend)
-
-
 NOTHING: dict[str, list[dict[str, Any]]] = {
     "foot_friction": [
         {"range": (0.8, 0.8), "operation": "set"},
@@ -282,68 +164,12 @@ NOTHING: dict[str, list[dict[str, Any]]] = {
 
 
 @each("rand", kind="model")
-def test_a_model_term_changes_masked_rows_of_its_declared_fields_only(
-    entry: Entry, make_backend: Callable[[int], MujocoCpu]
-) -> None:
-    backend, mask = make_backend(5), torch.tensor([True, False, True, False, True])
-    before = start_from(backend, entry)
-    assert set(before) == set(entry.traits["fields"])
-    entry.target(backend, stream(5), mask)
-    after = model_fields(backend)
-    assert set(after) == set(entry.traits["fields"])
-    for name, values in after.items():
-        changed = (values != before[name]).flatten(1).any(1)
-        assert torch.equal(changed, mask), name
-
-
-@each("rand", kind="model")
-def test_a_model_term_draws_the_same_from_the_same_seed_and_other_values_from_another(
-    entry: Entry, make_backend: Callable[[int], MujocoCpu]
-) -> None:
-    results = []
-    for seed in (7, 7, 8):
-        backend = make_backend(3)
-        entry.target(backend, stream(3, seed), everyone(3))
-        results.append(model_fields(backend))
-    for name in entry.traits["fields"]:
-        assert torch.equal(results[0][name], results[1][name])
-        assert not torch.equal(results[0][name], results[2][name])
-        first, second, third = results[0][name]
-        assert not torch.equal(first, second)
-        assert not torch.equal(second, third)
-
-
-@each("rand", kind="model")
-def test_a_model_term_draws_from_the_nominal_model_not_from_its_last_draw(
-    entry: Entry, make_backend: Callable[[int], MujocoCpu]
-) -> None:
-    backend = make_backend(3)
-    entry.target(backend, stream(3, 1), everyone(3))
-    first = model_fields(backend)
-    entry.target(backend, stream(3, 2), everyone(3))
-    entry.target(backend, stream(3, 1), everyone(3))
-    for name, values in model_fields(backend).items():
-        assert torch.equal(values, first[name]), name
-
-
-@each("rand", kind="model")
-def test_a_model_term_gives_a_robot_the_same_alone_and_in_a_batch(
-    entry: Entry, make_backend: Callable[[int], MujocoCpu]
-) -> None:
-    batch, alone = make_backend(4), make_backend(1)
-    entry.target(batch, stream(4), everyone(4))
-    entry.target(alone, stream(1, first_env=2), everyone(1))
-    for name in entry.traits["fields"]:
-        assert torch.equal(batch.field(name)[2], alone.field(name)[0])
-
-
-@each("rand", kind="model")
 def test_a_model_term_with_a_range_of_one_nominal_value_changes_nothing(
     entry: Entry, make_backend: Callable[[int], MujocoCpu]
 ) -> None:
     for parameters in NOTHING[entry.name]:
         backend = make_backend(3)
-        before = start_from(backend, entry)
+        before = with_fields(backend, entry)
         entry.target(backend, stream(3), everyone(3), **parameters)
         for name, values in model_fields(backend).items():
             # A value that is set is a float32 draw, or looked up; one that is scaled or shifted must not move at all.
@@ -465,18 +291,6 @@ def test_the_ranges_are_those_of_table_i_in_the_file_and_by_default(make_task: C
 # Randomisations of the initial state
 
 
-def start_states(n: int) -> KinematicState:
-    """Where the environment starts before any randomisation: nominal stance, at rest, float64."""
-    qpos, qvel = torch.zeros(n, 19, dtype=torch.float64), torch.zeros(n, 18, dtype=torch.float64)
-    qpos[:, 2], qpos[:, 3] = 0.33, 1.0
-    qpos[:, 7:] = torch.as_tensor(robot.NOMINAL_STANCE)
-    return KinematicState.of(qpos, qvel)
-
-
-def parts(state: KinematicState) -> dict[str, Tensor]:
-    return {f.name: getattr(state, f.name).clone() for f in fields(KinematicState)}
-
-
 WRITES = {
     "body_velocity": {"base_lin_vel_w", "base_ang_vel_b"},
     "body_position": {"base_pos_w"},
@@ -577,38 +391,6 @@ def test_body_orientation_turns_the_trunk_by_the_rotation_vector_that_is_drawn()
 DT = 0.02
 
 
-@each("command")
-def test_a_command_is_a_velocity_that_a_robot_gets_alone_and_in_a_batch(entry: Entry) -> None:
-    batch, alone = entry.target(stream(6)), entry.target(stream(1, first_env=4))
-    restart = everyone(6)
-    for k in range(100):
-        batch.advance(DT, restart)
-        alone.advance(DT, restart[4:5])
-        assert batch.value.shape == (6, 3)
-        assert batch.value.dtype == torch.float32
-        assert torch.equal(batch.value[4:5], alone.value), k
-        restart = torch.tensor([k % 7 == 0, False, False, k == 3, k % 20 == 0, False])
-
-
-@each("command")
-def test_a_command_keeps_one_tensor_and_continues_from_its_saved_state(entry: Entry) -> None:
-    random = EnvRandom(0, 6)
-    first = entry.target(random.stream("command"))
-    held = first.value
-    first.advance(DT, everyone(6))
-    for _ in range(50):
-        first.advance(DT, ~everyone(6))
-    twin_random = EnvRandom(5, 6)
-    second = entry.target(twin_random.stream("command"))
-    twin_random.load_state_dict(random.state_dict())
-    second.load_state_dict(first.state_dict())
-    for _ in range(300):
-        first.advance(DT, ~everyone(6))
-        second.advance(DT, ~everyone(6))
-        assert torch.equal(first.value, second.value)
-    assert first.value is held
-
-
 def test_uniform_velocities_fill_their_ranges_and_a_tenth_stand_still() -> None:
     n = 5000
     command = members("command")["uniform_velocity"].target(stream(n))
@@ -680,40 +462,6 @@ def test_a_fixed_velocity_stays_and_takes_a_row_for_each_robot() -> None:
 
 
 # Events
-
-
-@each("event")
-def test_an_event_leaves_a_restarted_robot_alone_and_is_the_same_alone_and_in_a_batch(entry: Entry) -> None:
-    batch, alone = entry.target(stream(5)), entry.target(stream(1, first_env=3))
-    state, single = start_states(5), start_states(1)
-    batch.advance(state, 30.0, everyone(5))
-    alone.advance(single, 30.0, everyone(1))
-    for name, values in parts(start_states(5)).items():
-        assert torch.equal(getattr(state, name), values), name
-    for _ in range(30):
-        batch.advance(state, 1.0, ~everyone(5))
-        alone.advance(single, 1.0, ~everyone(1))
-        for name, values in parts(single).items():
-            assert torch.equal(getattr(state, name)[3:4], values), name
-
-
-@each("event")
-def test_an_event_continues_from_its_saved_state(entry: Entry) -> None:
-    random, twin_random = EnvRandom(0, 4), EnvRandom(9, 4)
-    first, second = entry.target(random.stream("push")), entry.target(twin_random.stream("push"))
-    a, b = start_states(4), start_states(4)
-    first.advance(a, 1.0, everyone(4))
-    for _ in range(20):
-        first.advance(a, 1.0, ~everyone(4))
-    twin_random.load_state_dict(random.state_dict())
-    second.load_state_dict(first.state_dict())
-    for name, values in parts(a).items():
-        getattr(b, name).copy_(values)
-    for _ in range(40):
-        first.advance(a, 1.0, ~everyone(4))
-        second.advance(b, 1.0, ~everyone(4))
-        for name, values in parts(a).items():
-            assert torch.equal(values, getattr(b, name))
 
 
 def test_a_push_sets_the_horizontal_velocity_every_ten_to_fifteen_seconds() -> None:

@@ -287,9 +287,8 @@ class Search:
             return None, None
         windows = self.splits.select
         trial = tried(state.scorer, self.settings, fitted, train, select, windows, self.dt, self.rng, small)
-        names = tuple(
-            fitted[k].name for k in sorted(np.flatnonzero(trial.alias).tolist(), key=lambda k: -trial.mean[k])
-        )
+        alias = sorted(np.flatnonzero(trial.alias).tolist(), key=lambda k: -trial.mean[k])
+        names = tuple(fitted[k].name for k in alias)
         self._note_trial(trial, fitted, names)
         helps = [k for k in range(len(fitted)) if trial.helps[k] and trial.sizes[k] <= 1.0]
         inside = fitted[max(helps, key=lambda k: trial.mean[k])] if helps else None

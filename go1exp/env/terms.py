@@ -1,0 +1,109 @@
+"""The configured rewards, observations and terminations of a batch, called on one Snapshot after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from go1exp.config import TaskConfig
+from go1exp.mdp.types import Snapshot, TermSetup
+from go1exp.schema.registry import Term
+
+Call = Callable[[Snapshot], Tensor]
+
+TIME_LIMIT, LEFT_MAP = "time limit", "left the map"
+"""Ends of an episode that are no failure."""
+
+
+class StepTerms:
+    """Rewards, observations and terminations of N robots.
+
+    A term is a function, or a class whose object remembers something (``docs/extending.md``): it is called once a step,
+    an observation's ``advance`` once a step before it is read, and ``reset(mask)`` where an episode begins.
+
+    Attributes:
+        rewards: terms with a weight that is not zero.
+        values: (N, R) of the rewards in the last step, without their weights.
+        weights: (R,) times the policy's period.
+        sums: (R,) float64, of weighted rewards since ``core.drain_metrics``.
+        failed: (N, T) bool, which terminations were true in the last step.
+        left_map: (N,) bool, who was at the edge of the ground in the last step.
+        observation_size: O.
+    """
+
+    def __init__(self, task: TaskConfig, num_envs: int, device: torch.device) -> None:
+        """Build the terms of ``task``."""
+        setup = TermSetup(num_envs, device, task.sim.policy_dt)
+        self._remembering: dict[str, Any] = {}
+
+        def calls(group: str, terms: Sequence[Term]) -> list[Call]:
+            """Return the terms as functions of a Snapshot."""
+            made: list[Call] = [t(setup) if t.entry.remembers else t for t in terms]
+            named = zip(terms, made, strict=True)
+            self._remembering |= {f"{group}.{t.key}": call for t, call in named if t.entry.remembers}
+            return made
+
+        self.rewards = [t for t in task.reward if t.slots["weight"] != 0.0]
+        self._reward_calls = calls("reward", self.rewards)
+        weights = [t.slots["weight"] * task.sim.policy_dt for t in self.rewards]
+        self.weights = torch.tensor(weights, dtype=torch.float32, device=device)
+        self.values = setup.zeros(len(self.rewards))
+        self.sums = torch.zeros(len(self.rewards), dtype=torch.float64, device=device)
+        self._terminations = task.termination
+        self._termination_calls = calls("termination", task.termination)
+        self.failed = torch.zeros(num_envs, len(task.termination), dtype=torch.bool, device=device)
+        self.left_map = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._observation_calls = calls("observation", task.observation)
+        self._advancing = [self._remembering[k] for k in self._remembering if k.startswith("observation.")]
+        widths = [int(t.entry.traits["size"]) for t in task.observation]
+        self.observation_size = sum(widths)
+        noise = [t.slots["noise"] for t in task.observation]
+        self.noise = torch.tensor(noise).repeat_interleave(torch.tensor(widths)).float().to(device)
+
+    def terminated(self, s: Snapshot) -> Tensor:
+        """(N,) bool, any termination is true."""
+        for k, term in enumerate(self._termination_calls):
+            self.failed[:, k] = term(s)
+        return self.failed.any(-1)
+
+    def reward(self, s: Snapshot) -> Tensor:
+        """(N,) sum of weight x term x policy period."""
+        for k, term in enumerate(self._reward_calls):
+            self.values[:, k] = term(s)
+        weighted = self.values * self.weights
+        self.sums += weighted.sum(0)
+        return weighted.sum(-1)
+
+    def advance(self, s: Snapshot) -> None:
+        """Let the observations that remember something take in a step, as the robot's sensors saw it."""
+        for term in self._advancing:
+            term.advance(s)
+
+    def observation(self, s: Snapshot) -> Tensor:
+        """(N, O) all observations one after the other, without noise."""
+        return torch.cat([term(s) for term in self._observation_calls], dim=-1)
+
+    def reset(self, mask: Tensor) -> None:
+        """Begin new episodes in the rows of ``mask`` (N,)."""
+        for term in self._remembering.values():
+            term.reset(mask)
+
+    def reward_terms(self) -> dict[str, Tensor]:
+        """Return what each term contributed to the last step's reward, (N,) each, weight and period included."""
+        weighted = self.values * self.weights
+        return {t.key: weighted[:, k] for k, t in enumerate(self.rewards)}
+
+    def end(self, env: int, terminated: bool, truncated: bool) -> str | None:
+        """Say why an episode ended in the last step: the first termination that was true, or ``TIME_LIMIT`` ..."""
+        if terminated:
+            return self._terminations[int(self.failed[env].int().argmax())].key
+        if truncated:
+            return LEFT_MAP if self.left_map[env] else TIME_LIMIT
+        return None
+
+    def parts(self) -> dict[str, Any]:
+        """Return the terms that remember something, by group and key."""
+        return dict(self._remembering)

@@ -1,0 +1,86 @@
+"""Everything that a file of your own terms imports: ``docs/extending.md`` has an example of each kind.
+
+Importing this registers every term of the package first, so that a name of yours that exists already is refused.
+"""
+
+from __future__ import annotations
+
+import go1exp.actuator
+import go1exp.effects
+import go1exp.importers
+import go1exp.mdp
+import go1exp.record.policy  # noqa: F401  (registers an excitation)
+from go1exp import robot
+from go1exp.actuator.setup import Gains
+from go1exp.drive import DriveSetup, ModelFields
+from go1exp.effects.base import Effect, Gears, Measured, Param
+from go1exp.excitations import ExcitationError, Motion
+from go1exp.excitations.motion import always_on
+from go1exp.importers.source import columns, joint_columns, rate, recording
+from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.types import Snapshot, TermSetup
+from go1exp.recording import Recording, RecordingError
+from go1exp.schema.joint_values import JointValues, each_within
+from go1exp.schema.registry import (
+    Fraction,
+    NonNegative,
+    Positive,
+    PositiveRange,
+    Range,
+    actuator,
+    command,
+    curriculum,
+    effect,
+    event,
+    excitation,
+    importer,
+    observation,
+    randomization,
+    reward,
+    termination,
+)
+from go1exp.tensors.memory import Memory
+from go1exp.tensors.randomness import Stream
+
+__all__ = [
+    "DriveSetup",
+    "Effect",
+    "ExcitationError",
+    "Fraction",
+    "Gains",
+    "Gears",
+    "JointValues",
+    "KinematicState",
+    "Measured",
+    "Memory",
+    "ModelFields",
+    "Motion",
+    "NonNegative",
+    "Param",
+    "Positive",
+    "PositiveRange",
+    "Range",
+    "Recording",
+    "RecordingError",
+    "Snapshot",
+    "Stream",
+    "TermSetup",
+    "actuator",
+    "always_on",
+    "columns",
+    "command",
+    "curriculum",
+    "each_within",
+    "effect",
+    "event",
+    "excitation",
+    "importer",
+    "joint_columns",
+    "observation",
+    "randomization",
+    "rate",
+    "recording",
+    "reward",
+    "robot",
+    "termination",
+]

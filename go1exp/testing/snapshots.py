@@ -1,0 +1,153 @@
+"""What a term of the MDP promises that sees a Snapshot: rewards, observations and terminations."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.mdp.types import Snapshot, TermSetup
+from go1exp.schema.registry import Entry
+from go1exp.testing.description import alike, checked, expect
+
+ODD = 37
+"""Size of a batch that no vector register divides."""
+
+DT = 0.02
+
+
+def random_snapshot(n: int, seed: int = 0) -> Snapshot:
+    """Return N robots in the middle of something: every quantity of a plausible size, phases consistent."""
+    rng = np.random.default_rng(seed)
+    low, high = robot.JOINT_POS_LIMITS.T
+    quat = Rotation.random(n, random_state=seed)
+    touching = rng.random((n, 4)) < 0.5
+    phase = rng.uniform(0.002, 0.4, (n, 4))
+    values: dict[str, Any] = {
+        "base_pos_w": rng.normal(0.0, 3.0, (n, 3)),
+        "base_quat_w": quat.as_quat(scalar_first=True),
+        "base_lin_vel_b": rng.normal(0.0, 0.7, (n, 3)),
+        "base_ang_vel_b": rng.normal(0.0, 1.0, (n, 3)),
+        "projected_gravity_b": quat.inv().apply([0.0, 0.0, -1.0]),
+        "joint_pos": rng.uniform(1.02 * low, 1.02 * high, (n, 12)),
+        "joint_vel": rng.normal(0.0, 15.0, (n, 12)),
+        "joint_acc": rng.normal(0.0, 300.0, (n, 12)),
+        "joint_torque": rng.normal(0.0, 10.0, (n, 12)),
+        "joint_target": rng.uniform(low, high, (n, 12)),
+        "action": rng.normal(0.0, 1.0, (n, 12)),
+        "previous_action": rng.normal(0.0, 1.0, (n, 12)),
+        "command": rng.normal(0.0, 1.0, (n, 3)) * (rng.random((n, 1)) < 0.7),
+        "foot_height": rng.uniform(0.02, 0.2, (n, 4)),
+        "foot_vel_w": rng.normal(0.0, 1.0, (n, 4, 3)),
+        "foot_force": touching * rng.uniform(0.0, 100.0, (n, 4)),
+        "foot_contact": touching,
+        "foot_air_time": ~touching * phase,
+        "foot_contact_time": touching * phase,
+        "foot_last_air_time": rng.uniform(0.0, 0.7, (n, 4)),
+        "foot_last_contact_time": rng.uniform(0.0, 0.7, (n, 4)),
+        "foot_touchdown": touching & (phase < 0.02),
+        "thigh_contact": rng.random((n, 4)) < 0.3,
+        "calf_contact": rng.random((n, 4)) < 0.3,
+        "trunk_contact": rng.random(n) < 0.3,
+        "episode_time": rng.uniform(0.0, 20.0, n),
+    }
+    assert values.keys() == {f.name for f in fields(Snapshot)}
+    tensors = {k: torch.as_tensor(v) for k, v in values.items()}
+    return Snapshot(**{k: v if v.dtype == torch.bool else v.float() for k, v in tensors.items()})
+
+
+def rows(s: Snapshot, which: slice) -> Snapshot:
+    """Return some robots of a Snapshot."""
+    return Snapshot(**{f.name: getattr(s, f.name)[which].clone() for f in fields(Snapshot)})
+
+
+class _Made:
+    """A term for n robots: its function, or an object of its class."""
+
+    def __init__(self, entry: Entry, values: dict[str, Any], n: int) -> None:
+        self.n, self.values, self.target = n, values, entry.target
+        self.object = entry.target(TermSetup(n, torch.device("cpu"), DT), **values) if entry.remembers else None
+        self.advances = entry.group == "observation" and self.object is not None
+        if self.object is not None:
+            self.object.reset(torch.ones(n, dtype=torch.bool))
+
+    def __call__(self, s: Snapshot) -> Tensor:
+        if self.object is None:
+            result: Tensor = self.target(s, **self.values)
+            return result
+        if self.advances:
+            self.object.advance(s)
+        return self.object(s).clone()
+
+    def numbers(self) -> dict[str, Tensor]:
+        """Return what it remembers."""
+        assert self.object is not None
+        return {k: v.clone() for k, v in self.object.state_dict().items()}
+
+
+def check_reward(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+    """One finite float32 number per robot."""
+    _check(entry, checked(entry, parameters), exact, (), torch.float32)
+
+
+def check_observation(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+    """As many finite float32 numbers per robot as ``size`` says."""
+    expect(entry, isinstance(entry.traits.get("size"), int), "it must say how wide it is: @observation(name, size=3)")
+    _check(entry, checked(entry, parameters), exact, (entry.traits["size"],), torch.float32)
+
+
+def check_termination(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
+    """One flag per robot."""
+    _check(entry, checked(entry, parameters), exact, (), torch.bool)
+
+
+def _check(entry: Entry, values: dict[str, Any], exact: bool, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    moments = [random_snapshot(ODD, seed) for seed in range(4)]
+    batch = _Made(entry, values, ODD)
+    singles = {i: _Made(entry, values, 1) for i in (0, 17, ODD - 1)}
+    part = _Made(entry, values, 8)
+    for k, s in enumerate(moments):
+        together = batch(s)
+        expect(entry, together.shape == (ODD, *shape), f"it must be (N{''.join(f', {x}' for x in shape)})")
+        expect(entry, together.dtype == dtype, f"it must be {dtype}, and is {together.dtype}")
+        expect(entry, torch.isfinite(together).all(), "it must be finite")
+        before = random_snapshot(ODD, k)
+        same = [torch.equal(getattr(s, f.name), getattr(before, f.name)) for f in fields(Snapshot)]
+        expect(entry, all(same), "it must leave the Snapshot as it is")
+        promise = "a robot must get the same alone and in a batch"
+        for i, single in singles.items():
+            expect(entry, alike(single(rows(s, slice(i, i + 1))), together[i : i + 1], exact), promise)
+        expect(entry, alike(part(rows(s, slice(0, 8))), together[:8], exact), promise)
+    if entry.remembers:
+        _check_memory(entry, values, moments)
+
+
+def _check_memory(entry: Entry, values: dict[str, Any], moments: list[Snapshot]) -> None:
+    """Check what a term with a memory promises beyond the others."""
+    one, other, fresh = (_Made(entry, values, ODD) for _ in range(3))
+    memory = one.object
+    assert memory is not None
+    expect(entry, one.numbers(), "a class must name its tensors in `memory`; a term without any is a function")
+    held = {name: getattr(memory, name) for name in memory.memory}
+    for s in moments:
+        one(s)
+        other(s)
+    if one.advances:
+        expect(entry, torch.equal(memory(moments[0]), memory(moments[0])), "to read it twice must change nothing")
+    mask = torch.arange(ODD) % 3 == 0
+    memory.reset(mask)
+    for name, values_now in one.numbers().items():
+        if len(values_now) != ODD:
+            continue
+        expect(entry, torch.equal(values_now[~mask], other.numbers()[name][~mask]), "reset must touch masked rows only")
+        expect(entry, torch.equal(values_now[mask], fresh.numbers()[name][mask]), "reset must forget the masked rows")
+    fresh.object.load_state_dict(one.object.state_dict())  # type: ignore[union-attr]
+    for s in reversed(moments):
+        expect(entry, torch.equal(one(s), fresh(s)), "it must continue from its saved state bit for bit")
+    kept = all(getattr(memory, name) is tensor for name, tensor in held.items())
+    expect(entry, kept, "it must change its tensors in place: a captured GPU graph would not see an assignment")
