@@ -181,6 +181,8 @@ class _Deferred(ModuleType):
     """Stands for a module until something of it is used (``importlib.util.LazyLoader`` loads at the next import)."""
 
     def __getattr__(self, attribute: str) -> Any:
+        if attribute == "__file__":  # asked of every module by inspect.stack(), which Hydra calls
+            raise AttributeError(attribute)
         sys.modules.pop(self.__name__, None)
         real = importlib.import_module(self.__name__)
         self.__dict__.update(real.__dict__)
