@@ -179,7 +179,7 @@ def test_a_users_own_file_names_its_model_from_where_it_lies(tmp_path: Path) -> 
     assert container["search"]["window_s"] == 0.7
     assert compose("gap", [*given, "search.window_s=0.2"])["search"]["window_s"] == 0.2
     assert compose("gap", [])["search"]["window_s"] == GapSettings().window_s
-    FixedBase.of(model)
+    FixedBase.from_config(model)
 
 
 def test_a_robot_carries_its_tolerances_and_another_robot_beside_it_has_others() -> None:

@@ -81,7 +81,7 @@ def test_a_new_effect_is_screened_fitted_and_worded_by_its_own_file() -> None:
     for variant in variants:
         assert variant.free == (("creep", "size"), ("creep", "speed"))
         assert {p.key for p in variant.probes} == {("creep", "size")}
-        assert Layout.of(Robots.held, variant.probes).size == 12
+        assert Layout.from_probes(Robots.held, variant.probes).size == 12
         np.testing.assert_allclose(variant.probes[0].delta, 2.0 * 0.02)
     assert free_shapes("creep") == (("creep", "speed"),)
     assert answer.not_excited({"creep": 0.0})["creep"] == "slow_ramps"

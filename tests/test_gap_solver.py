@@ -80,7 +80,7 @@ def test_normal_equations_promise_what_the_model_gives() -> None:
     joints = np.ones(12)
     probes = [Probe(("coulomb", "bound"), 0, joints), Probe(("base_tilt", "roll"), None, np.ones(1))]
     machine = HungGo1(simulate_config())
-    layout = Layout.of(machine, probes)
+    layout = Layout.from_probes(machine, probes)
     assert layout.size == 5
     np.testing.assert_array_equal(layout.joint, [0, 3, 6, 9, -1])
     columns, state = rng.standard_normal((3, 4, 30, 2)), np.zeros((3, 4, 30, 1))

@@ -57,7 +57,7 @@ def truth(recording: Recording) -> np.ndarray:
 
 def errors(config: RobotConfig, recording: Recording) -> tuple[np.ndarray, list[Base]]:
     """Return by how much estimates miss height, roll, pitch, velocity and rate (K, 9), and the estimates."""
-    legs, log, true = Legs(config), Log.of(recording), truth(recording)
+    legs, log, true = Legs(config), Log.from_recording(recording), truth(recording)
     found, bases = [], []
     for row in range(40, len(log.t) - 40, 31):
         base = base_state(legs, log, float(log.t[row]))

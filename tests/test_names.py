@@ -18,17 +18,7 @@ from go1exp import data_root
 
 PACKAGE = data_root() / "go1exp"
 
-VAGUE = frozenset(
-    ("found", "said", "own", "told", "do", "go", "of", "there", "here", "mine", "seen", "more", "some", "word", "words")
-)
-
-NOT_YET = (
-    *("actuator", "cli", "effects", "env", "gap", "physics", "train"),
-    "terrain.py",
-    # names of these are changed together with the functions that are split
-    "deploy/walk.py",
-)
-"""Packages and files in which the words still occur; an entry goes as soon as it is clean."""
+VAGUE = frozenset(("found", "said", "own", "told", "do", "go", "of", "there", "here", "mine", "seen", "more", "some"))
 
 
 def names(tree: ast.AST) -> Iterator[tuple[str, int]]:
@@ -53,23 +43,9 @@ def vague(file: Path) -> list[str]:
     return sorted({f"{file.name}:{line}: {name}" for name, line in names(tree) if name.strip("_") in VAGUE})
 
 
-def listed(file: Path) -> bool:
-    """Whether a file is among those that are not clean yet."""
-    place = file.relative_to(PACKAGE).as_posix()
-    return any(place == entry or place.startswith(f"{entry}/") for entry in NOT_YET)
-
-
 def test_names_say_what_a_value_is() -> None:
-    problems = [line for file in sorted(PACKAGE.rglob("*.py")) if not listed(file) for line in vague(file)]
+    problems = [line for file in sorted(PACKAGE.rglob("*.py")) for line in vague(file)]
     assert problems == [], "a name is a noun that says what the value is; docs/glossary.md has the terms"
-
-
-@pytest.mark.parametrize("entry", NOT_YET)
-def test_what_is_excused_still_needs_it(entry: str) -> None:
-    place = PACKAGE / entry
-    files = [place] if place.is_file() else sorted(place.rglob("*.py"))
-    assert files, f"{entry} does not exist any more: remove it from NOT_YET"
-    assert any(vague(file) for file in files), f"{entry} is clean: remove it from NOT_YET"
 
 
 @pytest.mark.parametrize(

@@ -146,7 +146,7 @@ class Net(Memory):
             value = qd if name == "velocity" else q if name == "position" else target - q
             row.copy_(value.t().index_select(0, self._order))
 
-    def _some(self, mask: Tensor) -> bool:
+    def _any(self, mask: Tensor) -> bool:
         """Return whether any row may be meant; a device that would have to be waited for is not asked."""
         return not self._synchronous or bool(mask.any())
 
@@ -156,7 +156,7 @@ class Net(Memory):
         for k in range(taps.shape[1] - 1, 0, -1):
             taps[:, k].copy_(taps[:, k - 1])
         self._read(taps[:, 0], target, q, qd)
-        if self._some(self._fresh):
+        if self._any(self._fresh):
             taps.copy_(torch.where(self._fresh, taps[:, :1], taps))
             self._fresh.zero_()
 
@@ -164,7 +164,7 @@ class Net(Memory):
         """Let the robots whose clock strikes take a sample; return the torque in force."""
         due = self._wait == 0
         self._wait.copy_(torch.where(due, self._every, self._wait) - 1)
-        if self._some(due):
+        if self._any(due):
             before = self._taps.clone()
             self._shift(target, q, qd)
             self._taps.copy_(torch.where(due, self._taps, before))
@@ -178,7 +178,7 @@ class Net(Memory):
         now = self._taps[:, 0]
         self._read(now, target, q, qd)
         ring.index_copy_(0, self._newest, now.unsqueeze(0))
-        if self._some(self._fresh):
+        if self._any(self._fresh):
             ring.copy_(torch.where(self._fresh, now, ring))
             self._fresh.zero_()
         at = (self._newest - self._age).remainder_(size)

@@ -71,7 +71,7 @@ class App:
         version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
         title = f"go1exp {self.title or self.name}"
         formatwarning = warnings.formatwarning  # usually two lines, one of them of code
-        warnings.formatwarning = lambda message, *rest, **more: f"{title}: warning: {message}\n"
+        warnings.formatwarning = lambda message, *rest, **keywords: f"{title}: warning: {message}\n"
         try:
             _refuse_stray_words(arguments, title)
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))

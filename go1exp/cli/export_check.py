@@ -49,8 +49,8 @@ def tables(bundle: Bundle) -> list[Any]:
     for name, value in summary(bundle):
         what.add_row(name, value)
     ports = table("graph", "", "name", "size", "unit", "frame", "meaning")
-    for kind, found in (("in", about.inputs), ("out", about.outputs)):
-        for port in found:
+    for kind, ports_of_kind in (("in", about.inputs), ("out", about.outputs)):
+        for port in ports_of_kind:
             ports.add_row(kind, port.name, str(port.size), port.unit, port.frame, port.meaning)
     terms = table("observation", "columns", "term", "noise in training")
     for block in about.observation:
@@ -90,10 +90,10 @@ def summary(bundle: Bundle) -> list[tuple[str, str]]:
 def estimator(settings: dict[str, Any]) -> str:
     """Return the estimator's settings in a line, without its legs."""
     plain = {name: value for name, value in settings.items() if not isinstance(value, list | dict)}
-    told = (
+    parts = (
         f"{name} {value:g}" if isinstance(value, float | int) else f"{name} {value}" for name, value in plain.items()
     )
-    return ", ".join(told) or "no settings of its own: those of a Go1"
+    return ", ".join(parts) or "no settings of its own: those of a Go1"
 
 
 APP = App("export_check", _task, title="export check")

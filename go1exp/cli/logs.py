@@ -22,13 +22,13 @@ def files_of(places: str | Sequence[str]) -> list[Path]:
     """
     from go1exp.recording import RecordingError
 
-    found: list[Path] = []
+    files: list[Path] = []
     for path in map(Path, [places] if isinstance(places, str) else places):
         inside = sorted(path.glob("*.parquet"))
         if path.is_dir() and not inside:
             raise RecordingError(f"{path}: no *.parquet in it")
-        found += inside if path.is_dir() else [path]
-    return found
+        files += inside if path.is_dir() else [path]
+    return files
 
 
 def writable(folder: str, key: str = "out") -> Path:

@@ -21,7 +21,7 @@ def _task(container: dict[str, Any]) -> int:
 
     from go1exp.audit import audit_file
 
-    found: dict[str, Any] = {}
+    reports: dict[str, Any] = {}
     unreadable: list[str] = []
     status = 0
     for file in files_of(settings.files):
@@ -29,15 +29,15 @@ def _task(container: dict[str, Any]) -> int:
             report = audit_file(file)
         except RecordingError as error:
             unreadable.append(str(error))
-            found[str(file)] = {"verdict": "unreadable", "message": str(error)}
+            reports[str(file)] = {"verdict": "unreadable", "message": str(error)}
             continue
         print(f"{file}\n{report.text()}\n")
-        found[str(file)] = report.as_dict()
+        reports[str(file)] = report.as_dict()
         status = max(status, STATUS[report.verdict])
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, found)
+        write_json(out, reports)
         print(f"written to {out}")
     if unreadable:  # the others have been judged all the same
         raise RecordingError("\n".join(unreadable))

@@ -73,12 +73,12 @@ def _source(start_from: str) -> Path:
     """Return the folder of the run or shipped policy whose weights are meant; a run folder goes first."""
     if (Path(start_from) / "config.yaml").is_file():
         return Path(start_from)
-    there = shipped_policies()
-    if start_from not in there:
-        known = ", ".join(there) or "none"
-        said = f"no run folder (it has no config.yaml) and no shipped policy (there are: {known})"
-        raise ConfigError([f"start_from = {start_from!r}: {said}"])
-    return there[start_from]
+    shipped = shipped_policies()
+    if start_from not in shipped:
+        known = ", ".join(shipped) or "none"
+        problem = f"no run folder (it has no config.yaml) and no shipped policy (there are: {known})"
+        raise ConfigError([f"start_from = {start_from!r}: {problem}"])
+    return shipped[start_from]
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
     linear = search.state.linear(search.state.theta, fitted)
     (best,) = fit(scorer, [search.state.model(search.state.theta)], linear, 1, search.dt)
     assert best.chi2 is not None
-    layout = Layout.of(machine, linear.probes)
+    layout = Layout.from_probes(machine, linear.probes)
     grams = linear.grams(scorer) / np.maximum(best.chi2, 1.0)[..., None, None]
     limits = tolerances.bounds(layout, linear.probes, search.state.theta, search.state.may)
     episode = scorer.windows.episode[fitted]
@@ -230,14 +230,14 @@ def where(joints: Sequence[str], everyone: Sequence[str]) -> str:
     return ", ".join(joints)
 
 
-def sentence(answer: Answer, search: Search, silent: Mapping[str, str], more: Sequence[str]) -> str:
+def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggestions: Sequence[str]) -> str:
     """Put the answer into words.
 
     Args:
         answer: what the search comes to.
         search: that is done.
         silent: effects that the data cannot show.
-        more: what to record next, a sentence each.
+        suggestions: what to record next, a sentence each.
     """
     everyone = search.state.scorer.windows.joints
     first, final = 1.0 + answer.excess["box"], 1.0 + answer.excess["final"]
@@ -256,7 +256,7 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], more: Se
     ]
     if quiet:
         parts.append(f"These logs cannot show {', '.join(quiet)}.")
-    return " ".join([*filter(None, parts), *more])
+    return " ".join([*filter(None, parts), *suggestions])
 
 
 def _opening(verdict: Verdict, first: float) -> str:

@@ -90,9 +90,9 @@ def _start(
     angle, speed = np.stack([one, x, x**2, x**3], 1), np.stack([zero, one, 2 * x, 3 * x**2], 1)
     w = np.array([1.0 / np.median(sd[0]), 1.0 / np.median(sd[1])])
     design = np.concatenate([angle * w[0], speed * w[1]])
-    seen = np.concatenate([q[near] * w[0], qd[near] * w[1]])
-    cubic = np.linalg.lstsq(design, seen, rcond=None)[0]
-    misfit = np.sqrt(np.mean((design @ cubic - seen) ** 2, axis=0))
+    measured = np.concatenate([q[near] * w[0], qd[near] * w[1]])
+    cubic = np.linalg.lstsq(design, measured, rcond=None)[0]
+    misfit = np.sqrt(np.mean((design @ cubic - measured) ** 2, axis=0))
     return cubic[0], cubic[1], 2.0 * cubic[2], misfit
 
 
@@ -135,7 +135,9 @@ class _Track:
     holes: np.ndarray
 
     @staticmethod
-    def of(number: int, recording: Recording, t: np.ndarray, quantities: Sequence[str], period: float) -> _Track:
+    def from_recording(
+        number: int, recording: Recording, t: np.ndarray, quantities: Sequence[str], period: float
+    ) -> _Track:
         """Read a recording on the clock ``t`` (T,), s."""
         y = np.stack([recording.joint(name) for name in quantities], axis=1)
         stamps, targets, hidden = bridged(t, recording.joint("q_target"), period)
@@ -231,7 +233,10 @@ def cut(
     period = float(np.median([np.median(np.diff(t)) for t in clocks]))
     samples = int(np.ceil(settings.window_s / period)) + 1
     cutter = _Cutter(settings, sd, max(FIT_S, FIT_SAMPLES * period), samples, doubt)
-    tracks = (_Track.of(k, r, t, quantities, period) for k, (r, t) in enumerate(zip(recordings, clocks, strict=True)))
+    tracks = (
+        _Track.from_recording(k, r, t, quantities, period)
+        for k, (r, t) in enumerate(zip(recordings, clocks, strict=True))
+    )
     rows = [window for track in tracks for window in cutter.windows(track)]
     if not rows:
         raise RecordingError(

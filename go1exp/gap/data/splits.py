@@ -57,13 +57,13 @@ def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.r
     select = np.zeros(len(episode), dtype=bool)
     alone = []
     for kind in dict.fromkeys(kinds):
-        mine = rng.permutation([u for u in range(len(units)) if kinds[u] == kind and u not in kept])
-        if len(mine) == 1:
-            alone.append(units[mine[0]])
-            stretch = np.unique(_stretch(episode)[unit == mine[0]], return_inverse=True)[1]
-            select[unit == mine[0]] = (stretch + len(alone)) % 2 == 1
+        shuffled = rng.permutation([u for u in range(len(units)) if kinds[u] == kind and u not in kept])
+        if len(shuffled) == 1:
+            alone.append(units[shuffled[0]])
+            stretch = np.unique(_stretch(episode)[unit == shuffled[0]], return_inverse=True)[1]
+            select[unit == shuffled[0]] = (stretch + len(alone)) % 2 == 1
         else:
-            select |= np.isin(unit, mine[: len(mine) // 2])
+            select |= np.isin(unit, shuffled[: len(shuffled) // 2])
     confirmed = np.isin(unit, kept)
     train, held, last_check = (np.flatnonzero(m) for m in (~select & ~confirmed, select & ~confirmed, confirmed))
     return Splits(train, held, last_check, tuple(alone))

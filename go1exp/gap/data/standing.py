@@ -134,7 +134,7 @@ def cut_standing(recordings: Sequence[Recording], settings: GapSettings, config:
     Recordings of a held trunk may be among them. Their IMU is not compared: it says nothing that is not known.
     """
     legs = Legs(config)
-    logs = {k: Log.of(r) for k, r in enumerate(recordings) if r.meta.base == "floating"}
+    logs = {k: Log.from_recording(r) for k, r in enumerate(recordings) if r.meta.base == "floating"}
     bases: dict[tuple[int, float], Base] = {}
 
     def doubt(number: int, at: float) -> float:

@@ -42,7 +42,7 @@ class Log:
     attitude: Rotation
 
     @staticmethod
-    def of(recording: Recording) -> Log:
+    def from_recording(recording: Recording) -> Log:
         """Read it; the torque is what the drives should make of target, angle and speed."""
         q, qd = recording.joint("q"), recording.joint("qd")
         kp, kd = np.asarray(recording.meta.kp, dtype=float), np.asarray(recording.meta.kd, dtype=float)

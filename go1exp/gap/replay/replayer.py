@@ -46,9 +46,9 @@ class Replayer:
         y = np.empty((len(rows.window), w.t.shape[1], len(w.quantities), len(w.joints)))
         attitudes, which = np.unique(self.quats[rows.window].round(6), axis=0, return_inverse=True)
         for k, quat in enumerate(attitudes):
-            mine = np.flatnonzero(which.ravel() == k)
-            pieces = int(np.ceil(len(mine) / self.max_rows))
-            for piece in np.array_split(mine, pieces):
+            members = np.flatnonzero(which.ravel() == k)
+            pieces = int(np.ceil(len(members) / self.max_rows))
+            for piece in np.array_split(members, pieces):
                 size = min(padded(len(piece)), self.max_rows)
                 full = np.concatenate([piece, np.repeat(piece[-1:], size - len(piece))])
                 y[piece] = self._batch(rows.part(full), dt, tuple(float(v) for v in quat))[: len(piece)]
@@ -87,8 +87,8 @@ class Replayer:
         plant.enabled = None
         backend.reset(everyone, *self._state(plant, rows, q, qd))
         plant.reset(everyone, past[0])
-        seen, _ = effects.on_encoder(q, qd)
-        true = q - (seen - q)
+        encoder, _ = effects.on_encoder(q, qd)
+        true = q - (encoder - q)
         if effects.rotors:  # the twist under the torque that the drive makes at this pose
             torque = plant.actuator.torque(past[-1], q, qd)
             gears = effects.gears()
@@ -147,10 +147,10 @@ class Replayer:
         recorder = self._recorder(kept, len(index))
         for k in range(steps):
             if k >= first:
-                seen = Measured(plant.q, plant.speed())
+                sensed = Measured(plant.q, plant.speed())
                 if senses:
-                    seen = plant.effects.measure(seen)
-                q[k - first], qd[k - first] = seen.joint_pos.numpy(), seen.joint_vel.numpy()
+                    sensed = plant.effects.measure(sensed)
+                q[k - first], qd[k - first] = sensed.joint_pos.numpy(), sensed.joint_vel.numpy()
                 if recorder is not None:
                     recorder.record(k - first, plant)
             if not always:

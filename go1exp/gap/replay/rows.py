@@ -79,15 +79,15 @@ def variants(
             full[key] = np.tile(np.broadcast_to(theta.get(key, value), (wide,)), (count, 1))
     q, qd, base = np.zeros((count, joints)), np.zeros((count, joints)), np.zeros((count, len(machine.base_probe)))
     for k, probe in enumerate(probes):
-        mine = slice(1 + k, None, size)
+        changed = slice(1 + k, None, size)
         if probe.key == "base":
-            base[mine] += probe.delta
+            base[changed] += probe.delta
             continue
         columns = slice(None) if probe.place is None else groups[:, probe.place]
         if isinstance(probe.key, str):
-            (q if probe.key == "q" else qd)[mine, columns] += probe.delta[columns]
+            (q if probe.key == "q" else qd)[changed, columns] += probe.delta[columns]
             continue
         for key, value in probe.also.items():
-            full[key][mine] = value
-        full[probe.key][mine, columns] += probe.delta[columns]
+            full[key][changed] = value
+        full[probe.key][changed, columns] += probe.delta[columns]
     return Rows(np.repeat(windows, size), full, q, qd, base)

@@ -48,10 +48,10 @@ class ImuRecorder:
         site = self._site.expand_as(rate)
         force = rotate_inverse(self._quat.flatten(0, 1), (change[..., :3] + up).flatten(0, 1)).view_as(up)
         force = force + torch.linalg.cross(turn, site) + torch.linalg.cross(rate, torch.linalg.cross(rate, site))
-        seen = plant.effects.measure(Measured(plant.q, plant.speed(), gyro=rate, acc=force))
-        assert seen.gyro is not None
-        assert seen.acc is not None
-        return torch.cat([seen.gyro, seen.acc], dim=-1)
+        sensed = plant.effects.measure(Measured(plant.q, plant.speed(), gyro=rate, acc=force))
+        assert sensed.gyro is not None
+        assert sensed.acc is not None
+        return torch.cat([sensed.gyro, sensed.acc], dim=-1)
 
     def joined(self, joints: np.ndarray, at: np.ndarray, plant: Plant, dt: float) -> np.ndarray:
         """Put the IMU's readings at times ``at`` (R, n), in steps, beside those of the joints (R, n, 2, J)."""
@@ -70,13 +70,13 @@ class TrunkRecorder(ImuRecorder):
         return beside(super().joined(joints, at, plant, dt), trunk, at)
 
 
-def beside(joints: np.ndarray, more: np.ndarray, at: np.ndarray) -> np.ndarray:
+def beside(joints: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Put values (K, R, c) of every step, at times ``at`` (R, n) in steps, beside quantities (R, n, C, J)."""
-    low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(more) - 2)
+    low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(series) - 2)
     share = np.maximum(at - low, 0.0)[..., None]
     row = np.arange(at.shape[0])[:, None]
     both = np.zeros((*joints.shape[:2], 1, joints.shape[3]))
-    both[:, :, 0, : more.shape[2]] = (1.0 - share) * more[low, row] + share * more[low + 1, row]
+    both[:, :, 0, : series.shape[2]] = (1.0 - share) * series[low, row] + share * series[low + 1, row]
     return np.concatenate([joints, both], axis=2)
 
 

@@ -245,16 +245,18 @@ def floors(result: GapResult) -> list[tuple[str, str, str, str, str]]:
 def provenance(result: GapResult) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return where the result is from: (what, entries), what is not a mapping of names under ``Run``."""
     plain = result.as_dict()["provenance"]
-    single = [(name, _said(value)) for name, value in plain.items() if not isinstance(value, dict)]
+    single = [(name, _value_text(value)) for name, value in plain.items() if not isinstance(value, dict)]
     if math.isfinite(result.seconds):
         single.append(("seconds", f"{words.number(result.seconds)} s"))
     tables = [
-        (name, [(k, _said(v)) for k, v in value.items()]) for name, value in plain.items() if isinstance(value, dict)
+        (name, [(k, _value_text(v)) for k, v in value.items()])
+        for name, value in plain.items()
+        if isinstance(value, dict)
     ]
     return [(name, rows) for name, rows in [("Run", single), *tables] if rows]
 
 
-def _said(value: Any) -> str:
+def _value_text(value: Any) -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, list) and all(isinstance(v, str) for v in value):

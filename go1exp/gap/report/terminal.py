@@ -36,13 +36,13 @@ def localisation_text(where: Localisation) -> str:
 
     Regimes without a sample are left out.
     """
-    seen = [r for r in range(len(where.regimes)) if where.samples[:, r].any()]
-    titles = [textwrap.wrap(where.regimes[r], 9, break_long_words=False) for r in seen]
+    shown = [r for r in range(len(where.regimes)) if where.samples[:, r].any()]
+    titles = [textwrap.wrap(where.regimes[r], 9, break_long_words=False) for r in shown]
     deep = max((len(title) for title in titles), default=0)
     head = zip_longest(*([""] * (deep - len(title)) + title for title in titles), fillvalue="")
     rows = [("", *line) for line in head]
     for j, joint in enumerate(where.joints):
-        cells = (short(float(where.excess[j, r])) + ("*" if where.flagged[j, r] else " ") for r in seen)
+        cells = (short(float(where.excess[j, r])) + ("*" if where.flagged[j, r] else " ") for r in shown)
         rows.append((joint, *cells))
     title = "Mean excess over the noise floor by joint and regime; 0 is right, * significant."
     return "\n".join([title, *_table(rows)]) + "\n"

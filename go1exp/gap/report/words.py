@@ -242,9 +242,9 @@ class Next:
     effects: tuple[str, ...] = ()
 
 
-def record(names: Sequence[str], *more: str, out: str) -> str:
+def record(names: Sequence[str], *settings: str, out: str) -> str:
     """Return the command that records excitations, quoted for a shell."""
-    words = ["go1exp", "record", f"excitation=[{','.join(names)}]", *more, f"out={out}"]
+    words = ["go1exp", "record", f"excitation=[{','.join(names)}]", *settings, f"out={out}"]
     return " ".join(shlex.quote(word) for word in words)
 
 
@@ -254,10 +254,10 @@ def next_recordings(result: GapResult) -> list[Next]:
     recordings: list[Next] = []
     for sentence in result.advice:
         names = [name for name in known if re.search(rf"\b{re.escape(name)}\b", sentence)]
-        more = re.findall(r"\b((?:gains|hang)=\[\[[-\d.,\[\]]*\]\])", sentence)
-        if names or more:
+        settings = re.findall(r"\b((?:gains|hang)=\[\[[-\d.,\[\]]*\]\])", sentence)
+        if names or settings:
             out = f"recordings/apart{len(recordings) + 1 if recordings else ''}"
-            recordings.append(Next(sentence, record(names or ["chirp", "steps"], *more, out=out)))
+            recordings.append(Next(sentence, record(names or ["chirp", "steps"], *settings, out=out)))
     by_name: dict[str, list[str]] = {}
     for effect, name in result.not_excited.items():
         if name in known:

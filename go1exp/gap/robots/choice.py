@@ -18,4 +18,4 @@ def robot_of(model: ModelConfig | Go1Model, config: RobotConfig, path: str = "mo
     """
     if isinstance(model, Go1Model):
         return hung(config, Tolerances.from_effects(model.tolerances))
-    return FixedBase.of(model, path)
+    return FixedBase.from_config(model, path)

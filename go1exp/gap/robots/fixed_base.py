@@ -69,7 +69,7 @@ class FixedBase:
     base_probe: tuple[float, ...] = ()
 
     @staticmethod
-    def of(config: ModelConfig, path: str = "model") -> FixedBase:
+    def from_config(config: ModelConfig, path: str = "model") -> FixedBase:
         """Check a description against its MuJoCo file.
 
         Raises:
@@ -140,8 +140,8 @@ class FixedBase:
             warnings.append(f"Speeds are not compared, and initial speeds come from the angles: {wrong}.")
         whole = tuple(completed(r, self.config, bool(wrong)) for r in recordings)
         warnings += [*clock_warnings(recordings, whole, self.config), *gain_warnings(recordings, self.config)]
-        settings, more = spaced(whole, settings, len(self.groups[0]))
-        return Ready(whole, settings, ("qd",) if wrong else (), (*warnings, *more))
+        settings, spacing_warnings = spaced(whole, settings, len(self.groups[0]))
+        return Ready(whole, settings, ("qd",) if wrong else (), (*warnings, *spacing_warnings))
 
     def windows(self, ready: Ready) -> Windows:
         """Cut recordings into windows; what is ignored has infinite noise."""

@@ -149,7 +149,7 @@ def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
     replayer, windows = score.replayer, score.windows
     joints, coordinates = len(windows.joints), 2 * len(windows.joints) + windows.base_sd.shape[1]
     everything = np.arange(len(windows))
-    here = replayer.run(plain, dt)
+    nominal = replayer.run(plain, dt)
     _, root = solved(score.state[:, 0], np.zeros(score.state.shape[::2][:1] + score.state.shape[2:3]))
     sd = np.concatenate([windows.q_sd, windows.qd_sd, windows.base_sd], axis=1)
     rng, square = np.random.default_rng(0), np.zeros_like(score.scale)
@@ -158,6 +158,6 @@ def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
         x[:, coordinates:] = 0.0
         off = x[:, :coordinates] * sd
         drawn = Rows(everything, plain.values, off[:, :joints], off[:, joints : 2 * joints], off[:, 2 * joints :])
-        change = score.unit(replayer.run(drawn, dt) - here, everything)[:, 0]
+        change = score.unit(replayer.run(drawn, dt) - nominal, everything)[:, 0]
         square += _mean_square(score, change - (score.state[:, 0] @ x[..., None].astype(np.float32))[..., 0])
     return _rescaled(score, np.sqrt(1.0 + square / DRAWS))

@@ -118,15 +118,15 @@ def scorer(
     scale: np.ndarray,
     dt: float,
     clock_s: float = 0.0,
-    some: np.ndarray | None = None,
+    subset: np.ndarray | None = None,
 ) -> Scorer:
     """Measure how the initial states, and a clock that is off by ``clock_s``, act on the readings, at ``theta``.
 
-    With the numbers of ``some`` windows, ``state`` is that of those alone.
+    ``subset`` holds the numbers of windows; with it, ``state`` is that of those windows alone.
     """
     w, machine = replayer.windows, replayer.machine
     probes = state_probes(machine)
-    everything = np.arange(len(w)) if some is None else some
+    everything = np.arange(len(w)) if subset is None else subset
     rows = variants(machine, theta, everything, probes)
     empty = Scorer(replayer, scale, np.empty(0), clock_s=clock_s)
     y = replayer.run(rows, dt).reshape(len(everything), 1 + len(probes), *w.y.shape[1:])

@@ -30,7 +30,7 @@ class Layout:
     probe: np.ndarray
 
     @staticmethod
-    def of(machine: Machine, probes: Sequence[Probe]) -> Layout:
+    def from_probes(machine: Machine, probes: Sequence[Probe]) -> Layout:
         """Number the unknowns, column by column."""
         groups = len(machine.groups)
         index = np.zeros((groups, len(probes)), dtype=int)

@@ -95,10 +95,10 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     score = np.log(np.maximum(square, 1e-3)) * w.valid[windows][..., None]  # a few violent samples must not decide
     excess = np.divide((square * inside).sum((1, 2)), count, where=count > 0, out=np.full(count.shape, np.nan)) - 1.0
     p = np.full(count.shape, np.nan)
-    seen = _means(score, inside, count)
+    observed = _means(score, inside, count)
     larger = np.zeros(count.shape)
     for _ in range(SHUFFLES):
-        larger += _means(score, inside[:, rng.permutation(len(windows))], count) >= seen
+        larger += _means(score, inside[:, rng.permutation(len(windows))], count) >= observed
     enough = (count > 20) & (inside.any(2).sum(1) > 2)
     p[enough] = ((1 + larger) / (SHUFFLES + 1))[enough]
     flagged = np.zeros(count.shape, dtype=bool)

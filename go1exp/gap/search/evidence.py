@@ -85,12 +85,12 @@ def absorbed(
     ]
 
 
-def inaudible(signal: Mapping[str, float], threshold: float, seen: Sequence[str]) -> list[Candidate]:
+def inaudible(signal: Mapping[str, float], threshold: float, judged: Sequence[str]) -> list[Candidate]:
     """Return rows for the effects that the data cannot show."""
     return [
         Candidate(
             effect, (), {}, math.nan, 0.0, 1.0, 0.0, (effect,), "not excited", "twice its tolerance would not show"
         )
         for effect, loud in signal.items()
-        if loud < threshold and effect not in seen
+        if loud < threshold and effect not in judged
     ]

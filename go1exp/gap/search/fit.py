@@ -90,8 +90,8 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
         ]
         tried = residuals(scorer, tries, windows, dt)
         for n, k in enumerate(alive):
-            mine = slice(n * len(STEPS), (n + 1) * len(STEPS))
-            best[k] = _longest(scorer, best[k], moves[n], tries[mine], tried[mine], windows)
+            lengths = slice(n * len(STEPS), (n + 1) * len(STEPS))
+            best[k] = _longest(scorer, best[k], moves[n], tries[lengths], tried[lengths], windows)
         if turn == 0 and len(models) > 1:
             gain = {k: origin - misfit(best[k]) for k in alive}
             alive = [k for k in alive if gain[k] > 0.0 and gain[k] >= HOPELESS * max(gain.values())]
@@ -123,7 +123,7 @@ def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) ->
     for model, (probes, fresh) in zip(models, _refreshed(scorer, models, windows, dt), strict=True):
         kept = [i for i, p in enumerate(common.probes) if p.key not in model.keys]
         every = [*(common.probes[i] for i in kept), *probes]
-        layout = Layout.of(machine, every)
+        layout = Layout.from_probes(machine, every)
         assert model.residual is not None
         columns = common.columns if len(kept) == len(common.probes) else common.columns[..., kept]
         whole = np.concatenate([columns, fresh], axis=-1) if probes else columns
@@ -184,7 +184,7 @@ def _refreshed(
     y = replayer.run(stacked(parts), 2.0 * dt)
     refreshed, at = [], 0
     for probes, rows in zip(lots, parts, strict=True):
-        mine = y[at : at + len(rows.window)].reshape(len(windows), 1 + len(probes), *y.shape[1:])
+        replayed = y[at : at + len(rows.window)].reshape(len(windows), 1 + len(probes), *y.shape[1:])
         at += len(rows.window)
-        refreshed.append((probes, differences(scorer, mine, windows, probes)))
+        refreshed.append((probes, differences(scorer, replayed, windows, probes)))
     return refreshed

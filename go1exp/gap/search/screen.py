@@ -180,19 +180,19 @@ class _Ranking:
         pick = [*range(known), *added]
         probes = [*self.present.probes, *variant.probes]
         part = self.grams[:, :, [*pick, -1]][..., [*pick, -1]]
-        layout = Layout.of(self.machine, probes)
+        layout = Layout.from_probes(self.machine, probes)
         matrix, right = layout.total(part * (1.0 / np.maximum(self.before, 1.0))[..., None, None])
         freed = self.may.also(variant.effect)
         limits, strict = (tolerances.bounds(layout, probes, theta, freed, back) for back in (False, True))
-        for some in (limits, strict) if variant.quadrature else ():
-            some.low[layout.part(np.arange(known, len(probes)))] = -np.inf
+        for bounds in (limits, strict) if variant.quadrature else ():
+            bounds.low[layout.part(np.arange(known, len(probes)))] = -np.inf
         relief = (self.plain - strain.price(matrix, right, strict)) / self.count
         x = tolerances.solve(matrix, right, limits)
         after = predicted(part, layout, x) / self.size
         gain = float(np.mean(np.log(self.before.sum(1) / np.maximum(after, 0.3).sum(1))))
         start = _start(theta, variant, self.present.probes, layout, x, self.machine)
-        mine = [*added, *(k for k, p in enumerate(self.present.probes) if p.key[0] == variant.effect)]
-        signal = _signal(self.grams, self.full.probes, mine, self.size, self.may.tolerances)
+        columns = [*added, *(k for k, p in enumerate(self.present.probes) if p.key[0] == variant.effect)]
+        signal = _signal(self.grams, self.full.probes, columns, self.size, self.may.tolerances)
         return Screened(variant, start, gain, relief, signal)
 
 
@@ -219,18 +219,18 @@ def _start(
     What else the linear model would move, it would move too far: with the effect so large, it is no longer right.
     """
     if variant.probes:
-        extra = Layout.of(machine, variant.probes)
+        extra = Layout.from_probes(machine, variant.probes)
         return variant.start(theta, extra, x[layout.size - extra.size :], machine)
     of_it = np.array([known[k].key[0] == variant.effect for k in layout.probe])
     return tolerances.moved(theta, layout, known, np.where(of_it, x, 0.0), machine)
 
 
 def _signal(
-    grams: np.ndarray, probes: Sequence[Probe], mine: Sequence[int], size: np.ndarray, declared: Tolerances
+    grams: np.ndarray, probes: Sequence[Probe], columns: Sequence[int], size: np.ndarray, declared: Tolerances
 ) -> float:
     """Return the largest mean square, in units of the noise, that a change by twice a tolerance makes in a window."""
     most = 0.0
-    for k in mine:
+    for k in columns:
         key = probes[k].key
         assert isinstance(key, tuple)
         reach = 2.0 * declared.param(key).tolerance
@@ -246,11 +246,11 @@ def _columns(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence
     for k, p in enumerate(probes):
         by_effect.setdefault(p.key[0], []).append(k)
     lots: list[list[int]] = []
-    for mine in by_effect.values():
-        if lots and len(lots[-1]) + len(mine) <= 14:
-            lots[-1] += mine
+    for members in by_effect.values():
+        if lots and len(lots[-1]) + len(members) <= 14:
+            lots[-1] += members
         else:
-            lots.append(list(mine))
+            lots.append(list(members))
     columns = np.zeros((len(windows), len(machine.groups), *_sizes(scorer), len(probes)), dtype=np.float32)
     for lot in lots:
         chosen = [probes[k] for k in lot]

@@ -39,8 +39,8 @@ def max_t(gain: np.ndarray, rng: np.random.Generator, flips: int = FLIPS) -> np.
     scale = np.sqrt(np.mean(gain**2, axis=1)) / np.sqrt(count) + 1e-12
     signs = rng.choice([-1.0, 1.0], size=(flips, count))
     largest = ((signs @ gain.T) / count / scale).max(axis=1)
-    seen = gain.mean(axis=1) / scale
-    return np.asarray([(1 + np.sum(largest >= s - 1e-12)) / (flips + 1) for s in seen])
+    observed = gain.mean(axis=1) / scale
+    return np.asarray([(1 + np.sum(largest >= s - 1e-12)) / (flips + 1) for s in observed])
 
 
 def same(gain: float) -> float:
@@ -63,6 +63,6 @@ def resampled(episode: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     units = np.unique(episode)
     picked = []
     for unit in rng.choice(units, len(units)):
-        mine = np.flatnonzero(episode == unit)
-        picked.append(rng.choice(mine, len(mine)))
+        rows = np.flatnonzero(episode == unit)
+        picked.append(rng.choice(rows, len(rows)))
     return np.concatenate(picked)

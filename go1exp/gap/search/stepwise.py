@@ -224,8 +224,8 @@ class Search:
         # Half of the windows that are looked at are the worst, half are spread evenly.
         worst = np.argsort(-self.state.scorer.chi2(linear.residual, linear.windows).sum(1))[: SCREENED // 2]
         evenly = np.linspace(0, count - 1, min(SCREENED // 2, count)).astype(int)
-        some = linear.part(np.unique([*worst, *evenly]))
-        return screen(self.state.scorer, self.state.theta, some, self.state.may, variants, self.dt)
+        part = linear.part(np.unique([*worst, *evenly]))
+        return screen(self.state.scorer, self.state.theta, part, self.state.may, variants, self.dt)
 
     def _note_signals(self, screened: Sequence[Screened]) -> None:
         for s in screened:
@@ -375,9 +375,9 @@ class Search:
             out = np.flatnonzero(evidence.beyond(name, theta, joints, self.state.tolerances))
             without = {int(j): cost(replace(may, kept=kept | {(name, int(j))})) for j in out}
             for j in sorted(without, key=lambda j: without[j])[: len(out) - 1]:  # where it brings most, it stays
-                more = kept | {(name, j)}
-                if cost(replace(may, kept=more)) - cost(replace(may, kept=kept)) < NEEDED:
-                    kept = more
+                candidate = kept | {(name, j)}
+                if cost(replace(may, kept=candidate)) - cost(replace(may, kept=kept)) < NEEDED:
+                    kept = candidate
         if kept != self.state.kept:
             self.state = self.state.keeping(kept).settled(2)
             self.steps.append(("at fewer joints", excess(self.state.held_out())))

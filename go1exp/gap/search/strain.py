@@ -29,7 +29,7 @@ def values(scorer: Scorer, linear: Table) -> float:
 
 def cost(scorer: Scorer, linear: Table) -> Callable[[tolerances.Freedom], float]:
     """Return a function that says how small chi2 and priors can be, to first order about ``own``, with some freedom."""
-    layout = Layout.of(scorer.replayer.machine, linear.probes)
+    layout = Layout.from_probes(scorer.replayer.machine, linear.probes)
     chi2 = scorer.chi2(linear.residual, linear.windows)
     matrix, right = layout.total(linear.grams(scorer) / np.maximum(chi2, 1.0)[..., None, None])
 

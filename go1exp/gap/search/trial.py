@@ -171,6 +171,6 @@ def _bic(scorer: Scorer, fitted: Sequence[Model], train: np.ndarray) -> np.ndarr
     growth = []
     for model in fitted:
         assert model.chi2 is not None
-        unknowns = Layout.of(machine, tolerances.probes(machine, model.keys, model.theta)).size
+        unknowns = Layout.from_probes(machine, tolerances.probes(machine, model.keys, model.theta)).size
         growth.append(values * np.log(model.chi2.mean() / train.mean()) + unknowns * np.log(values))
     return np.array(growth)

@@ -179,10 +179,10 @@ def composed(*contents: Mapping[str, Any]) -> dict[str, Any]:
     """Return files' contents as one: later ones win, joint by joint, as when training composes them."""
     whole: dict[str, Any] = {}
     for effect, params in (item for content in contents for item in content.items()):
-        mine = whole.setdefault(effect, {})
+        merged = whole.setdefault(effect, {})
         for name, value in params.items():
-            both = isinstance(value, Mapping) and isinstance(mine.get(name), Mapping)
-            mine[name] = {**mine[name], **value} if both else value
+            both = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
+            merged[name] = {**merged[name], **value} if both else value
     return whole
 
 

@@ -62,7 +62,7 @@ class CheckResult:
             lines.append(line)
         if self.not_excited:
             lines.append("not excited, so not to be judged from these logs; record next:")
-            lines += [f"  {effect}: {more}" for effect, more in self.not_excited.items()]
+            lines += [f"  {effect}: {excitation}" for effect, excitation in self.not_excited.items()]
         return "\n".join(lines)
 
 

@@ -101,11 +101,11 @@ def written(
     shown = np.sort(np.concatenate([parts.select, parts.confirm]))
     before, after = residuals(score, [{}, search.state.theta], shown, dt)
     silent = not_excited(search.signal, held=not comparison.robot.base_probe)
-    more = advice({n.effect: n.alias_set for n in answer.named})
+    suggestions = advice({n.effect: n.alias_set for n in answer.named})
     named = {n.effect: n for n in answer.named}
     return GapResult(
         verdict=answer.verdict,
-        sentence=sentence(answer, search, silent, more),
+        sentence=sentence(answer, search, silent, suggestions),
         named=answer.named,
         candidates=evidence(search),
         floors=comparison.floors(),
@@ -114,7 +114,7 @@ def written(
         before=localise(score, before, shown, search.rng),
         after=localise(score, after, shown, search.rng),
         not_excited=silent,
-        advice=more,
+        advice=suggestions,
         bootstrap_share=dict(search.shares),
         waterfall=(("model as it is", answer.excess["null"]), *search.steps),
         overlays=overlays(score, comparison.recordings, search.state.theta, parts.select, settings.overlays, dt),

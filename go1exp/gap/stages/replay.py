@@ -168,10 +168,10 @@ def replay(
     comparisons = []
     parts: list[Part] = []
     with one_thread():
-        for some in filter(None, kinds):
+        for same_base in filter(None, kinds):
             on_progress("replaying the logs", len(parts) / 2)
             try:
-                comparison = compare(some, robot, settings, physics_dt=physics_dt, fewest=1)
+                comparison = compare(same_base, robot, settings, physics_dt=physics_dt, fewest=1)
             except NotComparable as error:
                 return ReplayResult(error.flaws)
             comparisons.append(comparison)
@@ -254,8 +254,8 @@ def _measured(comparison: Comparison) -> Readings:
             noise |= dict(zip(columns, noise_of(series).tolist(), strict=True))
     if not comparison.robot.base_probe:
         return readings, {}, noise
-    of_trunk, reference, more = _measured_trunk(recordings, taken)
-    return readings | of_trunk | {name: np.zeros_like(w.t) for name in TURN}, reference, noise | more
+    of_trunk, reference, trunk_noise = _measured_trunk(recordings, taken)
+    return readings | of_trunk | {name: np.zeros_like(w.t) for name in TURN}, reference, noise | trunk_noise
 
 
 def _measured_trunk(recordings: Sequence[Recording], taken: Callable[[Sequence[np.ndarray]], np.ndarray]) -> Readings:
