@@ -59,8 +59,8 @@ def test_what_no_robot_replaces_is_as_declared() -> None:
     for effect in members("effect"):
         for key in sizes(effect):
             assert DECLARED.param(key) == declared(key)
-    assert Tolerances.of(DECLARED.by_effect()).by_effect() == DECLARED.by_effect()
-    changed = Tolerances.of({"armature": {"added": 0.003}})
+    assert Tolerances.from_effects(DECLARED.by_effect()).by_effect() == DECLARED.by_effect()
+    changed = Tolerances.from_effects({"armature": {"added": 0.003}})
     assert changed.param(ADDED) == replace(declared(ADDED), tolerance=0.003)
     assert changed.param(("coulomb", "bound")) == declared(("coulomb", "bound"))
     assert changed.by_effect()["armature"] == {"added": 0.003}
@@ -187,7 +187,7 @@ def test_friction_that_is_within_the_users_tolerance_is_no_gap(monkeypatch: pyte
         ["physics_dt=0.0005", "seconds=3.0", "excitation=[chirp]", "gains=[[20,0.5],[35,0.6],[35,1.2]]"],
         {"coulomb": {"bound": {"calf": 0.3}}},
     )
-    worse_known = hung(rig.robot, Tolerances.of({"coulomb": {"bound": 0.5}}))
+    worse_known = hung(rig.robot, Tolerances.from_effects({"coulomb": {"bound": 0.5}}))
     result = explain(logs, worse_known, QUICK)
     assert result.verdict == "no gap"
     assert result.tolerances["coulomb"] == {"bound": 0.5}

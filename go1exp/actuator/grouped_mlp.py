@@ -111,8 +111,8 @@ class GroupedMLP:
             else:
                 target = buffer = self._out[:, first : first + width]
             for net, start, stop in pieces:
-                here = slice(start - first, stop - first)
-                self._calls.append((torch.mm, (weights[net][k], source[:, here]), target[:, here]))
+                columns = slice(start - first, stop - first)
+                self._calls.append((torch.mm, (weights[net][k], source[:, columns]), target[:, columns]))
             if k < depth - 1:  # softsign: h / (1 + |h|)
                 size = spare[:units, :width]
                 self._calls += [(torch.abs, (target,), size), (torch.add, (size, 1.0), size)]

@@ -182,11 +182,11 @@ class Net(Memory):
             ring.copy_(torch.where(self._fresh, now, ring))
             self._fresh.zero_()
         at = (self._newest - self._age).remainder_(size)
-        seen = ring.index_select(0, at)
+        sampled = ring.index_select(0, at)
         if self._share is not None:
             older = ring.index_select(0, at.sub_(1).remainder_(size))
-            seen.lerp_(older, self._share.expand_as(seen))
-        self._taps.copy_(seen.transpose(0, 1))
+            sampled.lerp_(older, self._share.expand_as(sampled))
+        self._taps.copy_(sampled.transpose(0, 1))
 
     def reset(self, mask: Tensor) -> None:
         """Take the next inputs for the whole past in the rows of ``mask`` (N,), and sample them at once."""

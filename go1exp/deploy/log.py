@@ -17,7 +17,7 @@ from go1exp.deploy.metadata import Metadata
 from go1exp.files import opened
 
 if TYPE_CHECKING:
-    from go1exp.recording import Recording
+    from go1exp.recording import Meta, Recording
 
 STATES_PER_S = 500.0
 """States that a Go1 sends in a second."""
@@ -134,16 +134,34 @@ class Log:
             about: its origin.
             truth: columns of the format by name, with ``clock``, s; rows are joined where the clocks are the same.
         """
-        from go1exp.recording import FOOT_FORCE, VECTORS, Meta, Recording, joint_channels
+        from go1exp.recording import Recording
 
-        states, rows = self.states, self._in_force()
+        rows = self._in_force()
         if rows is None:
             return None
         kept, targets = rows
-        clock = states.part("clock")[kept]
-        t = states.part("t")[kept] if np.isnan(clock).any() else clock
+        clock = self.states.part("clock")[kept]
+        t = self.states.part("t")[kept] if np.isnan(clock).any() else clock
+        channels = self._channels(about, kept, targets)
+        if truth is not None:
+            channels |= _joined(truth, clock)
+        # A recording needs an increasing clock and finite values; other rows are dropped and counted in the notes.
+        good = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
+        good &= np.isfinite(np.stack(list(channels.values()))).all(axis=0)
+        if good.sum() < 2:
+            return None
+        notes = [about.notes, "" if (self.states.part("in_force")[kept] >= 0).all() else UNKNOWN_DELAY]
+        notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
+        meta = _meta(about, t[good], "; ".join(note for note in notes if note))
+        channels = {"t": t, **channels}
+        return Recording(meta, {name: np.ascontiguousarray(values[good]) for name, values in channels.items()})
+
+    def _channels(self, about: About, kept: np.ndarray, targets: np.ndarray) -> dict[str, np.ndarray]:
+        """Return what was measured in the states ``kept`` (S,) bool, by column, each (T,), with targets (T, J)."""
+        from go1exp.recording import FOOT_FORCE, VECTORS, joint_channels
+
+        states, joints = self.states, about.metadata.joints
         channels: dict[str, np.ndarray] = {}
-        joints = about.metadata.joints
         for name in ("q", "qd", "tau_est"):
             channels |= dict(zip(joint_channels(name, joints), states.part(name)[kept].T, strict=True))
         channels |= dict(zip(joint_channels("q_target", joints), targets.T, strict=True))
@@ -156,34 +174,7 @@ class Log:
         if about.newton:
             feet = states.part("foot_force")[kept]
             channels |= {FOOT_FORCE + leg: feet[:, k] for k, leg in enumerate(about.metadata.legs)}
-        if truth is not None:
-            channels |= _joined(truth, clock)
-        # A recording needs an increasing clock and finite values; other rows are dropped and counted in the notes.
-        good = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
-        good &= np.isfinite(np.stack([values for name, values in channels.items()])).all(axis=0)
-        if good.sum() < 2:
-            return None
-        channels = {"t": t, **channels}
-        notes = [about.notes, "" if (states.part("in_force")[kept] >= 0).all() else UNKNOWN_DELAY]
-        notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
-        meta = Meta(
-            robot=about.metadata.robot,
-            joints=joints,
-            rate_hz=float(np.round(1.0 / np.median(np.diff(t[good])), 3)),
-            base="floating",
-            base_quat=None,
-            kp=tuple(map(float, about.kp)),
-            kd=tuple(map(float, about.kd)),
-            tau_limit=about.metadata.torque_limit,
-            excitation="policy",
-            episode=about.episode,
-            repeat_of=None,
-            source="simulated" if about.simulated else "measured",
-            tool="go1exp deploy",
-            versions={"go1exp": __version__, "onnxruntime": metadata.version("onnxruntime")},
-            notes="; ".join(note for note in notes if note),
-        )
-        return Recording(meta, {name: np.ascontiguousarray(values[good]) for name, values in channels.items()})
+        return channels
 
     def _in_force(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""
@@ -203,6 +194,29 @@ class Log:
 
 
 UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell what it obeys, and the way takes time"
+
+
+def _meta(about: About, t: np.ndarray, notes: str) -> Meta:
+    """Return the description of a recording with the times ``t`` (T,), s."""
+    from go1exp.recording import Meta
+
+    return Meta(
+        robot=about.metadata.robot,
+        joints=about.metadata.joints,
+        rate_hz=float(np.round(1.0 / np.median(np.diff(t)), 3)),
+        base="floating",
+        base_quat=None,
+        kp=tuple(map(float, about.kp)),
+        kd=tuple(map(float, about.kd)),
+        tau_limit=about.metadata.torque_limit,
+        excitation="policy",
+        episode=about.episode,
+        repeat_of=None,
+        source="simulated" if about.simulated else "measured",
+        tool="go1exp deploy",
+        versions={"go1exp": __version__, "onnxruntime": metadata.version("onnxruntime")},
+        notes=notes,
+    )
 
 
 def _joined(truth: Mapping[str, np.ndarray], clock: np.ndarray) -> dict[str, np.ndarray]:

@@ -44,9 +44,9 @@ class Tolerances:
     replaced: Mapping[Key, float] = field(default_factory=dict, hash=False)
 
     @staticmethod
-    def of(by_effect: Mapping[str, Mapping[str, float]]) -> Tolerances:
+    def from_effects(by_effect: Mapping[str, Mapping[str, float]]) -> Tolerances:
         """Return those of a configuration or a file: effect -> parameter -> tolerance."""
-        return Tolerances({(effect, name): value for effect, some in by_effect.items() for name, value in some.items()})
+        return Tolerances({(effect, name): value for effect, params in by_effect.items() for name, value in params.items()})
 
     def param(self, key: Key) -> Param:
         """Return the declaration of a parameter with the tolerance that counts."""
@@ -69,12 +69,12 @@ DECLARED = Tolerances()
 def problems(by_effect: Mapping[str, Mapping[str, float]], path: str) -> list[str]:
     """Return what is wrong with the names in a configuration of tolerances, one line each with its key path."""
     lines = []
-    for effect, some in by_effect.items():
+    for effect, params in by_effect.items():
         if effect not in members("effect"):
             lines.append(unknown_name(f"{path}.{effect}", effect, members("effect"), "effect"))
             continue
         known = {p.name: p for p in effect_class(effect).params}
-        for name in some:
+        for name in params:
             if name not in known:
                 lines.append(unknown_name(f"{path}.{effect}.{name}", name, known, "parameter"))
             elif not math.isfinite(known[name].tolerance):

@@ -93,8 +93,8 @@ class Plant:
 
     def set_gains(self, kp: Tensor, kd: Tensor) -> None:
         """Give each robot gains (N, J) of its own; effects on gains act on top of them."""
-        for own, given in zip(self._gains, (kp, kd), strict=True):
-            own.copy_(given)
+        for gains, given in zip(self._gains, (kp, kd), strict=True):
+            gains.copy_(given)
         self.actuator.kp.copy_(kp)  # type: ignore[attr-defined]  # has gains, or there would be none to unpack
         self.actuator.kd.copy_(kd)  # type: ignore[attr-defined]
         self.effects.set_gains(self.actuator, *self._gains)
@@ -188,21 +188,21 @@ class Plant:
 
     def sense(self, s: Snapshot) -> Snapshot:
         """Replace the truth about the present moment by what the robots' sensors say of it."""
-        seen = self.effects.measure(Measured(self.q, self.qd, s.projected_gravity_b, s.base_ang_vel_b))
-        assert seen.gravity is not None
-        assert seen.gyro is not None
-        joints = {"joint_pos": seen.joint_pos.float(), "joint_vel": seen.joint_vel.float()}
-        return dataclasses.replace(s, **joints, projected_gravity_b=seen.gravity, base_ang_vel_b=seen.gyro)
+        sensed = self.effects.measure(Measured(self.q, self.qd, s.projected_gravity_b, s.base_ang_vel_b))
+        assert sensed.gravity is not None
+        assert sensed.gyro is not None
+        joints = {"joint_pos": sensed.joint_pos.float(), "joint_vel": sensed.joint_vel.float()}
+        return dataclasses.replace(s, **joints, projected_gravity_b=sensed.gravity, base_ang_vel_b=sensed.gyro)
 
     _STATE = ("before", "target", "bound", "inertia")
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the drives and effects remember."""
-        own = {name: getattr(self, f"_{name}").clone() for name in self._STATE}
+        physics = {name: getattr(self, f"_{name}").clone() for name in self._STATE}
         parts = {"actuator": self.actuator.state_dict(), "effects": self.effects.state_dict()}
         if self._rotors:
             parts["rotors"] = self._rotors.state_dict()
-        return {**own, "torque": self.torque.clone(), **parts}
+        return {**physics, "torque": self.torque.clone(), **parts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``; the backend holds the model."""

@@ -109,9 +109,9 @@ def feel_each_other(model: mujoco.MjModel, a: int, b: int) -> bool:
     """Return whether one of two degrees of freedom carries the other."""
 
     def above(dof: int) -> set[int]:
-        found = {dof}
+        ancestors = {dof}
         while (dof := int(model.dof_parentid[dof])) >= 0:
-            found.add(dof)
-        return found
+            ancestors.add(dof)
+        return ancestors
 
     return a in above(b) or b in above(a)

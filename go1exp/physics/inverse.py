@@ -30,9 +30,9 @@ def joint_torques(
     model, _ = build_model(config, terrain, physics_dt=0.002, held=base_quat)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # no stop and no ground is touched
     data = mujoco.MjData(model)
-    found = np.zeros_like(q)
+    torque = np.zeros_like(q)
     for row in range(len(q)):
         data.qpos[:], data.qvel[:], data.qacc[:] = q[row], qd[row], qdd[row]
         mujoco.mj_inverse(model, data)
-        found[row] = data.qfrc_inverse
-    return found + robot.per_joint(config.friction_loss) * np.sign(qd)
+        torque[row] = data.qfrc_inverse
+    return torque + robot.per_joint(config.friction_loss) * np.sign(qd)

@@ -45,5 +45,5 @@ class Legs:
 
     def forces(self, moves: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the forces on the feet (4, 3), N, that balance joint torques (12,); a straight leg's is the least."""
-        own = np.arange(robot.NUM_JOINTS).reshape(robot.NUM_LEGS, -1)
-        return np.stack([-np.linalg.lstsq(moves[k][:, own[k]].T, torque[own[k]])[0] for k in range(len(own))])
+        joints = np.arange(robot.NUM_JOINTS).reshape(robot.NUM_LEGS, -1)
+        return np.stack([-np.linalg.lstsq(moves[k][:, joints[k]].T, torque[joints[k]])[0] for k in range(len(joints))])

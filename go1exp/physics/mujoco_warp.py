@@ -171,9 +171,9 @@ class MujocoWarp:
                 self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
             place, attribute = self._place(name)
             shared = getattr(place, attribute)
-            own = wp.to_torch(shared).repeat_interleave(self.num_envs, 0)
+            per_env = wp.to_torch(shared).repeat_interleave(self.num_envs, 0)
             with self._scope():
-                array = wp.from_torch(own.contiguous(), dtype=shared.dtype)
+                array = wp.from_torch(per_env.contiguous(), dtype=shared.dtype)
             array._is_batched = True  # as mujoco_warp marks its own
             setattr(place, attribute, array)
             self._fields[name] = wp.to_torch(array)
@@ -284,13 +284,13 @@ class MujocoWarp:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``, of this backend or of the CPU's, which knows further fields."""
-        own = "engine" in state
+        same_engine = "engine" in state
         for name, value in state["fields"].items():
-            if own or name in self._fields:
+            if same_engine or name in self._fields:
                 self.field(name).copy_(value)
         for name, value in state["baseline"].items():
             self._baseline.setdefault(name, torch.empty_like(self.field(name))).copy_(value)
         for name in STATE_FIELDS:
             self._memory[name].copy_(state["state"][name].reshape(self._memory[name].shape))
-        if not own and DERIVED[0] in state["fields"]:
+        if not same_engine and DERIVED[0] in state["fields"]:
             self.derive_constants(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))

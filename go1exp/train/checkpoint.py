@@ -114,8 +114,8 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
         torch.cuda.set_rng_state(rng["cuda"])
     kind, keys, position, has_gauss, cached = rng["numpy"]
     np.random.set_state((kind, keys.numpy().astype(np.uint32), position, has_gauss, cached))  # noqa: NPY002 (SB3's)
-    version, words, gauss = rng["python"]
-    random.setstate((version, tuple(words), gauss))
+    version, state_words, gauss = rng["python"]
+    random.setstate((version, tuple(state_words), gauss))
 
 
 def _core(ppo: AdaptivePPO) -> Any:
@@ -126,7 +126,7 @@ def _core(ppo: AdaptivePPO) -> Any:
 
 def _state(ppo: AdaptivePPO) -> dict[str, Any]:
     kind, keys, position, has_gauss, cached = np.random.get_state(legacy=True)  # noqa: NPY002 (SB3 draws from it)
-    version, words, gauss = random.getstate()
+    version, state_words, gauss = random.getstate()
     assert ppo.ep_info_buffer is not None
     assert isinstance(ppo._last_obs, np.ndarray)
     return {
@@ -144,6 +144,6 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
             "numpy": [kind, torch.from_numpy(np.asarray(keys).astype(np.int64)), position, has_gauss, cached],
-            "python": [version, list(words), gauss],
+            "python": [version, list(state_words), gauss],
         },
     }

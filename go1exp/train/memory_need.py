@@ -105,7 +105,7 @@ def _left_in(folder: Path, limit: str, statistics: str, used: str) -> list[int]:
     """Return a group's limit less what its processes use (the disk's cache gives way); empty if unlimited."""
     try:
         most = int((folder / limit).read_text())
-        words = dict(line.split() for line in (folder / statistics).read_text().splitlines())
+        figures = dict(line.split() for line in (folder / statistics).read_text().splitlines())
     except (OSError, ValueError):
         return []
-    return [most - int(words.get(used, 0))]
+    return [most - int(figures.get(used, 0))]

@@ -76,7 +76,7 @@ def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | 
 
 def tolerances(result: GapResult) -> Tolerances:
     """Return the tolerances that counted."""
-    return Tolerances.of(result.tolerances)
+    return Tolerances.from_effects(result.tolerances)
 
 
 def unit(effect: str, name: str) -> str:

@@ -17,5 +17,5 @@ def robot_of(model: ModelConfig | Go1Model, config: RobotConfig, path: str = "mo
         ConfigError: with what its MuJoCo file lacks, naming the key.
     """
     if isinstance(model, Go1Model):
-        return hung(config, Tolerances.of(model.tolerances))
+        return hung(config, Tolerances.from_effects(model.tolerances))
     return FixedBase.of(model, path)

@@ -78,7 +78,7 @@ class FixedBase:
         index = {name: k for k, name in enumerate(config.joints)}
         groups = tuple(tuple(index[name] for name in group) for group in config.joint_groups)
         effort, top = (tuple(float(v) for v in config.per_joint(name)) for name in ("torque_limit", "speed_limit"))
-        machine = FixedBase(config, config.joints, groups, effort, top, Tolerances.of(config.tolerances))
+        machine = FixedBase(config, config.joints, groups, effort, top, Tolerances.from_effects(config.tolerances))
         try:
             model = machine.model(0.001, (1.0, 0.0, 0.0, 0.0))
         except FixedBaseError as error:

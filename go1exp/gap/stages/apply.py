@@ -79,7 +79,7 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
         (
             CALIBRATION,
             "The model's own parameters, within their tolerances.",
-            _box_lines(result.box, Tolerances.of(result.tolerances)),
+            _box_lines(result.box, Tolerances.from_effects(result.tolerances)),
         ),
         (COMPENSATING, "Makes up for something that no effect describes. Not for training.", _named_lines(rest)),
     ):
@@ -214,7 +214,7 @@ def _same_search(
     changed = [f"search.{k}" for k in SPLITTING if k in before and before[k] != now[k]]
     if changed:
         raise GapFileError(f"{', '.join(changed)}: not as in the search that found this; run go1exp gap explain again")
-    searched = Tolerances.of(result.tolerances)
+    searched = Tolerances.from_effects(result.tolerances)
     for key, value in tolerances.replaced.items():
         if value != searched.param(key).tolerance:
             raise GapFileError(
