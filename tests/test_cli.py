@@ -122,7 +122,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("fit-actuator recordings=x epoch=3", ("epoch=3", "did you mean 'epochs'")),
         ("fit-actuator recordings=x history=0 share=leg", ("history = 0", "share = 'leg'", "'all', 'kind' or 'none'")),
         ("gap", ("logs: required",)),
-        ("gap logs=[5]", ("gap: logs", "valid string")),
+        ("gap logs=[5]", ("logs.0 = 5", "valid string")),
         ("gap logs=x stage=fit search.alpha=2", ("2 problems", "stage = 'fit'", "'localise'", "search.alpha = 2")),
         ("gap logs=x +search.int=3", ("search.int: unknown key",)),
         ("export", ("run: required",)),
@@ -325,7 +325,13 @@ def test_a_path_by_position_may_hold_anything(tmp_path: Path) -> None:
 def test_the_value_of_an_option_is_no_setting(tmp_path: Path) -> None:
     done = cli(tmp_path, "record", "import", "--cfg", "job", "go2_in_air", "logs", "options={rate_hz: 100.0}")
     assert done.returncode == 0, done.stderr
-    expected = {"source": "go2_in_air", "path": "logs", "options": {"rate_hz": 100.0}, "out": "recordings"}
+    expected = {
+        "source": "go2_in_air",
+        "path": "logs",
+        "options": {"rate_hz": 100.0},
+        "out": "recordings",
+        "plugins": [],
+    }
     assert OmegaConf.create(done.stdout) == expected
 
 

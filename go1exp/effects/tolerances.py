@@ -46,7 +46,9 @@ class Tolerances:
     @staticmethod
     def from_effects(by_effect: Mapping[str, Mapping[str, float]]) -> Tolerances:
         """Return those of a configuration or a file: effect -> parameter -> tolerance."""
-        return Tolerances({(effect, name): value for effect, params in by_effect.items() for name, value in params.items()})
+        return Tolerances(
+            {(effect, name): value for effect, params in by_effect.items() for name, value in params.items()}
+        )
 
     def param(self, key: Key) -> Param:
         """Return the declaration of a parameter with the tolerance that counts."""
