@@ -122,7 +122,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("fit-actuator recordings=x epoch=3", ("epoch=3", "did you mean 'epochs'")),
         ("fit-actuator recordings=x history=0 share=leg", ("history = 0", "share = 'leg'", "'all', 'kind' or 'none'")),
         ("gap", ("logs: required",)),
-        ("gap logs=5", ("gap: logs = 5: ", "valid string or a valid array")),
+        ("gap logs=[5]", ("logs.0 = 5", "valid string")),
         ("gap logs=x stage=fit search.alpha=2", ("2 problems", "stage = 'fit'", "'localise'", "search.alpha = 2")),
         ("gap logs=x +search.int=3", ("search.int: unknown key",)),
         ("export", ("run: required",)),
@@ -131,8 +131,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("export check", ("go1exp export check: file: required",)),
         ("export check a.zip +deep=1", ("deep: unknown key",)),
         ("deploy", ("bundle: required", "go1exp deploy runs/NAME/bundle.zip")),
-        ("deploy a.zip robot=dog rate=1", ("2 problems", "link = 'dog'", "'sim' or 'go1'", "rate = 1")),
-        ("deploy a.zip command=[1,0]", ("commands",)),
+        ("deploy a.zip robot=dog rate=1", ("2 problems", "robot = 'dog'", "'sim' or 'go1'", "rate = 1")),
+        ("deploy a.zip command=[1,0]", ("command.2: required",)),
         ("deploy a.zip sim.los=0.1", ("sim.los=0.1", "did you mean 'sim.loss'")),
         ("deploy a.zip robot=go1 effect=payload", ("effect: the real robot has its own",)),
         ("list efects", ("'efects'", "did you mean 'effect'")),
@@ -325,7 +325,13 @@ def test_a_path_by_position_may_hold_anything(tmp_path: Path) -> None:
 def test_the_value_of_an_option_is_no_setting(tmp_path: Path) -> None:
     done = cli(tmp_path, "record", "import", "--cfg", "job", "go2_in_air", "logs", "options={rate_hz: 100.0}")
     assert done.returncode == 0, done.stderr
-    expected = {"source": "go2_in_air", "path": "logs", "options": {"rate_hz": 100.0}, "out": "recordings"}
+    expected = {
+        "source": "go2_in_air",
+        "path": "logs",
+        "options": {"rate_hz": 100.0},
+        "out": "recordings",
+        "plugins": [],
+    }
     assert OmegaConf.create(done.stdout) == expected
 
 
