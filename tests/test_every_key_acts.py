@@ -186,6 +186,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "fit-actuator:smoothing": lambda walk: [0.02],
     "eval:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "play:run": lambda walk: [str(walk.trained("other", "seed=5"))],
+    "play:out": lambda walk: ["other.gif"],
     "eval:physics_dt": lambda walk: [0.5 * SMALL["train"]["sim.physics_dt"]],
     "eval:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "play:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],

@@ -201,12 +201,13 @@ def test_on_the_command_line_a_fault_is_a_message_and_a_status(run: Path) -> Non
 import sys
 from go1exp.cli import main
 from go1exp.env.core import Go1Core
-reward = Go1Core._reward
-def broken(self, s):
+snapshot = Go1Core.snapshot
+def broken(self):
+    s = snapshot(self)
     if int(self.steps[3]) == 12:
         s.joint_torque[3, 5] = float("nan")
-    return reward(self, s)
-Go1Core._reward = broken
+    return s
+Go1Core.snapshot = broken
 sys.exit(main())
 """
     done = cli(Path.cwd(), "train", *SMALL, f"hydra.run.dir={run}", code=code)

@@ -384,11 +384,11 @@ def test_the_command_seals_writes_and_continues(
     digest = hashlib.sha256(answers.read_bytes()).hexdigest()
     assert (out / "SEAL").read_text().split()[0] == digest
     assert digest in capsys.readouterr().out
-    known = json.loads(answers.read_text())
-    assert sorted(known) == sorted(p.name for p in out.glob("case_*"))
+    sealed = json.loads(answers.read_text())
+    assert sorted(sealed) == sorted(p.name for p in out.glob("case_*"))
     assert not list(out.rglob("*answer*"))
     bad = 0
-    for name, answer in known.items():
+    for name, answer in sealed.items():
         if answer.get("damage") == "truncated":
             bad += 1
             with pytest.raises(RecordingError):
@@ -402,7 +402,7 @@ def test_the_command_seals_writes_and_continues(
             assert r.meta.source == "measured"
             assert not any(word in text for word in (*known.LIBRARY, *outside.EFFECTS, answer["kind"]))
     assert bad == 1
-    removed = next(out / name for name, answer in known.items() if answer["kind"] == "single")
+    removed = next(out / name for name, answer in sealed.items() if answer["kind"] == "single")
     before = (removed / "episode_00.parquet").read_bytes()
     for file in removed.iterdir():
         file.unlink()
@@ -418,9 +418,9 @@ def test_the_command_seals_writes_and_continues(
     ("words", "message"),
     [
         (["seed=1"], "usage"),
-        (["out=x", "seed=1", "kinds=nil"], "there are null, single"),
+        (["out=x", "seed=1", "kinds=nil"], "must be one of null, single"),
         (["out=x", "seed=1.5"], "not a number"),
-        (["out=x", "seed=1", "effects=stiction"], "there are armature"),
+        (["out=x", "seed=1", "effects=stiction"], "must be one of armature"),
         (["out=x", "seed=1", "answers=x/a.json"], "must not lie beside the cases"),
         (["out=x", "seed=1", "size=3"], "no such setting"),
     ],

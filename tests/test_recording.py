@@ -9,7 +9,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -186,8 +186,8 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(path: Path, monkeyp
     rec.write(path, arm())
     before = path.read_bytes()
 
-    def half(table: pa.Table, where: Path, **_: Any) -> None:
-        Path(where).write_bytes(b"PAR1 and then the disk was full")
+    def half(table: pa.Table, where: BinaryIO, **_: Any) -> None:
+        where.write(b"PAR1 and then the disk was full")
         raise OSError("no space left on device")
 
     monkeypatch.setattr(pq, "write_table", half)

@@ -59,7 +59,7 @@ def test_what_is_wrong_with_the_choice_is_said(tmp_path: Path) -> None:
     for given, said in (
         ((None, None), "run: required, such as run=runs/NAME, or a shipped policy, such as policy=paper"),
         ((str(tmp_path), "paper"), "only one of them"),
-        ((None, "papr"), "policy = 'papr': no such policy; there are paper"),
+        ((None, "papr"), "policy: unknown shipped policy 'papr'; did you mean 'paper'?"),
     ):
         with pytest.raises(ConfigError) as caught:
             trained(given[0], given[1], "eval.json", None)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar, dataclass_transform, get_args, get_type_hints
 from pydantic import TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
+from go1exp.schema.plugins import KEY as PLUGINS
 from go1exp.schema.registry import STRICT, ConfigError, as_json, explain
 
 T = TypeVar("T")
@@ -34,18 +35,19 @@ def parse(kind: type[T], container: Mapping[str, Any], examples: Mapping[str, st
 
     Args:
         kind: a class made by ``settings``, or another dataclass.
-        container: a composed configuration, by key.
+        container: a composed configuration, by key. Its ``plugins`` are for whoever loads terms (schema/plugins.py).
         examples: how a key that has no default is given, by key.
 
     Raises:
         ConfigError: with every problem.
     """
+    container = {key: value for key, value in container.items() if key != PLUGINS}
     absent = [key for key, value in container.items() if value == MISSING]
     if absent:
         hints = examples or {}
         raise ConfigError([f"{key}: required, such as {hints.get(key, f'{key}=...')}" for key in absent])
     try:
-        return TypeAdapter(kind).validate_json(as_json(dict(container)))
+        return TypeAdapter(kind).validate_json(as_json(container))
     except ValidationError as error:
         raise ConfigError(explain(error, "", [f.name for f in fields(kind)])) from None  # type: ignore[arg-type]
 
