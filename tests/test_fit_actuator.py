@@ -221,7 +221,7 @@ def test_recordings_that_do_not_fit_together_are_refused(recordings: list[Record
 
     with pytest.raises(FitError, match="robot is go1, but go2"):
         fit(odd(robot="go2"), QUICK)
-    with pytest.raises(FitError, match="kp differs between the recordings.*gains=\\[20,0.5\\]"):
+    with pytest.raises(FitError, match=r"kp differs between the recordings.*gains=\[20,0.5\]"):
         fit(odd(kp=(20.0, 30.0)), QUICK)
     with pytest.raises(FitError, match="period: set it; e1 was recorded at 200 Hz, but e0 at 300 Hz"):
         fit(odd(rate_hz=300.0), replace(QUICK, period=None))
