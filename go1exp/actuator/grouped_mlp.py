@@ -7,9 +7,10 @@ are a further column of the weights, against a row of ones, which spares a pass 
 
 No column depends on the others. That holds to the bit where the matrix library adds up the products of a column in one
 order however many columns there are. MKL does when each of its threads gets at least 12 columns and when there is more
-than one output; fewer columns are added up in another order (tried with MKL 2024.2 on Intel AVX-512 and AMD AVX2
-processors and on MKL's SSE4.2, AVX, AVX2 and AVX-512 code paths, on 1 to 3 threads). ``padded_rows`` keeps clear of
-that. Other libraries may differ in the last bits (docs/trust.md).
+than one output; fewer columns are added up in another order. ``padded_rows`` keeps clear of that. Tried with MKL 2024.2
+on an AMD processor with AVX2, on its compatible and AVX2 code paths and on 1 to 3 threads, for layers of up to 96
+units: one of 128 is added up otherwise on the compatible path with two threads. Other libraries may differ in the last
+bits (docs/trust.md).
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from go1exp.audit import audit
+from go1exp.errors import Expected
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.splits import Splits, splits
 from go1exp.gap.data.windows import Windows
@@ -31,7 +32,7 @@ FEWEST_RECORDINGS = 3
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
-class NotComparable(Exception):
+class NotComparable(Expected):
     """Recordings that cannot be compared with a robot.
 
     Attributes:
