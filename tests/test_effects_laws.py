@@ -221,6 +221,14 @@ def test_coulomb_raises_the_bound_that_mujoco_keeps() -> None:
     assert plant.backend.field("dof_frictionloss")[0].tolist() == pytest.approx([0.1, 0.0, 0.4] + [0.0, 0.0, 0.4] * 3)
 
 
+def test_coulomb_is_added_to_the_friction_that_the_model_has() -> None:
+    def rough(model: mujoco.MjModel) -> None:
+        model.dof_frictionloss[:] = 0.2
+
+    plant = stand({"coulomb": {"bound": 0.1}}, change=rough)
+    assert plant.backend.field("dof_frictionloss")[0].tolist() == pytest.approx([0.3] * 12)
+
+
 def test_bounds_of_dry_friction_add_up() -> None:
     plant = stand(
         {

@@ -22,7 +22,7 @@ NET = ("ppo.hidden=[16,8]",)
 JUDGED = ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=1", "duration_s=0.4", "settle_s=0.1")
 SEARCH = (
     *("search.window_s=0.1", "search.burn_s=0.02", "search.stride_s=0.15", "search.physics_dt=0.002"),
-    *("search.max_terms=1", "search.shortlist=1", "search.iterations=1", "search.bags=0", "search.overlays=1"),
+    *("search.max_terms=1", "search.shortlist=1", "search.iterations=1", "search.bootstraps=0", "search.overlays=1"),
     *("search.threads=1", "+search.effects=[coulomb,viscous]"),
 )
 
