@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import threading
 
 from go1exp.cli import ONE_BLAS_THREAD
 
@@ -41,6 +43,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Ask git once."""
+    # Started by nohup, this process ignores SIGHUP, and so would every process that a test starts.
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
     slow = str(config.getoption("--slow"))
     config.stash[CHANGED] = None if slow in ("all", "none") else changed_since(slow, config.rootpath)
 
