@@ -14,6 +14,7 @@ from go1exp import robot
 from go1exp.actuator.setup import Gains
 from go1exp.drive import DriveSetup, ModelFields
 from go1exp.effects.base import Effect, Gears, Measured, Param
+from go1exp.effects.identification import Identification
 from go1exp.excitations import ExcitationError, Motion
 from go1exp.excitations.motion import always_on
 from go1exp.importers.source import columns, joint_columns, rate, recording
@@ -49,6 +50,7 @@ __all__ = [
     "Fraction",
     "Gains",
     "Gears",
+    "Identification",
     "JointValues",
     "KinematicState",
     "Measured",

@@ -1080,7 +1080,7 @@ def test_every_key_of_a_slow_program_is_read(program: str, walk: Walk) -> None:
     whole = SETTINGS[program][0]
     parts = [kind for kind in get_type_hints(whole).values() if is_dataclass(kind) and isinstance(kind, type)]
     container = walk.setup(Leaf(program, "", None))
-    assert unread([whole, *parts], lambda: list(walk.base(program, container, ""))) == []
+    assert unread([whole, *parts], lambda: list(walk.trace(program, container, ""))) == []
 
 
 def test_a_field_that_is_only_checked_and_copied_is_unread() -> None:

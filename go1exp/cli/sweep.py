@@ -6,7 +6,6 @@ its folder, and a job by the state in its run folder (``go1exp/train/run_state.p
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from go1exp.cli.app import FAILED, App, Refused
+from go1exp.cli.quoting import command
 from go1exp.compose import as_container
 from go1exp.schema.registry import ConfigError
 
@@ -107,7 +107,7 @@ class Sweep:
             self.status = FAILED
             given = any(a.startswith("hydra.sweep.dir=") for a in self.arguments)
             folder = [] if given else [f"hydra.sweep.dir={self.folder}"]
-            print(f"go on with: {shlex.join(['go1exp', self.app.name, *self.arguments, *folder])}", flush=True)
+            print(f"go on with: {command(self.app.name, *self.arguments, *folder)}", flush=True)
 
 
 class Check(Callback):

@@ -187,3 +187,6 @@ class Effect(Memory):
 
     def reset(self, mask: Tensor) -> None:
         """Begin a new episode in the rows of ``mask`` (N,)."""
+
+    def elapse(self, seconds: Tensor) -> None:
+        """Take up an episode that began ``seconds`` (N,) ago; called after ``reset``, where a replay begins later."""

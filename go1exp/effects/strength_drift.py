@@ -49,3 +49,7 @@ class StrengthDrift(Effect):
     def reset(self, mask: Tensor) -> None:
         """Begin an episode in the rows of ``mask`` (N,)."""
         self._time.masked_fill_(mask.unsqueeze(1), 0.0)
+
+    def elapse(self, seconds: Tensor) -> None:
+        """Weaken from the strength that ``seconds`` (N,) have left."""
+        self._time.copy_(seconds.unsqueeze(1))

@@ -103,8 +103,7 @@ class Replayer:
         for target in past:  # what a delayed command remembers
             effects.on_target(target)
         for effect in effects.effects.values():
-            if hasattr(effect, "_time"):
-                effect._time.copy_(torch.as_tensor(w.elapsed[rows.window]).unsqueeze(1))
+            effect.elapse(torch.as_tensor(w.elapsed[rows.window]))
 
     def _state(self, plant: Plant, rows: Rows, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coordinates and speeds of robots whose joints are at ``q`` (R, J) and ``qd``."""

@@ -245,7 +245,7 @@ class Next:
 def record(names: Sequence[str], *settings: str, out: str) -> str:
     """Return the command that records excitations, quoted for a shell."""
     words = ["go1exp", "record", f"excitation=[{','.join(names)}]", *settings, f"out={out}"]
-    return " ".join(shlex.quote(word) for word in words)
+    return shlex.join(words)
 
 
 def next_recordings(result: GapResult) -> list[Next]:
