@@ -231,6 +231,7 @@ actuator = partial(register, "actuator")
 importer = partial(register, "importer")
 effect = partial(register, "effect")
 excitation = partial(register, "excitation")
+measure = partial(register, "measure")
 
 
 def members(group: str) -> dict[str, Entry]:
