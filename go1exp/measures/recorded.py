@@ -50,13 +50,13 @@ def trace_of(
     attitude = quat if quat is not None else vector("imu_quat")
     gravity = None if attitude is None else _into_body(attitude, np.array([0.0, 0.0, -1.0]))[:, None]
     in_body = None if velocity is None or quat is None else _into_body(quat, velocity)[:, None]
-    told = None if command is None else np.broadcast_to(np.array(command), (rows, 1, 3))
+    commanded = None if command is None else np.broadcast_to(np.array(command), (rows, 1, 3))
     return Trace(
         contact=hysteresis(force, contact_on, contact_off)[:, None],
         contact_dt=float(np.median(np.diff(recording.t))) if rows > 1 else 1.0 / recording.meta.rate_hz,
         counts=recording.channels.get("torque_enable", np.ones(rows, bool))[:, None],
         mass=None if mass is None else np.array([mass]),
-        command=told,
+        command=commanded,
         base_lin_vel_b=in_body,
         projected_gravity_b=gravity,
         joint_vel=joint("qd"),
