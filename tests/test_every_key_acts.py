@@ -188,6 +188,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "play:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "play:out": lambda walk: ["other.gif"],
     "eval:physics_dt": lambda walk: [0.5 * SMALL["train"]["sim.physics_dt"]],
+    "eval:measures": lambda walk: [["stride_rate"]],
     "eval:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "play:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "gap:logs": lambda walk: [str(walk.recorded("stiff", {**HELD, "effect": {"viscous": {"damping": 0.6}}}))],
@@ -798,7 +799,7 @@ def eval_trace(container: dict[str, Any], walk: Walk) -> Trace:
     yield "files", sorted(files)
     for content in files.values():
         report = json.loads(content)
-        yield "report", {k: report[k] for k in ("commands", "rmse", "falls", "episodes")}
+        yield "report", {k: report.get(k) for k in ("commands", "rmse", "falls", "episodes", "delay_margin")}
 
 
 def play_trace(container: dict[str, Any], walk: Walk) -> Trace:

@@ -12,7 +12,7 @@ from go1exp import robot
 from go1exp.measures import every_measure, measured
 from go1exp.measures.recorded import hysteresis, trace_of
 from go1exp.measures.runs import find_runs, largest_within, settled
-from go1exp.measures.statistics import mean_interval, share_interval
+from go1exp.measures.statistics import mean_interval, phase_interval, share_interval
 from go1exp.measures.trace import NotMeasured, Trace
 from go1exp.recording import Meta, Recording, RecordingError
 from go1exp.schema.registry import members
@@ -428,3 +428,11 @@ def test_the_share_has_wilson_s_interval() -> None:
     assert none.high == pytest.approx(1.959964**2 / (600 + 1.959964**2), rel=1e-5)
     assert share_interval(13, 500).low == pytest.approx(0.01526, abs=1e-4)
     assert share_interval(0, 0).n == 0
+
+
+def test_phases_on_both_sides_of_zero_have_their_mean_at_zero() -> None:
+    interval = phase_interval([0.98, 0.02, 0.99, 0.01, np.nan])
+    assert min(interval.estimate, 1.0 - interval.estimate) == pytest.approx(0.0, abs=1e-9)
+    assert interval.n == 4
+    assert interval.high - interval.low == pytest.approx(2 * mean_interval([-0.02, 0.02, -0.01, 0.01]).high)
+    assert np.isnan(phase_interval([]).estimate)

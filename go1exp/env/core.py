@@ -289,12 +289,15 @@ class Go1Core:
 
     # ------------------------------------------------------------------ what the MDP sees
 
+    def ground_height(self, xy: Tensor) -> Tensor | float:
+        """Height of the ground at world positions (..., 2), (...), m; of flat ground the number 0."""
+        return self._ground(xy) if self._bounded else 0.0
+
     def snapshot(self) -> Snapshot:
         """Return the present moment as the MDP sees it; staleness of sensors as in ``physics/backend.py``."""
         state = self._state
         quat = state.base_quat_w.float()
         foot_pos = self._foot_pos_w.float()
-        ground = self._ground(foot_pos[..., :2]) if self._bounded else 0.0
         return Snapshot(
             base_pos_w=state.base_pos_w.float(),
             base_quat_w=quat,
@@ -309,7 +312,7 @@ class Go1Core:
             action=self.action,
             previous_action=self.previous_action,
             command=self.command.value,
-            foot_height=foot_pos[..., 2] - ground,
+            foot_height=foot_pos[..., 2] - self.ground_height(foot_pos[..., :2]),
             foot_vel_w=self._foot_vel_w.float(),
             foot_force=self._foot_contact[..., 1:].norm(dim=-1).float(),
             **self.feet.snapshot_fields(),

@@ -71,7 +71,7 @@ def _mean_phasors(trace: Trace) -> NDArray[np.complex128]:
     return np.where(counts > 0, sums / np.maximum(counts, 1), missing)
 
 
-@measure("touchdown_phase", unit="cycles", per="foot")
+@measure("touchdown_phase", unit="cycles", per="foot", circular=True)
 def touchdown_phase(trace: Trace) -> Array:
     """Touchdown of each foot after that of FR, circular mean over strides, 0 to 1 (N, 4)."""
     mean = _mean_phasors(trace)
@@ -109,7 +109,7 @@ def gait(trace: Trace, *, largest_error: Fraction = 0.125, least_consistency: Fr
     ``largest_error``, cycles: half of the way from a trot to a walk. ``least_consistency`` of the least alike foot.
     """
     names, errors = _errors(trace)
-    defined = np.isfinite(errors).all(0)
+    defined = np.isfinite(errors.sum(0))
     best = np.where(defined, errors, np.inf).argmin(0)
     duty = duty_factor(trace).mean(-1)
     consistency = phase_consistency(trace).min(-1)
@@ -166,5 +166,5 @@ def clearance(trace: Trace) -> Array:
 @measure("flight_share", unit="-")
 def flight_share(trace: Trace) -> Array:
     """Share of the time with no foot on the ground (N,)."""
-    flying = ~trace.touching.any(-1)
-    return mean_over(flying.astype(np.float32), np.repeat(trace.moving, trace.samples, axis=0))
+    flying = (~trace.touching).all(-1).astype(np.float32)
+    return mean_over(np.asarray(flying), np.repeat(trace.moving, trace.samples, axis=0))

@@ -38,6 +38,18 @@ def mean_interval(values: ArrayLike, level: float = LEVEL) -> Interval:
     return Interval(mean, mean - half, mean + half, len(each))
 
 
+def phase_interval(phases: ArrayLike, level: float = LEVEL) -> Interval:
+    """Return the circular mean of one phase per robot, cycles in 0 to 1, and the interval of the deviations from it.
+
+    The bounds may lie beyond 0 and 1, so that low <= mean <= high.
+    """
+    each = np.asarray(phases, dtype=np.float64).ravel()
+    each = each[np.isfinite(each)]
+    mean = float(np.angle(np.exp(2j * np.pi * each).sum()) / (2.0 * np.pi) % 1.0) if len(each) else np.nan
+    around = mean_interval((each - mean + 0.5) % 1.0 - 0.5, level)
+    return Interval(mean, mean + around.low - around.estimate, mean + around.high - around.estimate, len(each))
+
+
 def share_interval(count: int, n: int, level: float = LEVEL) -> Interval:
     """Return the share ``count`` / ``n`` with Wilson's interval, which is sound for few and for none."""
     from scipy import stats

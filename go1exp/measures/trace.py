@@ -188,7 +188,7 @@ def percentile_by_robot(values: Array, robots: NDArray[np.intp], count: int, per
     return result
 
 
-def ratio(numerator: Array, denominator: Array) -> Array:
+def ratio(numerator: NDArray[Any], denominator: NDArray[Any]) -> Array:
     """Return the quotient, NaN where the denominator is not positive."""
     out = np.full(np.broadcast(numerator, denominator).shape, np.nan)
     return np.divide(numerator, denominator, out=out, where=np.asarray(denominator) > 0)

@@ -270,6 +270,19 @@ class Term:
         return self.entry.target(*args, **self.parameters)
 
 
+def bind_list(group: str, given: Iterable[Any], path: str) -> list[Term]:
+    """Resolve a list of names and of ``{name: {parameter: value}}``.
+
+    Raises:
+        ConfigError: with every problem of them.
+    """
+    items = [pair for item in given for pair in (item.items() if isinstance(item, Mapping) else [(item, {})])]
+    bound = [bind(group, str(key), value, f"{path}.{key}") for key, value in items]
+    if problems := [problem for _, term_problems in bound for problem in term_problems]:
+        raise ConfigError(problems)
+    return [term for term, _ in bound if term]
+
+
 def bind(
     group: str, key: str, settings: Any, path: str, slots: type[BaseModel] | None = None
 ) -> tuple[Term | None, list[str]]:

@@ -66,7 +66,8 @@ def part(trace: Trace, which: list[int]) -> Trace:
 
 def without(trace: Trace, *names: str) -> Trace:
     """Return a trace that does not have these columns."""
-    return dataclasses.replace(trace, **dict.fromkeys(names))
+    missing: dict[str, Any] = dict.fromkeys(names)
+    return dataclasses.replace(trace, **missing)
 
 
 def check_measure(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
@@ -96,7 +97,7 @@ def check_measure(entry: Entry, parameters: dict[str, Any], exact: bool) -> None
     for n in range(ROBOTS):
         alone = compute(part(trace, [n]))
         expect(entry, _same(alone, together[n : n + 1]), "a robot must get the same alone and among others")
-    empty = {name: np.full_like(getattr(trace, name), np.nan) for name in columns()}
+    empty: dict[str, Any] = {name: np.full_like(getattr(trace, name), np.nan) for name in columns()}
     compute(dataclasses.replace(trace, **empty))
     for name in (*columns(), "mass"):
         try:
