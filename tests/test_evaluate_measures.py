@@ -161,8 +161,8 @@ def test_the_delay_of_the_margin_is_that_of_the_effect_and_takes_the_place_of_an
     task = delayed(make_task("effect=command_delay", "backend.threads=1"), 0.03)
     core = Go1Core(evaluation_task(task, QUIET), 2, 1, noise=False)
     core.reset()
-    (effect,) = [e for e in core.plant.effects.effects if type(e).__name__ == "CommandDelay"]
-    assert effect.delay.unique().tolist() == pytest.approx([0.03])
+    assert list(core.plant.effects.effects) == ["command_delay"]
+    assert core.plant.effects.effects["command_delay"].delay.unique().tolist() == pytest.approx([0.03])
 
 
 @pytest.mark.parametrize(

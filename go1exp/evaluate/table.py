@@ -67,8 +67,9 @@ CONTACT: dict[str, Show] = {
 """Columns of the table of contacts and effort."""
 
 LEGEND = """error: of the touchdowns to a trot's, phase: after FR, both in cycles; feet: FR FL RR RL; pitch: nose down;
-touchdown and peak (body weights): 95th percentile; step of the target in 20 ms, share of peak torque, top speed
-and the motors' line: 99th percentile; CoT: positive work / (m g way). Means over n robots; the JSON has intervals and all measures."""
+touchdown and peak (body weights): 95th percentile; step of the target in 20 ms; tau, qd, line: share of peak torque,
+top speed and the motors' torque-speed line; the last four: 99th percentile; CoT: positive work / (m g way).
+Means over n robots; the JSON has intervals and all measures."""
 
 
 def _triple(values: Any) -> str:
@@ -124,10 +125,10 @@ def _falls(report: dict[str, Any]) -> str:
     """Say how many of the robots that differ fell, with the interval, and how many do."""
     falls = report["distinct_falls"]
     same = report["episodes"] - falls["n"]
-    repeats = "repeat another one to the bit and do not count"
+    repeats = "repeat another one and do not count"
     alike = f"; {same} of {report['episodes']} episodes {repeats}" if same else ""
     low, high = (100.0 * falls[k] for k in ("low", "high"))
-    return f"falls {falls['count']} of {falls['n']} different robots: 95 % interval {low:.1f} to {high:.1f} %{alike}"
+    return f"falls {falls['count']} of {falls['n']} different robots (95 %: {low:.1f} to {high:.1f} %){alike}"
 
 
 def _delay(report: dict[str, Any]) -> str:
