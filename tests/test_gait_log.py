@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +16,8 @@ from go1exp.env.gait_log import GaitLog
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.types import Snapshot
 from go1exp.testing.snapshots import random_snapshot
+from go1exp.train import checkpoint
+from go1exp.train.checkpoint import DamagedCheckpoint
 
 DT, SUBSTEPS = 0.02, 10
 TROT, PRONK, HOP = (0.0, 0.5, 0.5, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.11, 0.71, 0.05)
@@ -84,6 +87,18 @@ def test_a_slipping_foot_and_a_blow_are_seen(make_core: Callable[..., Go1Core], 
     figures = log.drain()
     assert figures["contact/slip_share"] == 1.0
     assert figures["contact/largest_force"] > 1e5
+
+
+def test_a_checkpoint_of_before_is_refused_in_a_line(
+    make_core: Callable[..., Go1Core], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core = make_core(num_envs=1)
+    state = core.state_dict()
+    del state["gait_log"]
+    monkeypatch.setattr(checkpoint, "_core", lambda ppo: core)
+    learner: Any = None
+    with pytest.raises(DamagedCheckpoint, match="of another version of go1exp: it has no 'gait_log'"):
+        checkpoint.restore(learner, {"env": state})
 
 
 def test_the_environment_logs_the_same_figures_after_a_pause(make_core: Callable[..., Go1Core]) -> None:

@@ -19,7 +19,7 @@ def _moving(row: Row) -> bool:
     return any(row["command"])
 
 
-def _told(axis: int, size: float) -> Callable[[Row], bool]:
+def _alone(axis: int, size: float) -> Callable[[Row], bool]:
     """Return whether a command is this one alone, in either direction."""
     others = [k for k in range(3) if k != axis]
     return lambda row: math.isclose(abs(row["command"][axis]), size) and not any(row["command"][k] for k in others)
@@ -81,7 +81,7 @@ BARS = (
     Bar("RMSE xy", _up_to(1.5), _rmse("x", "y"), high=0.08),
     Bar("RMSE yaw", lambda row: True, _rmse("yaw"), high=0.10),
     Bar("told 2.0 m/s", _forward(2.0, 2.0), _answer, low=0.95),
-    Bar("told 1.8 rad/s", _told(2, 1.8), _answer, low=0.95),
+    Bar("told 1.8 rad/s", _alone(2, 1.8), _answer, low=0.95),
     Bar("told 3.0 m/s", _forward(3.0, 3.0), _answer, low=0.90),
     Bar("told 0.1 to 0.3", _slow, _answer, low=0.70),
     Bar("falls", lambda row: True, lambda row: [float(row["distinct_falls"]["count"])], high=0.0),

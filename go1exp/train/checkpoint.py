@@ -96,7 +96,18 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
-    """Put ``ppo`` and its environment into the state of a checkpoint."""
+    """Put ``ppo`` and its environment into the state of a checkpoint.
+
+    Raises:
+        DamagedCheckpoint: if it lacks a part that this version's environment has; the learner is as it was.
+    """
+    try:
+        _core(ppo).load_state_dict(state["env"])
+    except KeyError as missing:
+        raise DamagedCheckpoint(
+            f"a checkpoint of another version of go1exp: it has no {missing}; go on with that version, or begin a new "
+            "run with its weights (start_from=)"
+        ) from None
     ppo.policy.load_state_dict(state["policy"])
     ppo.policy.optimizer.load_state_dict(state["optimizer"])
     ppo.iteration = state["iteration"]
@@ -105,7 +116,6 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     # SB3 makes these two when learning starts, unless the first is there already.
     ppo.ep_info_buffer = deque(state["episodes"], maxlen=ppo._stats_window_size)
     ppo.ep_success_buffer = deque(maxlen=ppo._stats_window_size)
-    _core(ppo).load_state_dict(state["env"])
     ppo._last_obs = state["last_obs"].numpy()
     ppo._last_episode_starts = state["last_episode_starts"].numpy()
     rng = state["rng"]
