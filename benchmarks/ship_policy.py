@@ -24,6 +24,7 @@ from go1exp import data_root
 from go1exp.evaluate import table
 from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
+from go1exp.measures import every_measure
 from go1exp.train import checkpoint, start
 
 GRID = {
@@ -95,7 +96,7 @@ def main(arguments: Sequence[str]) -> None:
             continue
         print(f"== {name}", flush=True)
         wanted = EvalConfig(commands, int(given.get("episodes", 31)), **{**usual, **off, **on})
-        report = {"policy": about, **evaluate(config.task, policy, wanted)}
+        report = {"policy": about, **evaluate(config.task, policy, wanted, measures=every_measure())}
         (to / f"eval_{name}.json").write_text(json.dumps(report, indent=1) + "\n")
         print(table.text(report), flush=True)
 
