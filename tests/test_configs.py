@@ -56,7 +56,11 @@ ABLATIONS = [c.removeprefix("experiment=ablation/") for c in choices() if c.star
 NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
 
 
-@pytest.mark.parametrize("choice", [c for c in choices() if not c.startswith("experiment=ablation/")])
+ELSEWHERE = ("experiment=ablation/", "effect=")
+"""Choices with tests of their own: below, and in tests/contracts/test_effects.py."""
+
+
+@pytest.mark.parametrize("choice", [c for c in choices() if not c.startswith(ELSEWHERE)])
 def test_every_file_composes_and_parses(choice: str, make_net: Callable[..., Path]) -> None:
     needs = [f"actuator.file={make_net()}"] if choice == "actuator=net" else NEEDS.get(choice, [])
     parse_train(compose("train", [choice, *needs]))

@@ -1052,10 +1052,12 @@ SLOW = {
     "ppo": ("conf/ppo/", *RUN),
     "logger": ("conf/logger/", *RUN),
     "experiment": ("conf/experiment/", *RUN),
+    "effect": ("conf/effect/", "go1exp/effects/", "go1exp/env/plant.py"),
 }
 """Programs, and groups of train, of which a trace takes long, and what they are made of. ``make test`` asks of their
 keys only that each is read, in one trace for all of a program; ``make test-all`` that each acts. The terms of the MDP,
-drives, effects, randomisation and ground act in both."""
+drives, randomisation and ground act in both; that each parameter of an effect moves a robot is also the contract of
+effects (tests/contracts/test_effects.py)."""
 
 READ: dict[str, list[type]] = {
     **{program: [kind] for program, (kind, _) in SETTINGS.items() if program in SLOW},
@@ -1142,6 +1144,7 @@ def test_a_trace_repeats(program: str, walk: Walk) -> None:
     assert difference(walk.base(program, container, ""), walk.trace(program, container, "")) is None
 
 
+@pytest.mark.slow("go1exp/schema/", "go1exp/config.py")
 def test_dead_keys_are_found(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
     def ghost(s: Snapshot, *, used: float = 1.0, unused: float = 1.0, half: Range = (0.0, 1.0)) -> torch.Tensor:
         return used * half[1] * s.joint_vel.square().sum(-1)

@@ -224,7 +224,9 @@ def test_a_run_killed_between_checkpoints_goes_on_when_the_same_command_is_given
     assert_the_same_run(killed_copy, flat)
 
 
-@pytest.mark.slow("go1exp/train/", "go1exp/signals.py", "go1exp/cli/", "go1exp/tensors/", "go1exp/terrain.py", "go1exp/env/")
+@pytest.mark.slow(
+    "go1exp/train/", "go1exp/signals.py", "go1exp/cli/", "go1exp/tensors/", "go1exp/terrain.py", "go1exp/env/"
+)
 def test_a_run_on_rough_ground_stopped_by_sigterm_goes_on_with_resume(
     folder: Path, monkeypatch: pytest.MonkeyPatch, usual_handler: Callable[[int, FrameType | None], None]
 ) -> None:

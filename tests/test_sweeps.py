@@ -6,6 +6,8 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
+
 from go1exp.train import run_state
 from tests.command import run as cli
 from tests.small_run import SMALL
