@@ -189,6 +189,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "play:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "play:out": lambda walk: ["other.gif"],
     "eval:physics_dt": lambda walk: [0.5 * SMALL["train"]["sim.physics_dt"]],
+    "eval:measures": lambda walk: [["stride_rate"]],
     "eval:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "play:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "gap:logs": lambda walk: [str(walk.recorded("stiff", {**HELD, "effect": {"viscous": {"damping": 0.6}}}))],
@@ -667,7 +668,7 @@ def provoked(core: Go1Core, steps: int = 12) -> Trace:
         qvel[:, 6:] = torch.tensor(rng.uniform(-40, 40, (n, 12)))
         core.backend.reset(here, qpos, qvel)
         for name in ("air", "contact", "last_air", "last_contact"):
-            getattr(core.feet, name)[here] = torch.tensor(rng.uniform(0, 1, (n, 4)), dtype=torch.float32)[here]
+            getattr(core.feet.timers, name)[here] = torch.tensor(rng.uniform(0, 1, (n, 4)), dtype=torch.float32)[here]
         core.command.value[here & (torch.arange(n) % 4 < 2)] = 0.0
         for part in (core.command, *core.events.values()):
             if hasattr(part, "time_left"):
@@ -799,7 +800,7 @@ def eval_trace(container: dict[str, Any], walk: Walk) -> Trace:
     yield "files", sorted(files)
     for content in files.values():
         report = json.loads(content)
-        yield "report", {k: report[k] for k in ("commands", "rmse", "falls", "episodes")}
+        yield "report", {k: report.get(k) for k in ("commands", "rmse", "falls", "episodes", "delay_margin")}
 
 
 def play_trace(container: dict[str, Any], walk: Walk) -> Trace:

@@ -20,7 +20,12 @@ from tests.small_run import SMALL
 
 PAGE = data_root() / "docs/extending.md"
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
-BUDGET = {"train": [*SMALL, "ppo.iterations=1"], "record": ["seconds=0.5", "out=recordings"], "record import": []}
+BUDGET = {
+    "train": [*SMALL, "ppo.iterations=1"],
+    "record": ["seconds=0.5", "out=recordings"],
+    "record import": [],
+    "eval": ["episodes=1", "duration_s=0.5", "settle_s=0.2", "grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]"],
+}
 
 
 def files() -> dict[str, str]:
