@@ -18,6 +18,7 @@ from go1exp.env.engine import CapturedStep, make_backend
 from go1exp.env.evidence import Evidence, accuse
 from go1exp.env.gait_log import GaitLog
 from go1exp.env.plant import Plant, drive_setup
+from go1exp.env.restarts import Restarts
 from go1exp.env.terms import StepTerms
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.clearance import lift
@@ -75,7 +76,9 @@ class Go1Core:
         self._held = held
         self._state = KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
-        self._build_terms(EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random)
+        drives = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
+        self._build_terms(drives)
+        self._restarts = Restarts(self._restart, (self.random, drives))
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
@@ -155,7 +158,7 @@ class Go1Core:
             self.level.copy_(self.random.stream("level").integers(self._start_levels, 1).squeeze(1))
             self.plant.startup()
             self._randomize_model("startup", everyone)
-        self._restart(everyone)
+        self._restarts(everyone)
         if self._spread_starts and not self._started:
             self._first_step.copy_(self.random.stream("spread").integers(self.task.sim.episode_steps, 1).squeeze(1))
             self.steps.copy_(self._first_step)
@@ -237,7 +240,7 @@ class Go1Core:
 
         ended = terminated | truncated
         self._move_levels(ended)
-        self._restart(ended)
+        self._restarts(ended)
         self._advance_world(ended)
         observation = self._observe(self.snapshot())
         return StepResult(observation, reward, terminated, truncated, final_observation, episode_return, episode_length)
