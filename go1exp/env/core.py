@@ -379,15 +379,8 @@ class Go1Core:
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own."""
         events = {f"event.{name}": part for name, part in self.events.items()}
-        named = {"backend": self.backend, "random": self.random, "plant": self.plant}
-        return {
-            **named,
-            "command": self.command,
-            "feet": self.feet,
-            "gait_log": self.gait_log,
-            **events,
-            **self.terms.parts(),
-        }
+        named = {"backend": self.backend, "random": self.random, "plant": self.plant, "command": self.command}
+        return {**named, "feet": self.feet, "gait_log": self.gait_log, **events, **self.terms.parts()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything needed to continue bit for bit."""
