@@ -489,7 +489,8 @@ def test_eval_prints_a_table_and_writes_the_same_as_json(run: Path, tmp_path: Pa
     assert report["policy"]["num_timesteps"] == 2 * 4 * 4
     assert [c["command"] for c in report["commands"]] == [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
     for command in report["commands"]:
-        assert set(command) == {"command", "mean", "rmse", "falls", "episodes", "mean_time_s"}
+        tracking = {"command", "mean", "rmse", "falls", "episodes", "mean_time_s"}
+        assert set(command) == {*tracking, "distinct_falls", "measures"}
         assert set(command["rmse"]) == set(command["mean"]) == {"x", "y", "yaw"}
         assert command["episodes"] == 2
     assert report["episodes"] == 4
