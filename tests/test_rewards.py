@@ -11,6 +11,18 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.gait_scores import (
+    GAITS,
+    PHYSICS_DT,
+    RATES,
+    SCORES,
+    climbing,
+    mean_scores,
+    pattern,
+    steps,
+    trembling,
+    walking,
+)
 from go1exp import robot
 from go1exp.config import TaskConfig
 from go1exp.mdp.types import Snapshot
@@ -97,6 +109,9 @@ TROT_PHASE = {"foot_air_time": feet(FR=0.1, RL=0.1), "foot_contact_time": feet(F
 PACE_PHASE = {"foot_air_time": feet(FR=0.1, RR=0.1), "foot_contact_time": feet(FL=0.1, RL=0.1)}
 BOUND_PHASE = {"foot_air_time": feet(FR=0.1, FL=0.1), "foot_contact_time": feet(RR=0.1, RL=0.1)}
 PRONK_PHASE = {"foot_air_time": [0.1] * 4, "foot_contact_time": [0.0] * 4}
+STRIDE = {"command": WALK, "foot_last_air_time": [0.2] * 4, "foot_last_contact_time": [0.2] * 4}
+"""A cycle of 0.4 s: with the phases above a foot in the air is at 0.75 of it, one on the ground at 0.25."""
+
 APART = {"foot_air_time": [0.0, 1.0, 2.0, 3.0], "foot_contact_time": [10.0, 20.0, 30.0, 40.0]}
 SLIDING = {
     "foot_vel_w": feet(FR=[3.0, -4.0, 9.0], FL=[0.0, 1.0, 9.0], RR=[0.5, 0.0, -9.0]),
@@ -200,6 +215,44 @@ CASES = [
     Case("gait", "all twelve differences at their cut", {"command": WALK, **APART}, 0.00822975),  # exp(-4.8)
     Case("gait", "a trot without a command", TROT_PHASE, 0.0),
     Case("gait", "a trot that drifts fast without a command", {**TROT_PHASE, "base_lin_vel_b": [0, 0.51, 0]}, 1.0),
+    Case("trot", "a perfect trot", {**STRIDE, **TROT_PHASE}, 1.0),
+    # Two pairs in phase that should not be, two in opposition that should be in phase, each 2; exp(-8 / 2).
+    Case("trot", "a pace", {**STRIDE, **PACE_PHASE}, 0.01831564),
+    Case("trot", "a bound", {**STRIDE, **BOUND_PHASE}, 0.01831564),
+    Case("trot", "a pronk", {**STRIDE, **PRONK_PHASE}, 0.01831564),
+    Case("trot", "a pace on another scale", {**STRIDE, **PACE_PHASE}, 0.36787944, {"scale": 8.0}),
+    # FR 0.75, FL 0.25, RR 0, RL 0.5: four pairs a quarter off, each 1; exp(-4 / 2).
+    Case(
+        "trot",
+        "a walk",
+        {**STRIDE, "foot_air_time": feet(FR=0.1), "foot_contact_time": feet(FL=0.1, RL=0.2)},
+        0.13533528,
+    ),
+    # FL and its three pairs, each 1; exp(-3 / 2).
+    Case(
+        "trot",
+        "a leg that is never lifted",
+        {**STRIDE, **TROT_PHASE, "foot_contact_time": feet(FL=9.0, RR=0.1)},
+        0.22313016,
+    ),
+    # FL is at 1.25 cycles, of length 0.75: three pairs of 1 - 0.75; exp(-0.75 / 2).
+    Case(
+        "trot",
+        "a leg that is late",
+        {**STRIDE, **TROT_PHASE, "foot_contact_time": feet(FL=0.5, RR=0.1)},
+        0.68728928,
+    ),
+    Case("trot", "cycles of 0.4 of 0.8 s", {**STRIDE, **TROT_PHASE}, 0.5, {"full_cycle": 0.8}),
+    Case("trot", "cycles longer than needed", {**STRIDE, **TROT_PHASE}, 1.0, {"full_cycle": 0.3}),
+    Case("trot", "standing when told to walk: six pairs without a phase", {"command": WALK}, 0.04978707),  # exp(-3)
+    Case("trot", "a trot without a command", {**STRIDE, **TROT_PHASE, "command": [0.0] * 3}, 0.0),
+    Case(
+        "trot",
+        "a slow drift without a command, another speed threshold",
+        {**STRIDE, **TROT_PHASE, "command": [0.0] * 3, "base_lin_vel_b": [0.0, 0.3, 0.0]},
+        1.0,
+        {"speed_threshold": 0.2},
+    ),
     Case("foot_clearance", "standing", {}, 1.0),
     Case(
         "foot_clearance",
@@ -408,6 +461,58 @@ def test_a_trot_of_any_phase_is_perfect_and_any_other_pairing_is_not() -> None:
         for a, c in [(air, contact), (contact, air)]:
             value = evaluate("gait", snapshot(9, command=WALK, foot_air_time=a, foot_contact_time=c))
             assert torch.equal(value, torch.ones(9)) if pair == (FR, RL) else (value < 1.0).all()
+
+
+TROT_SCORES = {name: SCORES[name] for name in ("gait", "trot")}
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("duty", [0.35, 0.5, 0.65])
+def test_a_trot_is_paid_in_full_at_every_stride_rate_and_duty(rate: float, duty: float) -> None:
+    """At 25 Hz and a duty of 0.35 or 0.65 the timers' 2 ms round a phase by a twentieth of the cycle."""
+    score = mean_scores(walking(pattern(rate, GAITS["trot"], duty)), TROT_SCORES)["trot"]
+    assert score.item() > (0.98 if duty == 0.5 or rate < 20 else 0.9)
+
+
+@pytest.mark.parametrize("name", [name for name in GAITS if name != "trot"])
+def test_no_other_gait_is_paid_at_any_stride_rate(name: str) -> None:
+    """The kernel in absolute time pays all of them at 25 Hz, the hop of three legs 0.72 at the rate that it had."""
+    for rate in RATES:
+        scores = mean_scores(walking(pattern(rate, GAITS[name])), TROT_SCORES)
+        assert scores["trot"].item() < 0.2, rate
+    assert scores["gait"].item() > 0.95  # the last rate
+
+
+@pytest.mark.parametrize("duty", [-1.0, 2.0])
+def test_a_trot_of_three_legs_is_paid_a_quarter(duty: float) -> None:
+    score = mean_scores(walking(pattern(2.5, GAITS["trot"], (0.5, 0.5, duty, 0.5))), TROT_SCORES)["trot"]
+    assert score.item() == pytest.approx(math.exp(-1.5), rel=0.02)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
+def test_trembling_is_not_paid(share: float) -> None:
+    scores = mean_scores(trembling(share, n=50, seconds=2.0), TROT_SCORES)
+    assert scores["trot"].mean().item() < 0.1
+    assert scores["gait"].mean().item() > 0.7
+
+
+@pytest.mark.parametrize("duty", [0.35, 0.5])
+def test_from_all_phases_there_is_a_way_up_to_the_trot(duty: float) -> None:
+    """With timers that are compared as times it is a part of them (``docs/paper.md``)."""
+    assert climbing(SCORES["trot"], duty, points=8) > 0.97
+
+
+def test_a_trot_that_begins_is_paid_from_its_second_cycle_on() -> None:
+    """Without a cycle behind it a foot has no phase: then neither a reward nor anything that is not finite."""
+    values = [SCORES["trot"](s).item() for s in steps(trotting(0.4), 1, 0, 60)]
+    assert max(values[:10]) < 0.2
+    assert min(values[40:]) > 0.98
+
+
+def trotting(cycle: float) -> Callable[[int], torch.Tensor]:
+    """Who touches the ground in a substep of a trot."""
+    offset = torch.tensor([GAITS["trot"]])
+    return lambda substep: (substep * PHYSICS_DT / cycle - offset + 1e-4) % 1.0 < 0.5
 
 
 def test_feet_air_time_pays_most_when_the_phase_changes_every_mode_time() -> None:
