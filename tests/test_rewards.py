@@ -61,6 +61,8 @@ def snapshot(n: int = 1, **changes: Any) -> Snapshot:
         "foot_last_air_time": [0.0] * 4,
         "foot_last_contact_time": [0.0] * 4,
         "foot_touchdown": [False] * 4,
+        "foot_peak_force": [31.25] * 4,
+        "foot_touchdown_speed": [0.0] * 4,
         "thigh_contact": [False] * 4,
         "calf_contact": [False] * 4,
         "trunk_contact": False,

@@ -20,7 +20,7 @@ from go1exp.env.plant import Plant, drive_setup
 from go1exp.env.terms import StepTerms
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.clearance import lift
-from go1exp.mdp.foot_timers import FootTimers
+from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.types import Snapshot, StepResult
@@ -89,7 +89,7 @@ class Go1Core:
         self.episode_return = zeros()
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
         self.reward_sums = self.terms.sums
-        self.feet = FootTimers(num_envs, task.sim.physics_dt, self.device)
+        self.feet = Feet(num_envs, task.sim.physics_dt, self.device)
         self._touched = torch.zeros_like(self._link_contacts)
         self._calf_touched = torch.zeros_like(self._foot_contact[..., 0])
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
@@ -254,7 +254,7 @@ class Go1Core:
         for _ in range(self.task.sim.decimation):
             self.plant.step(target)
             feet = self._foot_contact[..., 0]
-            self.feet.update(self._foot_contact[..., 3] != 0)  # the vertical force: exactly zero if there is none
+            self.feet.update(self._foot_contact[..., 1:], self._foot_vel_w)
             # Counts, largest over the substeps; a calf's contacts without those of its foot.
             torch.maximum(self._touched, self._link_contacts, out=self._touched)
             torch.maximum(self._calf_touched, self._link_contacts[:, CALVES] - feet, out=self._calf_touched)
@@ -295,7 +295,6 @@ class Go1Core:
         quat = state.base_quat_w.float()
         foot_pos = self._foot_pos_w.float()
         ground = self._ground(foot_pos[..., :2]) if self._bounded else 0.0
-        timers = self.feet
         return Snapshot(
             base_pos_w=state.base_pos_w.float(),
             base_quat_w=quat,
@@ -313,12 +312,7 @@ class Go1Core:
             foot_height=foot_pos[..., 2] - ground,
             foot_vel_w=self._foot_vel_w.float(),
             foot_force=self._foot_contact[..., 1:].norm(dim=-1).float(),
-            foot_contact=timers.contact > 0,
-            foot_air_time=timers.air,
-            foot_contact_time=timers.contact,
-            foot_last_air_time=timers.last_air,
-            foot_last_contact_time=timers.last_contact,
-            foot_touchdown=timers.touchdown,
+            **self.feet.snapshot_fields(),
             thigh_contact=self._touched[:, THIGHS] > 0,
             calf_contact=self._calf_touched > 0,
             trunk_contact=(self._touched[:, TRUNK] > 0).any(-1),

@@ -33,8 +33,8 @@ class FootTimers(Memory):
         """Forget the touchdowns of the last policy step."""
         self.touchdown.zero_()
 
-    def update(self, touching: Tensor) -> None:
-        """Let one physics step pass in which the feet of ``touching`` (N, 4) bool bore force."""
+    def update(self, touching: Tensor) -> Tensor:
+        """Let one physics step pass in which the feet of ``touching`` (N, 4) bool bore force; return who landed."""
         landed = touching & (self.air > 0)
         lifted = ~touching & (self.contact > 0)
         self.last_air.copy_(torch.where(landed, self.air + self._dt, self.last_air))
@@ -42,6 +42,7 @@ class FootTimers(Memory):
         self.air.add_(self._dt).mul_(~touching)
         self.contact.add_(self._dt).mul_(touching)
         self.touchdown.logical_or_(landed)
+        return landed
 
     def reset(self, mask: Tensor) -> None:
         """Zero the rows of ``mask`` (N,) bool."""

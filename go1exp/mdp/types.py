@@ -36,7 +36,8 @@ class Snapshot:
 
     Joints and legs in the order of ``robot.py``; ``_b`` is the trunk frame, ``_w`` the world frame. Joint and base
     state are current. Contact forces and foot kinematics are MuJoCo sensors and describe the last physics substep,
-    2 ms before the state (see ``physics/backend.py``); timers and ``*_contact`` flags cover every substep of the step.
+    2 ms before the state (see ``physics/backend.py``); timers, ``*_contact`` flags, peak force and touchdown speed
+    cover every substep of the step.
     """
 
     base_pos_w: Tensor | None
@@ -83,6 +84,11 @@ class Snapshot:
     """(N, 4) duration of the last completed stance phase, s."""
     foot_touchdown: Tensor
     """(N, 4) bool, the foot touched down during this policy step."""
+    foot_peak_force: Tensor | None
+    """(N, 4) largest magnitude of the ground's force on each foot over the substeps of this policy step, N."""
+    foot_touchdown_speed: Tensor | None
+    """(N, 4) speed of the foot's last touchdown, kept until the next one, 0 before the first, m/s: the downward
+    component (world) of the velocity of the foot's centre just before the contact, 0 if it moved upward."""
     thigh_contact: Tensor | None
     """(N, 4) bool, the thigh touched the ground during this policy step."""
     calf_contact: Tensor | None

@@ -51,6 +51,8 @@ def random_snapshot(n: int, seed: int = 0) -> Snapshot:
         "foot_last_air_time": rng.uniform(0.0, 0.7, (n, 4)),
         "foot_last_contact_time": rng.uniform(0.0, 0.7, (n, 4)),
         "foot_touchdown": touching & (phase < 0.02),
+        "foot_peak_force": touching * rng.uniform(100.0, 300.0, (n, 4)),
+        "foot_touchdown_speed": rng.uniform(0.0, 2.0, (n, 4)),
         "thigh_contact": rng.random((n, 4)) < 0.3,
         "calf_contact": rng.random((n, 4)) < 0.3,
         "trunk_contact": rng.random(n) < 0.3,

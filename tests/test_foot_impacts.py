@@ -1,0 +1,109 @@
+"""Peak force and touchdown speed of the feet, over every substep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from go1exp import robot
+from go1exp.env.core import Go1Core
+from go1exp.mdp.feet import Feet
+
+QUIET = ("rand=none", "event=none", "termination=none", "command=forward")
+
+
+def feed(feet: Feet, force: float, descent: float) -> None:
+    """One physics step in which every foot of every robot has this vertical force and downward speed."""
+    like = torch.zeros(len(feet.timers.air), robot.NUM_LEGS, 3)
+    feet.update(like + torch.tensor([0.0, 0.0, force]), like + torch.tensor([3.0, 0.0, -descent]))
+
+
+def test_the_touchdown_speed_is_that_before_the_first_force_and_stays_until_the_next() -> None:
+    feet = Feet(1, 0.002, torch.device("cpu"))
+    seen = []
+    # force in the step, downward speed at its start: a fall, a blow that stops it, a bounce, and a slower landing
+    for force, descent in [(0, 0.7), (0, 0.8), (300, 0.9), (80, -0.1), (0, -0.2), (0, 0.1), (50, 0.3), (40, 0.0)]:
+        feet.begin_step()
+        feed(feet, force, descent)
+        seen.append((feet.impacts.touchdown_speed[0, 0].item(), feet.impacts.peak_force[0, 0].item()))
+    speeds, forces = zip(*seen, strict=True)
+    assert speeds == pytest.approx([0, 0, 0.9, 0.9, 0.9, 0.9, 0.3, 0.3])
+    assert forces == pytest.approx([0, 0, 300, 80, 0, 0, 50, 40])
+
+
+def test_a_foot_that_moves_up_when_it_touches_has_no_touchdown_speed() -> None:
+    feet = Feet(1, 0.002, torch.device("cpu"))
+    feed(feet, 0, 0.5)
+    feed(feet, 20, -0.5)
+    assert feet.timers.touchdown.all()
+    assert not feet.impacts.touchdown_speed.any()
+
+
+def test_the_peak_force_covers_the_substeps_of_one_policy_step_and_has_all_three_components() -> None:
+    feet = Feet(2, 0.002, torch.device("cpu"))
+    force, still = torch.zeros(2, 4, 3), torch.zeros(2, 4, 3)
+    feet.begin_step()
+    for vector in ([3.0, 0.0, 4.0], [0.0, 12.0, 5.0], [0.0, 0.0, 1.0]):
+        force[0, 1] = torch.tensor(vector)
+        feet.update(force, still)
+    assert feet.impacts.peak_force.tolist() == [[0, 13, 0, 0], [0, 0, 0, 0]]
+    feet.begin_step()
+    feet.update(force, still)
+    assert feet.impacts.peak_force[0].tolist() == [0, 1, 0, 0]
+
+
+def test_a_reset_zeroes_its_rows_even_where_they_are_not_finite() -> None:
+    feet = Feet(3, 0.002, torch.device("cpu"))
+    feed(feet, 0, 0.5)
+    feed(feet, 10, 0.5)
+    feet.impacts.peak_force[1] = torch.nan
+    feet.reset(torch.tensor([False, True, False]))
+    for values in (feet.impacts.peak_force, feet.impacts.touchdown_speed):
+        assert values.abs().sum(1).gt(0).tolist() == [True, False, True]
+
+
+def test_impacts_of_the_environment_are_those_of_mujocos_own_step(make_core: Callable[..., Go1Core]) -> None:
+    """A robot dropped with bent legs: largest force and speed at first touch from a loop over ``mj_step``."""
+    core = make_core(*QUIET, num_envs=2, noise=False)
+    core.reset()
+    core.backend.qpos[:, 2] += 0.05
+    model, data = core.backend.model, mujoco.MjData(core.backend.model)
+    data.qpos[:], data.qvel[:] = core.backend.qpos[0], core.backend.qvel[0]
+    contact = core.backend.sensors.foot_contact
+    velocity = core.backend.sensors.foot_vel_w
+    speed, touching, landings = np.zeros(4), np.zeros(4, bool), 0
+    stance, limit = robot.NOMINAL_STANCE, np.tile([23.7, 23.7, 35.55], 4)
+    before = data.qvel[6:].copy()
+    for _ in range(15):
+        core.step(torch.zeros(2, 12))
+        peak = np.zeros(4)
+        for _ in range(10):
+            now = 1.5 * data.qvel[6:] - 0.5 * before
+            before = data.qvel[6:].copy()
+            data.ctrl[:] = np.clip(20.0 * (stance - data.qpos[7:]) - 0.5 * now, -limit, limit)
+            descent = []
+            for leg in robot.LEGS:  # of the state before the step, by MuJoCo's own function and not by our sensor
+                jacobian = np.zeros((3, model.nv))
+                mujoco.mj_forward(model, data)
+                mujoco.mj_jacSite(model, data, jacobian, None, model.site(f"{leg}_foot").id)
+                descent.append(-(jacobian @ data.qvel)[2])
+            mujoco.mj_step(model, data)
+            force = np.linalg.norm(data.sensordata[contact].reshape(4, 4)[:, 1:], axis=1)
+            np.testing.assert_allclose(-data.sensordata[velocity].reshape(4, 3)[:, 2], descent, atol=1e-9)
+            peak = np.maximum(peak, force)
+            landed = (force > 0) & ~touching
+            landings += landed.sum()
+            speed = np.where(landed, np.maximum(descent, 0.0), speed)
+            touching = force > 0
+        s = core.snapshot()
+        assert s.foot_peak_force is not None
+        assert s.foot_touchdown_speed is not None
+        np.testing.assert_allclose(s.foot_peak_force[0], peak, rtol=1e-2, atol=0.1)
+        np.testing.assert_allclose(s.foot_touchdown_speed[0], speed, rtol=1e-3, atol=1e-3)
+        assert (s.foot_peak_force >= s.foot_force - 1e-3).all()
+    assert landings >= 4
+    assert speed.max() > 0.5
