@@ -22,6 +22,9 @@ SYNC_PAIRS = ((1, 2), (0, 3))
 ASYNC_PAIRS = ((1, 0), (2, 3), (1, 3), (0, 2))
 """Legs of a trot that move in opposition: across the body and along each side."""
 
+DIAGONAL_SIGNS = (1.0, -1.0, -1.0, 1.0)
+"""Diagonal of each leg: FR and RL, or FL and RR."""
+
 
 def is_moving(s: Snapshot, speed_threshold: float) -> Tensor:
     """(N,) bool: told to move, or moving faster than ``speed_threshold`` m/s all the same (Isaac Lab, Spot task)."""
@@ -58,3 +61,8 @@ def foot_phasors(s: Snapshot) -> tuple[Tensor, Tensor]:
     phase = since_touchdown / foot_cycle_time(s)
     length, angle = (2.0 - phase).clamp(0.0, 1.0), 2.0 * math.pi * phase
     return length * torch.cos(angle), length * torch.sin(angle)
+
+
+def clock_angle(s: Snapshot, rate: float) -> Tensor:
+    """(N,) angle of a gait clock that makes ``rate`` turns a second from the start of the episode, rad."""
+    return 2.0 * math.pi * (rate * s.episode_time).frac()

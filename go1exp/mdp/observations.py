@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from go1exp.mdp.derived import joint_deviation
+import torch
+
+from go1exp.mdp.derived import clock_angle, joint_deviation
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.registry import observation
+from go1exp.schema.registry import Positive, observation
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -57,3 +59,14 @@ def joint_velocity(s: Snapshot) -> Tensor:
 def previous_action(s: Snapshot) -> Tensor:
     """The policy's last output, unscaled, (N, 12); zero after a reset."""
     return s.action
+
+
+@observation("gait_clock", size=2)
+def gait_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
+    """Sine and cosine of a clock of ``rate`` turns a second, (N, 2); zero while no motion is commanded.
+
+    Reward ``foot_clock`` pays for following it. Not of the paper.
+    """
+    angle = clock_angle(s, rate)
+    moving = s.command.norm(dim=-1, keepdim=True) > 0
+    return torch.stack([torch.sin(angle), torch.cos(angle)], dim=-1) * moving

@@ -20,8 +20,10 @@ import torch
 from go1exp import robot
 from go1exp.mdp.derived import (
     ASYNC_PAIRS,
+    DIAGONAL_SIGNS,
     SHORTEST_CYCLE,
     SYNC_PAIRS,
+    clock_angle,
     foot_cycle_time,
     foot_phasors,
     foot_speed_xy,
@@ -117,6 +119,23 @@ def trot(
             error = error + 1.0 - sign * (x[:, i] * x[:, j] + y[:, i] * y[:, j])
     long_enough = (foot_cycle_time(s).mean(-1) / max(full_cycle, SHORTEST_CYCLE)).clamp(max=1.0)
     return torch.exp(-error / scale) * long_enough * is_moving(s, speed_threshold)
+
+
+@reward("foot_clock")
+def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06) -> Tensor:
+    """Feet that follow the clock of observation ``gait_clock`` in a trot: mean of 1 - min(|z_i - h_i| / height, 1).
+
+    z is the height of the sole over the ground, 0 for one that sinks in; h_i = ``height`` sin^2(p_i) where sin(p_i) > 0
+    (swing), else 0; p is the clock's angle for FR and RL, half a turn later for the others. Heights in m. In 0 to 1,
+    0.75 for standing feet, and as steep there as next to 1; 0 while no motion is commanded. Not in Table III; after
+    Siekmann et al., arXiv 2011.01387, with heights for forces.
+    """
+    assert s.foot_height is not None
+    lift = torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_height)
+    wanted = lift.clamp(min=0.0).square()
+    sole = (s.foot_height - robot.FOOT_RADIUS).clamp(min=0.0) / height
+    following = 1.0 - (sole - wanted).abs().clamp(max=1.0).mean(-1)
+    return following * (s.command.norm(dim=-1) > 0)
 
 
 @reward("foot_clearance")

@@ -73,6 +73,7 @@ def test_the_mirror_is_a_mirror() -> None:
 
 
 ONE_SIDED = {
+    "foot_clock": "a clock that begins with FR and RL begins with FL and RR in the mirror",
     "base_motion_literal": "a roll changes sign in the mirror, a pitch does not",
     "joint_deviation_literal": "hip angles change sign in the mirror",
     "joint_position_limit_literal": "a hip at its upper stop is one at its lower stop in the mirror",
