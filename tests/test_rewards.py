@@ -112,6 +112,10 @@ TROT_PHASE = {"foot_air_time": feet(FR=0.1, RL=0.1), "foot_contact_time": feet(F
 PACE_PHASE = {"foot_air_time": feet(FR=0.1, RR=0.1), "foot_contact_time": feet(FL=0.1, RL=0.1)}
 BOUND_PHASE = {"foot_air_time": feet(FR=0.1, FL=0.1), "foot_contact_time": feet(RR=0.1, RL=0.1)}
 PRONK_PHASE = {"foot_air_time": [0.1] * 4, "foot_contact_time": [0.0] * 4}
+LANDING = {
+    "foot_touchdown_speed": [1.5, 2.0, 0.5, 9.0],
+    "foot_touchdown": [True, False, True, False],
+}
 QUARTER = {"command": WALK, "episode_time": 0.1}
 STRIDE = {"command": WALK, "foot_last_air_time": [0.2] * 4, "foot_last_contact_time": [0.2] * 4}
 """A cycle of 0.4 s: with the phases above a foot in the air is at 0.75 of it, one on the ground at 0.25."""
@@ -319,6 +323,11 @@ CASES = [
     Case("base_orientation", "on its back is level", {"projected_gravity_b": [0.0, 0.0, 1.0]}, 0.0),
     Case("foot_slip", "two sliding feet bear force", SLIDING, 5.5),
     Case("foot_force", "four forces", {"foot_force": [3.0, 4.0, 0.0, 10.0]}, 125.0),
+    Case("foot_peak_force", "four forces", {"foot_peak_force": [3.0, 4.0, 0.0, 10.0]}, 125.0),
+    Case("foot_peak_force", "a peak that the last substep does not show", {"foot_peak_force": feet(RR=300.0)}, 90000.0),
+    # 1.5^2 + 0.5^2; the others are in the air or have stood for a while.
+    Case("touchdown_speed", "two feet land", LANDING, 2.5),
+    Case("touchdown_speed", "slow landings are free", LANDING, 0.81, {"free": 0.6}),
     Case("joint_torque", "2 N m everywhere", {"joint_torque": [2.0, -2.0] * 6}, math.sqrt(48)),
     Case("joint_acceleration", "3 and 4", {"joint_acc": [3.0] + [0.0] * 10 + [-4.0]}, 5.0),
     Case("joint_velocity", "5 and 12", {"joint_vel": [0.0, 5.0] + [0.0] * 9 + [-12.0]}, 13.0),

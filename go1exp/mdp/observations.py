@@ -1,7 +1,7 @@
-"""Observation terms: Snapshot -> ``(N, k)`` float32, unscaled. The list in the YAML is concatenated in its order.
+"""Observation terms: Snapshot -> ``(N, k)`` float32, unscaled by default. The YAML's list is concatenated in its order.
 
-Table II of the paper. The noise beside a term in the YAML is the half-width of a uniform distribution, drawn anew at
-each policy step and element.
+Table II of the paper; a ``scale`` other than 1 is not the paper's. The noise beside a term in the YAML is the
+half-width of a uniform distribution, drawn anew at each policy step and element, of the scaled number.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def projected_gravity(s: Snapshot) -> Tensor:
 
 
 @observation("velocity_command", size=3)
-def velocity_command(s: Snapshot) -> Tensor:
-    """Commanded velocity x, y (m/s) and yaw rate (rad/s) in the trunk frame, (N, 3)."""
-    return s.command
+def velocity_command(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Commanded velocity x, y (m/s) and yaw rate (rad/s) in the trunk frame, (N, 3), times ``scale``."""
+    return s.command * scale
 
 
 @observation("joint_position", size=12)
@@ -50,9 +50,9 @@ def joint_position(s: Snapshot) -> Tensor:
 
 
 @observation("joint_velocity", size=12)
-def joint_velocity(s: Snapshot) -> Tensor:
-    """Joint speeds, (N, 12) rad/s."""
-    return s.joint_vel
+def joint_velocity(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Joint speeds, (N, 12) rad/s, times ``scale``."""
+    return s.joint_vel * scale
 
 
 @observation("previous_action", size=12)

@@ -196,8 +196,28 @@ def foot_slip(s: Snapshot) -> Tensor:
 
 @reward("foot_force")
 def foot_force(s: Snapshot) -> Tensor:
-    """Hard footfalls: sum_i |F_i|^2, N2. Table III."""
+    """Forces on the feet in the last physics step: sum_i |F_i|^2, N2. Table III; ``foot_peak_force`` sees every step."""
     return s.foot_force.square().sum(-1)
+
+
+@reward("foot_peak_force")
+def foot_peak_force(s: Snapshot) -> Tensor:
+    """Hard footfalls: sum_i |F_i|^2, N2, of each foot's largest force in the policy step. Table III.
+
+    A footfall's peak lasts a few milliseconds; the last physics step shows one in several.
+    """
+    assert s.foot_peak_force is not None
+    return s.foot_peak_force.square().sum(-1)
+
+
+@reward("touchdown_speed")
+def touchdown_speed(s: Snapshot, *, free: NonNegative = 0.0) -> Tensor:
+    """Feet that land fast: sum_i max(w_i - free, 0)^2 [foot i touched down], m2/s2, w the downward speed in m/s.
+
+    Paid in the step of the touchdown: weight x policy period for each. Not in Table III.
+    """
+    assert s.foot_touchdown_speed is not None
+    return ((s.foot_touchdown_speed - free).clamp(min=0.0).square() * s.foot_touchdown).sum(-1)
 
 
 @reward("joint_torque")
