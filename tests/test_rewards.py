@@ -263,14 +263,18 @@ CASES = [
     ),
     # A quarter turn of a clock of 2.5 Hz: FR and RL should be 0.06 m up.
     Case("foot_clock", "feet that follow", {**QUARTER, "foot_height": [0.083, 0.02, 0.023, 0.083]}, 1.0),
-    Case("foot_clock", "the other diagonal", {**QUARTER, "foot_height": [0.023, 0.083, 0.083, 0.023]}, 0.0),
-    Case("foot_clock", "standing feet", QUARTER, 0.5),
-    Case("foot_clock", "two half as high, one too high", {**QUARTER, "foot_height": [0.053, 0.9, 0.023, 0.053]}, 0.5),
-    Case("foot_clock", "an eighth: half of the height", {**QUARTER, "episode_time": 0.05}, 0.75),
+    Case("foot_clock", "the other diagonal", {**QUARTER, "foot_height": [0.023, 0.083, 0.083, 0.023]}, -3.0),
+    Case("foot_clock", "standing feet, at worst", QUARTER, -1.0),
+    Case("foot_clock", "two half as high, one too high", {**QUARTER, "foot_height": [0.053, 0.9, 0.023, 0.053]}, -1.0),
+    Case("foot_clock", "an eighth: half of the height", {**QUARTER, "episode_time": 0.05}, 0.0),
     Case(
         "foot_clock", "the other swing", {**QUARTER, "episode_time": 0.3, "foot_height": feet(FL=0.083, RR=0.083)}, 1.0
     ),
-    Case("foot_clock", "another rate and height", QUARTER, 0.75, {"rate": 1.25, "height": 0.1}),
+    Case("foot_clock", "another rate", QUARTER, 0.0, {"rate": 1.25, "height": 0.1}),
+    # Two feet 0.06 of 0.12 m up: each half a height off.
+    Case(
+        "foot_clock", "half as high", {**QUARTER, "foot_height": [0.083, 0.023, 0.023, 0.083]}, 0.0, {"height": 0.12}
+    ),
     Case("foot_clock", "nothing without a command", {**QUARTER, "command": [0.0] * 3}, 0.0),
     Case("foot_clearance", "standing", {}, 1.0),
     Case(

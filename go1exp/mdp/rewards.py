@@ -123,18 +123,18 @@ def trot(
 
 @reward("foot_clock")
 def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06) -> Tensor:
-    """Feet that follow the clock of observation ``gait_clock`` in a trot: mean of 1 - min(|z_i - h_i| / height, 1).
+    """Feet that follow the clock of observation ``gait_clock`` in a trot: sum of 1/4 - min(|z_i - h_i| / height, 1).
 
     z is the height of the sole over the ground, 0 for one that sinks in; h_i = ``height`` sin^2(p_i) where sin(p_i) > 0
-    (swing), else 0; p is the clock's angle for FR and RL, half a turn later for the others. Heights in m. In 0 to 1,
-    0.75 for standing feet, and as steep there as next to 1; 0 while no motion is commanded. Not in Table III; after
-    Siekmann et al., arXiv 2011.01387, with heights for forces.
+    (swing), else 0; p is the clock's angle for FR and RL, half a turn later for the others. Heights in m. At most 1,
+    0 on average for standing feet, so that a fall costs no more than the trot that is missed; as steep there as next to
+    1; 0 while no motion is commanded. Not in Table III; after Siekmann et al., arXiv 2011.01387, heights for forces.
     """
     assert s.foot_height is not None
     lift = torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_height)
     wanted = lift.clamp(min=0.0).square()
     sole = (s.foot_height - robot.FOOT_RADIUS).clamp(min=0.0) / height
-    following = 1.0 - (sole - wanted).abs().clamp(max=1.0).mean(-1)
+    following = 1.0 - (sole - wanted).abs().clamp(max=1.0).sum(-1)
     return following * (s.command.norm(dim=-1) > 0)
 
 
@@ -196,7 +196,7 @@ def foot_slip(s: Snapshot) -> Tensor:
 
 @reward("foot_force")
 def foot_force(s: Snapshot) -> Tensor:
-    """Forces on the feet in the last physics step: sum_i |F_i|^2, N2. Table III; ``foot_peak_force`` sees every step."""
+    """Forces on the feet in the last physics step: sum_i |F_i|^2, N2. Table III; ``foot_peak_force`` sees all."""
     return s.foot_force.square().sum(-1)
 
 
