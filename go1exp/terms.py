@@ -9,6 +9,7 @@ import go1exp.actuator
 import go1exp.effects
 import go1exp.importers
 import go1exp.mdp
+import go1exp.measures
 import go1exp.record.policy  # noqa: F401  (registers an excitation)
 from go1exp import robot
 from go1exp.actuator.setup import Gains
@@ -20,6 +21,7 @@ from go1exp.excitations.motion import always_on
 from go1exp.importers.source import columns, joint_columns, rate, recording
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.types import Snapshot, TermSetup
+from go1exp.measures.trace import NotMeasured, Trace
 from go1exp.recording import Recording, RecordingError
 from go1exp.schema.joint_values import JointValues, each_within
 from go1exp.schema.registry import (
@@ -35,6 +37,7 @@ from go1exp.schema.registry import (
     event,
     excitation,
     importer,
+    measure,
     observation,
     randomization,
     reward,
@@ -58,6 +61,7 @@ __all__ = [
     "ModelFields",
     "Motion",
     "NonNegative",
+    "NotMeasured",
     "Param",
     "Positive",
     "PositiveRange",
@@ -67,6 +71,7 @@ __all__ = [
     "Snapshot",
     "Stream",
     "TermSetup",
+    "Trace",
     "actuator",
     "always_on",
     "columns",
@@ -78,6 +83,7 @@ __all__ = [
     "excitation",
     "importer",
     "joint_columns",
+    "measure",
     "observation",
     "randomization",
     "rate",

@@ -95,6 +95,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         # out of range
         ("train ppo.gamma=1.5", ("ppo.gamma = 1.5", "less than or equal to 1")),
         ("train event.push.interval=[3,1]", ("event.push.interval = [3, 1]", "low must not exceed high")),
+        ("eval run=x measures=[stride_rat]", ("measures.stride_rat", "did you mean 'stride_rate'")),
+        ("eval run=x measures=all", ("measures = 'all'", "[stride_rate]")),
         ("eval run=x episodes=0", ("episodes = 0", "greater than or equal to 1")),
         ("eval run=x settle_s=30", ("settle_s = 30.0", "duration_s = 20.0")),
         ("bench suite=fast", ("suite = 'fast'", "'env', 'train'", "'deploy'")),

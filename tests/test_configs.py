@@ -56,7 +56,11 @@ ABLATIONS = [c.removeprefix("experiment=ablation/") for c in choices() if c.star
 NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
 
 
-@pytest.mark.parametrize("choice", [c for c in choices() if not c.startswith("experiment=ablation/")])
+ELSEWHERE = ("experiment=ablation/", "effect=")
+"""Choices with tests of their own: below, and in tests/contracts/test_effects.py."""
+
+
+@pytest.mark.parametrize("choice", [c for c in choices() if not c.startswith(ELSEWHERE)])
 def test_every_file_composes_and_parses(choice: str, make_net: Callable[..., Path]) -> None:
     needs = [f"actuator.file={make_net()}"] if choice == "actuator=net" else NEEDS.get(choice, [])
     parse_train(compose("train", [choice, *needs]))
@@ -114,6 +118,7 @@ def ablated(name: str, base: Mapping[str, Any]) -> dict[str, Any]:
     return {**base, **{f"reward.{term}.weight": 0.0 for term in terms}}
 
 
+@pytest.mark.slow("conf/", "go1exp/config.py", "go1exp/schema/", "go1exp/compose.py")
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_an_ablation_changes_what_it_says_and_nothing_else(name: str) -> None:
     container = compose("train", [f"experiment=ablation/{name}"])
@@ -408,7 +413,16 @@ def test_the_pages_show_every_verb() -> None:
     assert missing == []
 
 
-@pytest.mark.parametrize("command", dict.fromkeys(COMMANDS))
+COMPOSED = ("README.md", "docs/", "conf/", "go1exp/cli/", "go1exp/compose.py", "go1exp/config.py", "go1exp/schema/")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(c, marks=[] if c in (data_root() / "README.md").read_text() else [pytest.mark.slow(*COMPOSED)])
+        for c in dict.fromkeys(COMMANDS)
+    ],
+)
 def test_commands_in_the_documentation_compose_and_parse(command: str, beside: Callable[[str], None]) -> None:
     beside(command)
     verb, *overrides = shlex.split(command, comments=True)[1:]

@@ -13,6 +13,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.testing import assert_close
 
 from go1exp import robot
 from go1exp.config import TaskConfig
@@ -90,6 +91,19 @@ def test_an_environment_does_in_a_batch_what_it_does_alone_bit_for_bit(
         for k, single in enumerate(run(alone, inputs[:, i : i + 1])):
             for name, value in single.items():
                 assert torch.equal(value, together[k][name][i : i + 1]), (i, k, name)
+
+
+def test_a_restart_of_nobody_can_be_left_out(make_core: Make) -> None:
+    random = ("actuator=delay", "effect=coulomb", "+effect.coulomb.spread={bound: 0.1}")
+    inputs = actions(3, 60, 3.0)
+    usual, thorough = (make_core(*LIVELY, *ROUGH, *random, num_envs=3, seed=3) for _ in range(2))
+    thorough._restarts = thorough._restart  # type: ignore[assignment]  # of nobody too
+    assert torch.equal(usual.reset(), thorough.reset())
+    ends = [bool((r["terminated"] | r["truncated"]).any()) for r in run(usual, inputs)]
+    assert 2 <= sum(ends) < len(ends) / 2
+    list(run(thorough, inputs))
+    assert_close(usual.state_dict(), thorough.state_dict(), rtol=0.0, atol=0.0)
+    assert torch.equal(usual.reset(), thorough.reset())
 
 
 @GROUNDS
@@ -625,7 +639,7 @@ def test_an_actuator_is_asked_at_the_physics_rate_told_of_resets_and_saved(
     assert actuator.calls == 5
     core.backend.qpos[2, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
     core.step(torch.zeros(3, 12))
-    assert actuator.resets == [[True] * 3, [False] * 3, [False, False, True]]
+    assert actuator.resets == [[True] * 3, [False, False, True]]  # and not of nobody
     resumed.load_state_dict(core.state_dict())
     assert other.calls == 10
 

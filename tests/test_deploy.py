@@ -899,6 +899,7 @@ def test_without_the_sdk_the_robot_is_refused(file: str, tmp_path: Path) -> None
 # ---------------------------------------------------------------------- processes
 
 
+@pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/", "go1exp/cli/", "go1exp/export/")
 def test_the_verb_walks_against_another_process_in_real_time(
     file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -933,6 +934,7 @@ def begun(folder: Path, *arguments: str) -> tuple[subprocess.Popen[str], IO[str]
     return process, process.stdout
 
 
+@pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/", "go1exp/cli/", "go1exp/export/")
 def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_path: Path) -> None:
     code = (
         "import sys, json\nfrom go1exp.deploy.__main__ import main\nstatus = main(sys.argv[1:])\n"
@@ -1026,6 +1028,7 @@ def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytes
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/", "go1exp/cli/", "go1exp/export/")
 def test_the_bench_measures_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
     from go1exp.bench import deploy
 

@@ -161,6 +161,7 @@ def somewhere(model: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize("name", EDITS)
 def test_inertia_and_weight_are_those_of_the_links_written_down_anew(name: str) -> None:
     edited = engine(rig({name: EDITS[name]}, held=None)).env_model(0)
@@ -189,6 +190,7 @@ def with_box(mass: float, at: tuple[float, float, float]) -> mujoco.MjModel:
     return spec.compile()
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize(("mass", "at"), [(3.0, (0.1, -0.05, 0.12)), (0.4, (-0.2, 0.0, -0.1))])
 def test_a_payload_is_a_body_on_the_trunk(mass: float, at: tuple[float, float, float]) -> None:
     values = {"mass": mass, **dict(zip("xyz", at, strict=True))}
@@ -204,6 +206,7 @@ def test_a_payload_is_a_body_on_the_trunk(mass: float, at: tuple[float, float, f
     assert np.allclose(a.qfrc_bias, b.qfrc_bias, atol=1e-7)
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_a_payload_taken_away_undoes_one_and_leaves_an_inertia() -> None:
     both = {
         "first": {"term": "payload", "mass": 0.8, "z": 0.05},
@@ -231,6 +234,7 @@ def test_a_shifted_calf_hangs_lower_by_the_torque_of_its_weight() -> None:
 # ---------------------------------------------------------------------- gravity, forces, IMU
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize("held", [LEVEL, (0.8, 0.0, 0.6, 0.0)])
 def test_a_tilted_stand_moves_as_a_robot_held_in_that_orientation(held: Quat) -> None:
     roll, pitch = 0.11, -0.17
@@ -275,6 +279,7 @@ def test_a_wrench_accelerates_the_whole_robot_by_force_over_mass() -> None:
 # ---------------------------------------------------------------------- contact
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize("scale", [0.3, 0.5])
 def test_feet_slip_beyond_friction_times_weight(scale: float) -> None:
     """Pushed beyond it a robot gains speed by (force - friction) / mass; below, its feet only creep (soft contact)."""
@@ -365,6 +370,7 @@ def frequency(signal: np.ndarray, dt: float) -> float:
     return float((len(crossings) - 1) / (2.0 * dt * (crossings[-1] - crossings[0])))
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize("compliance", [1 / 60, 1 / 150, 1 / 400])
 @pytest.mark.parametrize(("dt", "tolerance"), [(0.00025, 0.003), (0.002, 0.08)])
 def test_rotor_and_calf_swing_at_the_two_mass_frequency(compliance: float, dt: float, tolerance: float) -> None:
@@ -402,6 +408,7 @@ def test_a_spring_twists_by_compliance_times_torque_and_the_drive_reads_the_roto
     assert plant.torque.abs().max() > 0.5
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_free_play_between_upright_and_upside_down_is_the_gap() -> None:
     gap, upside_down = 0.02, (0.0, 1.0, 0.0, 0.0)
     q = {
@@ -441,6 +448,7 @@ def test_within_the_gap_no_torque_passes_and_the_joint_has_lost_its_rotor(drives
     assert torch.allclose(rotors.rate, 0.002 * torque / rotor)
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_the_stiffer_a_spring_the_more_it_is_a_rigid_gear() -> None:
     target = robot.NOMINAL_STANCE + 0.2
     rigid = settle(rig({}), target, 0.1)
@@ -467,6 +475,7 @@ def kinetic(plant: Plant) -> Tensor:
     return torch.tensor(found) + (0.5 * rotor * speed**2).sum(1)
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize("kinds", [("flexibility",), ("backlash",), ("flexibility", "backlash")])
 def test_gears_make_no_energy(kinds: tuple[str, ...]) -> None:
     """Drives off, weightless, legs thrown about, all values within the bounds: links and rotors only lose speed."""

@@ -361,7 +361,7 @@ def test_a_table_ends_with_what_it_is_of(lay_out: Callable[[dict[str, Any]], str
 def test_a_real_report_can_be_laid_out(task: TaskConfig) -> None:
     report = evaluate(task, stand, settings(duration_s=0.1, settle_s=0.0))
     report["policy"] = {"iteration": 0, "num_timesteps": 0, "file": ""}
-    assert len(table.text(report).split("\n")) == 4
+    assert len(table.text(report).split("\n")) == 5
     assert "+0.50, +0.00, +0.00" in table.markdown(report)
 
 

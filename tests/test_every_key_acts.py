@@ -46,6 +46,7 @@ from go1exp.export.build import build
 from go1exp.mdp.types import Snapshot
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.schema import registry
+from go1exp.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
 from go1exp.schema.registry import ConfigError, Expected, Range
 from go1exp.train import run_folder, start, trainer
 from tests.lockstep import lockstep
@@ -188,6 +189,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "play:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "play:out": lambda walk: ["other.gif"],
     "eval:physics_dt": lambda walk: [0.5 * SMALL["train"]["sim.physics_dt"]],
+    "eval:measures": lambda walk: [["stride_rate"]],
     "eval:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "play:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "gap:logs": lambda walk: [str(walk.recorded("stiff", {**HELD, "effect": {"viscous": {"damping": 0.6}}}))],
@@ -798,7 +800,7 @@ def eval_trace(container: dict[str, Any], walk: Walk) -> Trace:
     yield "files", sorted(files)
     for content in files.values():
         report = json.loads(content)
-        yield "report", {k: report[k] for k in ("commands", "rmse", "falls", "episodes")}
+        yield "report", {k: report.get(k) for k in ("commands", "rmse", "falls", "episodes", "delay_margin")}
 
 
 def play_trace(container: dict[str, Any], walk: Walk) -> Trace:
@@ -1037,19 +1039,40 @@ def walk(tmp_path_factory: pytest.TempPathFactory, make_net: Callable[..., Path]
     return Walk(tmp_path_factory.mktemp("keys"), make_net)
 
 
+VERB = ("go1exp/cli/", "go1exp/config.py", "go1exp/schema/")
+RUN = (*VERB, "go1exp/train/")
 SLOW = {
-    "gap": ("conf/gap.yaml", "go1exp/gap/", "go1exp/effects/", "go1exp/cli/gap.py", "go1exp/cli/settings.py"),
-    "export": ("conf/export.yaml", "go1exp/export/", "go1exp/cli/export.py", "go1exp/cli/settings.py"),
+    "gap": ("conf/gap.yaml", "go1exp/gap/", "go1exp/effects/", *VERB),
+    "export": ("conf/export.yaml", "go1exp/export/", *VERB),
+    "export_check": ("conf/export_check.yaml", "go1exp/export/", *VERB),
+    "deploy": ("conf/deploy.yaml", "go1exp/deploy/", "go1exp/sim_robot/", *VERB),
+    "fit-actuator": ("conf/fit-actuator.yaml", "go1exp/fit/", *VERB),
+    "eval": ("conf/eval.yaml", "go1exp/evaluate/", *VERB),
+    "play": ("conf/play.yaml", "go1exp/evaluate/", *VERB),
+    "bench": ("conf/bench.yaml", "go1exp/bench/", *VERB),
+    "ppo": ("conf/ppo/", *RUN),
+    "logger": ("conf/logger/", *RUN),
+    "experiment": ("conf/experiment/", *RUN),
+    "effect": ("conf/effect/", "go1exp/effects/", "go1exp/env/plant.py"),
 }
-"""Programs of which a trace takes seconds, and what they are made of. ``make test`` asks of their keys only that each
-is read, in one trace for all of them; ``make test-all`` that each acts."""
+"""Programs, and groups of train, of which a trace takes long, and what they are made of. ``make test`` asks of their
+keys only that each is read, in one trace for all of a program; ``make test-all`` that each acts. The terms of the MDP,
+drives, randomisation and ground act in both; that each parameter of an effect moves a robot is also the contract of
+effects (tests/contracts/test_effects.py)."""
+
+READ: dict[str, list[type]] = {
+    **{program: [kind] for program, (kind, _) in SETTINGS.items() if program in SLOW},
+    "ppo/paper": [PPOConfig, LoggerConfig, CheckpointConfig],
+}
+"""A file of a program or group -> the dataclasses of its settings."""
 
 
 @pytest.mark.parametrize(
     "leaf",
     [
-        pytest.param(leaf, id=leaf.name, marks=[pytest.mark.slow(*SLOW[leaf.program])] if leaf.program in SLOW else [])
+        pytest.param(leaf, id=leaf.name, marks=[pytest.mark.slow(*SLOW[start])] if start in SLOW else [])
         for leaf in WALKED
+        for start in [leaf.file.split("/")[0]]
     ],
 )
 def test_every_key_acts(leaf: Leaf, walk: Walk) -> None:
@@ -1075,12 +1098,13 @@ def unread(kinds: Iterable[type], work: Callable[[], object]) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("program", SLOW)
-def test_every_key_of_a_slow_program_is_read(program: str, walk: Walk) -> None:
-    whole = SETTINGS[program][0]
-    parts = [kind for kind in get_type_hints(whole).values() if is_dataclass(kind) and isinstance(kind, type)]
-    container = walk.setup(Leaf(program, "", None))
-    assert unread([whole, *parts], lambda: list(walk.trace(program, container, ""))) == []
+@pytest.mark.parametrize("file", READ)
+def test_every_key_of_a_slow_program_is_read(file: str, walk: Walk) -> None:
+    leaf = Leaf(file, "", None)
+    parts = [t for kind in READ[file] for t in get_type_hints(kind).values() if is_dataclass(t)]
+    kinds = list(dict.fromkeys([*READ[file], *(part for part in parts if isinstance(part, type))]))
+    container = walk.setup(leaf)
+    assert unread(kinds, lambda: list(walk.trace(leaf.program, container, ""))) == []
 
 
 def test_a_field_that_is_only_checked_and_copied_is_unread() -> None:
@@ -1108,13 +1132,20 @@ def test_the_tables_hold_no_keys_that_are_gone() -> None:
 # ---------------------------------------------------------------------- the test of the test
 
 
-@pytest.mark.parametrize("program", TRACES)
+@pytest.mark.parametrize(
+    "program",
+    [
+        pytest.param(p, marks=[pytest.mark.slow(*SLOW[p])] if p in ("gap", "export", "export_check", "deploy") else [])
+        for p in TRACES
+    ],
+)
 def test_a_trace_repeats(program: str, walk: Walk) -> None:
     container = walk.setup(Leaf(program, "", None))
     assert list(walk.base(program, container, ""))
     assert difference(walk.base(program, container, ""), walk.trace(program, container, "")) is None
 
 
+@pytest.mark.slow("go1exp/schema/", "go1exp/config.py")
 def test_dead_keys_are_found(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
     def ghost(s: Snapshot, *, used: float = 1.0, unused: float = 1.0, half: Range = (0.0, 1.0)) -> torch.Tensor:
         return used * half[1] * s.joint_vel.square().sum(-1)

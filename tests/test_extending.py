@@ -20,7 +20,12 @@ from tests.small_run import SMALL
 
 PAGE = data_root() / "docs/extending.md"
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
-BUDGET = {"train": [*SMALL, "ppo.iterations=1"], "record": ["seconds=0.5", "out=recordings"], "record import": []}
+BUDGET = {
+    "train": [*SMALL, "ppo.iterations=1"],
+    "record": ["seconds=0.5", "out=recordings"],
+    "record import": [],
+    "eval": ["episodes=1", "duration_s=0.5", "settle_s=0.2", "grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]"],
+}
 
 
 def files() -> dict[str, str]:
@@ -61,6 +66,7 @@ def test_the_page_has_an_example_of_each_kind_of_term() -> None:
     assert [entry.name for entry in plugin.entries if entry.name not in text] == []
 
 
+@pytest.mark.slow("docs/extending.md", "go1exp/schema/", "go1exp/terms.py", "go1exp/testing/", "go1exp/cli/plugins.py")
 @pytest.mark.parametrize("words", [words for words in commands() if words[0] == "go1exp"], ids=" ".join)
 def test_a_command_of_the_page_works(
     words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -70,6 +76,7 @@ def test_a_command_of_the_page_works(
     assert main() == 0, capsys.readouterr().err
 
 
+@pytest.mark.slow("docs/extending.md", "go1exp/schema/", "go1exp/terms.py", "go1exp/testing/", "go1exp/cli/plugins.py")
 def test_the_page_s_test_passes() -> None:
     (command,) = [words for words in commands() if words[0] == "pytest"]
     done = subprocess.run(

@@ -325,6 +325,7 @@ def test_a_calibration_counts_with_the_effect_and_not_alone(tmp_path: Path) -> N
     assert seen.after < 0.3
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_what_is_not_for_training_is_not_asked_of_the_proof(tmp_path: Path) -> None:
     lean = named("viscous", "compensating", damping=dict.fromkeys(JOINTS, 0.3))
     before = proof(tmp_path, result(excess={"box": 1e6, "final": 0.0})).before

@@ -18,7 +18,7 @@ SLICE = (("null", 1), ("single", 2 * len(cases.HUNG) + cases.HUNG.index("lag")),
 """Kind and index: a background within tolerances, lag at 5 tolerances, one beyond the library, lost samples."""
 
 
-FAST = ("single", "damaged")
+FAST = ("damaged",)
 ABOUT = ("benchmarks/gap/", "benchmarks/gap_solve.py", "go1exp/gap/", "go1exp/effects/", "go1exp/physics/")
 
 

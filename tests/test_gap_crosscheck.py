@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 import go1exp.excitations
 import go1exp.record.policy  # noqa: F401  (registers every excitation)
@@ -51,6 +52,7 @@ def library(names: tuple[str, ...], values: dict[str, cases.Values], episode: Ep
     return recording.joint("q")
 
 
+@pytest.mark.slow("benchmarks/", "go1exp/effects/", "go1exp/excitations/", "go1exp/record/")
 def test_both_sides_move_alike_under_the_same_effects() -> None:
     """Each group at 5 tolerances, all of it at once: what the effects change differs by some per cent between both."""
     rng, joints = np.random.default_rng(3), np.arange(12)

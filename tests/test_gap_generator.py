@@ -228,6 +228,7 @@ def test_a_command_delay_shifts_the_answer_in_time() -> None:
     assert np.abs(a[105:] - b[105:]).max() > 5e-3
 
 
+@pytest.mark.slow("benchmarks/", "go1exp/effects/")
 @pytest.mark.parametrize("effect", cases.HUNG)
 @pytest.mark.usefixtures("brief")
 def test_every_effect_moves_the_robot(effect: str) -> None:
@@ -241,6 +242,7 @@ def test_every_effect_moves_the_robot(effect: str) -> None:
     assert np.abs(a - b).max() > (1e-4 if effect in ("base_tilt", "encoder_offset", "joint_stop") else 2e-3)
 
 
+@pytest.mark.slow("benchmarks/", "go1exp/effects/")
 @pytest.mark.parametrize("effect", outside.EFFECTS)
 @pytest.mark.usefixtures("brief")
 def test_every_effect_beyond_the_library_moves_the_robot(effect: str) -> None:

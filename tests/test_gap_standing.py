@@ -210,6 +210,7 @@ def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it
     assert search.candidates[0].excess_after < 0.1 * plain
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> None:
     config, recordings = recorded("excitation=[gait]", "seeds=[0,1]", "+effect.payload.mass=2.0")
     replayer, dt = ready(config, recordings)
@@ -232,6 +233,7 @@ def test_rungs_of_a_ladder_are_on_both_sides_of_null_and_no_farther_than_a_param
     assert found == pytest.approx([-0.8, -0.4, 0.0, 0.4, 0.8, 1.6, 3.2])
 
 
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
     search = search_in()
     assert search.single_cause() is None

@@ -53,6 +53,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "recording.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "importers/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     "audit/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    "measures/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     "excitations/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     # what the robot's computer runs
     "estimation/": (*FOREIGN, "torch", "omegaconf", "go1exp.config", "go1exp.mdp", *UP),
@@ -286,11 +287,12 @@ def test_terms_are_registered_in_the_order_of_the_source() -> None:
     import go1exp.config
     import go1exp.excitations
     import go1exp.importers
+    import go1exp.measures
     import go1exp.record.policy  # noqa: F401  (registers every member)
 
     groups = registry.groups()
     expected = {"reward", "observation", "rand", "command", "event", "termination", "curriculum", "actuator"}
-    assert expected | {"effect", "excitation", "importer"} <= set(groups)
+    assert expected | {"effect", "excitation", "importer", "measure"} <= set(groups)
     for name, file in RELATIVE.items():
         found = list(decorated(file))
         for group in {g for g, _ in found}:

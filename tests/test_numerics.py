@@ -135,6 +135,7 @@ def worst(a: Tensor, b: Tensor) -> list[float]:
     return [1e3 * x for x in (a - b).abs().amax((0, 2)).tolist()]
 
 
+@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/", "go1exp/actuator/")
 def test_an_effect_moves_the_same_at_a_coarse_and_a_fine_step(effect: str) -> None:
     bars, _ = BARS.get(effect, ((BAR,) * len(GAINS), ""))
     found = worst(ours(COARSE, choice(effect)), ours(FINE, choice(effect)))

@@ -224,6 +224,9 @@ def test_a_run_killed_between_checkpoints_goes_on_when_the_same_command_is_given
     assert_the_same_run(killed_copy, flat)
 
 
+@pytest.mark.slow(
+    "go1exp/train/", "go1exp/signals.py", "go1exp/cli/", "go1exp/tensors/", "go1exp/terrain.py", "go1exp/env/"
+)
 def test_a_run_on_rough_ground_stopped_by_sigterm_goes_on_with_resume(
     folder: Path, monkeypatch: pytest.MonkeyPatch, usual_handler: Callable[[int, FrameType | None], None]
 ) -> None:
@@ -280,6 +283,7 @@ def test_a_signal_in_the_last_iteration_leaves_a_finished_run(
     assert caught.value.finished
 
 
+@pytest.mark.slow("go1exp/train/", "go1exp/signals.py", "go1exp/cli/", "go1exp/tensors/")
 def test_the_end_of_the_terminal_costs_no_checkpoint(tmp_path: Path) -> None:
     """The kernel sends SIGHUP, and what is printed from then on fails."""
     master, slave = pty.openpty()

@@ -50,7 +50,10 @@ def holder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     process.communicate()
 
 
-@pytest.mark.parametrize("again", ["hydra.run.dir={run}", "resume={run}"])
+@pytest.mark.parametrize(
+    "again",
+    ["hydra.run.dir={run}", pytest.param("resume={run}", marks=pytest.mark.slow("go1exp/train/", "go1exp/cli/"))],
+)
 def test_a_second_training_in_a_folder_is_refused_in_one_line(
     again: str, holder: subprocess.Popen[str], tmp_path: Path
 ) -> None:

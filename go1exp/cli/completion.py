@@ -189,7 +189,7 @@ def _by_position(verb: str, word: str, before: Sequence[str], folders: Sequence[
 
 def _listed(folders: Sequence[Path]) -> list[str]:
     """Return the groups that ``go1exp list`` knows."""
-    return sorted({*(group for folder in folders for group in groups_in(folder)), "importer", "excitation"})
+    return sorted({*(group for folder in folders for group in groups_in(folder)), "importer", "excitation", "measure"})
 
 
 def _importers() -> list[str]:

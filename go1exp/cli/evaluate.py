@@ -7,7 +7,18 @@ from typing import Any
 from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.files import write_json
-from go1exp.schema.registry import ConfigError
+from go1exp.schema.registry import ConfigError, Term, bind_list
+
+
+def _measures(given: Any) -> list[Term]:
+    """Resolve the measures, all of them for None; raise ConfigError with every problem of them."""
+    from go1exp.measures import every_measure
+
+    if given is None:
+        return every_measure()
+    if not isinstance(given, list):
+        raise ConfigError([f"measures = {given!r}: must be a list, such as [stride_rate], or null for all of them"])
+    return bind_list("measure", given, "measures")
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -23,7 +34,10 @@ def _task(container: dict[str, Any]) -> None:
     if settings.grid.cross and grid_is_empty:
         raise ConfigError(["grid: with cross=true every axis needs at least one value, such as grid.yaw=[0.0]"])
 
+    measures = _measures(settings.measures)
+
     from go1exp.evaluate import table
+    from go1exp.evaluate.delay_margin import delay_margin
     from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
 
@@ -34,8 +48,11 @@ def _task(container: dict[str, Any]) -> None:
     report = {
         "policy": about,
         "robot": other_robot.described(other),
-        **evaluate(task, policy, config, spinner(1, "evaluating")),
+        **evaluate(task, policy, config, spinner(1, "evaluating"), measures),
     }
+    if settings.delay_margin:
+        falls = report["distinct_falls"]
+        report["delay_margin"] = delay_margin(task, policy, config, falls, spinner(1, "with a delay"))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, report)
     print(table.text(report))

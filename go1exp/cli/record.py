@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
 from go1exp.cli.quoting import command
-from go1exp.schema.registry import ConfigError, Term, bind
+from go1exp.schema.registry import ConfigError, Term, bind_list
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,18 +24,10 @@ POLICY = "policy"
 
 
 def _motions(given: Any) -> list[Term]:
-    """Resolve the excitations, a list of names and of ``{name: {parameter: value}}``.
-
-    Raises:
-        ConfigError: with every problem of them.
-    """
+    """Resolve the excitations; raise ConfigError with every problem of them."""
     if not given or not isinstance(given, list):
         raise ConfigError([f"excitation = {given!r}: must be a list, such as [steps,{{chirp: {{band: [0.2, 5.0]}}}}]"])
-    items = [pair for item in given for pair in (item.items() if isinstance(item, Mapping) else [(item, {})])]
-    bound = [bind("excitation", str(key), value, f"excitation.{key}") for key, value in items]
-    if problems := [problem for _, term_problems in bound for problem in term_problems]:
-        raise ConfigError(problems)
-    return [term for term, _ in bound if term]
+    return bind_list("excitation", given, "excitation")
 
 
 def _unused(settings: RecordSettings) -> list[str]:

@@ -58,6 +58,9 @@ class EvalSettings:
         trunk_velocity: what the policy sees of it, exact, or estimated by the robot's filter from its sensors.
         policy_dt: another period of the policy, s; null keeps that of training.
         physics_dt: another physics step, s, such as 0.00125 for policy_dt=0.0025; null keeps that of training.
+        measures: gait and contact measures by name (go1exp list measure), [] for none; null takes all of them. With
+            parameters as {slip_share: {speed: 0.1}}.
+        delay_margin: also run the grid with targets 10, 20, 30 and 40 ms late, until a robot falls.
         seed: seed of everything random.
         out: JSON file; null writes eval.json in the run folder (of a shipped policy paper_eval.json here).
     """
@@ -76,6 +79,8 @@ class EvalSettings:
     trunk_velocity: Literal["exact", "estimated"]
     policy_dt: Annotated[float, Field(gt=0, le=0.1)] | None
     physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
+    measures: Any
+    delay_margin: bool
     seed: Annotated[int, Field(ge=0)]
     out: str | None
 

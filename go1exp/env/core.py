@@ -17,6 +17,7 @@ from go1exp.config import TaskConfig
 from go1exp.env.engine import CapturedStep, make_backend
 from go1exp.env.evidence import Evidence, accuse
 from go1exp.env.plant import Plant, drive_setup
+from go1exp.env.restarts import Restarts
 from go1exp.env.terms import StepTerms
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.clearance import lift
@@ -74,7 +75,9 @@ class Go1Core:
         self._held = held
         self._state = KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
-        self._build_terms(EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random)
+        drives = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
+        self._build_terms(drives)
+        self._restarts = Restarts(self._restart, (self.random, drives))
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
@@ -153,7 +156,7 @@ class Go1Core:
             self.level.copy_(self._initial_levels())
             self.plant.startup()
             self._randomize_model("startup", everyone)
-        self._restart(everyone)
+        self._restarts(everyone)
         if self._spread_starts and not self._started:
             self._first_step.copy_(self.random.stream("spread").integers(self.task.sim.episode_steps, 1).squeeze(1))
             self.steps.copy_(self._first_step)
@@ -236,7 +239,7 @@ class Go1Core:
 
         ended = terminated | truncated
         self._move_levels(ended)
-        self._restart(ended)
+        self._restarts(ended)
         self._advance_world(ended)
         observation = self._observe(self.snapshot())
         return StepResult(observation, reward, terminated, truncated, final_observation, episode_return, episode_length)
@@ -289,12 +292,15 @@ class Go1Core:
 
     # ------------------------------------------------------------------ what the MDP sees
 
+    def ground_height(self, xy: Tensor) -> Tensor | float:
+        """Height of the ground at world positions (..., 2), (...), m; of flat ground the number 0."""
+        return self._ground(xy) if self._bounded else 0.0
+
     def snapshot(self) -> Snapshot:
         """Return the present moment as the MDP sees it; staleness of sensors as in ``physics/backend.py``."""
         state = self._state
         quat = state.base_quat_w.float()
         foot_pos = self._foot_pos_w.float()
-        ground = self._ground(foot_pos[..., :2]) if self._bounded else 0.0
         return Snapshot(
             base_pos_w=state.base_pos_w.float(),
             base_quat_w=quat,
@@ -309,7 +315,7 @@ class Go1Core:
             action=self.action,
             previous_action=self.previous_action,
             command=self.command.value,
-            foot_height=foot_pos[..., 2] - ground,
+            foot_height=foot_pos[..., 2] - self.ground_height(foot_pos[..., :2]),
             foot_vel_w=self._foot_vel_w.float(),
             foot_force=self._foot_contact[..., 1:].norm(dim=-1).float(),
             **self.feet.snapshot_fields(),

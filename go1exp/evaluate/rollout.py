@@ -14,8 +14,10 @@ from go1exp.config import TaskConfig, time_rules
 from go1exp.deploy.past import PastActions
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.estimated import EstimatedVelocity
+from go1exp.evaluate.measured import described, interval
 from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy
+from go1exp.evaluate.recorder import Recorder
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.terrain import TerrainConfig
@@ -58,6 +60,11 @@ class EvalConfig:
     physics_dt: float | None = None
     trunk_velocity: Literal["exact", "estimated"] = "exact"
 
+    @property
+    def random(self) -> bool:
+        """Whether episodes of one command differ."""
+        return self.noise or self.randomize or self.push or self.train_ground
+
     @classmethod
     def from_settings(cls, settings: Any, **changes: Any) -> EvalConfig:
         """Build from those attributes that ``settings`` (of a verb) has; ``changes`` give the others."""
@@ -91,12 +98,17 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
 
 
 def evaluate(
-    task: TaskConfig, policy: Policy, config: EvalConfig, on_step: Callable[[int, int], None] = lambda done, total: None
+    task: TaskConfig,
+    policy: Policy,
+    config: EvalConfig,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+    measures: Sequence[Term] = (),
 ) -> dict[str, Any]:
     """Run the grid and return a report of plain data.
 
     A robot counts until it falls. Tracking figures of a command are over all its robots and the time after
     ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
+    ``measures`` (``go1exp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
     """
     count = len(config.commands) * config.episodes
     estimated = config.trunk_velocity == "estimated"
@@ -113,7 +125,10 @@ def evaluate(
     dt = core.task.sim.policy_dt
     steps, settle = round(config.duration_s / dt), round(config.settle_s / dt)
     tally = _Tally(count)
+    recorder = Recorder(core, steps - settle) if measures else None
     for step in range(steps):
+        if recorder and step >= settle:
+            recorder.begin_step()
         result = core.step(policy(see(observation)))
         core.check(result)
         observation = result.observation
@@ -123,8 +138,15 @@ def evaluate(
         tally.add_step(result.terminated, result.truncated, dt)
         if step >= settle:
             tally.add_velocity(_planar_velocity(core), core.command.value)
+            if recorder:
+                recorder.end_step(tally.alive)
         on_step(step + 1, steps)
-    return tally.report(config)
+    report = tally.report(config)
+    if recorder:
+        for k, row in enumerate(report["commands"]):
+            row["measures"] = described(measures, recorder.trace(tally.distinct(k, config).numpy()))
+        report["units"] = {t.key: t.entry.traits["unit"] for t in measures}
+    return report
 
 
 def _planar_velocity(core: Go1Core) -> torch.Tensor:
@@ -164,14 +186,33 @@ class _Tally:
         total = float(self.samples.sum())
         overall = (self.square_sum.sum(0) / total).sqrt() if total else None
         return {
-            "commands": [self._row(k, command, config.episodes) for k, command in enumerate(config.commands)],
+            "commands": [self._row(k, command, config) for k, command in enumerate(config.commands)],
             "rmse": _per_axis(overall) if overall is not None else None,
             "falls": int(self.fell.sum()),
             "episodes": len(self.fell),
+            "distinct_falls": self._falls(torch.cat([self.distinct(k, config) for k in range(len(config.commands))])),
             "settings": {k: v for k, v in dataclasses.asdict(config).items() if k != "commands"},
         }
 
-    def _row(self, k: int, command: Command, episodes: int) -> dict[str, Any]:
+    def distinct(self, k: int, config: EvalConfig) -> torch.Tensor:
+        """Return the robots of command ``k`` that did not do what one before them did: indices, ascending.
+
+        Where nothing is random, all did the same, whatever the last bits of a batched matrix product say.
+        """
+        first = k * config.episodes
+        if not config.random:
+            return torch.tensor([first])
+        robots = slice(first, first + config.episodes)
+        sums = torch.cat([self.velocity_sum[robots], self.square_sum[robots], self.survived[robots, None].double()], 1)
+        by_figures = {tuple(row): first + i for i, row in reversed(list(enumerate(sums.tolist())))}
+        return torch.tensor(sorted(by_figures.values()))
+
+    def _falls(self, robots: torch.Tensor) -> dict[str, Any]:
+        """Return falls of different robots, and their share with its 95 % interval."""
+        return {"count": int(self.fell[robots].sum()), **interval(int(self.fell[robots].sum()), len(robots))}
+
+    def _row(self, k: int, command: Command, config: EvalConfig) -> dict[str, Any]:
+        episodes = config.episodes
         robots = slice(k * episodes, (k + 1) * episodes)
         n = float(self.samples[robots].sum())
         return {
@@ -180,6 +221,7 @@ class _Tally:
             "rmse": _per_axis((self.square_sum[robots].sum(0) / n).sqrt()) if n else None,
             "falls": int(self.fell[robots].sum()),
             "episodes": episodes,
+            "distinct_falls": self._falls(self.distinct(k, config)),
             "mean_time_s": float(self.survived[robots].mean()),
         }
 

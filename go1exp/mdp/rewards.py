@@ -138,6 +138,18 @@ def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06) ->
     return following * (s.command.norm(dim=-1) > 0)
 
 
+@reward("load_clock")
+def load_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
+    """Weight on the diagonal that the clock of ``gait_clock`` puts on the ground: sum_i F_i c_i / sum_i F_i, in -1 to 1.
+
+    c = -sin(p), p as in ``foot_clock``; F are the forces on the feet, N. 0 for standing feet; shifting weight pays before
+    a foot leaves the ground. 0 while no motion is commanded. Not in Table III; after Siekmann et al., arXiv 2011.01387.
+    """
+    stance = -torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_force)
+    share = s.foot_force / s.foot_force.sum(-1, keepdim=True).clamp(min=1.0)
+    return (share * stance).sum(-1) * (s.command.norm(dim=-1) > 0)
+
+
 @reward("foot_clearance")
 def foot_clearance(
     s: Snapshot, *, target_height: Positive = 0.08, scale: Positive = 0.05, speed_scale: Positive = 2.0

@@ -231,6 +231,7 @@ actuator = partial(register, "actuator")
 importer = partial(register, "importer")
 effect = partial(register, "effect")
 excitation = partial(register, "excitation")
+measure = partial(register, "measure")
 
 
 def members(group: str) -> dict[str, Entry]:
@@ -267,6 +268,19 @@ class Term:
     def __call__(self, *args: Any) -> Any:
         """Call the member (for a class: construct it) with ``args`` and the configured parameters."""
         return self.entry.target(*args, **self.parameters)
+
+
+def bind_list(group: str, given: Iterable[Any], path: str) -> list[Term]:
+    """Resolve a list of names and of ``{name: {parameter: value}}``.
+
+    Raises:
+        ConfigError: with every problem of them.
+    """
+    items = [pair for item in given for pair in (item.items() if isinstance(item, Mapping) else [(item, {})])]
+    bound = [bind(group, str(key), value, f"{path}.{key}") for key, value in items]
+    if problems := [problem for _, term_problems in bound for problem in term_problems]:
+        raise ConfigError(problems)
+    return [term for term, _ in bound if term]
 
 
 def bind(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -121,6 +121,15 @@ class EnvRandom:
         if name not in self._streams:
             self._streams[name] = Stream(self._key(name), self._units)
         return self._streams[name]
+
+    def counters(self) -> dict[str, int]:
+        """Return how many numbers each stream has given. Waits for the device."""
+        return {name: int(stream.counter) for name, stream in self._streams.items()}
+
+    def leave_out(self, draws: Mapping[str, int]) -> None:
+        """Let as many numbers of each stream pass as ``draws`` says, unseen."""
+        for name, count in draws.items():
+            self._streams[name].counter += count
 
     def reseed(self, seed: int) -> None:
         """Start every stream again from ``seed``, in place."""

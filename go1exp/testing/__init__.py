@@ -16,7 +16,7 @@ from typing import Any
 import go1exp.terms  # noqa: F401  (registers every term)
 from go1exp.schema import plugins
 from go1exp.schema.registry import Entry
-from go1exp.testing import drives, motions, randomness, snapshots
+from go1exp.testing import drives, motions, randomness, snapshots, traces
 from go1exp.testing.description import check_description
 
 CHECKS = {
@@ -30,6 +30,7 @@ CHECKS = {
     "actuator": drives.check_actuator,
     "effect": drives.check_effect,
     "excitation": motions.check_excitation,
+    "measure": traces.check_measure,
 }
 """What a member of a group promises beyond its description; an importer's promises need one of its files."""
 

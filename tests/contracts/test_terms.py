@@ -109,7 +109,9 @@ def test_a_reward_is_the_same_in_the_mirror_unless_it_is_known_not_to_be(entry: 
 
 @each("reward")
 def test_a_penalty_or_reward_is_not_negative_unless_it_is_signed(entry: Entry) -> None:
-    signed = {"feet_air_time", "feet_air_time_touchdown", "feet_air_time_literal", "joint_deviation_literal"} | {"foot_clock"}
+    signed = {"feet_air_time", "feet_air_time_touchdown", "feet_air_time_literal", "joint_deviation_literal"} | {
+        "foot_clock"
+    }
     if entry.name not in signed | {"air_time_variance_literal"}:
         assert entry.target(random_snapshot(500)).min() >= 0.0
 
