@@ -579,7 +579,8 @@ def test_the_reward_is_weight_times_term_times_period_summed_over_terms(make_tas
     np.testing.assert_allclose(result.reward, [0.02 * (6.0 - 5.0), 0.02 * (12.0 - 5.0)], rtol=1e-6)
     core.step(torch.zeros(2, 12))
     # Per second, over robots and steps: 3 x (2 + 4) / 2 and -5.
-    assert core.drain_metrics(steps=2) == pytest.approx({"reward/two": 9.0, "reward/five": -5.0}, rel=1e-6)
+    rates = {k: v for k, v in core.drain_metrics(steps=2).items() if k.startswith("reward/")}
+    assert rates == pytest.approx({"reward/two": 9.0, "reward/five": -5.0}, rel=1e-6)
     core.step(torch.zeros(2, 12))
     assert core.drain_metrics(steps=1)["reward/five"] == pytest.approx(-5.0)
 

@@ -65,7 +65,7 @@ def test_what_is_recorded_is_what_the_environment_sees(make_task: MakeTask, grou
     task = make_task("backend.threads=1", f"terrain={ground}", *tiles)
     config = dataclasses.replace(QUIET, randomize=True, train_ground=True)
     core = Go1Core(evaluation_task(task, config), 6, 1, noise=False)
-    heard = []
+    heard: list[Tensor] = []
     core.plant.observer = heard.append
     core.reset()
     policy, recorder, snapshots = hop(), Recorder(core, 40), []
@@ -100,7 +100,8 @@ def test_positive_power_is_the_work_of_the_drives(task: TaskConfig) -> None:
     core = Go1Core(evaluation_task(task, QUIET), 1, 1, noise=False)
     core.reset()
     core.backend.qpos[:, 2] += 5.0
-    recorder, work = Recorder(core, 3), []
+    recorder = Recorder(core, 3)
+    work: list[float] = []
     observer = core.plant.observer
     assert observer is not None
 
@@ -162,7 +163,8 @@ def test_the_delay_of_the_margin_is_that_of_the_effect_and_takes_the_place_of_an
     core = Go1Core(evaluation_task(task, QUIET), 2, 1, noise=False)
     core.reset()
     assert list(core.plant.effects.effects) == ["command_delay"]
-    assert core.plant.effects.effects["command_delay"].delay.unique().tolist() == pytest.approx([0.03])
+    values = core.plant.effects.effects["command_delay"].state_dict()
+    assert values["delay"].unique().tolist() == pytest.approx([0.03])
 
 
 @pytest.mark.parametrize(

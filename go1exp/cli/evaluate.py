@@ -27,14 +27,13 @@ def _task(container: dict[str, Any]) -> None:
 
     other, container = other_robot.split(container)
     settings = parse(EvalSettings, container)
+    measures = _measures(settings.measures)
     run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
 
     grid_is_empty = not all((settings.grid.x, settings.grid.y, settings.grid.yaw))
     if settings.grid.cross and grid_is_empty:
         raise ConfigError(["grid: with cross=true every axis needs at least one value, such as grid.yaw=[0.0]"])
-
-    measures = _measures(settings.measures)
 
     from go1exp.evaluate import table
     from go1exp.evaluate.delay_margin import delay_margin

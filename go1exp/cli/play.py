@@ -42,7 +42,7 @@ def _task(container: dict[str, Any]) -> None:
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)
     progress = spinner(1, "filming")
     try:
-        frames = list(video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress))
+        frames = list(video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress, footfalls=True))
     except RenderingUnavailable as error:
         picture(core, policy, settings.seconds, out.with_suffix(".png"))
         print(f"{error}\nA stick figure instead: {out.with_suffix('.png')}")

@@ -16,6 +16,7 @@ from go1exp import robot
 from go1exp.config import TaskConfig
 from go1exp.env.engine import CapturedStep, make_backend
 from go1exp.env.evidence import Evidence, accuse
+from go1exp.env.gait_log import GaitLog
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.env.restarts import Restarts
 from go1exp.env.terms import StepTerms
@@ -93,6 +94,7 @@ class Go1Core:
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
         self.reward_sums = self.terms.sums
         self.feet = Feet(num_envs, task.sim.physics_dt, self.device)
+        self.gait_log = GaitLog(num_envs, task.sim.policy_dt, self.device)
         self._touched = torch.zeros_like(self._link_contacts)
         self._calf_touched = torch.zeros_like(self._foot_contact[..., 0])
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
@@ -153,7 +155,7 @@ class Go1Core:
         """Start all episodes anew and return the first observations (N, O)."""
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if not self._started:
-            self.level.copy_(self._initial_levels())
+            self.level.copy_(self.random.stream("level").integers(self._start_levels, 1).squeeze(1))
             self.plant.startup()
             self._randomize_model("startup", everyone)
         self._restarts(everyone)
@@ -168,9 +170,6 @@ class Go1Core:
         """Make the next ``reset`` the first one of an environment built with ``seed``."""
         self.random.reseed(seed)
         self._started = False
-
-    def _initial_levels(self) -> Tensor:
-        return self.random.stream("level").integers(self._start_levels, 1).squeeze(1)
 
     def _randomize_model(self, when: str, mask: Tensor) -> None:
         """Draw the model terms of ``when`` in the rows of ``mask``."""
@@ -197,6 +196,7 @@ class Go1Core:
             lift(fresh, self._ground if self._bounded else None)
         self.backend.reset(mask, qpos, qvel)
         self.feet.reset(mask)
+        self.gait_log.reset(mask)
         self.terms.reset(mask)
         for tensor in (self.action, self.previous_action, self.joint_acc):
             tensor.masked_fill_(rows, 0.0)  # and not a product: zero times NaN is NaN
@@ -225,6 +225,7 @@ class Go1Core:
         self._advance_physics(action)
         self.steps += 1
         s = self.snapshot()
+        self.gait_log.add(s)
         terminated = self.terms.terminated(s)
         self.terms.left_map.copy_(self._off_map())
         truncated = ((self.steps >= self.task.sim.episode_steps) | self.terms.left_map) & ~terminated
@@ -274,8 +275,7 @@ class Go1Core:
         """(N,) bool: at the edge of a height field, beyond which there is no ground."""
         if not self._bounded:
             return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        xy = self._state.base_pos_w[:, :2]
-        low, high = self._map
+        xy, (low, high) = self._state.base_pos_w[:, :2], self._map
         return ((xy < low) | (xy > high)).any(-1)
 
     def _move_levels(self, ended: Tensor) -> None:
@@ -369,7 +369,7 @@ class Go1Core:
         metrics = {f"reward/{t.key}": rate for t, rate in zip(self.terms.rewards, rates, strict=True)}
         if self._bounded:
             metrics["curriculum/terrain_level"] = float(self.level.float().mean())
-        return metrics | self.backend.drain_metrics()
+        return metrics | self.gait_log.drain() | self.backend.drain_metrics()
 
     _BUFFERS = (
         *("action", "previous_action", "target", "joint_acc", "spawn"),
@@ -380,7 +380,14 @@ class Go1Core:
         """Everything with a state of its own."""
         events = {f"event.{name}": part for name, part in self.events.items()}
         named = {"backend": self.backend, "random": self.random, "plant": self.plant}
-        return {**named, "command": self.command, "feet": self.feet, **events, **self.terms.parts()}
+        return {
+            **named,
+            "command": self.command,
+            "feet": self.feet,
+            "gait_log": self.gait_log,
+            **events,
+            **self.terms.parts(),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything needed to continue bit for bit."""

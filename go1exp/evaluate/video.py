@@ -10,16 +10,14 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 from imageio.v2 import get_writer
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.camera import (
@@ -34,6 +32,7 @@ from go1exp.evaluate.camera import (
     Stage,
     draw_velocities,
 )
+from go1exp.evaluate.footfalls import Footfalls, font
 from go1exp.evaluate.policy import Policy
 from go1exp.files import replacing
 from go1exp.mdp.commands import FixedVelocity
@@ -54,6 +53,7 @@ def record(
     on_frame: Callable[[int, int], None] | None = None,
     *,
     caption: bool = True,
+    footfalls: bool = False,
     width: int = 640,
     height: int = 480,
 ) -> Iterator[Picture]:
@@ -67,15 +67,17 @@ def record(
         fps: pictures per simulated second.
         on_frame: called with the progress: pictures done, pictures in all.
         caption: write time, command and velocity (mean over 0.5 s) on the picture.
+        footfalls: draw a gait diagram of the last 2 s under the picture, which is then higher.
         width: of the picture, pixels.
-        height: of the picture, pixels.
+        height: of the picture without the diagram, pixels.
 
     Raises:
         RenderingUnavailable: at once, if there is nothing to draw with.
         NumericalFault: while iterating, when a value is not finite.
     """
     camera = Camera(core, width, height)  # here, not in the generator, so that errors are raised before it starts
-    return _frames(camera, policy, seconds, env, fps, on_frame or (lambda done, total: None), caption)
+    diagram = Footfalls(core.task.sim.policy_dt) if footfalls else None
+    return _frames(camera, policy, seconds, env, fps, on_frame or (lambda done, total: None), caption, diagram)
 
 
 def _frames(
@@ -86,6 +88,7 @@ def _frames(
     fps: float,
     on_frame: Callable[[int, int], None],
     caption: bool,
+    diagram: Footfalls | None,
 ) -> Iterator[Picture]:
     core = camera.stage.core
     dt = core.task.sim.policy_dt
@@ -99,12 +102,19 @@ def _frames(
                 core.check(result)
                 observation = result.observation
                 step += 1
-                if result.terminated[env] or result.truncated[env]:
+                ended = bool(result.terminated[env] or result.truncated[env])
+                if ended:
                     measured.clear()
                 measured.append(_velocity(core, env))
+                if diagram:
+                    if ended:
+                        diagram.clear()
+                    diagram.add(core.snapshot().foot_contact[env].tolist())
             picture = camera.frame(env)
             if caption:
                 _write_caption(picture, step * dt, core.command.value[env].tolist(), np.mean(measured, 0).tolist())
+            if diagram:
+                picture = diagram.under(picture)
             on_frame(k + 1, total)
             yield picture
     finally:
@@ -191,17 +201,11 @@ def _velocity(core: Go1Core, env: int) -> list[float]:
     return [*s.base_lin_vel_b[env, :2].tolist(), float(s.base_ang_vel_b[env, 2])]
 
 
-@cache
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Return a font with digits of one width, so that changing numbers do not move."""
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSansMono.ttf")), size)
-
-
 def _write_caption(picture: Picture, seconds: float, command: Sequence[float], measured: Sequence[float]) -> None:
     """Write two lines on the lower edge, narrow enough to survive a crop to a square."""
     height, width = picture.shape[:2]
-    font = _font(max(7, width // 50))
-    line = round(1.35 * font.size)
+    letters = font(max(7, width // 50))
+    line = round(1.35 * letters.size)
     band = picture[height - round(2.5 * line) :]
     band[:] = (0.35 * band).astype(np.uint8)
     image = Image.fromarray(picture)
@@ -210,11 +214,11 @@ def _write_caption(picture: Picture, seconds: float, command: Sequence[float], m
     for k, (name, (x, y, yaw), rgb) in enumerate(rows):
         text = f"{name} {x:+5.2f} {y:+5.2f} m/s {yaw:+5.2f} rad/s"
         prefix = f"{seconds:5.1f} s  "
-        left = 0.5 * (width - font.getlength(prefix + text))
+        left = 0.5 * (width - letters.getlength(prefix + text))
         top = height - round((2.25 - k) * line)
         if k == 0:
-            draw.text((left, top), prefix, "white", font)
-        draw.text((left + font.getlength(prefix), top), text, tuple(round(255 * c) for c in rgb), font)
+            draw.text((left, top), prefix, "white", letters)
+        draw.text((left + letters.getlength(prefix), top), text, tuple(round(255 * c) for c in rgb), letters)
     picture[:] = np.asarray(image)
 
 

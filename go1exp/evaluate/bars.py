@@ -1,0 +1,126 @@
+"""What a policy must reach before one would put it on a robot, and which of that a report shows to be missed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+Row = dict[str, Any]
+"""One command of a report of ``rollout.evaluate``."""
+
+
+def _forward(low: float, high: float) -> Callable[[Row], bool]:
+    return lambda row: low <= row["command"][0] <= high and not any(row["command"][1:])
+
+
+def _moving(row: Row) -> bool:
+    return any(row["command"])
+
+
+def _told(axis: int, size: float) -> Callable[[Row], bool]:
+    """Return whether a command is this one alone, in either direction."""
+    others = [k for k in range(3) if k != axis]
+    return lambda row: math.isclose(abs(row["command"][axis]), size) and not any(row["command"][k] for k in others)
+
+
+def _slow(row: Row) -> bool:
+    """Whether one axis alone is told between 0.1 and 0.3, m/s or rad/s."""
+    asked = [abs(v) for v in row["command"] if v]
+    return len(asked) == 1 and 0.1 <= asked[0] <= 0.3
+
+
+def _up_to(speed: float) -> Callable[[Row], bool]:
+    return lambda row: math.hypot(*row["command"][:2]) <= speed
+
+
+def _measure(name: str) -> Callable[[Row], list[float | None]]:
+    """Return what reads the mean of a measure, or of its four feet."""
+
+    def read(row: Row) -> list[float | None]:
+        entry = (row.get("measures") or {}).get(name)
+        if entry is None:
+            return []
+        return entry["mean"] if isinstance(entry["mean"], list) else [entry["mean"]]
+
+    return read
+
+
+def _rmse(*axes: str) -> Callable[[Row], list[float | None]]:
+    return lambda row: [row["rmse"][axis] for axis in axes] if row["rmse"] else [None]
+
+
+def _answer(row: Row) -> list[float | None]:
+    """Share of the command that is reached, along the command."""
+    if not row["mean"]:
+        return [None]
+    reached = sum(c * v for c, v in zip(row["command"], row["mean"].values(), strict=True))
+    return [reached / sum(c * c for c in row["command"])]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One figure that every command which it is about must keep within limits, each of its feet or axes by itself."""
+
+    name: str
+    about: Callable[[Row], bool]
+    read: Callable[[Row], list[float | None]]
+    low: float = -math.inf
+    high: float = math.inf
+
+
+BARS = (
+    Bar("trot error", _forward(0.5, 2.0), _measure("trot_error"), high=0.10),
+    Bar("load share", _moving, _measure("load_share"), low=0.15),
+    Bar("clearance", _forward(0.5, 2.0), _measure("clearance"), low=0.030),
+    Bar("stride rate", _forward(0.5, 2.0), _measure("stride_rate"), low=2.0, high=3.2),
+    Bar("touchdown speed", _forward(1.0, 1.0), _measure("touchdown_speed_p95"), high=1.0),
+    Bar("peak force", _forward(1.0, 1.0), _measure("peak_force_p95"), high=2.5),
+    Bar("slip", _moving, _measure("slip_share_all"), high=0.08),
+    Bar("RMSE xy", _up_to(1.5), _rmse("x", "y"), high=0.08),
+    Bar("RMSE yaw", lambda row: True, _rmse("yaw"), high=0.10),
+    Bar("told 2.0 m/s", _forward(2.0, 2.0), _answer, low=0.95),
+    Bar("told 1.8 rad/s", _told(2, 1.8), _answer, low=0.95),
+    Bar("told 3.0 m/s", _forward(3.0, 3.0), _answer, low=0.90),
+    Bar("told 0.1 to 0.3", _slow, _answer, low=0.70),
+    Bar("falls", lambda row: True, lambda row: [float(row["distinct_falls"]["count"])], high=0.0),
+)
+"""Chosen: m, m/s, rad/s, Hz, cycles, body weights, shares; means over a command's robots."""
+
+LEAST_DELAY_MS = 30
+"""Delay of the target that no robot may fall at."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A bar against a report: its worst value over commands, feet and axes, None if a robot never showed one."""
+
+    name: str
+    worst: float | None
+    command: tuple[float, ...]
+    reached: bool
+
+
+def judged(report: dict[str, Any]) -> list[Verdict]:
+    """Return a verdict on each bar that the report has a command and a figure for."""
+    verdicts = []
+    for bar in BARS:
+        values = [(v, tuple(row["command"])) for row in report["commands"] if bar.about(row) for v in bar.read(row)]
+        if values:
+            worst, command = max(values, key=lambda pair: _excess(bar, pair[0]))
+            verdicts.append(Verdict(bar.name, worst, command, _excess(bar, worst) <= 0.0))
+    if "delay_margin" in report:
+        ms = report["delay_margin"]["ms"]
+        verdicts.append(Verdict("delay", ms, (), ms is not None and ms >= LEAST_DELAY_MS))
+    return verdicts
+
+
+def missed(report: dict[str, Any]) -> set[str]:
+    """Return the names of the bars that the report shows to be missed."""
+    return {verdict.name for verdict in judged(report) if not verdict.reached}
+
+
+def _excess(bar: Bar, value: float | None) -> float:
+    """By how much a value lies outside of the limits; without one, by anything."""
+    return math.inf if value is None else max(bar.low - value, value - bar.high)
