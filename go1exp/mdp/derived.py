@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-import torch
-
 from go1exp import robot
 from go1exp.mdp.types import Snapshot
 from go1exp.tensors.constants import constant_like
@@ -43,24 +41,9 @@ def foot_speed_xy(s: Snapshot) -> Tensor:
     return s.foot_vel_w[..., :2].norm(dim=-1)
 
 
-SHORTEST_CYCLE, LONGEST_CYCLE = 0.04, 1.0
-"""Between these a foot's cycle counts as one, s: two policy steps, and a foot that was left standing."""
-
-
-def foot_cycle_time(s: Snapshot) -> Tensor:
-    """(N, 4) last swing and last stance of each foot, s, held in ``SHORTEST_CYCLE`` to ``LONGEST_CYCLE``."""
-    return (s.foot_last_air_time + s.foot_last_contact_time).clamp(SHORTEST_CYCLE, LONGEST_CYCLE)
-
-
-def foot_phasors(s: Snapshot) -> tuple[Tensor, Tensor]:
-    """(N, 4) cosine and sine of each foot's phase, which begins at touchdown and takes one cycle.
-
-    A foot that does not touch down anew after one cycle has no phase: it fades from length 1 to 0 in the next.
-    """
-    since_touchdown = s.foot_contact_time + s.foot_air_time + s.foot_last_contact_time * (s.foot_air_time > 0)
-    phase = since_touchdown / foot_cycle_time(s)
-    length, angle = (2.0 - phase).clamp(0.0, 1.0), 2.0 * math.pi * phase
-    return length * torch.cos(angle), length * torch.sin(angle)
+def since_last_contact_began(s: Snapshot) -> Tensor:
+    """(N, 4) time since each foot last touched down, bounces included, s."""
+    return s.foot_contact_time + s.foot_air_time + s.foot_last_contact_time * (s.foot_air_time > 0)
 
 
 def clock_angle(s: Snapshot, rate: float) -> Tensor:

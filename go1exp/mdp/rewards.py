@@ -21,11 +21,8 @@ from go1exp import robot
 from go1exp.mdp.derived import (
     ASYNC_PAIRS,
     DIAGONAL_SIGNS,
-    SHORTEST_CYCLE,
     SYNC_PAIRS,
     clock_angle,
-    foot_cycle_time,
-    foot_phasors,
     foot_speed_xy,
     is_moving,
     joint_deviation,
@@ -80,7 +77,7 @@ def angular_velocity_error(s: Snapshot, *, scale: Positive = 2.0) -> Tensor:
 def gait(
     s: Snapshot, *, scale: Positive = 0.1, max_error: Positive = 0.2, speed_threshold: NonNegative = 0.5
 ) -> Tensor:
-    """Trot in absolute time, which also pays for trembling: prefer ``trot``. In (0, 1]; 0 while standing.
+    """Trot in absolute time, which also pays for trembling: prefer ``trot`` (``trot.py``). In (0, 1]; 0 while standing.
 
     sync(i, j) = exp(-(min((A_i - A_j)^2, e^2) + min((C_i - C_j)^2, e^2)) / scale) over diagonal legs, async(i, j) the
     same with A_i - C_j and C_i - A_j over the other pairs; A and C are running air and contact times, e = ``max_error``
@@ -97,28 +94,6 @@ def gait(
     for i, j in ASYNC_PAIRS:
         error = error + mismatch(air[:, i], contact[:, j]) + mismatch(contact[:, i], air[:, j])
     return torch.exp(-error / scale) * is_moving(s, speed_threshold)
-
-
-@reward("trot")
-def trot(
-    s: Snapshot, *, scale: Positive = 2.0, full_cycle: NonNegative = 0.0, speed_threshold: NonNegative = 0.5
-) -> Tensor:
-    """Trot at any stride rate: product of two synchrony and four asynchrony factors of phases; 0 while standing.
-
-    sync(i, j) = exp(-(1 - cos(p_i - p_j)) / scale) over diagonal legs, async(i, j) = exp(-(1 + cos(p_i - p_j)) / scale)
-    over the other pairs; p is the phase of a foot, from touchdown to touchdown. Pace, bound and pronk earn
-    exp(-8 / scale). The exponent is that of four equally coupled oscillators, which have one stable state: from almost
-    all phases there is a way up to the trot (``docs/paper.md``). A foot that never steps has no phase, and its cosines
-    are zero. Cycles shorter than ``full_cycle`` s earn in proportion to their length, mean of the feet. In (0, 1].
-    Source: the product is Table III's, whose factors are not printed; these are von Mises distributions.
-    """
-    x, y = foot_phasors(s)
-    error = torch.zeros_like(x[:, 0])
-    for pairs, sign in ((SYNC_PAIRS, 1.0), (ASYNC_PAIRS, -1.0)):
-        for i, j in pairs:
-            error = error + 1.0 - sign * (x[:, i] * x[:, j] + y[:, i] * y[:, j])
-    long_enough = (foot_cycle_time(s).mean(-1) / max(full_cycle, SHORTEST_CYCLE)).clamp(max=1.0)
-    return torch.exp(-error / scale) * long_enough * is_moving(s, speed_threshold)
 
 
 @reward("foot_clock")
@@ -140,10 +115,11 @@ def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06) ->
 
 @reward("load_clock")
 def load_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
-    """Weight on the diagonal that the clock of ``gait_clock`` puts on the ground: sum_i F_i c_i / sum_i F_i, in -1 to 1.
+    """Weight on the diagonal that the clock of ``gait_clock`` puts on the ground: sum_i F_i c_i / sum_i F_i.
 
-    c = -sin(p), p as in ``foot_clock``; F are the forces on the feet, N. 0 for standing feet; shifting weight pays before
-    a foot leaves the ground. 0 while no motion is commanded. Not in Table III; after Siekmann et al., arXiv 2011.01387.
+    c = -sin(p), p as in ``foot_clock``; F are the forces on the feet, N. In -1 to 1, 0 for standing feet; shifting
+    weight pays before a foot leaves the ground. 0 while no motion is commanded. Not in Table III; after Siekmann et
+    al., arXiv 2011.01387.
     """
     stance = -torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_force)
     share = s.foot_force / s.foot_force.sum(-1, keepdim=True).clamp(min=1.0)
