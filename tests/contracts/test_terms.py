@@ -57,7 +57,7 @@ def mirrored(s: Snapshot) -> Snapshot:
         elif value.shape[1] == robot.NUM_JOINTS:
             new[f.name] = value[:, joints] * torch.tensor(robot.MIRROR_JOINT_SIGNS)
         else:
-            new[f.name] = value[:, legs] * (polar if f.name == "foot_vel_w" else 1)
+            new[f.name] = value[:, legs] * polar if f.name == "foot_vel_w" else value[:, legs]
     return Snapshot(**new)
 
 
