@@ -201,8 +201,15 @@ def simulated() -> Iterator[tuple[str, dict[str, Tensor]]]:
 
     yield "random actions, standard deviation 1", mean_scores(shake())
     config, policy, _ = load_run(data_root() / "assets" / "policies" / "paper")
-    off = dict.fromkeys(("randomize", "push", "train_ground"), False)
-    wanted = EvalConfig(((1.0, 0.0, 0.0),), 16, 20.0, 2.0, noise=True, policy_dt=None, seed=1, **off)
+    wanted = EvalConfig(
+        *(((1.0, 0.0, 0.0),), 16, 20.0, 2.0),
+        noise=True,
+        randomize=False,
+        push=False,
+        train_ground=False,
+        policy_dt=None,
+        seed=1,
+    )
     shipped = Go1Core(evaluation_task(config.task, wanted), 16, 1)
     shipped.command.value.copy_(torch.tensor(wanted.commands).expand(16, 3))
 
