@@ -312,7 +312,7 @@ def test_what_the_paper_leaves_out_is_isaac_labs(paper: TrainConfig) -> None:
 
 
 def test_defaults_in_the_code_are_the_papers(paper: TrainConfig) -> None:
-    """So that a term added by hand, as ``+reward.gait={weight: 10.0}``, is the paper's term."""
+    """So that a term added by hand, as ``+reward.trot={weight: 10.0}``, is the paper's term."""
     task = paper.task
     terms = [*task.reward, *task.rand, *task.event, *task.termination, *task.curriculum, task.command, task.actuator]
     for term in terms:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -11,9 +11,23 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.gait_scores import (
+    GAITS,
+    PHYSICS_DT,
+    RATES,
+    SCORES,
+    Pattern,
+    climbing,
+    mean_scores,
+    pattern,
+    registered,
+    steps,
+    trembling,
+    walking,
+)
 from go1exp import robot
 from go1exp.config import TaskConfig
-from go1exp.mdp.types import Snapshot
+from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.schema.registry import members
 
 WALK = [0.5, 0.0, 0.0]
@@ -82,7 +96,10 @@ def feet(**values: Any) -> list[Any]:
 
 
 def evaluate(name: str, s: Snapshot, **parameters: Any) -> torch.Tensor:
-    return members("reward")[name].target(s, **parameters)
+    """The term's value; a term that remembers sees its first step."""
+    entry = members("reward")[name]
+    setup = TermSetup(len(s.command), s.command.device, 0.02)
+    return entry.target(setup, **parameters)(s) if entry.remembers else entry.target(s, **parameters)
 
 
 class Case(NamedTuple):
@@ -99,6 +116,11 @@ TROT_PHASE = {"foot_air_time": feet(FR=0.1, RL=0.1), "foot_contact_time": feet(F
 PACE_PHASE = {"foot_air_time": feet(FR=0.1, RR=0.1), "foot_contact_time": feet(FL=0.1, RL=0.1)}
 BOUND_PHASE = {"foot_air_time": feet(FR=0.1, FL=0.1), "foot_contact_time": feet(RR=0.1, RL=0.1)}
 PRONK_PHASE = {"foot_air_time": [0.1] * 4, "foot_contact_time": [0.0] * 4}
+LANDING = {
+    "foot_touchdown_speed": [1.5, 2.0, 0.5, 9.0],
+    "foot_touchdown": [True, False, True, False],
+}
+QUARTER = {"command": WALK, "episode_time": 0.1}
 APART = {"foot_air_time": [0.0, 1.0, 2.0, 3.0], "foot_contact_time": [10.0, 20.0, 30.0, 40.0]}
 SLIDING = {
     "foot_vel_w": feet(FR=[3.0, -4.0, 9.0], FL=[0.0, 1.0, 9.0], RR=[0.5, 0.0, -9.0]),
@@ -202,6 +224,33 @@ CASES = [
     Case("gait", "all twelve differences at their cut", {"command": WALK, **APART}, 0.00822975),  # exp(-4.8)
     Case("gait", "a trot without a command", TROT_PHASE, 0.0),
     Case("gait", "a trot that drifts fast without a command", {**TROT_PHASE, "base_lin_vel_b": [0, 0.51, 0]}, 1.0),
+    # Six pairs without a phase; exp(-6 / 2). More below, since the term remembers.
+    Case("trot", "the first step of a robot that is told to walk", {"command": WALK}, 0.04978707),
+    Case("trot", "the same on another scale", {"command": WALK}, 0.36787944, {"scale": 6.0}),
+    Case("trot", "no cycle is longer than the longest", {"command": WALK}, 0.04978707 / 2, {"full_cycle": 2.0}),
+    Case("trot", "standing", {}, 0.0),
+    Case("trot", "drifting without a command", {"base_lin_vel_b": [0, 0.3, 0]}, 0.04978707, {"speed_threshold": 0.2}),
+    # A quarter turn of a clock of 2.5 Hz: FR and RL should be 0.06 m up.
+    Case("foot_clock", "feet that follow", {**QUARTER, "foot_height": [0.083, 0.02, 0.023, 0.083]}, 1.0),
+    Case("foot_clock", "the other diagonal", {**QUARTER, "foot_height": [0.023, 0.083, 0.083, 0.023]}, -3.0),
+    Case("foot_clock", "standing feet, at worst", QUARTER, -1.0),
+    Case("foot_clock", "two half as high, one too high", {**QUARTER, "foot_height": [0.053, 0.9, 0.023, 0.053]}, -1.0),
+    Case("foot_clock", "an eighth: half of the height", {**QUARTER, "episode_time": 0.05}, 0.0),
+    Case(
+        "foot_clock", "the other swing", {**QUARTER, "episode_time": 0.3, "foot_height": feet(FL=0.083, RR=0.083)}, 1.0
+    ),
+    Case("foot_clock", "another rate", QUARTER, 0.0, {"rate": 1.25, "height": 0.1}),
+    # Two feet 0.06 of 0.12 m up: each half a height off.
+    Case("foot_clock", "half as high", {**QUARTER, "foot_height": [0.083, 0.023, 0.023, 0.083]}, 0.0, {"height": 0.12}),
+    Case("foot_clock", "nothing without a command", {**QUARTER, "command": [0.0] * 3}, 0.0),
+    # A quarter turn: FL and RR should bear the weight.
+    Case("load_clock", "standing feet", QUARTER, 0.0),
+    Case("load_clock", "all of it", {**QUARTER, "foot_force": feet(FL=60.0, RR=70.0)}, 1.0),
+    Case("load_clock", "all of it on the others", {**QUARTER, "foot_force": feet(FR=60.0, RL=70.0)}, -1.0),
+    Case("load_clock", "three quarters", {**QUARTER, "foot_force": [10.0, 30.0, 30.0, 10.0]}, 0.5),
+    Case("load_clock", "a fall through the air", {**QUARTER, "foot_force": [0.0] * 4}, 0.0),
+    Case("load_clock", "another rate", {**QUARTER, "foot_force": feet(FL=60.0)}, math.sqrt(0.5), {"rate": 1.25}),
+    Case("load_clock", "nothing without a command", {"episode_time": 0.1, "foot_force": feet(FL=60.0)}, 0.0),
     Case("foot_clearance", "standing", {}, 1.0),
     Case(
         "foot_clearance",
@@ -253,6 +302,11 @@ CASES = [
     Case("base_orientation", "on its back is level", {"projected_gravity_b": [0.0, 0.0, 1.0]}, 0.0),
     Case("foot_slip", "two sliding feet bear force", SLIDING, 5.5),
     Case("foot_force", "four forces", {"foot_force": [3.0, 4.0, 0.0, 10.0]}, 125.0),
+    Case("foot_peak_force", "four forces", {"foot_peak_force": [3.0, 4.0, 0.0, 10.0]}, 125.0),
+    Case("foot_peak_force", "a peak that the last substep does not show", {"foot_peak_force": feet(RR=300.0)}, 90000.0),
+    # 1.5^2 + 0.5^2; the others are in the air or have stood for a while.
+    Case("touchdown_speed", "two feet land", LANDING, 2.5),
+    Case("touchdown_speed", "slow landings are free", LANDING, 0.81, {"free": 0.6}),
     Case("joint_torque", "2 N m everywhere", {"joint_torque": [2.0, -2.0] * 6}, math.sqrt(48)),
     Case("joint_acceleration", "3 and 4", {"joint_acc": [3.0] + [0.0] * 10 + [-4.0]}, 5.0),
     Case("joint_velocity", "5 and 12", {"joint_vel": [0.0, 5.0] + [0.0] * 9 + [-12.0]}, 13.0),
@@ -382,7 +436,10 @@ def test_the_weights_are_those_of_table_iii(make_task: Callable[..., TaskConfig]
 def test_the_configured_terms_are_finite_at_rest_and_penalise_nothing_but_the_literal_ones(
     make_task: Callable[..., TaskConfig], reward: str
 ) -> None:
-    values = {term.key: term(snapshot()).item() for term in make_task(f"reward={reward}").reward}
+    terms = make_task(f"reward={reward}").reward
+    setup = TermSetup(1, torch.device("cpu"), 0.02)
+    calls = {term.key: term(setup) if term.entry.remembers else term for term in terms}
+    values = {key: call(snapshot()).item() for key, call in calls.items()}
     assert all(math.isfinite(v) for v in values.values())
     penalties = {k: v for k, v in values.items() if TABLE_III[k] < 0 and k != "foot_force"}
     assert penalties == dict.fromkeys(penalties, 0.0)
@@ -410,6 +467,96 @@ def test_a_trot_of_any_phase_is_perfect_and_any_other_pairing_is_not() -> None:
         for a, c in [(air, contact), (contact, air)]:
             value = evaluate("gait", snapshot(9, command=WALK, foot_air_time=a, foot_contact_time=c))
             assert torch.equal(value, torch.ones(9)) if pair == (FR, RL) else (value < 1.0).all()
+
+
+def together(patterns: Sequence[Pattern]) -> Pattern:
+    """Rows of one batch."""
+    return Pattern(*(torch.cat(part) for part in zip(*patterns, strict=True)))
+
+
+TROT_SCORES = {name: SCORES[name] for name in ("gait", "trot")}
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_a_trot_is_paid_in_full_at_every_stride_rate_and_duty(rate: float) -> None:
+    """At 25 Hz and a duty of 0.35 or 0.65 the timers' 2 ms round a phase by a twentieth of the cycle."""
+    trots = together([pattern(rate, GAITS["trot"], duty) for duty in (0.35, 0.5, 0.65)])
+    score = mean_scores(walking(trots), TROT_SCORES)["trot"]
+    assert score[1].item() > 0.99
+    assert score.min().item() > (0.98 if rate < 20 else 0.9)
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_no_other_gait_is_paid_at_any_stride_rate(rate: float) -> None:
+    """The kernel in absolute time pays all of them at 25 Hz, the hop of three legs 0.72 at the rate that it had."""
+    others = together([pattern(rate, offset) for name, offset in GAITS.items() if name != "trot"])
+    scores = mean_scores(walking(others), TROT_SCORES)
+    assert scores["trot"].max().item() < 0.2
+    if rate == 25.0:
+        assert scores["gait"].min().item() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("trot", 1.0), ("pace", math.exp(-4)), ("bound", math.exp(-4)), ("pronk", math.exp(-4)), ("walk", math.exp(-2))],
+)
+def test_a_gait_is_paid_by_the_closed_form(name: str, expected: float) -> None:
+    """Two pairs in phase that should not be and two in opposition that should be in phase: exp(-4 x 2 / 2)."""
+    makers = {"2": registered("trot"), "4": registered("trot", scale=4.0), "long": registered("trot", full_cycle=0.8)}
+    score = mean_scores(walking(pattern(2.5, GAITS[name])), makers)
+    assert score["2"].item() == pytest.approx(expected, rel=2e-3)
+    assert score["4"].item() == pytest.approx(expected**0.5, rel=2e-3)
+    assert score["long"].item() == pytest.approx(expected / 2, rel=2e-3)  # cycles of 0.4 s
+
+
+@pytest.mark.parametrize("rate", [1.5, 2.5, 4.5])
+def test_feet_that_bounce_trot_all_the_same(rate: float) -> None:
+    """Simulated feet do as they lift off: without care for it a trot earned 0.07. Phases are late by up to a step."""
+    bouncing = mean_scores(walking(pattern(rate, GAITS["trot"]), bounces=True), TROT_SCORES)
+    assert bouncing["trot"].item() > 0.85
+
+
+def test_a_new_episode_has_no_phases() -> None:
+    term = members("reward")["trot"].target(TermSetup(2, torch.device("cpu"), 0.02))
+    values = [term(s).clone() for _, s in walking(together([pattern(2.5, GAITS["trot"])] * 2))]
+    term.reset(torch.tensor([True, False]))
+    after = term(snapshot(2, command=WALK))
+    assert values[-1].min() > 0.98
+    assert after[0].item() == pytest.approx(math.exp(-3))
+    assert after[1] > 0.9
+
+
+@pytest.mark.parametrize("duty", [-1.0, 2.0])
+def test_a_trot_of_three_legs_is_paid_a_quarter(duty: float) -> None:
+    score = mean_scores(walking(pattern(2.5, GAITS["trot"], (0.5, 0.5, duty, 0.5))), TROT_SCORES)["trot"]
+    assert score.item() == pytest.approx(math.exp(-1.5), rel=0.02)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
+def test_trembling_is_not_paid(share: float) -> None:
+    scores = mean_scores(trembling(share, n=50, seconds=2.0), TROT_SCORES)
+    assert scores["trot"].mean().item() < 0.1
+    assert scores["gait"].mean().item() > 0.7
+
+
+@pytest.mark.parametrize("duty", [0.35, 0.5])
+def test_from_all_phases_there_is_a_way_up_to_the_trot(duty: float) -> None:
+    """With timers that are compared as times it is a part of them (``docs/paper.md``)."""
+    assert climbing(SCORES["trot"], duty, points=8) > 0.97
+
+
+def test_a_trot_that_begins_is_paid_from_its_second_cycle_on() -> None:
+    """Without a cycle behind it a foot has no phase: then neither a reward nor anything that is not finite."""
+    score = SCORES["trot"]()
+    values = [score(s).item() for _, s in steps(trotting(0.4), 1, 0, 60)]
+    assert max(values[:10]) < 0.2
+    assert min(values[40:]) > 0.98
+
+
+def trotting(cycle: float) -> Callable[[int], torch.Tensor]:
+    """Who touches the ground in a substep of a trot."""
+    offset = torch.tensor([GAITS["trot"]])
+    return lambda substep: (substep * PHYSICS_DT / cycle - offset + 1e-4) % 1.0 < 0.5
 
 
 def test_feet_air_time_pays_most_when_the_phase_changes_every_mode_time() -> None:

@@ -3,7 +3,17 @@
 Importing the package registers every term, from this explicit list.
 """
 
-from go1exp.mdp import commands, curricula, events, observations, randomizations, rewards, rewards_literal, terminations
+from go1exp.mdp import (
+    commands,
+    curricula,
+    events,
+    observations,
+    randomizations,
+    rewards,
+    rewards_literal,
+    terminations,
+    trot,
+)
 
 __all__ = [
     "commands",
@@ -14,4 +24,5 @@ __all__ = [
     "rewards",
     "rewards_literal",
     "terminations",
+    "trot",
 ]

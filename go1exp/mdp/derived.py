@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from go1exp import robot
@@ -19,6 +20,9 @@ SYNC_PAIRS = ((1, 2), (0, 3))
 ASYNC_PAIRS = ((1, 0), (2, 3), (1, 3), (0, 2))
 """Legs of a trot that move in opposition: across the body and along each side."""
 
+DIAGONAL_SIGNS = (1.0, -1.0, -1.0, 1.0)
+"""Diagonal of each leg: FR and RL, or FL and RR."""
+
 
 def is_moving(s: Snapshot, speed_threshold: float) -> Tensor:
     """(N,) bool: told to move, or moving faster than ``speed_threshold`` m/s all the same (Isaac Lab, Spot task)."""
@@ -35,3 +39,13 @@ def foot_speed_xy(s: Snapshot) -> Tensor:
     """(N, 4) horizontal speed of the feet, m/s."""
     assert s.foot_vel_w is not None
     return s.foot_vel_w[..., :2].norm(dim=-1)
+
+
+def since_last_contact_began(s: Snapshot) -> Tensor:
+    """(N, 4) time since each foot last touched down, bounces included, s."""
+    return s.foot_contact_time + s.foot_air_time + s.foot_last_contact_time * (s.foot_air_time > 0)
+
+
+def clock_angle(s: Snapshot, rate: float) -> Tensor:
+    """(N,) angle of a gait clock that makes ``rate`` turns a second from the start of the episode, rad."""
+    return 2.0 * math.pi * (rate * s.episode_time).frac()

@@ -1,16 +1,18 @@
-"""Observation terms: Snapshot -> ``(N, k)`` float32, unscaled. The list in the YAML is concatenated in its order.
+"""Observation terms: Snapshot -> ``(N, k)`` float32, unscaled by default. The YAML's list is concatenated in its order.
 
-Table II of the paper. The noise beside a term in the YAML is the half-width of a uniform distribution, drawn anew at
-each policy step and element.
+Table II of the paper; a ``scale`` other than 1 is not the paper's. The noise beside a term in the YAML is the
+half-width of a uniform distribution, drawn anew at each policy step and element, of the scaled number.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from go1exp.mdp.derived import joint_deviation
+import torch
+
+from go1exp.mdp.derived import clock_angle, joint_deviation
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.registry import observation
+from go1exp.schema.registry import Positive, observation
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -36,9 +38,9 @@ def projected_gravity(s: Snapshot) -> Tensor:
 
 
 @observation("velocity_command", size=3)
-def velocity_command(s: Snapshot) -> Tensor:
-    """Commanded velocity x, y (m/s) and yaw rate (rad/s) in the trunk frame, (N, 3)."""
-    return s.command
+def velocity_command(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Commanded velocity x, y (m/s) and yaw rate (rad/s) in the trunk frame, (N, 3), times ``scale``."""
+    return s.command * scale
 
 
 @observation("joint_position", size=12)
@@ -48,12 +50,23 @@ def joint_position(s: Snapshot) -> Tensor:
 
 
 @observation("joint_velocity", size=12)
-def joint_velocity(s: Snapshot) -> Tensor:
-    """Joint speeds, (N, 12) rad/s."""
-    return s.joint_vel
+def joint_velocity(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Joint speeds, (N, 12) rad/s, times ``scale``."""
+    return s.joint_vel * scale
 
 
 @observation("previous_action", size=12)
 def previous_action(s: Snapshot) -> Tensor:
     """The policy's last output, unscaled, (N, 12); zero after a reset."""
     return s.action
+
+
+@observation("gait_clock", size=2)
+def gait_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
+    """Sine and cosine of a clock of ``rate`` turns a second, (N, 2); zero while no motion is commanded.
+
+    Reward ``foot_clock`` pays for following it. Not of the paper.
+    """
+    angle = clock_angle(s, rate)
+    moving = s.command.norm(dim=-1, keepdim=True) > 0
+    return torch.stack([torch.sin(angle), torch.cos(angle)], dim=-1) * moving

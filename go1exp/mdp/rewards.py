@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS, foot_speed_xy, is_moving, joint_deviation
+from go1exp.mdp.derived import (
+    ASYNC_PAIRS,
+    DIAGONAL_SIGNS,
+    SYNC_PAIRS,
+    clock_angle,
+    foot_speed_xy,
+    is_moving,
+    joint_deviation,
+)
 from go1exp.mdp.types import Snapshot
 from go1exp.schema.registry import Fraction, NonNegative, Positive, reward
 from go1exp.tensors.constants import constant_like
@@ -69,7 +77,7 @@ def angular_velocity_error(s: Snapshot, *, scale: Positive = 2.0) -> Tensor:
 def gait(
     s: Snapshot, *, scale: Positive = 0.1, max_error: Positive = 0.2, speed_threshold: NonNegative = 0.5
 ) -> Tensor:
-    """Trot: product of two synchrony and four asynchrony factors in (0, 1]; 0 while standing.
+    """Trot in absolute time, which also pays for trembling: prefer ``trot`` (``trot.py``). In (0, 1]; 0 while standing.
 
     sync(i, j) = exp(-(min((A_i - A_j)^2, e^2) + min((C_i - C_j)^2, e^2)) / scale) over diagonal legs, async(i, j) the
     same with A_i - C_j and C_i - A_j over the other pairs; A and C are running air and contact times, e = ``max_error``
@@ -86,6 +94,36 @@ def gait(
     for i, j in ASYNC_PAIRS:
         error = error + mismatch(air[:, i], contact[:, j]) + mismatch(contact[:, i], air[:, j])
     return torch.exp(-error / scale) * is_moving(s, speed_threshold)
+
+
+@reward("foot_clock")
+def foot_clock(s: Snapshot, *, rate: Positive = 2.5, height: Positive = 0.06) -> Tensor:
+    """Feet that follow the clock of observation ``gait_clock`` in a trot: sum of 1/4 - min(|z_i - h_i| / height, 1).
+
+    z is the height of the sole over the ground, 0 for one that sinks in; h_i = ``height`` sin^2(p_i) where sin(p_i) > 0
+    (swing), else 0; p is the clock's angle for FR and RL, half a turn later for the others. Heights in m. At most 1,
+    0 on average for standing feet, so that a fall costs no more than the trot that is missed; as steep there as next to
+    1; 0 while no motion is commanded. Not in Table III; after Siekmann et al., arXiv 2011.01387, heights for forces.
+    """
+    assert s.foot_height is not None
+    lift = torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_height)
+    wanted = lift.clamp(min=0.0).square()
+    sole = (s.foot_height - robot.FOOT_RADIUS).clamp(min=0.0) / height
+    following = 1.0 - (sole - wanted).abs().clamp(max=1.0).sum(-1)
+    return following * (s.command.norm(dim=-1) > 0)
+
+
+@reward("load_clock")
+def load_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
+    """Weight on the diagonal that the clock of ``gait_clock`` puts on the ground: sum_i F_i c_i / sum_i F_i.
+
+    c = -sin(p), p as in ``foot_clock``; F are the forces on the feet, N. In -1 to 1, 0 for standing feet; shifting
+    weight pays before a foot leaves the ground. 0 while no motion is commanded. Not in Table III; after Siekmann et
+    al., arXiv 2011.01387.
+    """
+    stance = -torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_force)
+    share = s.foot_force / s.foot_force.sum(-1, keepdim=True).clamp(min=1.0)
+    return (share * stance).sum(-1) * (s.command.norm(dim=-1) > 0)
 
 
 @reward("foot_clearance")
@@ -146,8 +184,28 @@ def foot_slip(s: Snapshot) -> Tensor:
 
 @reward("foot_force")
 def foot_force(s: Snapshot) -> Tensor:
-    """Hard footfalls: sum_i |F_i|^2, N2. Table III."""
+    """Forces on the feet in the last physics step: sum_i |F_i|^2, N2. Table III; ``foot_peak_force`` sees all."""
     return s.foot_force.square().sum(-1)
+
+
+@reward("foot_peak_force")
+def foot_peak_force(s: Snapshot) -> Tensor:
+    """Hard footfalls: sum_i |F_i|^2, N2, of each foot's largest force in the policy step. Table III.
+
+    A footfall's peak lasts a few milliseconds; the last physics step shows one in several.
+    """
+    assert s.foot_peak_force is not None
+    return s.foot_peak_force.square().sum(-1)
+
+
+@reward("touchdown_speed")
+def touchdown_speed(s: Snapshot, *, free: NonNegative = 0.0) -> Tensor:
+    """Feet that land fast: sum_i max(w_i - free, 0)^2 [foot i touched down], m2/s2, w the downward speed in m/s.
+
+    Paid in the step of the touchdown: weight x policy period for each. Not in Table III.
+    """
+    assert s.foot_touchdown_speed is not None
+    return ((s.foot_touchdown_speed - free).clamp(min=0.0).square() * s.foot_touchdown).sum(-1)
 
 
 @reward("joint_torque")
