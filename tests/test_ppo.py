@@ -375,6 +375,16 @@ def test_bf16_changes_the_forward_pass_of_training_only_and_not_by_much() -> Non
         assert (one - other).abs().max() < 0.02 * one.abs().max()
 
 
+@pytest.mark.parametrize(("units", "precision"), [((), "highest"), (("_is_amx_tile_supported",), "bf16")])
+def test_without_units_for_bfloat16_the_update_is_in_float32(
+    units: tuple[str, ...], precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for check in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"):
+        monkeypatch.setattr(torch.cpu, check, lambda check=check: check in units)
+    auto, chosen = (policy_settings(settings(f"ppo.matmul_precision={p}")) for p in ("auto", precision))
+    assert auto == chosen
+
+
 def test_bf16_keeps_weights_and_their_gradients_in_float32() -> None:
     ppo = slider_ppo("ppo.matmul_precision=bf16")
     before = copy.deepcopy(ppo.policy.state_dict())

@@ -39,7 +39,8 @@ class PPOConfig:
         orthogonal_init: SB3's initial weights (gain sqrt(2), last layer of the actor 0.01); else PyTorch's, as rsl_rl.
         hidden: layers of actor and critic each.
         activation: nonlinearity between the layers.
-        matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16.
+        matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16; ``auto`` is
+            ``bf16`` on a processor with units for it and ``highest`` on all others, which are much slower in it.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -65,7 +66,7 @@ class PPOConfig:
     orthogonal_init: bool
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
     activation: Literal["elu", "relu", "tanh"]
-    matmul_precision: Literal["highest", "bf16"]
+    matmul_precision: Literal["highest", "bf16", "auto"]
 
 
 @dataclass(frozen=True)

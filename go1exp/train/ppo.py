@@ -59,6 +59,15 @@ def linear_rate(config: PPOConfig, done: int) -> float:
     return least + left * (config.learning_rate - least)
 
 
+def has_bf16_units() -> bool:
+    """Return whether this processor multiplies bfloat16 matrices in hardware (AVX-512 BF16 or AMX).
+
+    Others emulate it: an update took eight times as long as in float32 on an AMD EPYC with AVX2.
+    """
+    checks = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")  # torch has no public name for them
+    return any(getattr(torch.cpu, check, lambda: False)() for check in checks)
+
+
 def policy_settings(config: PPOConfig) -> dict[str, Any]:
     """Return the keyword arguments of ``GaussianPolicy`` that a configuration stands for."""
     return {
@@ -66,7 +75,7 @@ def policy_settings(config: PPOConfig) -> dict[str, Any]:
         "activation_fn": ACTIVATIONS[config.activation],
         "ortho_init": config.orthogonal_init,
         "log_std_init": float(np.log(config.init_std)),
-        "bf16": config.matmul_precision == "bf16",
+        "bf16": config.matmul_precision == "bf16" or (config.matmul_precision == "auto" and has_bf16_units()),
     }
 
 
