@@ -27,7 +27,7 @@ FAST = 0.2
 
 LEGS = robot.NUM_LEGS
 FR = robot.LEGS.index("FR")
-OTHERS = [leg for leg in range(LEGS) if leg != FR]
+OTHERS = slice(FR + 1, LEGS)  # a list of indices would be copied to the GPU at each step
 TROT = (0.5, 0.5, 0.0)
 """Touchdown of FL, RR and RL after FR in a trot, cycles."""
 
