@@ -108,7 +108,8 @@ def test_a_file_that_says_none_is_none(tmp_path: Path, run: Run) -> None:
         (
             "train reward=shrt",
             2,
-            "go1exp train: reward=shrt: unknown choice of reward 'shrt'; known: clock, paper, paper_literal, paper_trot",
+            "go1exp train: reward=shrt: unknown choice of reward 'shrt'; "
+            "known: clock, paper, paper_literal, paper_trot",
         ),
     ],
 )
