@@ -28,17 +28,15 @@ from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS
 from go1exp.mdp.foot_timers import FootTimers
 from go1exp.mdp.types import TermSetup
+from go1exp.measures import gait
 from go1exp.schema.registry import members
 
 PHYSICS_DT, SUBSTEPS = 0.002, 10
 
 GAITS = {
-    "trot": (0.0, 0.5, 0.5, 0.0),
-    "pace": (0.0, 0.5, 0.0, 0.5),
-    "bound": (0.0, 0.0, 0.5, 0.5),
-    "pronk": (0.0, 0.0, 0.0, 0.0),
-    "walk": (0.0, 0.5, 0.75, 0.25),
-    "amble": (0.0, 0.5, 0.25, 0.75),
+    **{name: gait.GAITS[name] for name in ("trot", "pace", "bound", "pronk")},
+    "walk": gait.GAITS["lateral sequence"],
+    "amble": gait.GAITS["diagonal sequence"],
     "gallop": (0.0, 0.1, 0.6, 0.5),
     "hop of version 0.1": (0.0, 0.11, 0.71, 0.05),
 }

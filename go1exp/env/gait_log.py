@@ -12,6 +12,7 @@ import torch
 
 from go1exp import robot
 from go1exp.mdp.derived import foot_speed_xy
+from go1exp.measures.gait import GAITS
 from go1exp.tensors.memory import Memory
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ FAST = 0.2
 LEGS = robot.NUM_LEGS
 FR = robot.LEGS.index("FR")
 OTHERS = slice(FR + 1, LEGS)  # a list of indices would be copied to the GPU at each step
-TROT = (0.5, 0.5, 0.0)
+TROT = GAITS["trot"][OTHERS]
 """Touchdown of FL, RR and RL after FR in a trot, cycles."""
 
 WIDTHS = {

@@ -68,7 +68,7 @@ CONTACT: dict[str, Show] = {
 
 LEGEND = """error: of the touchdowns to a trot's, phase: after FR, both in cycles; feet: FR FL RR RL; pitch: nose down;
 touchdown and peak (body weights): 95th percentile; step of the target in 20 ms; tau, qd, line: share of peak torque,
-top speed and the motors' torque-speed line; the last four: 99th percentile; CoT: positive work / (m g way).
+top speed and the motors' torque-speed line; step, tau, qd and line: 99th percentile; CoT: positive work / (m g way).
 Means over n robots; the JSON has intervals and all measures."""
 
 
@@ -145,7 +145,7 @@ def text(report: dict[str, Any]) -> str:
     for table in measure_tables(report):
         lines += ["", *_laid(table)]
     if any(c.get("measures") for c in report["commands"]):
-        lines += ["", LEGEND.format(where="intervals are in the JSON")]
+        lines += ["", LEGEND]
     lines += [""] + [
         line(report) for key, line in (("distinct_falls", _falls), ("delay_margin", _delay)) if key in report
     ]
