@@ -19,6 +19,7 @@ import go1exp.effects
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
 from go1exp.effects.rules import drive_problems
+from go1exp.mdp import mirror
 from go1exp.robot import RobotConfig
 from go1exp.schema import plugins
 from go1exp.schema.backends import BACKENDS, BackendConfig, CpuBackend
@@ -289,6 +290,8 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
             f"ppo.learning_rate = {ppo.learning_rate}: must lie in ppo.learning_rate_range = "
             f"{list(ppo.learning_rate_range)}"
         )
+    if ppo and ppo.symmetry:
+        problems += mirror.problems(parts.get("observation") or ())
     if "observation" in parts and not parts["observation"]:
         problems.append("observation: at least one term is required")
     terrain: Any = parts.get("terrain")

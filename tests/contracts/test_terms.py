@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.config import TaskConfig
@@ -22,7 +21,7 @@ from go1exp.physics.scene import build_model
 from go1exp.schema.registry import Entry, members
 from go1exp.terrain import build_terrain
 from go1exp.testing.randomness import everyone, model_fields, parts, start_states, stream, with_fields
-from go1exp.testing.snapshots import ODD, random_snapshot, rows
+from go1exp.testing.snapshots import ODD, mirrored, random_snapshot, rows
 
 
 def each(group: str, **traits: Any) -> Any:
@@ -33,32 +32,6 @@ def each(group: str, **traits: Any) -> Any:
 
 
 # Functions of a snapshot
-
-
-def mirrored(s: Snapshot) -> Snapshot:
-    """The same moment seen in a mirror that stands in the world's x-z plane."""
-    legs, joints = list(robot.MIRROR_LEGS), list(robot.MIRROR_JOINTS)
-    polar, axial = torch.tensor([1.0, -1.0, 1.0]), torch.tensor([-1.0, 1.0, -1.0])
-    flips = {
-        "base_pos_w": polar,
-        "base_quat_w": torch.tensor([1.0, -1.0, 1.0, -1.0]),
-        "base_lin_vel_b": polar,
-        "base_ang_vel_b": axial,
-        "projected_gravity_b": polar,
-        "command": torch.tensor([1.0, -1.0, -1.0]),
-    }
-    new = {}
-    for f in fields(Snapshot):
-        value: Tensor = getattr(s, f.name)
-        if f.name in flips:
-            new[f.name] = value * flips[f.name]
-        elif f.name in ("trunk_contact", "episode_time"):
-            new[f.name] = value.clone()
-        elif value.shape[1] == robot.NUM_JOINTS:
-            new[f.name] = value[:, joints] * torch.tensor(robot.MIRROR_JOINT_SIGNS)
-        else:
-            new[f.name] = value[:, legs] * polar if f.name == "foot_vel_w" else value[:, legs]
-    return Snapshot(**new)
 
 
 def test_the_mirror_is_a_mirror() -> None:
