@@ -28,6 +28,7 @@ from go1exp.train.device import DevicePPO
 from go1exp.train.loss import ppo_loss
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy
 from go1exp.train.symmetry import of_policy
+from tests.test_capture import Watch
 
 TERMS = {name: entry for name, entry in members("observation").items() if entry not in foreign()}
 
@@ -300,6 +301,16 @@ def test_training_with_mirrored_samples_goes_another_way_on_either_path(kind: ty
         weights.append(ppo.policy.action_net.weight.detach())
     assert all(torch.isfinite(w).all() for w in weights)
     assert not torch.equal(*weights)
+
+
+def test_a_minibatch_is_joined_with_nothing_that_a_graph_cannot_hold(ppo: AdaptivePPO) -> None:
+    batch = samples(ppo.policy)
+    assert ppo.mirror is not None
+    ppo.mirror.joined(batch)  # its numbers are made once
+    with Watch() as watch:
+        joined = ppo.mirror.joined(batch)
+    assert watch.unfit == []
+    assert joined.actions.shape == (48, 12)
 
 
 def test_the_images_count_in_the_memory_that_a_training_needs() -> None:
