@@ -256,7 +256,8 @@ def test_the_gradient_is_that_of_the_batch_joined_with_its_image(value_clip: str
 
 def test_the_statistics_are_of_the_collected_samples_alone(ppo: AdaptivePPO) -> None:
     """An image's ratio says how asymmetric a policy is: the adaptive rate must not take that for a step too long."""
-    batch, policy = samples(ppo.policy), ppo.policy
+    policy: Any = ppo.policy
+    batch = samples(policy)
     alone = ppo_loss(policy, batch, ppo.config)
     ppo._old_log_std = policy.log_std.detach().clone()
     with torch.no_grad():
@@ -275,7 +276,7 @@ def test_the_statistics_are_of_the_collected_samples_alone(ppo: AdaptivePPO) -> 
 
 def test_the_step_of_a_symmetric_policy_leaves_it_symmetric(ppo: AdaptivePPO) -> None:
     """Whatever one side earned by luck: here the right front hip is paid for what it happens to do."""
-    policy = ppo.policy
+    policy: Any = ppo.policy
     with torch.no_grad():  # the same action for every observation
         policy.action_net.weight.zero_()
         policy.action_net.bias.zero_()

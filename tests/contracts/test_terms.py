@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import mujoco
@@ -84,6 +84,13 @@ def test_a_reward_is_the_same_in_the_mirror_unless_it_is_known_not_to_be(entry: 
     there, here = once(entry, mirrored(s)), once(entry, s)
     same = torch.allclose(there, here, rtol=1e-5, atol=5e-6)
     assert same == (entry.name not in ONE_SIDED)
+
+
+@pytest.mark.parametrize("name", ["foot_clock", "load_clock"])
+def test_a_reward_of_the_gait_clock_is_the_same_in_the_mirror_half_a_turn_later(name: str) -> None:
+    s, entry = random_snapshot(500), members("reward")[name]
+    image = replace(mirrored(s), episode_time=s.episode_time + 0.2)  # of 2.5 turns a second
+    torch.testing.assert_close(once(entry, image), once(entry, s), rtol=0.0, atol=1e-4)
 
 
 @each("reward")
