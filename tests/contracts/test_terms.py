@@ -145,6 +145,7 @@ NOTHING: dict[str, list[dict[str, Any]]] = {
         {"range": (0.0, 0.0), "operation": "add"},
     ],
     "foot_restitution": [{"range": (math.exp(-2.0), math.exp(-2.0))}],
+    "ground_stiffness": [{"range": (0.02, 0.02)}],
     "center_of_mass": [{"range": (0.0, 0.0)}],
     "link_mass": [{"range": (1.0, 1.0)}],
 }
@@ -161,7 +162,7 @@ def test_a_model_term_with_a_range_of_one_nominal_value_changes_nothing(
         entry.target(backend, stream(3), everyone(3), **parameters)
         for name, values in model_fields(backend).items():
             # A value that is set is a float32 draw, or looked up; one that is scaled or shifted must not move at all.
-            rtol = {"foot_friction": 1e-7, "foot_restitution": 1e-4}.get(entry.name, 0.0)
+            rtol = {"foot_friction": 1e-7, "foot_restitution": 1e-4, "ground_stiffness": 1e-7}.get(entry.name, 0.0)
             rtol = 0.0 if parameters.get("operation") in ("scale", "add") else rtol
             np.testing.assert_allclose(values, before[name], rtol=rtol, atol=0, err_msg=f"{name} {parameters}")
 
