@@ -168,7 +168,7 @@ def seen_by_a_robot_and_its_image(symmetric: bool, steps: int) -> tuple[Tensor, 
         action = draw(12).float()
         core.step(torch.stack([action, mirror.ACTION(action)]))
         core.command.value.copy_(command)
-        observed.append(core.terms.observation(core.snapshot()))
+        observed.append(core.terms.observation(core.snapshot(), core.snapshot()))
     seen = torch.stack(observed)
     ends = np.cumsum([t.entry.traits["size"] for t in task.observation])
     columns = {t.key: slice(end - t.entry.traits["size"], end) for t, end in zip(task.observation, ends, strict=True)}

@@ -51,6 +51,7 @@ class Go1Core:
         imu: simulate the IMU's sensors too, for a logger.
         held: attitude w-x-y-z in which the trunks are held in the air; None lets them go.
         alike: draw the effects and drives once, for all robots: one robot, many times (for a logger).
+        critic: append what only the critic sees to the observations (training only).
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class Go1Core:
         imu: bool = False,
         held: tuple[float, float, float, float] | None = None,
         alike: bool = False,
+        critic: bool = False,
     ) -> None:
         self.task, self.num_envs, self.noise = task, num_envs, noise
         self._spread_starts = spread_starts
@@ -78,7 +80,7 @@ class Go1Core:
         self._state = KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
         drives = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
-        self._build_terms(drives)
+        self._build_terms(drives, critic)
         self._restarts = Restarts(self._restart, (self.random, drives))
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -128,7 +130,7 @@ class Go1Core:
         start = getattr(rules[0], "start_level_max", self._max_level) if rules else self._max_level
         self._start_levels = min(start, self._max_level) + 1
 
-    def _build_terms(self, drives: EnvRandom) -> None:
+    def _build_terms(self, drives: EnvRandom, critic: bool) -> None:
         """Turn the configured terms into callables, and make per-environment the model fields that will vary."""
         task, sim = self.task, self.task.sim
         setup = drive_setup(task.robot, sim.physics_dt, self.backend, drives)
@@ -136,7 +138,7 @@ class Go1Core:
         self.command = task.command(self.random.stream("command"))
         self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}
         self._curriculum = [t() for t in task.curriculum]
-        self.terms = StepTerms(task, self.num_envs, self.device)
+        self.terms = StepTerms(task, self.num_envs, self.device, critic)
         self.observation_size = self.terms.observation_size
         self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
         self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
@@ -328,10 +330,10 @@ class Go1Core:
 
     def _observe(self, s: Snapshot, *, advance: bool = False) -> Tensor:
         """(N, O) the configured observation of a snapshot, with its noise if that is on; ``advance`` once a step."""
-        s = self.plant.sense(s) if self.plant.effects.senses else s
+        sensed = self.plant.sense(s) if self.plant.effects.senses else s
         if advance:
-            self.terms.advance(s)
-        clean = self.terms.observation(s)
+            self.terms.advance(sensed, s)
+        clean = self.terms.observation(sensed, s)
         if not self.noise:
             return clean
         return clean + self.terms.noise * self.random.stream("noise").uniform(self.observation_size, low=-1.0)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.mdp.derived import clock_angle, joint_deviation
-from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, POLAR
+from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, LEGS, POLAR
 from go1exp.mdp.types import Snapshot
 from go1exp.schema.registry import Positive, observation
 
@@ -72,3 +72,34 @@ def gait_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
     angle = clock_angle(s, rate)
     moving = s.command.norm(dim=-1, keepdim=True) > 0
     return torch.stack([torch.sin(angle), torch.cos(angle)], dim=-1) * moving
+
+
+@observation("joint_torque", size=12, mirror=JOINTS)
+def joint_torque(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Torques of the drives, (N, 12) N m, times ``scale``."""
+    return s.joint_torque * scale
+
+
+@observation("foot_contact", size=4, mirror=LEGS)
+def foot_contact(s: Snapshot) -> Tensor:
+    """Whether each foot bears force now, 1 or 0, (N, 4)."""
+    return s.foot_contact.float()
+
+
+@observation("foot_force", size=4, mirror=LEGS)
+def foot_force(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Magnitudes of the ground's forces on the feet, (N, 4) N, times ``scale``."""
+    return s.foot_force * scale
+
+
+@observation("foot_height", size=4, mirror=LEGS)
+def foot_height(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Heights of the feet's centres over the ground below them, (N, 4) m, times ``scale``."""
+    assert s.foot_height is not None
+    return s.foot_height * scale
+
+
+@observation("foot_air_time", size=4, mirror=LEGS)
+def foot_air_time(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Time that each foot has been in the air, 0 in stance, (N, 4) s, times ``scale``."""
+    return s.foot_air_time * scale
