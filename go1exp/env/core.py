@@ -87,8 +87,7 @@ class Go1Core:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
         self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
-        self._last_action = zeros(robot.NUM_JOINTS)
-        self.target = zeros(robot.NUM_JOINTS)
+        self._last_action, self.target = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self.joint_acc = zeros(robot.NUM_JOINTS)
         self.spawn = zeros(3)
         self.steps = zeros(dtype=torch.int64)
