@@ -88,10 +88,8 @@ class Go1Core:
 
         self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self._last_action, self.target = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
-        self.joint_acc = zeros(robot.NUM_JOINTS)
-        self.spawn = zeros(3)
-        self.steps = zeros(dtype=torch.int64)
-        self._first_step = zeros(dtype=torch.int64)
+        self.joint_acc, self.spawn = zeros(robot.NUM_JOINTS), zeros(3)
+        self.steps, self._first_step = zeros(dtype=torch.int64), zeros(dtype=torch.int64)
         self.episode_return = zeros()
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
         self.reward_sums = self.terms.sums
