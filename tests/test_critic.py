@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from go1exp.compose import compose
 from go1exp.config import TrainConfig, parse_train
@@ -14,8 +16,9 @@ from go1exp.env.core import Go1Core
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.evaluate.policy import load_network
 from go1exp.export.build import build
+from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS, GroundHeight, HeightScan
 from go1exp.schema import plugins
-from go1exp.schema.registry import ConfigError
+from go1exp.schema.registry import ConfigError, members
 from go1exp.train import checkpoint, run_folder, start, trainer
 from go1exp.train.device import DevicePPO
 from go1exp.train.ppo import AdaptivePPO
@@ -166,6 +169,48 @@ def test_wrong_terms_of_the_critic_are_refused_under_their_key() -> None:
         with pytest.raises(ConfigError) as error:
             settings(override)
         assert [line[: len(complaint)] for line in error.value.problems] == [complaint]
+
+
+def scan(slope: tuple[float, float], yaw: float, pitch: float = 0.0) -> torch.Tensor:
+    """What a robot 0.3 m over (1, 2) sees of ground that rises by ``slope`` along x and y: (17, 11)."""
+    x, y = np.arange(0.0, 4.0, 0.1), np.arange(0.0, 5.0, 0.1)
+    heights = slope[0] * (x - 1.0)[None, :] + slope[1] * (y - 2.0)[:, None]
+    ground = GroundHeight(torch.as_tensor(heights), 0.0, 0.0, 0.1)
+    turned = Rotation.from_euler("ZY", [yaw, pitch]).as_quat(scalar_first=True)
+    position = torch.tensor([[1.0, 2.0, 0.3]], dtype=torch.float64)
+    seen = HeightScan(ground, torch.device("cpu"))(position, torch.as_tensor(turned)[None])
+    return seen.view(SCAN_ROWS, SCAN_COLUMNS)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4, -2.5])
+def test_a_height_scan_is_of_the_ground_about_the_robot_in_its_heading(yaw: float) -> None:
+    ahead, left = np.meshgrid(np.linspace(-0.8, 0.8, 17), np.linspace(-0.5, 0.5, 11), indexing="ij")
+    x, y = ahead * np.cos(yaw) - left * np.sin(yaw), ahead * np.sin(yaw) + left * np.cos(yaw)
+    for pitch in (0.0, 0.5):  # the grid stays level
+        np.testing.assert_allclose(scan((0.2, -0.1), yaw, pitch), 0.2 * x - 0.1 * y - 0.3, atol=1e-6)
+
+
+def test_a_robot_in_the_mirror_scans_the_image_of_the_ground() -> None:
+    image = members("observation")["height_scan"].traits["mirror"]
+    there = scan((0.2, 0.1), -0.3).flatten()
+    torch.testing.assert_close(there, image(scan((0.2, -0.1), 0.3).flatten()), rtol=0.0, atol=1e-6)
+
+
+def test_the_ground_is_scanned_only_for_whom_reads_it_and_is_that_of_the_terrain() -> None:
+    rough = ("terrain=rough", "terrain.cols=2", "terrain.border=2.0", "rand=none", "event=none")
+    task = settings(*rough, "critic=terrain").task
+    core, without = Go1Core(task, 4, noise=False, critic=True), Go1Core(task, 4, noise=False)
+    assert without.reset().shape == (4, O)
+    assert without.snapshot().height_scan is None
+    core.reset()
+    s = core.snapshot()
+    assert s.height_scan is not None
+    assert s.base_pos_w is not None
+    middle = s.height_scan[:, 187 // 2] + s.base_pos_w[:, 2]
+    torch.testing.assert_close(middle, core.ground_height(s.base_pos_w[:, :2]), rtol=0.0, atol=1e-5)
+    observed = core.step(torch.zeros(4, 12)).observation[:, O + C :]
+    torch.testing.assert_close(observed, (5.0 * (core.snapshot().height_scan + 0.3)).clamp(-1.0, 1.0))  # type: ignore[operator]
+    assert observed.std() > 0.0
 
 
 MEMORY = '''

@@ -23,7 +23,7 @@ from go1exp.env.terms import StepTerms
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.clearance import lift
 from go1exp.mdp.feet import Feet
-from go1exp.mdp.ground import GroundHeight
+from go1exp.mdp.ground import GroundHeight, HeightScan
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.physics.scene import build_model
@@ -137,6 +137,8 @@ class Go1Core:
         self._curriculum = [t() for t in task.curriculum]
         self.terms = StepTerms(task, self.num_envs, self.device, critic)
         self.observation_size = self.terms.observation_size
+        scan = HeightScan(self._ground if self._bounded else None, self.device)
+        self._scan = scan if "height_scan" in self.terms.read else None
         self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
         self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
         for term in self._model_terms:
@@ -323,6 +325,7 @@ class Go1Core:
             calf_contact=self._calf_touched > 0,
             trunk_contact=(self._touched[:, TRUNK] > 0).any(-1),
             episode_time=self.steps * self.task.sim.policy_dt,
+            height_scan=self._scan(state.base_pos_w.float(), quat) if self._scan else None,
         )
 
     def _observe(self, s: Snapshot, *, advance: bool = False) -> Tensor:

@@ -34,6 +34,7 @@ class StepTerms:
         observed: terms of the observation, in the order of their columns; those of the critic are the last ones.
         observation_size: O.
         policy_size: columns that are the policy's.
+        read: fields of the Snapshot that are computed only because an observation reads them.
     """
 
     def __init__(self, task: TaskConfig, num_envs: int, device: torch.device, critic: bool = False) -> None:
@@ -65,6 +66,7 @@ class StepTerms:
             for group in ("observation", "critic")
         )
         self.observed = (*task.observation, *beside)
+        self.read = {name for t in self.observed for name in t.entry.traits.get("reads", ())}
         widths = [int(t.entry.traits["size"]) for t in self.observed]
         self.observation_size, self.policy_size = sum(widths), sum(widths[: len(task.observation)])
         noise = [t.slots["noise"] for t in self.observed]

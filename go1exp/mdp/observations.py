@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.mdp.derived import clock_angle, joint_deviation
-from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, LEGS, POLAR
+from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS
+from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, LEGS, POLAR, grid
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.registry import Positive, observation
+from go1exp.schema.registry import NonNegative, Positive, observation
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -103,3 +104,14 @@ def foot_height(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
 def foot_air_time(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
     """Time that each foot has been in the air, 0 in stance, (N, 4) s, times ``scale``."""
     return s.foot_air_time * scale
+
+
+@observation("height_scan", size=SCAN_ROWS * SCAN_COLUMNS, mirror=grid(SCAN_ROWS, SCAN_COLUMNS), reads=("height_scan",))
+def height_scan(s: Snapshot, *, scale: Positive = 1.0, offset: NonNegative = 0.3, bound: Positive = 1.0) -> Tensor:
+    """Ground around the robot: its height over the trunk's origin plus ``offset`` m, times ``scale``, cut at ``bound``.
+
+    (N, 187), a grid of 1.6 m along the heading and 1.0 m across, every 0.1 m; 0 where the ground is ``offset`` below.
+    After Isaac Lab's term of this name, which has the other sign.
+    """
+    assert s.height_scan is not None
+    return ((s.height_scan + offset) * scale).clamp(-bound, bound)
