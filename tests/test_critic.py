@@ -209,7 +209,9 @@ def test_the_ground_is_scanned_only_for_whom_reads_it_and_is_that_of_the_terrain
     middle = s.height_scan[:, 187 // 2] + s.base_pos_w[:, 2]
     torch.testing.assert_close(middle, core.ground_height(s.base_pos_w[:, :2]), rtol=0.0, atol=1e-5)
     observed = core.step(torch.zeros(4, 12)).observation[:, O + C :]
-    torch.testing.assert_close(observed, (5.0 * (core.snapshot().height_scan + 0.3)).clamp(-1.0, 1.0))  # type: ignore[operator]
+    heights = core.snapshot().height_scan
+    assert heights is not None
+    torch.testing.assert_close(observed, (5.0 * (heights + 0.3)).clamp(-1.0, 1.0))
     assert observed.std() > 0.0
 
 
