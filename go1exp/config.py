@@ -292,6 +292,22 @@ def time_rules(sim: SimConfig) -> list[str]:
     return problems
 
 
+def _randomization_rules(terms: tuple[Term, ...]) -> list[str]:
+    """Rules between randomisations, and between each and when it is drawn."""
+    problems, setters = [], dict[str, str]()
+    for term in terms:
+        what = term.entry.traits.get("sets")
+        if what in setters:
+            problems.append(f"rand.{term.key}: sets the {what}, as rand.{setters[what]} does; use one of the two")
+        elif what:
+            setters[what] = term.key
+        if term.entry.traits["kind"] == "state" and term.slots["when"] == "startup":
+            problems.append(
+                f"rand.{term.key}.when = 'startup': a random initial state is drawn at every reset; use reset"
+            )
+    return problems
+
+
 def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
     """Rules between sections."""
     problems = []
@@ -322,12 +338,7 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
             problems.append(
                 f"curriculum.{rule.key}.start_level_max = {start}: terrain.rows = {top + 1} allows up to {top}"
             )
-    for term in parts.get("rand") or ():
-        if term.entry.traits["kind"] == "state" and term.slots["when"] == "startup":
-            problems.append(
-                f"rand.{term.key}.when = 'startup': a random initial state is drawn at every reset; use reset"
-            )
-    return problems
+    return problems + _randomization_rules(parts.get("rand") or ())
 
 
 def parse_task(container: Mapping[str, Any]) -> TaskConfig:

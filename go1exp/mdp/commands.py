@@ -90,9 +90,15 @@ class WideningVelocity(UniformVelocity):
         zero_fraction: Fraction = 0.0,
     ) -> None:
         """Keep the ranges; velocities are drawn from the share ``start`` of them first, from all after ``over`` s."""
-        ranges = {"lin_vel_x": lin_vel_x, "lin_vel_y": lin_vel_y, "ang_vel_z": ang_vel_z, "hold_time": hold_time}
-        fractions = {"standing_fraction": standing_fraction, "zero_fraction": zero_fraction}
-        super().__init__(stream, **ranges, **fractions)
+        super().__init__(
+            stream,
+            lin_vel_x=lin_vel_x,
+            lin_vel_y=lin_vel_y,
+            ang_vel_z=ang_vel_z,
+            hold_time=hold_time,
+            standing_fraction=standing_fraction,
+            zero_fraction=zero_fraction,
+        )
         self._start, self._over = start, over
         self.age = torch.zeros(len(stream.key), device=stream.key.device)
 

@@ -94,13 +94,24 @@ Restitution = Annotated[float, Field(ge=0.02, le=0.7)]
 ContactTime = Annotated[float, Field(ge=0.002, le=0.1)]
 
 
-def _undamped_time(model: ModelFields, feet: Tensor) -> Tensor:
-    """Return 1 / (natural frequency) of each foot's contact (N or 1, 4), s: MuJoCo's time constant x damping ratio."""
-    solref = model.field("geom_solref")[:, feet]
-    return solref[..., 0] * solref[..., 1]
+FEET_CONTACT = "contact of the feet"
+"""What two terms set, so that a configuration may have one of them only."""
 
 
-@randomization("foot_restitution", kind="model", fields=("geom_solref",))
+def _set_contact(model: ModelFields, mask: Tensor, time: Tensor, ratio: Tensor) -> None:
+    """Set each foot's spring: 1 / its natural frequency, s, and its damping ratio; (N, 4) or (N, 1)."""
+    feet = model.ids("geom", FEET)
+    _vary(model, "geom_solref", (feet, 0), mask, "set", time / ratio)
+    _vary(model, "geom_solref", (feet, 1), mask, "set", ratio)
+
+
+def _spring(model: ModelFields) -> tuple[Tensor, Tensor]:
+    """Return the feet's nominal spring (1 or N, 4): 1 / its natural frequency, s, and its damping ratio."""
+    time, ratio = model.nominal("geom_solref")[:, model.ids("geom", FEET)].unbind(-1)
+    return time * ratio, ratio
+
+
+@randomization("foot_restitution", kind="model", fields=("geom_solref",), sets=FEET_CONTACT)
 def foot_restitution(
     model: ModelFields,
     stream: Stream,
@@ -114,30 +125,29 @@ def foot_restitution(
     takes on the way out: at 1 m/s and a time constant of 5 ms 0.3 comes out as 0.25, 0.2 as 0.1 (docs/contact.md).
     Text of the paper, section II-B.1, which prints no range: 0.1 to 0.3 is chosen.
     """
-    feet = model.ids("geom", FEET)
     ratio = damping_ratio(stream.uniform(len(FEET), low=range[0], high=range[1]))
-    time = _undamped_time(model, feet)
-    _vary(model, "geom_solref", (feet, 0), mask, "set", time / ratio)
-    _vary(model, "geom_solref", (feet, 1), mask, "set", ratio)
+    _set_contact(model, mask, _spring(model)[0], ratio)
 
 
-@randomization("ground_stiffness", kind="model", fields=("geom_solref",))
+@randomization("ground_stiffness", kind="model", fields=("geom_solref",), sets=FEET_CONTACT)
 def ground_stiffness(
     model: ModelFields,
     stream: Stream,
     mask: Tensor,
     *,
     range: Annotated[tuple[ContactTime, ContactTime], AfterValidator(ordered)] = (0.004, 0.02),
+    restitution: Annotated[tuple[Restitution, Restitution], AfterValidator(ordered)] | None = None,
 ) -> None:
     """Stiffness of the ground under all feet, as the time constant of a contact with a damping ratio of 1, s.
 
     A foot sinks as its square: 0.004 is a hard floor, 0.02 MuJoCo's own and like a mattress. Below two physics steps
-    MuJoCo takes two. Damping ratios stay. Not in the paper.
+    MuJoCo takes two. ``restitution``, if given, is drawn for each foot as ``foot_restitution`` does. Not in the paper.
     """
-    feet = model.ids("geom", FEET)
     time = stream.uniform(1, low=range[0], high=range[1])
-    ratio = model.field("geom_solref")[:, feet, 1]
-    _vary(model, "geom_solref", (feet, 0), mask, "set", time / ratio)
+    ratio = _spring(model)[1]
+    if restitution is not None:
+        ratio = damping_ratio(stream.uniform(len(FEET), low=restitution[0], high=restitution[1]))
+    _set_contact(model, mask, time, ratio)
 
 
 @randomization("center_of_mass", kind="model", fields=("body_ipos",), derived=True)
