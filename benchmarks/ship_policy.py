@@ -4,9 +4,10 @@
 
 Writes ``assets/policies/NAME``: the run's configuration and origin, its curves (every tenth iteration), a checkpoint
 that holds only the policy (without what only training needs), and evaluations on the CPU engine: on flat ground
-with noise, with nothing random (``rand=none``), with noise at 100 Hz, and on the ground of training with all that
-training does to a robot. ``first`` is the run that ``run`` started from (``start_from``): its configuration, origin and
-curves go to ``first_stage``. Without ``run`` the present policy is evaluated again.
+with noise, with nothing random (``rand=none``), with noise at 100 Hz, on the ground of training with all that training
+does to a robot, and as policies are judged (``go1exp/evaluate/bars.py``): stiff feet, dry friction, late targets.
+``first`` is the run that ``run`` started from (``start_from``): its configuration, origin and curves go to
+``first_stage``. Without ``run`` the present policy is evaluated again.
 """
 
 from __future__ import annotations
@@ -21,8 +22,13 @@ from typing import Any
 import torch
 
 from go1exp import data_root
+from go1exp.cli import other_robot
+from go1exp.compose import compose
+from go1exp.config import TaskConfig
 from go1exp.evaluate import table
-from go1exp.evaluate.policy import load_run
+from go1exp.evaluate.bars import judged
+from go1exp.evaluate.delay_margin import delay_margin
+from go1exp.evaluate.policy import Policy, load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
 from go1exp.measures import every_measure
 from go1exp.train import checkpoint, start
@@ -41,6 +47,25 @@ EVALUATIONS: dict[str, dict[str, Any]] = {
     "training_ground": {"noise": True, "randomize": True, "push": True, "train_ground": True},
 }
 """Evaluation -> settings that differ from the default."""
+
+JUDGED = (
+    "actuator=pd",
+    "contact=elliptic",
+    "effect=[coulomb,command_delay]",
+    "effect.coulomb.bound=0.2",
+    "effect.command_delay.delay=0.01",
+)
+"""The robot that policies are judged on, for all the same."""
+
+JUDGED_GRID = {
+    "x": (0.1, 0.2, 0.3, 0.5, 1.0, 1.5, 2.0, 3.0, -1.0),
+    "y": (0.5, -0.5),
+    "yaw": (1.0, -0.6, 1.8),
+}
+"""Commands that the bars are about, m/s and rad/s."""
+
+COMBINED = (1.0, 0.3, 0.5)
+"""One command of all three kinds."""
 
 FIRST = "first_stage"
 """Folder for the origin of the run that a policy's run started from."""
@@ -70,14 +95,25 @@ def copy_origin(run: Path, to: Path) -> None:
     (to / "metrics.csv").write_text("".join([head, *rows[9::EVERY]]))
 
 
+def judge(task: TaskConfig, policy: Policy, about: dict[str, Any]) -> dict[str, Any]:
+    """Return the report of a policy on the robot of ``JUDGED``: 20 randomised ones a command, 10 s, noise, delays."""
+    other, _ = other_robot.split(compose("eval", list(JUDGED)))
+    changed = other_robot.replaced(task, other)
+    commands = (*grid(JUDGED_GRID["x"], JUDGED_GRID["y"], JUDGED_GRID["yaw"], cross=False), COMBINED)
+    config = EvalConfig(commands, 20, 10.0, 2.0, True, True, False, False, None, 1)
+    report = {"policy": about, "robot": other_robot.described(other)}
+    report |= evaluate(changed, policy, config, measures=every_measure())
+    report["delay_margin"] = delay_margin(changed, policy, config, report["distinct_falls"])
+    return report
+
+
 def main(arguments: Sequence[str]) -> None:
     """Copy and evaluate."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
-    if (
-        not {"name"} <= set(given) <= {"run", "name", "first", "episodes", "only"}
-        or given.get("only", "flat") not in EVALUATIONS
-    ):
-        known = "|".join(EVALUATIONS)
+    if not {"name"} <= set(given) <= {"run", "name", "first", "episodes", "only"} or given.get(
+        "only", "judged"
+    ) not in (*EVALUATIONS, "judged"):
+        known = "|".join((*EVALUATIONS, "judged"))
         raise SystemExit(
             f"usage: python -m benchmarks.ship_policy [run=RUN] name=NAME [first=RUN] [episodes=31] [only={known}]"
         )
@@ -97,8 +133,18 @@ def main(arguments: Sequence[str]) -> None:
         print(f"== {name}", flush=True)
         wanted = EvalConfig(commands, int(given.get("episodes", 31)), **{**usual, **off, **on})
         report = {"policy": about, **evaluate(config.task, policy, wanted, measures=every_measure())}
-        (to / f"eval_{name}.json").write_text(json.dumps(report, indent=1) + "\n")
-        print(table.text(report), flush=True)
+        write(report, to / f"eval_{name}.json")
+    if given.get("only", "judged") == "judged":
+        print("== judged", flush=True)
+        write(judge(config.task, policy, about), to / "eval_judged.json")
+
+
+def write(report: dict[str, Any], file: Path) -> None:
+    """Write a report, and print it with what it says of the bars."""
+    file.write_text(json.dumps(report, indent=1) + "\n")
+    print(table.text(report), flush=True)
+    for verdict in judged(report):
+        print(f"{'reached' if verdict.reached else 'MISSED':8} {verdict.name}: {verdict.worst} at {verdict.command}")
 
 
 if __name__ == "__main__":
