@@ -29,7 +29,6 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 import torch
-from hydra import compose as hydra_compose
 from mujoco.batch import Batch
 from omegaconf import OmegaConf
 
@@ -37,7 +36,7 @@ from go1exp import data_root
 from go1exp.cli import settings
 from go1exp.cli.app import App
 from go1exp.cli.record import RIG
-from go1exp.compose import hydra_for
+from go1exp.compose import compose_unresolved
 from go1exp.config import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
 from go1exp.deploy.bundle import loads
 from go1exp.deploy.walk import STATUS
@@ -624,8 +623,7 @@ class Walk:
 
 @cache
 def _compose(program: str, overrides: tuple[str, ...]) -> str:
-    with hydra_for(program):
-        return json.dumps(OmegaConf.to_container(hydra_compose(program, list(overrides))))
+    return json.dumps(OmegaConf.to_container(compose_unresolved(program, overrides)))
 
 
 def compose(program: str, overrides: tuple[str, ...] = ()) -> dict[str, Any]:
