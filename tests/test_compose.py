@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 from hydra import compose as hydra_compose
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from go1exp.choices import config_folder
+from go1exp.cli.app import App
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import as_container, as_hydra_takes_them, compose, compose_unresolved, hydra_for
 from go1exp.config_source import VerbSource
@@ -93,6 +95,27 @@ def test_the_fast_parser_reads_every_file_as_omegaconf_does() -> None:
     for file in sorted(config_folder().rglob("*.yaml")):
         name = file.relative_to(config_folder()).as_posix()
         assert source.load_config(name.replace("randomization/", "rand/")).config == OmegaConf.load(file)
+
+
+@pytest.mark.parametrize(
+    ("words", "runs", "compositions"),
+    [
+        (["--multirun", "duration_s=1,2"], 2, 5),  # the whole, and the sweeper each job twice
+        (["hydra.mode=MULTIRUN", "duration_s=1,2"], 2, 6),
+        (["hydra.run.dir=there"], 1, 1),
+        (["hydra.mode=RUN"], 1, 2),
+    ],
+)
+def test_a_verb_composes_once_and_runs_in_the_mode_that_is_asked_for(
+    words: list[str], runs: int, compositions: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    composed: list[Any] = []
+    given: list[dict[str, Any]] = []
+    load = ConfigLoaderImpl.load_configuration
+    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", lambda *a, **k: composed.append(a) or load(*a, **k))
+    assert App("eval", given.append).run(["run=there", *words]) == 0
+    assert (len(given), len(composed)) == (runs, compositions)
 
 
 @pytest.mark.parametrize(
