@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose as hydra_compose
-from hydra import initialize
+from hydra import version
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -68,8 +70,14 @@ def as_hydra_takes_them(overrides: Sequence[str]) -> list[str]:
 def hydra_for(name: str, folders: Sequence[Path] = ()) -> Iterator[None]:
     """Set Hydra up for what ``conf/<name>.yaml`` may choose from, with a user's ``folders`` of further choices."""
     GlobalHydra.instance().clear()
-    with seen_by(name, folders), initialize(config_path=None, version_base="1.3"):
-        yield
+    with seen_by(name, folders):
+        version.setbase("1.3")
+        # hydra.initialize does this too, but first looks through the call stack for a folder that we do not have
+        Hydra.create_main_hydra2("go1exp", create_config_search_path(None))
+        try:
+            yield
+        finally:
+            GlobalHydra.instance().clear()
 
 
 def compose(name: str, overrides: Sequence[str] = (), folders: Sequence[Path] = ()) -> dict[str, Any]:

@@ -114,7 +114,7 @@ def test_a_verb_composes_once_and_runs_in_the_mode_that_is_asked_for(
     given: list[dict[str, Any]] = []
     load = ConfigLoaderImpl.load_configuration
     monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", lambda *a, **k: composed.append(a) or load(*a, **k))
-    assert App("eval", given.append).run(["run=there", *words]) == 0
+    assert App("eval", given.append).run([*words, "run=there"]) == 0
     assert len(given) == runs
     assert compositions in (None, len(composed))
 
