@@ -25,7 +25,7 @@ from go1exp.choices import FOLDERS, config_folder, folder_of, hidden_from
 @cache
 def _fast_loader() -> Any:
     """Return OmegaConf's YAML loader on libyaml's parser, a tenth of the time; as it is where there is no libyaml."""
-    rules = get_yaml_loader()
+    rules: Any = get_yaml_loader()
     if not hasattr(yaml, "CSafeLoader"):
         return rules
 
@@ -44,9 +44,13 @@ def _pickled(file: Path, mtime_ns: int, size: int) -> bytes:
     text = file.read_text(encoding="utf-8")
     try:
         content = yaml.load(text, Loader=_fast_loader())
-        config = OmegaConf.create({} if content is None else content)
     except yaml.YAMLError:
-        config = OmegaConf.load(file)  # its words for what is wrong show the line
+        content = 0
+    config: Any
+    if content is None or isinstance(content, dict | list | str):
+        config = OmegaConf.create({} if content is None else content)
+    else:
+        config = OmegaConf.load(file)  # its words for what is wrong: they show the line
     return pickle.dumps((config, FileConfigSource._get_header_dict(text[:512])))
 
 

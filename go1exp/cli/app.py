@@ -149,11 +149,11 @@ def _composed_once(overrides: Sequence[str], folders: Sequence[Path]) -> Iterato
     """
     before = Hydra.get_mode
     if not folders and not any(re.match(r"-(?!m$|-multirun$)|[+~]*hydra(\.mode|[/=@])", o) for o in overrides):
-        Hydra.get_mode = lambda self, config_name, overrides: None
+        Hydra.get_mode = lambda self, config_name, overrides: None  # type: ignore[method-assign]
     try:
         yield
     finally:
-        Hydra.get_mode = before
+        Hydra.get_mode = before  # type: ignore[method-assign]
 
 
 def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:
