@@ -81,9 +81,11 @@ def go1exp_loop(num_envs: int, device: str) -> tuple[Loop, int, dict[str, str]]:
         ppo.learn(iterations * size, reset_num_timesteps=ppo.iteration == 0)
         wait(device)
 
+    task = config.task
+    model, _ = build_model(task.robot, env.core.terrain, sim.physics_dt, contact=task.contact)
     about = {
         "physics": f"{1000 * sim.physics_dt:g} ms x {sim.decimation}",
-        "solver": solver(build_model(config.task.robot, env.core.terrain, sim.physics_dt)[0]),
+        "solver": solver(model),
         "CUDA graphs": "policy step, gradient step" if env.core.captures else "no",
         "observations": f"{env.core.observation_size}",
         "networks": " x ".join(map(str, p.hidden)),

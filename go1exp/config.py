@@ -19,9 +19,11 @@ import go1exp.effects
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
 from go1exp.effects.rules import drive_problems
+from go1exp.mdp import mirror
 from go1exp.robot import RobotConfig
 from go1exp.schema import plugins
 from go1exp.schema.backends import BACKENDS, BackendConfig, CpuBackend
+from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.schema.learner import CheckpointConfig as CheckpointConfig
 from go1exp.schema.learner import LoggerConfig as LoggerConfig
 from go1exp.schema.learner import PPOConfig as PPOConfig
@@ -94,6 +96,7 @@ class TaskConfig:
     action: ActionConfig
     robot: RobotConfig
     terrain: TerrainConfig
+    contact: ContactConfig
     backend: BackendConfig
     actuator: Term
     effect: tuple[Term, ...]
@@ -189,12 +192,16 @@ SECTIONS: dict[str, type] = {
     "action": ActionConfig,
     "robot": RobotConfig,
     "terrain": TerrainConfig,
+    "contact": ContactConfig,
     "backend": CpuBackend,
     "ppo": PPOConfig,
     "logger": LoggerConfig,
     "checkpoint": CheckpointConfig,
 }
 """Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
+
+OF_OLDER_RUNS: dict[str, Any] = {"contact": MUJOCO_CONTACT}
+"""Parts that runs of older versions do not name, and what they were."""
 
 ONE_TERM = ("actuator", "command")
 """Groups of which a configuration uses one member; its key ``term`` names it."""
@@ -238,6 +245,9 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
     parts: dict[str, Any] = {}
     problems: list[str] = []
     for name in wanted:
+        if name not in container and name in OF_OLDER_RUNS:
+            parts[name] = OF_OLDER_RUNS[name]
+            continue
         if name not in container:
             problems.append(f"{name}: required, but not given")
             continue
@@ -289,6 +299,8 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
             f"ppo.learning_rate = {ppo.learning_rate}: must lie in ppo.learning_rate_range = "
             f"{list(ppo.learning_rate_range)}"
         )
+    if ppo and ppo.symmetry:
+        problems += mirror.problems(parts.get("observation") or ())
     if "observation" in parts and not parts["observation"]:
         problems.append("observation: at least one term is required")
     terrain: Any = parts.get("terrain")

@@ -19,7 +19,9 @@ from go1exp.effects.identification import Identification
 from go1exp.excitations import ExcitationError, Motion
 from go1exp.excitations.motion import always_on
 from go1exp.importers.source import columns, joint_columns, rate, recording
+from go1exp.mdp import mirror
 from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.mirror import Mirror
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.measures.trace import NotMeasured, Trace
 from go1exp.recording import Recording, RecordingError
@@ -58,6 +60,7 @@ __all__ = [
     "KinematicState",
     "Measured",
     "Memory",
+    "Mirror",
     "ModelFields",
     "Motion",
     "NonNegative",
@@ -84,6 +87,7 @@ __all__ = [
     "importer",
     "joint_columns",
     "measure",
+    "mirror",
     "observation",
     "randomization",
     "rate",

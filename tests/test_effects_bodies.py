@@ -337,7 +337,7 @@ def test_a_restitution_that_is_randomised_acts_on_soft_ground_too() -> None:
     foot_restitution(plant.backend, stream, torch.ones(2, dtype=torch.bool), range=(0.3, 0.5))
     model = engine(plant).env_model(1)
     foot = model.geom("FL_foot").id
-    assert model.geom_solref[foot, 0] == 0.05
+    assert model.geom_solref[foot].prod() == pytest.approx(0.05)  # the spring stays
     assert model.geom_solref[foot, 1] < 1.0
 
 

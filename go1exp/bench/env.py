@@ -47,7 +47,7 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
     The torques are computed once per policy step and held, so that nothing but physics is timed between substeps.
     """
     terrain = build_terrain(task.terrain)
-    model, _ = build_model(task.robot, terrain, task.sim.physics_dt)
+    model, _ = build_model(task.robot, terrain, task.sim.physics_dt, contact=task.contact)
     batch = Batch(model, num_envs, nthread=task.backend.as_reference().threads)
     qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
     batch.bind("sensordata")  # so that sensors are computed and copied, as in the environment

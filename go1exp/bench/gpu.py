@@ -66,7 +66,7 @@ def env_subject(task: TaskConfig, num_envs: int) -> Subject:
 def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
     """MuJoCo Warp alone, as one graph: the same model with its sensors, a PD torque once a policy step, no MDP."""
     terrain = build_terrain(task.terrain)
-    model, sensors = build_model(task.robot, terrain, task.sim.physics_dt)
+    model, sensors = build_model(task.robot, terrain, task.sim.physics_dt, contact=task.contact)
     backend = make_backend(task.backend, model, sensors, num_envs)
     device = backend.qpos.device
     qpos, qvel = torch.zeros_like(backend.qpos), torch.zeros_like(backend.qvel)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from go1exp.config import TaskConfig
 
-CHOICES = ("actuator", "effect")
+CHOICES = ("actuator", "effect", "contact")
 """Groups that a run's own choice can be replaced in; null or absent keeps it."""
 
 
@@ -46,8 +46,11 @@ def replaced(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
 
 def described(parts: dict[str, Any]) -> dict[str, Any]:
     """Return the choices as plain data, for a report."""
+    from go1exp.schema.registry import Term
 
-    def plain(term: Any) -> dict[str, Any]:
-        return {"term": term.entry.name, **term.parameters}
+    def plain(part: Any) -> Any:
+        if isinstance(part, tuple):
+            return [plain(term) for term in part]
+        return {"term": part.entry.name, **part.parameters} if isinstance(part, Term) else dataclasses.asdict(part)
 
-    return {name: [plain(t) for t in part] if isinstance(part, tuple) else plain(part) for name, part in parts.items()}
+    return {name: plain(part) for name, part in parts.items()}

@@ -69,7 +69,8 @@ class Go1Core:
         self.task, self.num_envs, self.noise = task, num_envs, noise
         self._spread_starts = spread_starts
         self.terrain = build_terrain(task.terrain)
-        model, sensors = build_model(task.robot, self.terrain, task.sim.physics_dt, imu=imu, held=held)
+        time, contact = task.sim, task.contact
+        model, sensors = build_model(task.robot, self.terrain, time.physics_dt, contact=contact, imu=imu, held=held)
         self.backend = make_backend(task.backend, model, sensors, num_envs)
         self.device = self.backend.qpos.device
         self.random = EnvRandom(seed, num_envs, first_env, self.device, units=self.backend.units)

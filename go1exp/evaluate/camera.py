@@ -171,7 +171,7 @@ class Stage:
 
     def _build(self) -> mujoco.MjModel:
         task = self.core.task
-        return build_model(task.robot, self._window, task.sim.physics_dt, self._decoration)[0]
+        return build_model(task.robot, self._window, task.sim.physics_dt, self._decoration, contact=task.contact)[0]
 
     def _cut(self, xy: Any) -> Terrain:
         """Return the ground within GROUND_RANGE of a place, or as much as there is."""

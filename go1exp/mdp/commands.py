@@ -29,12 +29,24 @@ class UniformVelocity(Memory):
         ang_vel_z: Range = (-1.5, 1.5),
         hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
+        zero_fraction: Fraction = 0.0,
     ) -> None:
-        """Keep the ranges (m/s, m/s, rad/s, s); ``standing_fraction`` of the draws is exactly zero."""
+        """Keep the ranges (m/s, m/s, rad/s, s).
+
+        Args:
+            stream: where draws come from.
+            lin_vel_x: range, m/s.
+            lin_vel_y: range, m/s.
+            ang_vel_z: range, rad/s.
+            hold_time: range of the time that a command is held, s.
+            standing_fraction: share of the commands that are exactly zero.
+            zero_fraction: probability that an axis of another command is zero, each axis by itself: without it a
+                robot is hardly ever told to do one thing alone.
+        """
         device = stream.key.device
         ranges = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z, hold_time], device=device)
         self._low, self._high = ranges.unbind(1)
-        self._standing_fraction = standing_fraction
+        self._standing_fraction, self._zero_fraction = standing_fraction, zero_fraction
         self._stream = stream
         self.value = torch.zeros(len(stream.key), 3, device=device)
         self.time_left = torch.zeros(len(stream.key), device=device)
@@ -44,8 +56,10 @@ class UniformVelocity(Memory):
         self.time_left -= dt
         due = (self.time_left <= 1e-6) | restart
         draw = self._stream.uniform(4, low=self._low, high=self._high)
-        standing = self._stream.uniform(1) < self._standing_fraction
-        self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * ~standing * self.share(), self.value))
+        asked = self._stream.uniform(1) >= self._standing_fraction
+        if self._zero_fraction:
+            asked = asked & (self._stream.uniform(3) >= self._zero_fraction)
+        self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * asked * self.share(), self.value))
         self.time_left.copy_(torch.where(due, draw[:, 3], self.time_left))
 
     def share(self) -> Tensor | float:
@@ -73,10 +87,12 @@ class WideningVelocity(UniformVelocity):
         ang_vel_z: Range = (-1.5, 1.5),
         hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
+        zero_fraction: Fraction = 0.0,
     ) -> None:
         """Keep the ranges; velocities are drawn from the share ``start`` of them first, from all after ``over`` s."""
         ranges = {"lin_vel_x": lin_vel_x, "lin_vel_y": lin_vel_y, "ang_vel_z": ang_vel_z, "hold_time": hold_time}
-        super().__init__(stream, **ranges, standing_fraction=standing_fraction)
+        fractions = {"standing_fraction": standing_fraction, "zero_fraction": zero_fraction}
+        super().__init__(stream, **ranges, **fractions)
         self._start, self._over = start, over
         self.age = torch.zeros(len(stream.key), device=stream.key.device)
 

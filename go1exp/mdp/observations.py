@@ -1,7 +1,8 @@
 """Observation terms: Snapshot -> ``(N, k)`` float32, unscaled by default. The YAML's list is concatenated in its order.
 
 Table II of the paper; a ``scale`` other than 1 is not the paper's. The noise beside a term in the YAML is the
-half-width of a uniform distribution, drawn anew at each policy step and element, of the scaled number.
+half-width of a uniform distribution, drawn anew at each policy step and element, of the scaled number. ``mirror`` says
+what a term is in a mirror that swaps left and right (``mdp/mirror.py``).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.mdp.derived import clock_angle, joint_deviation
+from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, POLAR
 from go1exp.mdp.types import Snapshot
 from go1exp.schema.registry import Positive, observation
 
@@ -18,50 +20,50 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-@observation("base_linear_velocity", size=3)
+@observation("base_linear_velocity", size=3, mirror=POLAR)
 def base_linear_velocity(s: Snapshot) -> Tensor:
     """Velocity of the trunk origin in the trunk frame, (N, 3) m/s. On the robot it comes from an estimator."""
     assert s.base_lin_vel_b is not None
     return s.base_lin_vel_b
 
 
-@observation("base_angular_velocity", size=3)
+@observation("base_angular_velocity", size=3, mirror=AXIAL)
 def base_angular_velocity(s: Snapshot) -> Tensor:
     """Angular velocity in the trunk frame, (N, 3) rad/s. The table prints omega_yaw, with three components."""
     return s.base_ang_vel_b
 
 
-@observation("projected_gravity", size=3)
+@observation("projected_gravity", size=3, mirror=POLAR)
 def projected_gravity(s: Snapshot) -> Tensor:
     """Direction of gravity in the trunk frame, (N, 3), unit length."""
     return s.projected_gravity_b
 
 
-@observation("velocity_command", size=3)
+@observation("velocity_command", size=3, mirror=COMMAND)
 def velocity_command(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
     """Commanded velocity x, y (m/s) and yaw rate (rad/s) in the trunk frame, (N, 3), times ``scale``."""
     return s.command * scale
 
 
-@observation("joint_position", size=12)
+@observation("joint_position", size=12, mirror=JOINTS)
 def joint_position(s: Snapshot) -> Tensor:
     """Joint angles relative to the nominal stance, (N, 12) rad."""
     return joint_deviation(s)
 
 
-@observation("joint_velocity", size=12)
+@observation("joint_velocity", size=12, mirror=JOINTS)
 def joint_velocity(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
     """Joint speeds, (N, 12) rad/s, times ``scale``."""
     return s.joint_vel * scale
 
 
-@observation("previous_action", size=12)
+@observation("previous_action", size=12, mirror=ACTION)
 def previous_action(s: Snapshot) -> Tensor:
     """The policy's last output, unscaled, (N, 12); zero after a reset."""
     return s.action
 
 
-@observation("gait_clock", size=2)
+@observation("gait_clock", size=2, mirror=CLOCK)
 def gait_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
     """Sine and cosine of a clock of ``rate`` turns a second, (N, 2); zero while no motion is commanded.
 

@@ -61,10 +61,15 @@ def feet_air_time_touchdown(s: Snapshot, *, threshold: NonNegative = 0.175) -> T
 
 
 @reward("linear_velocity_error")
-def linear_velocity_error(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
-    """Tracking of the commanded planar velocity: exp(-|v*_xy - v_xy| / scale); scale in m/s. Table III."""
+def linear_velocity_error(s: Snapshot, *, scale: Positive = 1.0, ramp: NonNegative = 0.0) -> Tensor:
+    """Tracking of the commanded planar velocity: exp(-|v*_xy - v_xy| / scale); scale in m/s. Table III.
+
+    ``ramp``, s/m, makes fast commands worth their effort: times 1 + ramp max(|v*_xy| - 1 m/s, 0). Isaac Lab's Spot task.
+    """
     assert s.base_lin_vel_b is not None
-    return torch.exp(-(s.command[:, :2] - s.base_lin_vel_b[:, :2]).norm(dim=-1) / scale)
+    wanted = s.command[:, :2]
+    kernel = torch.exp(-(wanted - s.base_lin_vel_b[:, :2]).norm(dim=-1) / scale)
+    return kernel * (1.0 + ramp * (wanted.norm(dim=-1) - 1.0).clamp(min=0.0))
 
 
 @reward("angular_velocity_error")

@@ -13,6 +13,7 @@ from go1exp import robot
 from go1exp.physics.model import load_robot
 from go1exp.physics.terrain_geom import FLOOR, add_to_spec
 from go1exp.robot import RobotConfig
+from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.terrain import Terrain
 
 DECORATION_GROUP = 2
@@ -58,6 +59,7 @@ def build_model(
     physics_dt: float,
     decoration: bool = False,
     *,
+    contact: ContactConfig = MUJOCO_CONTACT,
     imu: bool = False,
     held: tuple[float, float, float, float] | None = None,
 ) -> tuple[mujoco.MjModel, Sensors]:
@@ -68,6 +70,7 @@ def build_model(
         terrain: the ground, which touches every collision shape of the robot.
         physics_dt: timestep, s.
         decoration: keep the shapes that are only for the eye (they change no trajectory).
+        contact: of the feet with the ground.
         imu: add the IMU's sensors (they cost time and a policy does not need them).
         held: orientation w-x-y-z in which the trunk is held in the air, as on a stand; None lets it go. A held robot's
             state is its joints' alone.
@@ -101,8 +104,17 @@ def build_model(
             motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             motor.forcerange = [-config.effort_limit[kind], config.effort_limit[kind]]
     add_to_spec(spec, terrain)
+    _set_contact(spec, contact)
     sensors = _add_sensors(spec, imu)
     return spec.compile(), sensors
+
+
+def _set_contact(spec: mujoco.MjSpec, contact: ContactConfig) -> None:
+    """Give the feet their contact: they have priority over the ground, so that what they say holds for the pair."""
+    spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{contact.cone.upper()}")
+    spec.option.impratio = contact.impratio
+    for leg in robot.LEGS:
+        spec.geom(f"{leg}_foot").solref[0] = contact.time_constant
 
 
 def _add_sensors(spec: mujoco.MjSpec, imu: bool) -> Sensors:

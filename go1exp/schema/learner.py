@@ -41,6 +41,7 @@ class PPOConfig:
         activation: nonlinearity between the layers.
         matmul_precision: ``highest`` is float32; ``bf16`` runs the update's matrix products in bfloat16; ``auto`` is
             ``bf16`` on a processor with units for it and ``highest`` on all others, which are much slower in it.
+        symmetry: join each minibatch with its mirror image, left for right (Mittal et al., arXiv 2403.04359).
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -67,6 +68,7 @@ class PPOConfig:
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
     activation: Literal["elu", "relu", "tanh"]
     matmul_precision: Literal["highest", "bf16", "auto"]
+    symmetry: bool = False  # runs of older versions do not have the key
 
 
 @dataclass(frozen=True)

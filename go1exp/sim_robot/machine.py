@@ -62,7 +62,9 @@ class Robot:
             )
         self._config, self._rng = config, np.random.default_rng(config.seed)
         held = (1.0, 0.0, 0.0, 0.0) if config.start == "hung" else None
-        model, blocks = build_model(task.robot, build_terrain(TerrainConfig()), TICK, imu=True, held=held)
+        model, blocks = build_model(
+            task.robot, build_terrain(TerrainConfig()), TICK, contact=task.contact, imu=True, held=held
+        )
         backend = MujocoCpu(model, blocks, 1, threads=1)
         random = EnvRandom(config.seed, 1, device=backend.qpos.device)
         self._plant = Plant(backend, drive_setup(task.robot, TICK, backend, random), task.actuator, task.effect)

@@ -35,7 +35,7 @@ class DeviceUpdate:
     """
 
     def __init__(self, ppo: AdaptivePPO, buffer: DeviceRolloutBuffer, captures: bool) -> None:
-        self._config, self._policy, self._buffer = ppo.config, ppo.policy, buffer
+        self._config, self._policy, self._buffer, self._mirror = ppo.config, ppo.policy, buffer, ppo.mirror
         self._adam = ppo.policy.optimizer
         c, device = ppo.config, ppo.device
         self._rate = torch.zeros((), device=device)
@@ -69,14 +69,15 @@ class DeviceUpdate:
         """Loss, gradients and rsl_rl's rate for one minibatch; in place, so that it can be replayed."""
         c, policy = self._config, self._policy
         batch = self._buffer.batch(self._rows)
-        loss = ppo_loss(policy, batch, c)
+        loss = ppo_loss(policy, batch, c, self._mirror)
 
         self._adam.zero_grad(set_to_none=True)
         loss.total.backward()
         norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), c.max_grad_norm)
         with torch.no_grad():
-            mean = policy.last_distribution.distribution.mean
-            kl = gaussian_kl(self._buffer.current_means, self._old_log_std, mean, policy.log_std).mean()
+            means = self._buffer.current_means
+            mean = policy.last_distribution.distribution.mean[: len(means)]  # without mirror images
+            kl = gaussian_kl(means, self._old_log_std, mean, policy.log_std).mean()
             if c.schedule == "adaptive":
                 self._rate.copy_(adapted_rate(self._rate, kl, c.desired_kl, c.learning_rate_range))
             figures = torch.stack((*loss, kl, torch.isfinite(norm).float()))

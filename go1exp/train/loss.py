@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
+    from go1exp.train.symmetry import SampleMirror
+
 
 class Loss(NamedTuple):
     """The loss of one minibatch, its parts, and what is reported of it; each ().
@@ -31,6 +33,9 @@ class Loss(NamedTuple):
         clip_fraction: share of samples whose ratio of probabilities left the clip range; without gradient.
         approx_kl: a sampled divergence from the policy that collected the samples (J. Schulman, "Approximating KL
             divergence", 2020); without gradient.
+
+    The last two are of the samples that were collected, without their mirror images: an image's ratio says how
+    asymmetric a policy is, not how far it has moved.
     """
 
     total: Tensor
@@ -41,12 +46,21 @@ class Loss(NamedTuple):
     approx_kl: Tensor
 
 
-def ppo_loss(policy: ActorCriticPolicy, batch: RolloutBufferSamples, config: PPOConfig) -> Loss:
-    """Return the clipped loss of a minibatch (Schulman et al. 2017, equations 7 and 9), without a look at any value."""
+def ppo_loss(
+    policy: ActorCriticPolicy, batch: RolloutBufferSamples, config: PPOConfig, mirror: SampleMirror | None = None
+) -> Loss:
+    """Return the clipped loss of a minibatch (Schulman et al. 2017, equations 7 and 9), without a look at any value.
+
+    With ``mirror`` it is the loss of the minibatch joined with its mirror image, and the policy's
+    ``last_distribution`` has the image's rows behind those of the minibatch.
+    """
+    collected = len(batch.actions)
+    if mirror is not None:
+        batch = mirror.joined(batch)
     values, log_prob, entropy = policy.evaluate_actions(batch.observations, batch.actions)
     values, advantage = values.flatten(), batch.advantages
     assert entropy is not None
-    if config.normalize_advantage and len(advantage) > 1:
+    if config.normalize_advantage and collected > 1:
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     log_ratio = log_prob - batch.old_log_prob
     ratio = log_ratio.exp()
@@ -57,6 +71,7 @@ def ppo_loss(policy: ActorCriticPolicy, batch: RolloutBufferSamples, config: PPO
     value_loss, entropy_loss = mse_loss(batch.returns, values), -entropy.mean()
     total = policy_loss + config.entropy * entropy_loss + config.value_coef * value_loss
     with torch.no_grad():
+        log_ratio, ratio = log_ratio[:collected], ratio[:collected]
         clip_fraction = ((ratio - 1).abs() > config.clip_range).float().mean()
         approx_kl = ((ratio - 1) - log_ratio).mean()
     return Loss(total, policy_loss, value_loss, entropy_loss, clip_fraction, approx_kl)

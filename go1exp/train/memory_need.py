@@ -26,7 +26,7 @@ def needed_bytes(config: TrainConfig) -> int:
     """Return a lower bound of the memory that a training takes, B: what fails for certain is refused, nothing else.
 
     Robots; the rollout once (observations of one number a term, actions, their means, six numbers a step); the layers'
-    outputs of one minibatch, which wait for the backward pass.
+    outputs of one minibatch, and of its mirror image, which wait for the backward pass.
     """
     ppo, backend = config.ppo, config.task.backend
     per_robot = CPU_ROBOT_BYTES
@@ -34,7 +34,8 @@ def needed_bytes(config: TrainConfig) -> int:
         per_robot = FLOAT * DEGREES_OF_FREEDOM * backend.njmax + CONTACT_BYTES * backend.nconmax
     row = len(config.task.observation) + 2 * robot.NUM_JOINTS + 6
     rollout = ppo.num_envs * ppo.steps
-    outputs = rollout // ppo.minibatches * 2 * sum(ppo.hidden)
+    samples = rollout // ppo.minibatches * (2 if ppo.symmetry else 1)
+    outputs = samples * 2 * sum(ppo.hidden)
     return ppo.num_envs * per_robot + FLOAT * (rollout * row + outputs)
 
 

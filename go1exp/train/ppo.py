@@ -26,6 +26,8 @@ from torch import Tensor, nn
 
 from go1exp.config import PPOConfig
 from go1exp.env.faults import NumericalFault
+from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.train import symmetry
 from go1exp.train.loss import ppo_loss, write_advantages
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
@@ -167,6 +169,9 @@ class AdaptivePPO(PPO):
     """PPO that steers its learning rate and reports after each iteration.
 
     ``after_iteration(ppo)`` is called when an iteration is complete: rollout, update and metrics, nothing half done.
+
+    Attributes:
+        mirror: of its samples, with ``ppo.symmetry``; else None.
     """
 
     buffer_class: type[RolloutBuffer] = MeanRolloutBuffer
@@ -177,6 +182,10 @@ class AdaptivePPO(PPO):
         self.config = config
         self.iteration = 0
         self.after_iteration: Callable[[AdaptivePPO], None] = lambda ppo: None
+        self.mirror: symmetry.SampleMirror | None = None
+        if config.symmetry:
+            assert isinstance(env, Go1VecEnv), "only a robot's observations have a mirror image"
+            self.mirror = symmetry.of_policy(env.core.task.observation)
         super().__init__(
             GaussianPolicy,
             env,
@@ -228,8 +237,8 @@ class AdaptivePPO(PPO):
     def _divergence(self) -> Tensor:
         """Return the KL divergence of the policy from the one that collected this minibatch, ()."""
         with torch.no_grad():
-            mean = self.policy.last_distribution.distribution.mean
             means = self.rollout_buffer.current_means
+            mean = self.policy.last_distribution.distribution.mean[: len(means)]  # without mirror images
             return gaussian_kl(means, self._old_log_std, mean, self.policy.log_std).mean()
 
     def train(self) -> None:
@@ -247,7 +256,7 @@ class AdaptivePPO(PPO):
 
     def _gradient_step(self, batch: RolloutBufferSamples) -> list[float]:
         """Follow the loss of a minibatch downhill by one step; return the figures of the loss."""
-        loss = ppo_loss(self.policy, batch, self.config)
+        loss = ppo_loss(self.policy, batch, self.config, self.mirror)
         self.policy.optimizer.zero_grad()
         loss.total.backward()
         nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.max_grad_norm)

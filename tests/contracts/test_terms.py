@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import mujoco
@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from go1exp import robot
 from go1exp.config import TaskConfig
@@ -22,7 +21,7 @@ from go1exp.physics.scene import build_model
 from go1exp.schema.registry import Entry, members
 from go1exp.terrain import build_terrain
 from go1exp.testing.randomness import everyone, model_fields, parts, start_states, stream, with_fields
-from go1exp.testing.snapshots import ODD, random_snapshot, rows
+from go1exp.testing.snapshots import ODD, mirrored, random_snapshot, rows
 
 
 def each(group: str, **traits: Any) -> Any:
@@ -33,32 +32,6 @@ def each(group: str, **traits: Any) -> Any:
 
 
 # Functions of a snapshot
-
-
-def mirrored(s: Snapshot) -> Snapshot:
-    """The same moment seen in a mirror that stands in the world's x-z plane."""
-    legs, joints = list(robot.MIRROR_LEGS), list(robot.MIRROR_JOINTS)
-    polar, axial = torch.tensor([1.0, -1.0, 1.0]), torch.tensor([-1.0, 1.0, -1.0])
-    flips = {
-        "base_pos_w": polar,
-        "base_quat_w": torch.tensor([1.0, -1.0, 1.0, -1.0]),
-        "base_lin_vel_b": polar,
-        "base_ang_vel_b": axial,
-        "projected_gravity_b": polar,
-        "command": torch.tensor([1.0, -1.0, -1.0]),
-    }
-    new = {}
-    for f in fields(Snapshot):
-        value: Tensor = getattr(s, f.name)
-        if f.name in flips:
-            new[f.name] = value * flips[f.name]
-        elif f.name in ("trunk_contact", "episode_time"):
-            new[f.name] = value.clone()
-        elif value.shape[1] == robot.NUM_JOINTS:
-            new[f.name] = value[:, joints] * torch.tensor(robot.MIRROR_JOINT_SIGNS)
-        else:
-            new[f.name] = value[:, legs] * polar if f.name == "foot_vel_w" else value[:, legs]
-    return Snapshot(**new)
 
 
 def test_the_mirror_is_a_mirror() -> None:
@@ -113,6 +86,13 @@ def test_a_reward_is_the_same_in_the_mirror_unless_it_is_known_not_to_be(entry: 
     assert same == (entry.name not in ONE_SIDED)
 
 
+@pytest.mark.parametrize("name", ["foot_clock", "load_clock"])
+def test_a_reward_of_the_gait_clock_is_the_same_in_the_mirror_half_a_turn_later(name: str) -> None:
+    s, entry = random_snapshot(500), members("reward")[name]
+    image = replace(mirrored(s), episode_time=s.episode_time + 0.2)  # of 2.5 turns a second
+    torch.testing.assert_close(once(entry, image), once(entry, s), rtol=0.0, atol=1e-4)
+
+
 @each("reward")
 def test_a_penalty_or_reward_is_not_negative_unless_it_is_signed(entry: Entry) -> None:
     signed = {"feet_air_time", "feet_air_time_touchdown", "feet_air_time_literal", "joint_deviation_literal"}
@@ -165,6 +145,7 @@ NOTHING: dict[str, list[dict[str, Any]]] = {
         {"range": (0.0, 0.0), "operation": "add"},
     ],
     "foot_restitution": [{"range": (math.exp(-2.0), math.exp(-2.0))}],
+    "ground_stiffness": [{"range": (0.02, 0.02)}],
     "center_of_mass": [{"range": (0.0, 0.0)}],
     "link_mass": [{"range": (1.0, 1.0)}],
 }
@@ -181,7 +162,7 @@ def test_a_model_term_with_a_range_of_one_nominal_value_changes_nothing(
         entry.target(backend, stream(3), everyone(3), **parameters)
         for name, values in model_fields(backend).items():
             # A value that is set is a float32 draw, or looked up; one that is scaled or shifted must not move at all.
-            rtol = {"foot_friction": 1e-7, "foot_restitution": 1e-4}.get(entry.name, 0.0)
+            rtol = {"foot_friction": 1e-7, "foot_restitution": 1e-4, "ground_stiffness": 1e-7}.get(entry.name, 0.0)
             rtol = 0.0 if parameters.get("operation") in ("scale", "add") else rtol
             np.testing.assert_allclose(values, before[name], rtol=rtol, atol=0, err_msg=f"{name} {parameters}")
 

@@ -1,0 +1,31 @@
+"""What a foot on the ground is like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import ConfigDict, Field
+
+from go1exp.schema.registry import STRICT
+
+
+@dataclass(frozen=True)
+class ContactConfig:
+    """Contact of the feet with the ground (docs/contact.md).
+
+    Attributes:
+        time_constant: of the spring-damper under each foot, s: a foot sinks as its square. At least two physics steps.
+        cone: friction cone: ``elliptic``, the same in every direction, or ``pyramidal``, weaker by 0.71 on diagonals.
+        impratio: how much harder friction is than the normal force; more means less creep of a loaded foot.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    time_constant: Annotated[float, Field(ge=0.002, le=0.1)]
+    cone: Literal["pyramidal", "elliptic"]
+    impratio: Annotated[float, Field(ge=1, le=100)]
+
+
+MUJOCO_CONTACT = ContactConfig(time_constant=0.02, cone="pyramidal", impratio=1.0)
+"""MuJoCo's own: a mattress. Runs of go1exp 0.1 were trained on it."""
