@@ -90,7 +90,10 @@ class ActionConfig:
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """One environment: everything that shapes what a policy sees, does and is paid for."""
+    """One environment: everything that shapes what a policy sees, does and is paid for.
+
+    ``critic`` is what the value function sees beside the policy's observation, in training alone.
+    """
 
     sim: SimConfig
     action: ActionConfig
@@ -107,6 +110,7 @@ class TaskConfig:
     event: tuple[Term, ...]
     termination: tuple[Term, ...]
     curriculum: tuple[Term, ...]
+    critic: tuple[Term, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -200,7 +204,7 @@ SECTIONS: dict[str, type] = {
 }
 """Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
 
-OF_OLDER_RUNS: dict[str, Any] = {"contact": MUJOCO_CONTACT}
+OF_OLDER_RUNS: dict[str, Any] = {"contact": MUJOCO_CONTACT, "critic": ()}
 """Parts that runs of older versions do not name, and what they were."""
 
 ONE_TERM = ("actuator", "command")
@@ -210,12 +214,16 @@ MANY_TERMS: dict[str, type[BaseModel] | None] = {
     "reward": RewardSlots,
     "rand": RandomizationSlots,
     "observation": ObservationSlots,
+    "critic": ObservationSlots,
     "effect": EffectSlots,
     "event": None,
     "termination": None,
     "curriculum": None,
 }
 """Groups that are a mapping of terms, with the keys that the group reads beside each term's parameters."""
+
+REGISTERED_AS = {"critic": "observation"}
+"""Groups whose terms are those of another group."""
 
 
 @cache
@@ -236,7 +244,8 @@ def _section(kind: type, settings: Any, path: str) -> tuple[Any, list[str]]:
 def _terms(group: str, settings: Any) -> tuple[tuple[Term, ...], list[str]]:
     if not isinstance(settings, Mapping):
         return (), [f"{group} = {settings!r}: must be a mapping of terms"]
-    bound = [bind(group, key, value, f"{group}.{key}", MANY_TERMS[group]) for key, value in settings.items()]
+    kind, slots = REGISTERED_AS.get(group, group), MANY_TERMS[group]
+    bound = [bind(kind, key, value, f"{group}.{key}", slots) for key, value in settings.items()]
     return tuple(term for term, _ in bound if term), [p for _, problems in bound for p in problems]
 
 
@@ -300,7 +309,8 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
             f"{list(ppo.learning_rate_range)}"
         )
     if ppo and ppo.symmetry:
-        problems += mirror.problems(parts.get("observation") or ())
+        for group in ("observation", "critic"):
+            problems += mirror.problems(group, parts.get(group) or ())
     if "observation" in parts and not parts["observation"]:
         problems.append("observation: at least one term is required")
     terrain: Any = parts.get("terrain")

@@ -52,7 +52,9 @@ def without_engine(core: Go1Core) -> Iterator[None]:
 ROUGH = ("terrain=rough", "terrain.cols=2", "terrain.border=2.0", "curriculum=terrain_level")
 
 
-@pytest.mark.parametrize("choices", [ROUGH, ("experiment=trot", "backend=cpu"), ("reward=paper_literal",)])
+@pytest.mark.parametrize(
+    "choices", [(*ROUGH, "+observation.height_scan={}"), ("experiment=trot", "backend=cpu"), ("reward=paper_literal",)]
+)
 def test_a_step_holds_nothing_that_a_graph_cannot(choices: tuple[str, ...], make_core: Callable[..., Go1Core]) -> None:
     core = make_core(*choices)
     core.reset()

@@ -505,6 +505,9 @@ def test_the_snapshot_describes_the_state(make_core: Make) -> None:
         assert s.base_lin_vel_b is not None
         for f in dataclasses.fields(s):
             value = getattr(s, f.name)
+            if f.name == "height_scan":  # which nobody reads here
+                assert value is None
+                continue
             assert value.shape[0] == 5, f.name
             assert value.dtype in (torch.float32, torch.bool), f.name
         np.testing.assert_allclose(s.base_pos_w, core.backend.qpos[:, :3], atol=1e-6)

@@ -259,10 +259,8 @@ class FakeLink:
 class FakePolicy:
     """Answers with its command, as an action for every joint."""
 
-    inputs = tuple(
-        Port(name, size, "", "", "")
-        for name, size in (("joint_pos", 12), ("base_lin_vel_b", 3), ("command", 3), ("previous_action", 12))
-    )
+    sizes = {"joint_pos": 12, "base_lin_vel_b": 3, "command": 3, "previous_action": 12, "walked": 1}  # noqa: RUF012
+    inputs = tuple(Port(name, size, "", "", "") for name, size in sizes.items())
 
     def __init__(self) -> None:
         self.calls: list[dict[str, np.ndarray]] = []
@@ -338,6 +336,15 @@ def test_the_estimator_gets_every_state_once_and_the_policy_the_newest_estimate(
     made.run_cycles(20)
     assert made.it._estimator.count == 100
     assert [readings["base_lin_vel_b"][0, 0] for readings in made.policy.calls] == [5.0 * k for k in range(11, 21)]
+
+
+def test_a_gait_clock_begins_when_walking_begins() -> None:
+    made = controller()
+    made.run_cycles(30)
+    walking = [cycle.t for cycle in made.log if cycle.phase == "walking"]
+    walked = [float(readings["walked"][0, 0]) for readings in made.policy.calls]
+    np.testing.assert_allclose(walked, np.array(walking) - walking[0], atol=1e-6)
+    assert walked[-1] > 0.1
 
 
 def test_at_another_rate_the_previous_action_is_that_of_a_training_period_ago() -> None:

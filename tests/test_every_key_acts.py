@@ -94,6 +94,7 @@ EXEMPT = {
 
 NEEDS = {
     "curriculum/terrain_level": ["terrain=rough"],
+    "critic/terrain": ["terrain=rough"],
     "experiment/trot": ["observation=clock", "reward=clock", "ppo=gpu"],  # it changes what these say
     "experiment/reference_second": ["experiment=reference", "backend=cpu"],  # it changes what that one adds
 }

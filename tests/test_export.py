@@ -46,9 +46,7 @@ from go1exp.train import run_folder, trainer
 from go1exp.train.ppo import GaussianPolicy
 from tests.small_run import SMALL
 
-SIMULATED = ("clock",)
-"""Choices that read what a bundle does not have: the time since the episode began."""
-OBSERVATIONS = sorted(p.stem for p in (data_root() / "conf/observation").glob("*.yaml") if p.stem not in SIMULATED)
+OBSERVATIONS = sorted(p.stem for p in (data_root() / "conf/observation").glob("*.yaml"))
 ROWS = 1000
 
 
@@ -245,15 +243,6 @@ def test_a_term_that_needs_the_truth_is_named(field: str) -> None:
     terms = [term("fine", lambda s: s.joint_pos, 12), term("cheat", lambda s: getattr(s, field), 4)]
     with pytest.raises(ExportError, match=rf"^observation\.cheat: reads {field}, which the robot does not measure"):
         DeployedPolicy(network(16), terms, ActionConfig(scale=0.2, clip=100.0))
-
-
-@pytest.mark.parametrize("choice", SIMULATED)
-def test_an_observation_of_what_a_bundle_does_not_have_is_refused_by_its_name(
-    choice: str, make_task: Callable[..., TaskConfig]
-) -> None:
-    task = make_task(f"observation={choice}")
-    with pytest.raises(ExportError, match=r"observation\.gait_clock: reads episode_time"):
-        required_inputs(task.observation)
 
 
 def test_a_term_without_a_form_in_onnx_is_named() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import mujoco
@@ -10,8 +11,13 @@ import pytest
 import torch
 
 from go1exp import robot
+from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
+from go1exp.mdp.derived import slip_speed
 from go1exp.mdp.feet import Feet
+from go1exp.physics.scene import build_model
+from go1exp.terrain import build_terrain
+from go1exp.testing.snapshots import random_snapshot
 
 QUIET = ("rand=none", "event=none", "termination=none", "command=forward")
 
@@ -107,3 +113,28 @@ def test_impacts_of_the_environment_are_those_of_mujocos_own_step(make_core: Cal
         assert (s.foot_peak_force >= s.foot_force - 1e-3).all()
     assert landings >= 4
     assert speed.max() > 0.5
+
+
+def test_the_speed_of_a_sole_is_that_of_the_lowest_point_of_its_sphere(make_task: Callable[..., TaskConfig]) -> None:
+    task = make_task()
+    model = build_model(task.robot, build_terrain(task.terrain), 0.002)[0]
+    data, rng = mujoco.MjData(model), np.random.default_rng(3)
+    data.qpos[:] = rng.normal(size=19)
+    data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+    data.qvel[:] = rng.normal(size=18)
+    mujoco.mj_forward(model, data)
+    centre, sole = np.zeros((4, 3)), np.zeros((4, 3))
+    for k, leg in enumerate(robot.LEGS):
+        velocity = np.zeros(6)  # angular, linear; of the geom's centre, in the world
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_GEOM, model.geom(f"{leg}_foot").id, velocity, 0)
+        centre[k] = velocity[3:]
+        sole[k] = velocity[3:] + np.cross(velocity[:3], [0.0, 0.0, -robot.FOOT_RADIUS])
+    s = dataclasses.replace(
+        random_snapshot(1),
+        base_quat_w=torch.tensor(data.qpos[None, 3:7]),
+        base_ang_vel_b=torch.tensor(data.qvel[None, 3:6]),
+        joint_pos=torch.tensor(data.qpos[None, 7:]),
+        joint_vel=torch.tensor(data.qvel[None, 6:]),
+        foot_vel_w=torch.tensor(centre[None]),
+    )
+    np.testing.assert_allclose(slip_speed(s)[0], np.hypot(sole[:, 0], sole[:, 1]), atol=1e-9)

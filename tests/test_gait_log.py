@@ -28,6 +28,7 @@ def walk(phase: tuple[float, ...], rate: float = 2.0, command: float = 1.0, seco
     log, feet = GaitLog(2, DT, torch.device("cpu")), Feet(2, 0.002, torch.device("cpu"))
     plain = random_snapshot(2)
     still = {"command": torch.tensor([[command, 0.0, 0.0]] * 2), "foot_vel_w": torch.zeros(2, 4, 3)}
+    still |= {"base_ang_vel_b": torch.zeros(2, 3), "joint_vel": torch.zeros(2, 12)}
     velocity = torch.zeros(2, 4, 3)
     velocity[..., 2] = -1.0
     offset = torch.tensor(phase)

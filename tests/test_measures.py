@@ -226,7 +226,7 @@ def test_a_foot_slips_while_it_is_loaded_and_fast() -> None:
     trace = pattern(PATTERNS["trot"], seconds=4.0)
     speed = constant(trace, 0.1, 0.3, 1.0, 1.0)
     force = constant(trace, 30.0, 30.0, 30.0, 1.0)
-    slipping = dataclasses.replace(trace, foot_speed=speed, foot_force=force)
+    slipping = dataclasses.replace(trace, foot_slip_speed=speed, foot_force=force)
     np.testing.assert_array_equal(value("slip_share", slipping), [0.0, 1.0, 1.0, np.nan])
     assert value("slip_share_all", slipping) == pytest.approx(2 / 3, abs=0.02)
     # on the ground for 0.2 s of each stride
@@ -314,7 +314,7 @@ def test_every_measure_has_a_unit_and_a_value_per_robot_or_foot() -> None:
 def test_a_trace_whose_columns_do_not_fit_is_refused_by_name() -> None:
     trace = random_trace()
     with pytest.raises(ValueError, match=r"joint_vel: must be \(150, 5, 12\)"):
-        dataclasses.replace(trace, joint_vel=trace.foot_speed)
+        dataclasses.replace(trace, joint_vel=trace.foot_slip_speed)
     with pytest.raises(ValueError, match="a multiple of the 150 steps"):
         dataclasses.replace(trace, contact=trace.contact[:-1])
 

@@ -69,6 +69,7 @@ def snapshot(n: int = 1, **changes: Any) -> Snapshot:
         "calf_contact": [False] * 4,
         "trunk_contact": False,
         "episode_time": 1.0,
+        "height_scan": [-0.33] * 187,
     }
     assert rest.keys() == {f.name for f in fields(Snapshot)}
     assert changes.keys() <= rest.keys()

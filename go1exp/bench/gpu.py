@@ -114,7 +114,7 @@ def train_subject(config: TrainConfig) -> Subject:
 
 def border_subject(config: TrainConfig) -> Subject:
     """Training through SB3's own loop and buffer, with every step in numpy."""
-    core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=True)
+    core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=True, critic=True)
     ppo = AdaptivePPO(config.ppo, Go1VecEnv(core), config.process.seed, "cuda")
     size = config.ppo.num_envs * config.ppo.steps
 

@@ -107,7 +107,7 @@ def texts_of(verb: str) -> dict[str, str]:
 
 def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
     """Return what the keys of a group mean: those of a section by its class, a term by its docstring."""
-    from go1exp.config import ONE_TERM, SECTIONS
+    from go1exp.config import ONE_TERM, REGISTERED_AS, SECTIONS
     from go1exp.schema.backends import BACKENDS
     from go1exp.schema.registry import members
     from go1exp.schema.settings import lines
@@ -116,7 +116,7 @@ def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
         return lines(BACKENDS[settings["name"]], "backend.")
     if group in SECTIONS:
         return lines(SECTIONS[group], f"{group}.")
-    terms = members(group)
+    terms = members(REGISTERED_AS.get(group, group))
     if group in ONE_TERM:
         return {f"{group}.term": terms[settings["term"]].doc}
     names = {key: value.get("term", key) if isinstance(value, dict) else key for key, value in settings.items()}

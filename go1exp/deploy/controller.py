@@ -250,6 +250,7 @@ class Controller:
             "joint_torque": state.joint_torque,
             "joint_target": self._target,
             "command": self._velocity,
+            "walked": self.walked(now),
         }
         for name, values in given.items():
             if name in self._readings:

@@ -23,7 +23,7 @@ from go1exp.env.terms import StepTerms
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.clearance import lift
 from go1exp.mdp.feet import Feet
-from go1exp.mdp.ground import GroundHeight
+from go1exp.mdp.ground import GroundHeight, HeightScan
 from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.physics.scene import build_model
@@ -51,6 +51,7 @@ class Go1Core:
         imu: simulate the IMU's sensors too, for a logger.
         held: attitude w-x-y-z in which the trunks are held in the air; None lets them go.
         alike: draw the effects and drives once, for all robots: one robot, many times (for a logger).
+        critic: append what only the critic sees to the observations (training only).
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class Go1Core:
         imu: bool = False,
         held: tuple[float, float, float, float] | None = None,
         alike: bool = False,
+        critic: bool = False,
     ) -> None:
         self.task, self.num_envs, self.noise = task, num_envs, noise
         self._spread_starts = spread_starts
@@ -78,19 +80,16 @@ class Go1Core:
         self._state = KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
         drives = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
-        self._build_terms(drives)
+        self._build_terms(drives, critic)
         self._restarts = Restarts(self._restart, (self.random, drives))
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
         self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
-        self._last_action = zeros(robot.NUM_JOINTS)
-        self.target = zeros(robot.NUM_JOINTS)
-        self.joint_acc = zeros(robot.NUM_JOINTS)
-        self.spawn = zeros(3)
-        self.steps = zeros(dtype=torch.int64)
-        self._first_step = zeros(dtype=torch.int64)
+        self._last_action, self.target = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
+        self.joint_acc, self.spawn = zeros(robot.NUM_JOINTS), zeros(3)
+        self.steps, self._first_step = zeros(dtype=torch.int64), zeros(dtype=torch.int64)
         self.episode_return = zeros()
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
         self.reward_sums = self.terms.sums
@@ -128,7 +127,7 @@ class Go1Core:
         start = getattr(rules[0], "start_level_max", self._max_level) if rules else self._max_level
         self._start_levels = min(start, self._max_level) + 1
 
-    def _build_terms(self, drives: EnvRandom) -> None:
+    def _build_terms(self, drives: EnvRandom, critic: bool) -> None:
         """Turn the configured terms into callables, and make per-environment the model fields that will vary."""
         task, sim = self.task, self.task.sim
         setup = drive_setup(task.robot, sim.physics_dt, self.backend, drives)
@@ -136,8 +135,10 @@ class Go1Core:
         self.command = task.command(self.random.stream("command"))
         self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}
         self._curriculum = [t() for t in task.curriculum]
-        self.terms = StepTerms(task, self.num_envs, self.device)
+        self.terms = StepTerms(task, self.num_envs, self.device, critic)
         self.observation_size = self.terms.observation_size
+        scan = HeightScan(self._ground if self._bounded else None, self.device)
+        self._scan = scan if "height_scan" in self.terms.read else None
         self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
         self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
         for term in self._model_terms:
@@ -324,14 +325,15 @@ class Go1Core:
             calf_contact=self._calf_touched > 0,
             trunk_contact=(self._touched[:, TRUNK] > 0).any(-1),
             episode_time=self.steps * self.task.sim.policy_dt,
+            height_scan=self._scan(state.base_pos_w.float(), quat) if self._scan else None,
         )
 
     def _observe(self, s: Snapshot, *, advance: bool = False) -> Tensor:
         """(N, O) the configured observation of a snapshot, with its noise if that is on; ``advance`` once a step."""
-        s = self.plant.sense(s) if self.plant.effects.senses else s
+        sensed = self.plant.sense(s) if self.plant.effects.senses else s
         if advance:
-            self.terms.advance(s)
-        clean = self.terms.observation(s)
+            self.terms.advance(sensed, s)
+        clean = self.terms.observation(sensed, s)
         if not self.noise:
             return clean
         return clean + self.terms.noise * self.random.stream("noise").uniform(self.observation_size, low=-1.0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.mdp.derived import foot_speed_xy
+from go1exp.mdp.derived import slip_speed
 from go1exp.measures.gait import GAITS
 from go1exp.tensors.memory import Memory
 
@@ -62,7 +62,7 @@ class GaitLog(Memory):
         landed = s.foot_touchdown & moving
         contact = s.foot_contact.float()
         errors, phases = self._phase_errors(s, landed)
-        fast = contact * (foot_speed_xy(s) > FAST)
+        fast = contact * (slip_speed(s) > FAST)
         peak = torch.maximum(self.stance_peak, s.foot_peak_force)
         ended = ~s.foot_contact & (peak > 0.0)
         self.stance_peak.copy_(torch.where(s.foot_contact, peak, 0.0))

@@ -31,11 +31,14 @@ class StepTerms:
         sums: (R,) float64, of weighted rewards since ``core.drain_metrics``.
         failed: (N, T) bool, which terminations were true in the last step.
         left_map: (N,) bool, who was at the edge of the ground in the last step.
+        observed: terms of the observation, in the order of their columns; those of the critic are the last ones.
         observation_size: O.
+        policy_size: columns that are the policy's.
+        read: fields of the Snapshot that are computed only because an observation reads them.
     """
 
-    def __init__(self, task: TaskConfig, num_envs: int, device: torch.device) -> None:
-        """Build the terms of ``task``."""
+    def __init__(self, task: TaskConfig, num_envs: int, device: torch.device, critic: bool = False) -> None:
+        """Build the terms of ``task``; with ``critic`` those that only the value function sees, too."""
         setup = TermSetup(num_envs, device, task.sim.policy_dt)
         self._remembering: dict[str, Any] = {}
 
@@ -56,11 +59,17 @@ class StepTerms:
         self._termination_calls = calls("termination", task.termination)
         self.failed = torch.zeros(num_envs, len(task.termination), dtype=torch.bool, device=device)
         self.left_map = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._observation_calls = calls("observation", task.observation)
-        self._advancing = [self._remembering[k] for k in self._remembering if k.startswith("observation.")]
-        widths = [int(t.entry.traits["size"]) for t in task.observation]
-        self.observation_size = sum(widths)
-        noise = [t.slots["noise"] for t in task.observation]
+        beside = task.critic if critic else ()
+        self._observation_calls, self._critic_calls = calls("observation", task.observation), calls("critic", beside)
+        self._advancing, self._critic_advancing = (
+            [part for key, part in self._remembering.items() if key.startswith(f"{group}.")]
+            for group in ("observation", "critic")
+        )
+        self.observed = (*task.observation, *beside)
+        self.read = {name for t in self.observed for name in t.entry.traits.get("reads", ())}
+        widths = [int(t.entry.traits["size"]) for t in self.observed]
+        self.observation_size, self.policy_size = sum(widths), sum(widths[: len(task.observation)])
+        noise = [t.slots["noise"] for t in self.observed]
         self.noise = torch.tensor(noise).repeat_interleave(torch.tensor(widths)).float().to(device)
 
     def terminated(self, s: Snapshot) -> Tensor:
@@ -77,14 +86,17 @@ class StepTerms:
         self.sums += weighted.sum(0)
         return weighted.sum(-1)
 
-    def advance(self, s: Snapshot) -> None:
-        """Let the observations that remember something take in a step, as the robot's sensors saw it."""
+    def advance(self, sensed: Snapshot, s: Snapshot) -> None:
+        """Let observations that remember something take in a step: as the sensors saw it, the critic's as it was."""
         for term in self._advancing:
+            term.advance(sensed)
+        for term in self._critic_advancing:
             term.advance(s)
 
-    def observation(self, s: Snapshot) -> Tensor:
-        """(N, O) all observations one after the other, without noise."""
-        return torch.cat([term(s) for term in self._observation_calls], dim=-1)
+    def observation(self, sensed: Snapshot, s: Snapshot) -> Tensor:
+        """(N, O) all observations without noise: what the sensors saw, and behind it the critic's, of the truth."""
+        policy = [term(sensed) for term in self._observation_calls]
+        return torch.cat([*policy, *(term(s) for term in self._critic_calls)], dim=-1)
 
     def reset(self, mask: Tensor) -> None:
         """Begin new episodes in the rows of ``mask`` (N,)."""

@@ -58,12 +58,12 @@ def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tup
         FileNotFoundError: if there is no checkpoint.
     """
     state, path = (checkpoint.read(which), which) if which else checkpoint.load_latest(run)
-    size = state["policy"]["mlp_extractor.policy_net.0.weight"].shape[1]
+    size, policy_size = (state["policy"][f"mlp_extractor.{net}_net.0.weight"].shape[1] for net in ("value", "policy"))
     network = GaussianPolicy(
         Box(-np.inf, np.inf, (size,), np.float32),
         Box(-1.0, 1.0, (robot.NUM_JOINTS,), np.float32),
         lambda _: 0.0,
-        **policy_settings(config),
+        **policy_settings(config, policy_size if policy_size < size else None),
     )
     network.load_state_dict(state["policy"])
     network.set_training_mode(False)

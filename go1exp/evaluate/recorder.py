@@ -11,6 +11,7 @@ from torch import Tensor
 
 from go1exp import robot
 from go1exp.env.core import Go1Core
+from go1exp.mdp.derived import slip_speed
 from go1exp.mdp.types import Snapshot
 from go1exp.measures.trace import Trace
 
@@ -43,7 +44,7 @@ class Recorder:
         self._contact = np.zeros((steps * self._samples, n, legs), bool)
         self._counts = np.zeros((steps, n), bool)
         joints = {name: room(robot.NUM_JOINTS) for name in ("joint_vel", "joint_torque", "joint_target")}
-        feet = ("foot_height", "foot_speed", "foot_force", "foot_peak_force", "foot_touchdown_speed")
+        feet = ("foot_height", "foot_slip_speed", "foot_force", "foot_peak_force", "foot_touchdown_speed")
         self._columns = {name: room(3) for name in SNAPSHOT_COLUMNS if name not in joints} | joints
         self._columns |= {name: room(legs) for name in feet} | {n: room() for n in ("base_height", "positive_power")}
         self._touching = np.ones((n, legs), bool)
@@ -64,7 +65,7 @@ class Recorder:
         s = self._core.snapshot()
         for name in SNAPSHOT_COLUMNS:
             columns[name][row] = getattr(s, name).numpy()
-        columns["foot_speed"][row] = np.hypot(self._vel[..., 0], self._vel[..., 1])
+        columns["foot_slip_speed"][row] = slip_speed(s).numpy()
         columns["base_height"][row] = self._height(s)
         self._counts[row] = alive.numpy()
         self._row += 1

@@ -41,6 +41,11 @@ def _same(reading: Tensor) -> Tensor:
     return reading
 
 
+def _of_all(reading: Tensor) -> Tensor:
+    """(N, 1) -> (N,): a field with one number for each robot."""
+    return reading.squeeze(-1)
+
+
 @dataclass(frozen=True)
 class Source:
     """Source of a field of the Snapshot on the robot: the name of a reading, and the function of it."""
@@ -59,6 +64,7 @@ READINGS = (
     Port("joint_target", J, "rad", "joint", "position targets now in force; the nominal stance at the start"),
     Port("command", 3, "m/s, m/s, rad/s", "trunk", "commanded velocity: x, y and yaw rate"),
     Port("previous_action", J, "1", "joint", "the output `action` of one training period before; zero until then"),
+    Port("walked", 1, "s", "-", "time since walking began: a gait clock is a function of it"),
 )
 """Inputs that the robot's computer can provide. A graph has those that its terms read, in this order."""
 
@@ -73,6 +79,7 @@ SOURCES = {
     "joint_target": Source("joint_target"),
     "command": Source("command"),
     "action": Source("previous_action"),
+    "episode_time": Source("walked", _of_all),
 }
 """Field of the Snapshot -> its source. The robot does not measure the other fields."""
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import torch
+
 from go1exp import robot
 from go1exp.mdp.types import Snapshot
 from go1exp.tensors.constants import constant_like
+from go1exp.tensors.rotation import rotate
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,6 +42,22 @@ def foot_speed_xy(s: Snapshot) -> Tensor:
     """(N, 4) horizontal speed of the feet, m/s."""
     assert s.foot_vel_w is not None
     return s.foot_vel_w[..., :2].norm(dim=-1)
+
+
+def slip_speed(s: Snapshot) -> Tensor:
+    """(N, 4) horizontal speed of the sole, m/s: of the lowest point of each foot's sphere.
+
+    A foot that stands still rolls with its leg, so that its centre moves: at 3 m/s by 0.3 m/s.
+    """
+    assert s.foot_vel_w is not None
+    assert s.base_quat_w is not None
+    hip, turning = s.joint_pos.unflatten(-1, (4, 3))[..., 0], s.joint_vel.unflatten(-1, (4, 3))
+    pitching = turning[..., 1] + turning[..., 2]  # thigh and calf turn about the axis that the hip has tilted
+    of_leg = torch.stack([turning[..., 0], torch.cos(hip) * pitching, torch.sin(hip) * pitching], dim=-1)
+    turn_w = rotate(s.base_quat_w.unsqueeze(1), s.base_ang_vel_b.unsqueeze(1) + of_leg)
+    x = s.foot_vel_w[..., 0] - robot.FOOT_RADIUS * turn_w[..., 1]
+    y = s.foot_vel_w[..., 1] + robot.FOOT_RADIUS * turn_w[..., 0]
+    return torch.hypot(x, y)
 
 
 def since_last_contact_began(s: Snapshot) -> Tensor:

@@ -1,4 +1,4 @@
-"""Height of the ground under batches of points."""
+"""Height of the ground under batches of points, and around robots."""
 
 from __future__ import annotations
 
@@ -8,6 +8,12 @@ import torch
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+SCAN_ROWS, SCAN_COLUMNS = 17, 11
+"""Points of a height scan along x, from behind to the front; in each of its rows along y, from right to left."""
+
+SCAN_SPACING = 0.1
+"""Distance between its points, m: 1.6 m x 1.0 m with the trunk's origin in the middle, as in Isaac Lab."""
 
 
 class GroundHeight:
@@ -46,3 +52,29 @@ class GroundHeight:
         far, high = self._flat[at + self.nx], self._flat[at + self.nx + 1]
         # Each cell is split from (low x, low y) to (high x, high y), as MuJoCo does.
         return low + torch.where(u >= v, u * (right - low) + v * (high - right), v * (far - low) + u * (high - far))
+
+
+class HeightScan:
+    """Heights of the ground on a grid about each robot, level, and turned with the robot's heading.
+
+    Args:
+        ground: lookup of heights; None for flat ground at height 0.
+        device: of the grid.
+    """
+
+    def __init__(self, ground: GroundHeight | None, device: torch.device) -> None:
+        self._ground = ground
+        x, y = (SCAN_SPACING * (torch.arange(n, device=device) - (n - 1) / 2) for n in (SCAN_ROWS, SCAN_COLUMNS))
+        self._grid = torch.cartesian_prod(x, y)
+
+    def __call__(self, position: Tensor, quat: Tensor) -> Tensor:
+        """Return heights over the trunks' origins (N, 187), m, for trunks at ``position`` (N, 3), ``quat`` (N, 4)."""
+        below = -position[:, 2:].expand(-1, len(self._grid))
+        if self._ground is None:
+            return below
+        w, x, y, z = quat.unsqueeze(1).unbind(-1)
+        ahead = torch.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], dim=-1)  # the x axis, seen from above
+        ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        left = torch.stack([-ahead[..., 1], ahead[..., 0]], dim=-1)
+        points = position[:, None, :2] + self._grid[:, :1] * ahead + self._grid[:, 1:] * left
+        return self._ground(points) + below

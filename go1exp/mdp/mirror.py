@@ -99,19 +99,19 @@ CLOCK = Mirror((0, 1), (-1.0, -1.0))
 """Sine and cosine of a gait clock: left and right swap roles, and are half a turn apart."""
 
 
-def problems(terms: Iterable[Term]) -> list[str]:
-    """Return what is wrong with the mirrors of observation terms, a line for each."""
+def problems(group: str, terms: Iterable[Term]) -> list[str]:
+    """Return what is wrong with the mirrors of the observation terms in a group, a line for each."""
     lines = []
     for term in terms:
         mirror, size, where = term.entry.traits.get("mirror"), term.entry.traits.get("size"), term.entry.place
         if not isinstance(mirror, Mirror):
             lines.append(
-                f"ppo.symmetry = True: observation.{term.key} does not say what its mirror image is; add mirror= to "
+                f"ppo.symmetry = True: {group}.{term.key} does not say what its mirror image is; add mirror= to "
                 f"@observation in {where}, as docs/extending.md shows, or use ppo.symmetry=false"
             )
         elif len(mirror.signs) != size:
             lines.append(
-                f"ppo.symmetry = True: observation.{term.key} has {size} columns and a mirror of {len(mirror.signs)} "
+                f"ppo.symmetry = True: {group}.{term.key} has {size} columns and a mirror of {len(mirror.signs)} "
                 f"({where})"
             )
     return lines

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.mdp.derived import clock_angle, joint_deviation
-from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, POLAR
+from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS
+from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, LEGS, POLAR, grid
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.registry import Positive, observation
+from go1exp.schema.registry import NonNegative, Positive, observation
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -72,3 +73,45 @@ def gait_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
     angle = clock_angle(s, rate)
     moving = s.command.norm(dim=-1, keepdim=True) > 0
     return torch.stack([torch.sin(angle), torch.cos(angle)], dim=-1) * moving
+
+
+@observation("joint_torque", size=12, mirror=JOINTS)
+def joint_torque(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Torques of the drives, (N, 12) N m, times ``scale``."""
+    return s.joint_torque * scale
+
+
+@observation("foot_contact", size=4, mirror=LEGS)
+def foot_contact(s: Snapshot) -> Tensor:
+    """Whether each foot bears force now, 1 or 0, (N, 4)."""
+    return s.foot_contact.float()
+
+
+@observation("foot_force", size=4, mirror=LEGS)
+def foot_force(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Magnitudes of the ground's forces on the feet, (N, 4) N, times ``scale``."""
+    return s.foot_force * scale
+
+
+@observation("foot_height", size=4, mirror=LEGS)
+def foot_height(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Heights of the feet's centres over the ground below them, (N, 4) m, times ``scale``."""
+    assert s.foot_height is not None
+    return s.foot_height * scale
+
+
+@observation("foot_air_time", size=4, mirror=LEGS)
+def foot_air_time(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
+    """Time that each foot has been in the air, 0 in stance, (N, 4) s, times ``scale``."""
+    return s.foot_air_time * scale
+
+
+@observation("height_scan", size=SCAN_ROWS * SCAN_COLUMNS, mirror=grid(SCAN_ROWS, SCAN_COLUMNS), reads=("height_scan",))
+def height_scan(s: Snapshot, *, scale: Positive = 1.0, offset: NonNegative = 0.3, bound: Positive = 1.0) -> Tensor:
+    """Ground around the robot: its height over the trunk's origin plus ``offset`` m, times ``scale``, cut at ``bound``.
+
+    (N, 187), a grid of 1.6 m along the heading and 1.0 m across, every 0.1 m; 0 where the ground is ``offset`` below.
+    After Isaac Lab's term of this name, which has the other sign.
+    """
+    assert s.height_scan is not None
+    return ((s.height_scan + offset) * scale).clamp(-bound, bound)

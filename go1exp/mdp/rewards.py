@@ -64,7 +64,8 @@ def feet_air_time_touchdown(s: Snapshot, *, threshold: NonNegative = 0.175) -> T
 def linear_velocity_error(s: Snapshot, *, scale: Positive = 1.0, ramp: NonNegative = 0.0) -> Tensor:
     """Tracking of the commanded planar velocity: exp(-|v*_xy - v_xy| / scale); scale in m/s. Table III.
 
-    ``ramp``, s/m, makes fast commands worth their effort: times 1 + ramp max(|v*_xy| - 1 m/s, 0). Isaac Lab's Spot task.
+    ``ramp``, s/m, makes fast commands worth their effort: times 1 + ramp max(|v*_xy| - 1 m/s, 0), as in Isaac Lab's
+    Spot task.
     """
     assert s.base_lin_vel_b is not None
     wanted = s.command[:, :2]

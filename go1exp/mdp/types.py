@@ -97,6 +97,9 @@ class Snapshot:
     """(N,) bool, trunk, head or a hip touched the ground during this policy step."""
     episode_time: Tensor
     """(N,) time since the last reset, s."""
+    height_scan: Tensor | None = None
+    """(N, 187) height of the ground over the trunk's origin, m, on the grid of ``mdp/ground.py``; None unless an
+    observation reads it."""
 
 
 @dataclass(frozen=True)

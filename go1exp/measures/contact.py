@@ -70,14 +70,14 @@ def slip_share_all(trace: Trace, *, speed: Positive = 0.2, least_force: NonNegat
 def slip_distance(trace: Trace, *, least_force: NonNegative = 5.0) -> Array:
     """Way that each foot slides while it is loaded, per stride (N, 4)."""
     loaded = _loaded(trace, least_force)
-    way = (np.where(loaded, trace.need("foot_speed"), 0.0)).sum(0, dtype=np.float64) * trace.step_dt
+    way = (np.where(loaded, trace.need("foot_slip_speed"), 0.0)).sum(0, dtype=np.float64) * trace.step_dt
     strides = np.bincount(trace.phases.where(1, whole=False).column, minlength=way.size).reshape(way.shape)
     return ratio(way, strides)
 
 
 def _fast_and_loaded(trace: Trace, speed: float, least_force: float) -> tuple[Array, np.ndarray]:
     """(T, N, 4) each: 1 where a loaded foot moves faster than this, NaN where its speed is; and where it is loaded."""
-    loaded, moves = _loaded(trace, least_force), trace.need("foot_speed")
+    loaded, moves = _loaded(trace, least_force), trace.need("foot_slip_speed")
     return np.where(np.isnan(moves), moves, moves > speed) * np.where(loaded, 1.0, 0.0), loaded
 
 

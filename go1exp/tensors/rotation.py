@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:
-    """Express a vector (N, 3) of the frame whose orientation is ``quat`` (N, 4), w-x-y-z, in the world."""
-    return rotate_inverse(torch.cat([quat[:, :1], -quat[:, 1:]], dim=-1), vector)
+    """Express a vector (..., 3) of the frame whose orientation is ``quat`` (..., 4), w-x-y-z, in the world."""
+    return rotate_inverse(torch.cat([quat[..., :1], -quat[..., 1:]], dim=-1), vector)
 
 
 def rotate_inverse(quat: Tensor, vector: Tensor) -> Tensor:
-    """Express a world vector (N, 3) in the frame whose orientation is ``quat`` (N, 4), w-x-y-z."""
-    w, axis = quat[:, :1], quat[:, 1:]
+    """Express a world vector (..., 3) in the frame whose orientation is ``quat`` (..., 4), w-x-y-z."""
+    w, axis = quat[..., :1], quat[..., 1:]
     t = 2.0 * torch.linalg.cross(axis, vector)
     return vector - w * t + torch.linalg.cross(axis, t)
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from go1exp import robot
+from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS
 from go1exp.mdp.mirror import Mirror
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.schema.registry import Entry
@@ -58,6 +59,7 @@ def random_snapshot(n: int, seed: int = 0) -> Snapshot:
         "calf_contact": rng.random((n, 4)) < 0.3,
         "trunk_contact": rng.random(n) < 0.3,
         "episode_time": rng.uniform(0.0, 20.0, n),
+        "height_scan": rng.uniform(-0.6, 0.0, (n, SCAN_ROWS * SCAN_COLUMNS)),
     }
     assert values.keys() == {f.name for f in fields(Snapshot)}
     tensors = {k: torch.as_tensor(v) for k, v in values.items()}
@@ -91,6 +93,8 @@ def mirrored(s: Snapshot) -> Snapshot:
             new[f.name] = value * flips[f.name]
         elif f.name in ("trunk_contact", "episode_time"):
             new[f.name] = value.clone()
+        elif f.name == "height_scan":
+            new[f.name] = value.unflatten(1, (SCAN_ROWS, SCAN_COLUMNS)).flip(2).flatten(1)
         elif value.shape[1] == robot.NUM_JOINTS:
             new[f.name] = value[:, joints] * torch.tensor(robot.MIRROR_JOINT_SIGNS)
         else:

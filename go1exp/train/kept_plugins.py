@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from go1exp.config import MANY_TERMS, ONE_TERM
+from go1exp.config import MANY_TERMS, ONE_TERM, REGISTERED_AS
 from go1exp.schema import plugins
 from go1exp.schema.plugins import Plugin
 from go1exp.schema.registry import ConfigError
@@ -113,7 +113,7 @@ def _used(container: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield group and name of every term in a configuration."""
     for group in MANY_TERMS:
         for key, settings in (container.get(group) or {}).items():
-            yield group, str((settings or {}).get("term", key))
+            yield REGISTERED_AS.get(group, group), str((settings or {}).get("term", key))
     for group in ONE_TERM:
         inner: Any = container.get(group)
         while isinstance(inner, Mapping):  # a drive may be in a drive

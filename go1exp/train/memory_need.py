@@ -32,7 +32,7 @@ def needed_bytes(config: TrainConfig) -> int:
     per_robot = CPU_ROBOT_BYTES
     if isinstance(backend, WarpBackend):
         per_robot = FLOAT * DEGREES_OF_FREEDOM * backend.njmax + CONTACT_BYTES * backend.nconmax
-    row = len(config.task.observation) + 2 * robot.NUM_JOINTS + 6
+    row = len(config.task.observation) + len(config.task.critic) + 2 * robot.NUM_JOINTS + 6
     rollout = ppo.num_envs * ppo.steps
     samples = rollout // ppo.minibatches * (2 if ppo.symmetry else 1)
     outputs = samples * 2 * sum(ppo.hidden)

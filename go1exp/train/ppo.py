@@ -70,7 +70,7 @@ def has_bf16_units() -> bool:
     return any(getattr(torch.cpu, check, lambda: False)() for check in checks)
 
 
-def policy_settings(config: PPOConfig) -> dict[str, Any]:
+def policy_settings(config: PPOConfig, policy_size: int | None = None) -> dict[str, Any]:
     """Return the keyword arguments of ``GaussianPolicy`` that a configuration stands for."""
     return {
         "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
@@ -78,6 +78,7 @@ def policy_settings(config: PPOConfig) -> dict[str, Any]:
         "ortho_init": config.orthogonal_init,
         "log_std_init": float(np.log(config.init_std)),
         "bf16": config.matmul_precision == "bf16" or (config.matmul_precision == "auto" and has_bf16_units()),
+        "policy_size": policy_size,
     }
 
 
@@ -85,32 +86,53 @@ LOSS_FIGURES = ("loss", "policy_gradient_loss", "value_loss", "entropy_loss", "c
 """SB3's names for the fields of ``Loss``, in their order."""
 
 
-class Bf16MlpExtractor(MlpExtractor):
-    """SB3's two networks with bfloat16 matrix products while training; weights and everything else stay float32."""
+class TwoNetworks(MlpExtractor):
+    """SB3's two networks, of which the actor may see fewer columns, and with bfloat16 as a choice.
+
+    Args:
+        policy_size: the first columns that are the actor's; None for all of them.
+        bf16: multiply matrices in bfloat16 while training; weights and everything else stay float32.
+    """
+
+    def __init__(self, *args: Any, policy_size: int | None, bf16: bool, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._policy_size, self._bf16 = policy_size, bf16
+        if policy_size is not None:
+            _, *others = args
+            self.policy_net = MlpExtractor(policy_size, *others, **kwargs).policy_net
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return the latents of actor and critic, float32."""
+        if not self._bf16:
+            return super().forward(features)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=self.training):
             pi, vf = super().forward(features)
         return pi.float(), vf.float()
 
+    def forward_actor(self, features: Tensor) -> Tensor:
+        """Return the actor's latent; columns of the critic may be missing."""
+        return super().forward_actor(features[..., : self._policy_size])
+
 
 class GaussianPolicy(ActorCriticPolicy):
-    """SB3's actor-critic, which remembers the distribution of its last forward pass."""
+    """SB3's actor-critic, which remembers the distribution of its last forward pass.
+
+    Args:
+        *args: SB3's.
+        policy_size: columns of the observation that the actor sees, the first ones; the critic sees all.
+        bf16: as for ``TwoNetworks``.
+        **kwargs: SB3's.
+    """
 
     last_distribution: DiagGaussianDistribution
 
-    def __init__(self, *args: Any, bf16: bool = False, **kwargs: Any) -> None:
-        self._bf16 = bf16
+    def __init__(self, *args: Any, policy_size: int | None = None, bf16: bool = False, **kwargs: Any) -> None:
+        self._networks: dict[str, Any] = {"policy_size": policy_size, "bf16": bf16}
         super().__init__(*args, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
-        if not self._bf16:
-            return super()._build_mlp_extractor()
-        self.mlp_extractor = Bf16MlpExtractor(
-            self.features_dim, net_arch=self.net_arch, activation_fn=self.activation_fn, device=self.device
-        )
-        return None
+        arch, activation, device = self.net_arch, self.activation_fn, self.device
+        self.mlp_extractor = TwoNetworks(self.features_dim, arch, activation, device, **self._networks)
 
     def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
         distribution = super()._get_action_dist_from_latent(latent_pi)
@@ -182,10 +204,10 @@ class AdaptivePPO(PPO):
         self.config = config
         self.iteration = 0
         self.after_iteration: Callable[[AdaptivePPO], None] = lambda ppo: None
-        self.mirror: symmetry.SampleMirror | None = None
-        if config.symmetry:
-            assert isinstance(env, Go1VecEnv), "only a robot's observations have a mirror image"
-            self.mirror = symmetry.of_policy(env.core.task.observation)
+        terms = env.core.terms if isinstance(env, Go1VecEnv) else None
+        assert terms or not config.symmetry, "only a robot's observations have mirror images"
+        self.mirror = symmetry.of_policy(terms.observed) if config.symmetry and terms else None
+        policy_size = terms.policy_size if terms and terms.policy_size < terms.observation_size else None
         super().__init__(
             GaussianPolicy,
             env,
@@ -202,7 +224,7 @@ class AdaptivePPO(PPO):
             vf_coef=config.value_coef,
             max_grad_norm=config.max_grad_norm,
             rollout_buffer_class=self.buffer_class,
-            policy_kwargs=policy_settings(config),
+            policy_kwargs=policy_settings(config, policy_size),
             seed=seed,
             device=device,
         )

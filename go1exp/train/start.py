@@ -44,6 +44,7 @@ def read(config: TrainConfig, source: Path) -> Weights:
         f"{name} is {new} here and {old} there"
         for name, new, old in (
             ("observation", *([t.entry.name for t in c.task.observation] for c in (config, theirs))),
+            ("critic", *([t.entry.name for t in c.task.critic] for c in (config, theirs))),
             ("ppo.hidden", list(config.ppo.hidden), list(theirs.ppo.hidden)),
             ("ppo.activation", config.ppo.activation, theirs.ppo.activation),
         )

@@ -52,7 +52,8 @@ def build(config: TrainConfig) -> AdaptivePPO:
     preflight.check_devices(config)
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)
-    core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=config.task.sim.spread_starts)
+    spread = config.task.sim.spread_starts
+    core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=spread, critic=True)
     device = str(core.device) if config.process.device == "auto" else config.process.device
     learner = DevicePPO if core.device.type == torch.device(device).type == "cuda" else AdaptivePPO
     return learner(config.ppo, Go1VecEnv(core), config.process.seed, device)
