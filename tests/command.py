@@ -52,8 +52,9 @@ import go1exp.config, go1exp.cli.settings, go1exp.excitations, go1exp.importers
 
 WARM = f"""{COMPOSED}
 import torch, mujoco, stable_baselines3
+import torch._dynamo  # an optimiser imports it: 1.5 s
 import go1exp.train.trainer, go1exp.evaluate, go1exp.record.simulate, go1exp.excitations, go1exp.importers
-import go1exp.cli.app
+import go1exp.audit, go1exp.audit.checks, go1exp.fit.fitting, go1exp.cli.app
 """
 """What work needs."""
 

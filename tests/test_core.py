@@ -78,15 +78,16 @@ def data_of(core: Go1Core, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
 def test_an_environment_does_in_a_batch_what_it_does_alone_bit_for_bit(
     make_core: Make, ground: tuple[str, ...]
 ) -> None:
-    n, steps = 3, 150
+    n, steps = 3, 60
     inputs = actions(n, steps, 3.0)
-    batch = make_core(*LIVELY, *ground, num_envs=n, seed=3)
+    lively = (*LIVELY, *ground, "sim.episode_s=0.5")
+    batch = make_core(*lively, num_envs=n, seed=3)
     first = batch.reset()
     together = list(run(batch, inputs))
     assert sum(int(r["terminated"].sum()) for r in together) >= 2
     assert sum(int(r["truncated"].sum()) for r in together) >= 2
     for i in range(n):
-        alone = make_core(*LIVELY, *ground, num_envs=1, seed=3, first_env=i)
+        alone = make_core(*lively, num_envs=1, seed=3, first_env=i)
         assert torch.equal(alone.reset(), first[i : i + 1])
         for k, single in enumerate(run(alone, inputs[:, i : i + 1])):
             for name, value in single.items():
@@ -110,7 +111,7 @@ def test_a_restart_of_nobody_can_be_left_out(make_core: Make) -> None:
 def test_the_same_seed_gives_the_same_trajectory_and_another_seed_another(
     make_core: Make, ground: tuple[str, ...]
 ) -> None:
-    inputs = actions(4, 60)
+    inputs = actions(4, 40)
     first, second, other = (make_core(*LIVELY, *ground, num_envs=4, seed=s) for s in (1, 1, 2))
     start, again, elsewhere = first.reset(), second.reset(), other.reset()
     assert torch.equal(start, again)
@@ -132,7 +133,7 @@ def test_the_number_of_threads_changes_no_bit(make_core: Make, ground: tuple[str
 
 @GROUNDS
 def test_a_saved_environment_continues_bit_for_bit(make_core: Make, ground: tuple[str, ...]) -> None:
-    n, inputs = 4, actions(4, 130)
+    n, inputs = 4, actions(4, 90)
     core = make_core(*LIVELY, *ground, num_envs=n, seed=5)
     core.reset()
     list(run(core, inputs[:37]))
@@ -148,7 +149,7 @@ def test_a_saved_environment_continues_bit_for_bit(make_core: Make, ground: tupl
     new = make_core(*LIVELY, *ground, num_envs=n, seed=99)
     used = make_core(*LIVELY, *ground, num_envs=n, seed=98)
     used.reset()
-    list(run(used, actions(n, 20, seed=1)))
+    list(run(used, actions(n, 10, seed=1)))
     for resumed in (new, used):
         file.seek(0)
         resumed.load_state_dict(torch.load(file, weights_only=True))
@@ -175,10 +176,10 @@ def test_a_reseeded_environment_is_a_new_one(make_core: Make, when: str) -> None
     options = (*LIVELY, *ROUGH, f"rand.link_mass.when={when}")
     used, new = make_core(*options, seed=1, spread_starts=True), make_core(*options, seed=7, spread_starts=True)
     used.reset()
-    list(run(used, actions(4, 30)))
+    list(run(used, actions(4, 20)))
     used.reseed(7)
     assert torch.equal(used.reset(), new.reset())
-    inputs = actions(4, 60, seed=2)
+    inputs = actions(4, 40, seed=2)
     assert all(same(a, b) for a, b in zip(run(used, inputs), run(new, inputs), strict=True))
 
 

@@ -10,7 +10,6 @@ it has no effect within a few robots and steps; ``EXEMPT`` has those that cannot
 
 from __future__ import annotations
 
-import copy
 import csv
 import io
 import itertools
@@ -29,7 +28,6 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 import torch
-from hydra import compose as hydra_compose
 from mujoco.batch import Batch
 from omegaconf import OmegaConf
 
@@ -37,12 +35,14 @@ from go1exp import data_root
 from go1exp.cli import settings
 from go1exp.cli.app import App
 from go1exp.cli.record import RIG
-from go1exp.compose import hydra_for
+from go1exp.compose import compose_unresolved
 from go1exp.config import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
 from go1exp.deploy.bundle import loads
 from go1exp.deploy.walk import STATUS
 from go1exp.env.core import Go1Core
+from go1exp.export import graph
 from go1exp.export.build import build
+from go1exp.export.graph import DeployedPolicy
 from go1exp.mdp.types import Snapshot
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.schema import registry
@@ -325,32 +325,49 @@ def has(container: Mapping[str, Any], key: str) -> bool:
     return True
 
 
-def put(container: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """A copy with another value."""
-    changed = copy.deepcopy(container)
-    *parents, last = key.split(".")
+def _opened(container: dict[str, Any], parents: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A copy in which the mapping at ``parents`` can be changed, and that mapping; what is beside it is shared."""
+    changed = dict(container)
     node = changed
     for part in parents:
+        node[part] = dict(node[part])
         node = node[part]
+    return changed, node
+
+
+def put(container: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """A copy with another value."""
+    *parents, last = key.split(".")
+    changed, node = _opened(container, parents)
     node[last] = value
     return changed
 
 
 def drop(container: dict[str, Any], key: str) -> dict[str, Any]:
     """A copy without the key."""
-    changed = copy.deepcopy(container)
-    parent, _, last = key.rpartition(".")
-    del get(changed, parent)[last]
+    *parents, last = key.split(".")
+    changed, node = _opened(container, parents)
+    del node[last]
     return changed
 
 
-@lru_cache(4)
+@lru_cache(64)
 def _resolved(container: str) -> str:
     return json.dumps(OmegaConf.to_container(OmegaConf.create(json.loads(container)), resolve=True))
 
 
 def resolved(container: dict[str, Any]) -> dict[str, Any]:
-    plain: dict[str, Any] = json.loads(_resolved(json.dumps(container)))
+    """A copy without interpolations. OmegaConf gets those and what they read; the whole would take it 30 ms."""
+    whole = json.dumps(container)
+    texts = {key: text for key, text in flat(container, "") if isinstance(text, str) and "${" in text}
+    assert whole.count("${") == sum(text.count("${") for text in texts.values())
+    read = {name for text in texts.values() for name in re.findall(r"\$\{(?:oc\.select:)?(\w+)", text)}
+    part = {"texts": list(texts.values()), **{name: container[name] for name in sorted(read) if name in container}}
+    values = json.loads(_resolved(json.dumps(part)))["texts"]
+    plain: dict[str, Any] = json.loads(whole)
+    for key, value in zip(texts, values, strict=True):
+        parent, _, last = key.rpartition(".")
+        (get(plain, parent) if parent else plain)[last] = value
     return plain
 
 
@@ -625,8 +642,7 @@ class Walk:
 
 @cache
 def _compose(program: str, overrides: tuple[str, ...]) -> str:
-    with hydra_for(program):
-        return json.dumps(OmegaConf.to_container(hydra_compose(program, list(overrides))))
+    return json.dumps(OmegaConf.to_container(compose_unresolved(program, overrides)))
 
 
 def compose(program: str, overrides: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -1037,14 +1053,27 @@ TRACES: dict[str, Callable[[dict[str, Any], Walk], Trace]] = {
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory, make_net: Callable[..., Path]) -> Walk:
-    return Walk(tmp_path_factory.mktemp("keys"), make_net)
+def walk(tmp_path_factory: pytest.TempPathFactory, make_net: Callable[..., Path]) -> Iterator[Walk]:
+    """What the leaves share. A policy is exported once: torch takes 3 s, whatever the rest of the bundle is."""
+    kept: dict[str, bytes] = {}
+
+    def to_onnx(module: DeployedPolicy) -> bytes:
+        weights = {name: value.tolist() for name, value in module.state_dict().items()}
+        identity = repr((weights, [(t.key, t.entry.name, t.parameters) for t in module._terms], module._action))
+        if identity not in kept:
+            kept[identity] = graph.to_onnx(module)
+        return kept[identity]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("go1exp.export.build.to_onnx", to_onnx)
+        yield Walk(tmp_path_factory.mktemp("keys"), make_net)
 
 
 VERB = ("go1exp/cli/", "go1exp/config.py", "go1exp/schema/")
 RUN = (*VERB, "go1exp/train/")
 SLOW = {
     "gap": ("conf/gap.yaml", "go1exp/gap/", "go1exp/effects/", *VERB),
+    "record_audit": ("conf/record_audit.yaml", "go1exp/audit/", *VERB),
     "export": ("conf/export.yaml", "go1exp/export/", *VERB),
     "export_check": ("conf/export_check.yaml", "go1exp/export/", *VERB),
     "deploy": ("conf/deploy.yaml", "go1exp/deploy/", "go1exp/sim_robot/", *VERB),
@@ -1059,8 +1088,33 @@ SLOW = {
 }
 """Programs, and groups of train, of which a trace takes long, and what they are made of. ``make test`` asks of their
 keys only that each is read, in one trace for all of a program; ``make test-all`` that each acts. The terms of the MDP,
-drives, randomisation and ground act in both; that each parameter of an effect moves a robot is also the contract of
-effects (tests/contracts/test_effects.py)."""
+drives, randomisation and ground act in both (``REPEATED``); that each parameter of an effect moves a robot is also the
+contract of effects (tests/contracts/test_effects.py)."""
+
+
+def repeated(leaves: Iterable[Leaf]) -> set[str]:
+    """Names of the leaves that another choice of the group has too, of the same term, but for the first of each."""
+    leaves = list(leaves)
+    names = {(leaf.file, leaf.key): leaf.value for leaf in leaves if leaf.key.endswith("term")}
+    first: dict[tuple[Any, ...], str] = {}
+    for leaf in leaves:
+        parts = leaf.key.split(".")
+        terms = [names.get((leaf.file, ".".join([*parts[:n], "term"]))) for n in range(1, len(parts))]
+        first.setdefault((leaf.program, leaf.key, leaf.value if parts[-1] == "term" else None, *terms), leaf.name)
+    return {leaf.name for leaf in leaves} - set(first.values())
+
+
+REPEATED = repeated(leaf for leaf in WALKED if not leaf.overlay)
+"""``make test`` tries a key of a term in one choice, ``make test-all`` in each: ``reward.gait.weight`` has four."""
+
+
+def marks(leaf: Leaf) -> list[pytest.MarkDecorator]:
+    """Whether a leaf is for ``make test-all``, and what its trace is made of."""
+    start = leaf.file.split("/")[0]
+    if start in SLOW:
+        return [pytest.mark.slow(*SLOW[start])]
+    return [pytest.mark.slow(f"conf/{leaf.file}.yaml", "go1exp/mdp/")] if leaf.name in REPEATED else []
+
 
 READ: dict[str, list[type]] = {
     **{program: [kind] for program, (kind, _) in SETTINGS.items() if program in SLOW},
@@ -1069,14 +1123,7 @@ READ: dict[str, list[type]] = {
 """A file of a program or group -> the dataclasses of its settings."""
 
 
-@pytest.mark.parametrize(
-    "leaf",
-    [
-        pytest.param(leaf, id=leaf.name, marks=[pytest.mark.slow(*SLOW[start])] if start in SLOW else [])
-        for leaf in WALKED
-        for start in [leaf.file.split("/")[0]]
-    ],
-)
+@pytest.mark.parametrize("leaf", [pytest.param(leaf, id=leaf.name, marks=marks(leaf)) for leaf in WALKED])
 def test_every_key_acts(leaf: Leaf, walk: Walk) -> None:
     assert not (dead := walk.dead(leaf)), f"{leaf.file}.yaml: nothing changes with {', '.join(dead)}"
 
@@ -1119,6 +1166,15 @@ def test_a_field_that_is_only_checked_and_copied_is_unread() -> None:
             assert self.unused
 
     assert unread([Two], lambda: asdict(replace(Two(), used=3)) and Two().used) == ["Two.unused"]
+
+
+def test_a_repeated_key_is_one_of_the_same_term_in_another_choice() -> None:
+    files = ("reward/a", {"gait": {"weight": 1.0}}), ("reward/b", {"gait": {"weight": 2.0, "term": "gait_clock"}})
+    leaves = [Leaf(name, key, value) for name, content in files for key, value in flat(content, "reward")]
+    assert repeated(leaves) == set()
+    assert repeated([*leaves, Leaf("reward/c", "reward.gait.weight", 3.0)]) == {"reward/c.yaml:reward.gait.weight"}
+    tried = [leaf for leaf in WALKED if leaf.name not in REPEATED]
+    assert {leaf.key for leaf in WALKED} == {leaf.key for leaf in tried}
 
 
 def test_exemptions_are_needed() -> None:

@@ -359,7 +359,7 @@ def test_friction_hidden_in_a_servo_is_named() -> None:
 @pytest.mark.usefixtures("few")
 def test_friction_hidden_in_a_double_pendulum_of_torque_drives_is_named() -> None:
     robot = machine("ak80_double_pendulum_a", tolerances={})
-    steps, logs, joints = np.arange(0.0, 4.0, 0.0005), [], ("shoulder", "elbow")
+    steps, logs, joints = np.arange(0.0, 2.5, 0.0005), [], ("shoulder", "elbow")
     for n, speed in enumerate((3.0, 4.0, 6.0)):
         torque = np.stack([0.9 * np.sin(speed * steps), 0.5 * np.sin(1.7 * speed * steps)], 1)
         q = played(robot, {"coulomb": {"bound": {"elbow": 0.15}}}, torque, 4)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import gymnasium
@@ -24,6 +23,7 @@ from go1exp.env.faults import NumericalFault
 from go1exp.env.gym_env import Go1Env
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.schema.registry import ConfigError
+from tests.command import run, run_alone
 
 Make = Callable[..., Go1Core]
 
@@ -56,10 +56,14 @@ def actions(n: int, steps: int, scale: float = 1.0, seed: int = 0) -> np.ndarray
 # Gymnasium
 
 
-def test_the_example_of_the_readme_works_in_a_fresh_interpreter() -> None:
+alone = pytest.mark.slow("README.md", "go1exp/__init__.py", "go1exp/env/", "go1exp/compose.py", "conf/")
+
+
+@pytest.mark.parametrize("start", [run, pytest.param(run_alone, marks=alone)], ids=["forked", "alone"])
+def test_the_example_of_the_readme_works(start: Callable[..., CompletedProcess[str]], tmp_path: Path) -> None:
     code = (data_root() / "README.md").read_text().split("```python")[1].split("```")[0]
     more = "\nobservation, _ = env.reset(seed=0)\nprint(observation.shape, env.spec.id)"
-    done = subprocess.run([sys.executable, "-c", code + more], capture_output=True, text=True, timeout=120)
+    done = start(tmp_path, code=code + more)
     assert done.stdout.strip() == "(48,) Go1-v0", done.stderr
 
 

@@ -37,21 +37,22 @@ def quantum(values: np.ndarray) -> float:
         return 0.0
     gaps = gaps[:: -(-len(gaps) // MOST_GAPS)]
     guesses = {float(gaps[int(share * len(gaps))]) / m for share in (0, 0.02, 0.1, 0.5) for m in range(1, 7)}
-    for guess in sorted(guesses, reverse=True):
-        step = _refined(gaps, guess)
-        if step > limits.CONTINUOUS * largest and np.abs(np.mean(np.exp(2j * np.pi * gaps / step))) > 0.9:
-            return step
-    return 0.0
+    steps = _refined(gaps, np.array(sorted(guesses, reverse=True)))
+    steps = steps[steps > limits.CONTINUOUS * largest]
+    whole = np.abs(np.exp(2j * np.pi * gaps / steps[:, None]).mean(axis=1)) > 0.9
+    return float(steps[whole][0]) if whole.any() else 0.0
 
 
-def _refined(gaps: np.ndarray, step: float) -> float:
+def _refined(gaps: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Refine candidates (C,) by regression of ``gaps`` (G,) on whole multiples of them, of larger and larger gaps."""
+    refining = np.ones(len(steps), dtype=bool)
     for most in (3, 10, 30, 100):
-        count = np.round(gaps / step)
-        use = (count >= 1) & (count <= most)
-        if not use.any():
-            break
-        step = float(gaps[use] @ count[use] / (count[use] @ count[use]))
-    return step
+        count = np.round(gaps / steps[:, None])
+        count[(count < 1) | (count > most)] = 0.0
+        squares = np.einsum("cg,cg->c", count, count)
+        refining &= squares > 0  # a candidate is left as it is from where no gap is near enough
+        steps = np.where(refining, count @ gaps / np.maximum(squares, 1.0), steps)
+    return steps
 
 
 def noise(values: np.ndarray) -> tuple[float, bool]:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import shutil
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import hydra
+from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -76,7 +79,7 @@ class App:
             _refuse_stray_words(arguments, title)
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
             sys.argv = [title, *map(protected, as_hydra_takes_them(overrides))]
-            with seen_by(self.name, folders):
+            with seen_by(self.name, folders), _composed_once(overrides, folders):
                 hydra.main(**version, config_path=None, config_name=self.name)(task)()
             if failure:
                 raise failure[0]
@@ -135,6 +138,22 @@ class App:
         if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # the latter is torch's
             return FAILED, f"out of memory: {' '.join(str(error).split())}"
         raise error
+
+
+@contextmanager
+def _composed_once(overrides: Sequence[str], folders: Sequence[Path]) -> Iterator[None]:
+    """Spare a third of the time of starting: Hydra composes everything twice, first only to read ``hydra.mode``.
+
+    None of our files sets it, so that Hydra goes by ``--multirun``, as it does for None. Where an override or a user's
+    file may set it, Hydra looks.
+    """
+    before = Hydra.get_mode
+    if not folders and not any(re.match(r"-(?!m$|-multirun$)|[+~]*hydra(\.mode|[/=@])", o) for o in overrides):
+        Hydra.get_mode = lambda self, config_name, overrides: None  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        Hydra.get_mode = before  # type: ignore[method-assign]
 
 
 def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:

@@ -91,8 +91,9 @@ class Robot:
         plant.reset(everyone, self._target)
         self._gains = self._default_gains
         self._set_gains(*((np.zeros(robot.NUM_JOINTS), self._braking_kd) if start == "lying" else self._default_gains))
-        for _ in range(round(SETTLE_S / TICK)):
-            self._advance()
+        for _ in range(round(SETTLE_S / TICK) - 1):
+            plant.step(self._target)
+        self._advance()
         plant.effects.reset(everyone)  # an effect that drifts starts now
 
     _braking_kd = np.full(robot.NUM_JOINTS, DEFAULT_KD)
