@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -241,7 +241,7 @@ class Controller:
         """Return the policy's command; None, and a fault, if the estimate or the commanded velocity is not finite."""
         asked = self._commands(now - self._since) if self.phase == "walking" else np.zeros(3)
         self._velocity = np.asarray(asked, dtype=float)
-        given = {
+        given: dict[str, Any] = {
             "joint_pos": state.joint_pos,
             "joint_vel": state.joint_vel,
             "imu_gyro": state.imu_gyro,

@@ -44,7 +44,7 @@ class Recorder:
         self._contact = np.zeros((steps * self._samples, n, legs), bool)
         self._counts = np.zeros((steps, n), bool)
         joints = {name: room(robot.NUM_JOINTS) for name in ("joint_vel", "joint_torque", "joint_target")}
-        feet = ("foot_height", "foot_slip_speed", "foot_force", "foot_peak_force", "foot_touchdown_speed")
+        feet = ("foot_height", "foot_depth", "foot_slip_speed", "foot_force", "foot_peak_force", "foot_touchdown_speed")
         self._columns = {name: room(3) for name in SNAPSHOT_COLUMNS if name not in joints} | joints
         self._columns |= {name: room(legs) for name in feet} | {n: room() for n in ("base_height", "positive_power")}
         self._touching = np.ones((n, legs), bool)
@@ -106,6 +106,7 @@ class Recorder:
         height = self._pos[..., 2] - np.asarray(self._core.ground_height(torch.from_numpy(self._pos[..., :2])))
         top = columns["foot_height"][row]
         np.copyto(top, height if self._sample == 0 else np.maximum(top, height), casting="same_kind")
+        np.maximum(columns["foot_depth"][row], robot.FOOT_RADIUS - height, out=columns["foot_depth"][row])
         # MuJoCo moves q by qd dt after it has changed qd: tau qd dt is the work of the step.
         power = self._plant.torque.numpy() * self._plant.qd.numpy()
         columns["positive_power"][row] += np.maximum(power, 0.0).sum(-1)

@@ -49,6 +49,18 @@ def peak_force_p95(trace: Trace) -> Array:
     return percentile_by_robot(peak, stance.column // robot.NUM_LEGS, trace.robots, HIGH) / weight
 
 
+@measure("sink_p99", unit="m", per="foot")
+def sink_p99(trace: Trace, *, least_force: NonNegative = 5.0) -> Array:
+    """Depth of each sole in the ground while it bears force, 99th percentile over the steps (N, 4)."""
+    depth = np.where(_loaded(trace, least_force), trace.need("foot_depth"), np.nan).astype(np.float64)
+    result = np.full(depth.shape[1:], np.nan)
+    for place in np.ndindex(*result.shape):
+        steps = depth[:, *place]
+        if (steps >= 0).any():
+            result[place] = np.nanpercentile(steps, 99.0)
+    return result
+
+
 @measure("slip_share", unit="-", per="foot")
 def slip_share(trace: Trace, *, speed: Positive = 0.2, least_force: NonNegative = 5.0) -> Array:
     """Share of each foot's loaded time in which it moves faster than ``speed`` m/s over the ground (N, 4).

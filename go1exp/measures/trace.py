@@ -56,6 +56,8 @@ class Trace:
     """(T, N) mean over the step of sum_j max(0, tau_j qd_j), W."""
     foot_height: Array | None = None
     """(T, N, 4) largest height of the foot's centre over the ground during the step, m."""
+    foot_depth: Array | None = None
+    """(T, N, 4) largest depth of the sole in the ground during the step, m; 0 in the air."""
     foot_slip_speed: Array | None = None
     """(T, N, 4) horizontal speed of the sole, the lowest point of the foot's sphere, m/s."""
     foot_force: Array | None = None

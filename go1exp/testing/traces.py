@@ -44,6 +44,7 @@ def random_trace(robots: int = ROBOTS, seed: int = 0) -> Trace:
         "joint_target": signed(joints),
         "positive_power": positive(),
         "foot_height": positive(legs),
+        "foot_depth": 0.01 * positive(legs),
         "foot_slip_speed": positive(legs),
         "foot_force": 100.0 * positive(legs),
         "foot_peak_force": 300.0 * positive(legs),
