@@ -1,8 +1,8 @@
 """What the contact of the feet does to a walk: ``python -m benchmarks.contact [policy=paper] [robots=10]``.
 
 A shipped policy walks on contacts of several time constants, cones and physics steps: how deep its feet sink, how much
-of the loaded time they slip, how hard they land. ``fine=true`` adds physics of 0.25 ms, the reference. Then the speed of
-the environment on the CPU, each contact twice, in turns.
+of the loaded time they slip, how hard they land. ``fine=true`` adds physics of 0.25 ms, the reference. Then the speed
+of the environment on the CPU, each contact twice, in turns.
 """
 
 from __future__ import annotations
