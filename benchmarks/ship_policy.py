@@ -26,7 +26,6 @@ from go1exp.cli import other_robot
 from go1exp.compose import compose
 from go1exp.config import TaskConfig
 from go1exp.evaluate import table
-from go1exp.evaluate.bars import judged
 from go1exp.evaluate.delay_margin import delay_margin
 from go1exp.evaluate.policy import Policy, load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
@@ -140,11 +139,9 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def write(report: dict[str, Any], file: Path) -> None:
-    """Write a report, and print it with what it says of the bars."""
+    """Write a report and print it."""
     file.write_text(json.dumps(report, indent=1) + "\n")
     print(table.text(report), flush=True)
-    for verdict in judged(report):
-        print(f"{'reached' if verdict.reached else 'MISSED':8} {verdict.name}: {verdict.worst} at {verdict.command}")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from go1exp.evaluate.bars import BARS, judged, missed
+from go1exp.evaluate.table import bars
 
 
 def row(*command: float, mean: tuple[float, ...] | None = None, **changes: Any) -> dict[str, Any]:
@@ -69,3 +70,15 @@ def test_a_fall_at_30_ms_of_delay_is_missed_and_without_a_command_nothing_is_jud
     assert {v.name for v in judged({"commands": unmeasured})} == {
         *("RMSE xy", "RMSE yaw", "told 2.0 m/s", "told 1.8 rad/s", "told 3.0 m/s", "told 0.1 to 0.3", "falls")
     }
+
+
+def test_the_report_says_which_bars_are_missed_by_how_much_and_where() -> None:
+    assert bars({"commands": GOOD}) == ["bars for a policy (go1exp/evaluate/bars.py): 14 of 14 reached"]
+    slow = row(2, 0, 0, mean=(1.5, 0.0, 0.0), stride_rate=4.5)
+    assert bars({"commands": [*GOOD, slow], "delay_margin": {"ms": None}}) == [
+        "bars for a policy (go1exp/evaluate/bars.py): 12 of 15 reached; missed, worst command's mean:",
+        "  stride rate: 4.5 at +2, +0, +0",
+        "  told 2.0 m/s: 0.75 at +2, +0, +0",
+        "  delay: -",
+    ]
+    assert bars({"commands": []}) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 from go1exp.cli import other_robot
@@ -36,6 +37,7 @@ def _task(container: dict[str, Any]) -> None:
         raise ConfigError(["grid: with cross=true every axis needs at least one value, such as grid.yaw=[0.0]"])
 
     from go1exp.evaluate import table
+    from go1exp.evaluate.bars import judged
     from go1exp.evaluate.delay_margin import delay_margin
     from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
@@ -52,6 +54,7 @@ def _task(container: dict[str, Any]) -> None:
     if settings.delay_margin:
         falls = report["distinct_falls"]
         report["delay_margin"] = delay_margin(task, policy, config, falls, spinner(1, "with a delay"))
+    report["bars"] = [dataclasses.asdict(verdict) for verdict in judged(report)]
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, report)
     print(table.text(report))

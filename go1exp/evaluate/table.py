@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from go1exp.evaluate.bars import Verdict, judged
 from go1exp.evaluate.rollout import AXES
 
 HEADER = ("command x, y, yaw", "mean x, y, yaw", "RMSE x, y, yaw", "falls", "mean time s")
@@ -139,17 +140,34 @@ def _delay(report: dict[str, Any]) -> str:
     return f"largest delay of the target without a fall: {held} (falls: {runs})"
 
 
+def bars(report: dict[str, Any]) -> list[str]:
+    """Say which of the bars for a policy (``evaluate/bars.py``) the report has a figure for and which it misses."""
+    verdicts = judged(report)
+    missed = [verdict for verdict in verdicts if not verdict.reached]
+    if not verdicts:
+        return []
+
+    def worst(verdict: Verdict) -> str:
+        value = "-" if verdict.worst is None else f"{verdict.worst:.3g}"
+        command = ", ".join(f"{v:+g}" for v in verdict.command)
+        return f"  {verdict.name}: {value}" + (f" at {command}" if command else "")
+
+    head = f"bars for a policy (go1exp/evaluate/bars.py): {len(verdicts) - len(missed)} of {len(verdicts)} reached"
+    return [head + ("; missed, worst command's mean:" if missed else ""), *map(worst, missed)]
+
+
 def text(report: dict[str, Any]) -> str:
     """Return the report as text for a terminal; m/s and rad/s."""
     lines = _laid([HEADER, *rows(report)])
     for table in measure_tables(report):
         lines += ["", *_laid(table)]
-    if any(c.get("measures") for c in report["commands"]):
+    measured = any(c.get("measures") for c in report["commands"])
+    if measured:
         lines += ["", LEGEND]
     lines += [""] + [
         line(report) for key, line in (("distinct_falls", _falls), ("delay_margin", _delay)) if key in report
     ]
-    return "\n".join([*lines, _summary(report)])
+    return "\n".join([*lines, *(bars(report) if measured else ()), _summary(report)])
 
 
 def markdown(report: dict[str, Any]) -> str:
