@@ -26,6 +26,7 @@ from go1exp.cli import other_robot
 from go1exp.compose import compose
 from go1exp.config import TaskConfig
 from go1exp.evaluate import table
+from go1exp.evaluate.bars import ROBOT
 from go1exp.evaluate.delay_margin import delay_margin
 from go1exp.evaluate.policy import Policy, load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
@@ -46,15 +47,6 @@ EVALUATIONS: dict[str, dict[str, Any]] = {
     "training_ground": {"noise": True, "randomize": True, "push": True, "train_ground": True},
 }
 """Evaluation -> settings that differ from the default."""
-
-JUDGED = (
-    "actuator=pd",
-    "contact=elliptic",
-    "effect=[coulomb,command_delay]",
-    "effect.coulomb.bound=0.2",
-    "effect.command_delay.delay=0.01",
-)
-"""The robot that policies are judged on, for all the same."""
 
 JUDGED_GRID = {
     "x": (0.1, 0.2, 0.3, 0.5, 1.0, 1.5, 2.0, 3.0, -1.0),
@@ -95,8 +87,8 @@ def copy_origin(run: Path, to: Path) -> None:
 
 
 def judge(task: TaskConfig, policy: Policy, about: dict[str, Any]) -> dict[str, Any]:
-    """Return the report of a policy on the robot of ``JUDGED``: 20 randomised ones a command, 10 s, noise, delays."""
-    other, _ = other_robot.split(compose("eval", list(JUDGED)))
+    """Return the report of a policy on ``bars.ROBOT``: 20 robots a command, 10 s, noise; and its delay margin."""
+    other, _ = other_robot.split(compose("eval", list(ROBOT)))
     changed = other_robot.replaced(task, other)
     commands = (*grid(JUDGED_GRID["x"], JUDGED_GRID["y"], JUDGED_GRID["yaw"], cross=False), COMBINED)
     config = EvalConfig(commands, 20, 10.0, 2.0, True, True, False, False, None, 1)

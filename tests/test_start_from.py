@@ -119,7 +119,8 @@ def test_from_the_command_line(
     for wrong, said in (
         (
             "nowhere",
-            "start_from = 'nowhere': no run folder (it has no config.yaml) and no shipped policy (there are: paper)",
+            "start_from = 'nowhere': no run folder (it has no config.yaml) and no shipped policy "
+            "(there are: paper, trot)",
         ),
         (str(first), "ppo.hidden is [512, 256, 128] here"),
     ):

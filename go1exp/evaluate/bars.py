@@ -59,6 +59,16 @@ def _answer(row: Row) -> list[float | None]:
     return [reached / sum(c * c for c in row["command"])]
 
 
+ROBOT = (
+    "actuator=pd",
+    "contact=elliptic",
+    "effect=[coulomb,command_delay]",
+    "effect.coulomb.bound=0.2",
+    "effect.command_delay.delay=0.01",
+)
+"""The robot that all policies are judged on, as overrides of ``go1exp eval``, with ``noise=true randomize=true``."""
+
+
 @dataclass(frozen=True)
 class Bar:
     """One figure that every command which it is about must keep within limits, each of its feet or axes by itself."""
