@@ -22,6 +22,7 @@ import go1exp.record.policy  # noqa: F401  (registers every importer and excitat
 from go1exp import cli, data_root
 from go1exp.cli import listing, settings
 from go1exp.cli.files import choices_from_files
+from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.plugins import begin
 from go1exp.cli.record import RIG
 from go1exp.cli.record import _motions as motions
@@ -374,7 +375,7 @@ def parse(verb: str, container: dict[str, Any]) -> None:
     own = {f.name for f in fields(VERBS[verb])}
     checked: Any = settings.parse(VERBS[verb], {k: v for k, v in container.items() if k in own})
     others = container.keys() - own
-    assert others <= {*RIG, "excitation", "model"}
+    assert others <= {*RIG, *CHOICES, "excitation", "model"}
     problems = parse_parts(container, tuple(others - {"excitation", "model"}))[1]
     if "model" in others:
         parse_model(container["model"])

@@ -34,6 +34,7 @@ from omegaconf import OmegaConf
 from go1exp import data_root
 from go1exp.cli import settings
 from go1exp.cli.app import App
+from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.record import RIG
 from go1exp.compose import compose_unresolved
 from go1exp.config import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
@@ -95,7 +96,11 @@ EXEMPT = {
 NEEDS = {
     "curriculum/terrain_level": ["terrain=rough"],
     "critic/terrain": ["terrain=rough"],
-    "experiment/trot": ["observation=clock", "reward=clock", "ppo=gpu"],  # it changes what these say
+    "experiment/trot": [  # it changes what these say
+        *("observation=clock", "reward=clock", "ppo=gpu", "command=widening", "actuator=delay"),
+        "observation.gait_clock.rate=3.1",  # neither the file's nor the experiment's, which the rewards take over
+    ],
+    "experiment/paper_trot": ["reward=paper_trot", "command=widening", "actuator=delay", "ppo=gpu"],
     "experiment/reference_second": ["experiment=reference", "backend=cpu"],  # it changes what that one adds
 }
 """Choices that other choices must go with."""
@@ -393,7 +398,7 @@ SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
     "gap": (settings.GapVerb, ("robot", "model")),
     "export": (settings.ExportSettings, ()),
     "export_check": (settings.ExportCheckSettings, ()),
-    "deploy": (settings.DeploySettings, ("actuator", "effect")),
+    "deploy": (settings.DeploySettings, CHOICES),
     "list": (settings.ListSettings, ()),
     "bench": (settings.BenchSettings, ()),
 }
