@@ -58,7 +58,7 @@ def walk(task: TaskConfig, policy: Policy, contact: ContactConfig, step: float, 
 
 def steps_per_second(task: TaskConfig, contact: ContactConfig) -> float:
     """Return the environment's speed under random actions, 512 robots."""
-    core = Go1Core(dataclasses.replace(task, contact=contact), 512)
+    core = Go1Core(dataclasses.replace(task, backend=task.backend.as_reference(), contact=contact), 512)
     core.reset()
     action = torch.zeros(512, robot.NUM_JOINTS)
     for _ in range(10):

@@ -161,7 +161,6 @@ def somewhere(model: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize("name", EDITS)
 def test_inertia_and_weight_are_those_of_the_links_written_down_anew(name: str) -> None:
     edited = engine(rig({name: EDITS[name]}, held=None)).env_model(0)
@@ -190,7 +189,6 @@ def with_box(mass: float, at: tuple[float, float, float]) -> mujoco.MjModel:
     return spec.compile()
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize(("mass", "at"), [(3.0, (0.1, -0.05, 0.12)), (0.4, (-0.2, 0.0, -0.1))])
 def test_a_payload_is_a_body_on_the_trunk(mass: float, at: tuple[float, float, float]) -> None:
     values = {"mass": mass, **dict(zip("xyz", at, strict=True))}
@@ -234,7 +232,6 @@ def test_a_shifted_calf_hangs_lower_by_the_torque_of_its_weight() -> None:
 # ---------------------------------------------------------------------- gravity, forces, IMU
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 @pytest.mark.parametrize("held", [LEVEL, (0.8, 0.0, 0.6, 0.0)])
 def test_a_tilted_stand_moves_as_a_robot_held_in_that_orientation(held: Quat) -> None:
     roll, pitch = 0.11, -0.17

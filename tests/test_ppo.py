@@ -7,12 +7,14 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.buffers import RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal, kl_divergence
@@ -24,6 +26,7 @@ from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.mdp.types import StepResult
 from go1exp.schema.registry import ConfigError
 from go1exp.train import trainer
+from go1exp.train.loss import ppo_loss
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, linear_rate, policy_settings
 
 TINY = (
@@ -125,6 +128,14 @@ def test_the_divergence_is_that_of_torch_distributions(seed: int) -> None:
     old = Independent(Normal(old_mean, old_log_std.exp()), 1)
     new = Independent(Normal(mean, log_std.exp()), 1)
     torch.testing.assert_close(gaussian_kl(old_mean, old_log_std, mean, log_std), kl_divergence(old, new))
+
+
+def test_the_value_clip_holds_on_both_sides() -> None:
+    config, zero = parse_train(compose("train", ["ppo.value_clip=0.1"])).ppo, torch.zeros(2)
+    batch = RolloutBufferSamples(zero, zero[:, None], zero, zero, torch.tensor([1.0, -1.0]), zero)
+    policy: Any = SimpleNamespace(evaluate_actions=lambda o, a: (torch.tensor([[0.5], [-0.7]]), zero, zero))
+    # Values of 0, with returns of 0, have moved to 0.5 and -0.7: they count as 0.1 and -0.1.
+    assert float(ppo_loss(policy, batch, config).value) == pytest.approx(0.1**2)
 
 
 def test_the_divergence_of_two_gaussians_on_paper() -> None:
