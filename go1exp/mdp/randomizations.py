@@ -91,8 +91,8 @@ def damping_ratio(e: Tensor) -> Tensor:
 Restitution = Annotated[float, Field(ge=0.02, le=0.7)]
 """Below, a contact of MuJoCo would have to be far too soft; above, a physics step of 2 ms cannot resolve it."""
 
+RestitutionRange = Annotated[tuple[Restitution, Restitution], AfterValidator(ordered)]
 ContactTime = Annotated[float, Field(ge=0.002, le=0.1)]
-
 
 FEET_CONTACT = "contact of the feet"
 """What two terms set, so that a configuration may have one of them only."""
@@ -117,7 +117,7 @@ def foot_restitution(
     stream: Stream,
     mask: Tensor,
     *,
-    range: Annotated[tuple[Restitution, Restitution], AfterValidator(ordered)] = (0.1, 0.3),
+    range: RestitutionRange = (0.1, 0.3),
 ) -> None:
     """Coefficient of restitution of each foot, 0.02 to 0.7, by the damper of its contact; the spring stays.
 
@@ -136,7 +136,7 @@ def ground_stiffness(
     mask: Tensor,
     *,
     range: Annotated[tuple[ContactTime, ContactTime], AfterValidator(ordered)] = (0.004, 0.02),
-    restitution: Annotated[tuple[Restitution, Restitution], AfterValidator(ordered)] | None = None,
+    restitution: RestitutionRange | None = None,
 ) -> None:
     """Stiffness of the ground under all feet, as the time constant of a contact with a damping ratio of 1, s.
 
