@@ -222,6 +222,14 @@ def test_the_peak_force_is_that_of_each_stance_in_body_weights() -> None:
     assert value("peak_force_p95", loaded) == pytest.approx(240.0 / (12.0 * 9.81))  # every fourth stance
 
 
+def test_a_sole_sinks_as_deep_as_it_does_under_load() -> None:
+    trace = pattern(PATTERNS["trot"], seconds=4.0)
+    sunk = dataclasses.replace(
+        trace, foot_depth=constant(trace, 0.001, 0.002, 0.003, 0.05), foot_force=constant(trace, 30.0, 30.0, 30.0, 1.0)
+    )
+    np.testing.assert_allclose(value("sink_p99", sunk), [0.001, 0.002, 0.003, np.nan], rtol=1e-6)
+
+
 def test_a_foot_slips_while_it_is_loaded_and_fast() -> None:
     trace = pattern(PATTERNS["trot"], seconds=4.0)
     speed = constant(trace, 0.1, 0.3, 1.0, 1.0)
