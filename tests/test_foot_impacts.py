@@ -15,6 +15,7 @@ from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.mdp.derived import slip_speed
 from go1exp.mdp.feet import Feet
+from go1exp.mdp.rewards import foot_force, foot_peak_force
 from go1exp.physics.scene import build_model
 from go1exp.terrain import build_terrain
 from go1exp.testing.snapshots import random_snapshot
@@ -138,3 +139,29 @@ def test_the_speed_of_a_sole_is_that_of_the_lowest_point_of_its_sphere(make_task
         foot_vel_w=torch.tensor(centre[None]),
     )
     np.testing.assert_allclose(slip_speed(s)[0], np.hypot(sole[:, 0], sole[:, 1]), atol=1e-9)
+
+
+def test_a_force_that_physics_cannot_make_ends_the_episode_without_a_fall(
+    make_core: Callable[..., Go1Core], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core = make_core(*QUIET, num_envs=3)
+    core.reset()
+    usual = core.feet.update
+
+    def blow(force: torch.Tensor, velocity: torch.Tensor) -> None:
+        """Make the second robot's readings those of a physics step that went wrong, and the third's those of a fall."""
+        usual(force + torch.tensor([0.0, 3e5, 2e3]).reshape(3, 1, 1), velocity)
+
+    monkeypatch.setattr(core.feet, "update", blow)
+    result = core.step(torch.zeros(3, robot.NUM_JOINTS))
+    assert result.truncated.tolist() == [False, True, False]
+    assert not result.terminated.any()
+    assert core.episode_end(result, 1) == "a force that physics cannot make"
+    assert core.drain_metrics(1)["contact/impossible"] == 1.0
+
+
+@pytest.mark.parametrize(("price", "force"), [(foot_force, "foot_force"), (foot_peak_force, "foot_peak_force")])
+def test_a_wrong_step_costs_no_more_than_a_hard_fall(price: Callable[..., torch.Tensor], force: str) -> None:
+    s = random_snapshot(2)
+    forces = torch.tensor([[0.0, 100.0, 0.0, 2000.0], [0.0, 100.0, 0.0, 3e5]])
+    assert price(dataclasses.replace(s, **{force: forces})).tolist() == [100.0**2 + 2000.0**2] * 2

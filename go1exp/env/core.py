@@ -229,8 +229,8 @@ class Go1Core:
         s = self.snapshot()
         self.gait_log.add(s)
         terminated = self.terms.terminated(s)
-        self.terms.left_map.copy_(self._off_map())
-        truncated = ((self.steps >= self.task.sim.episode_steps) | self.terms.left_map) & ~terminated
+        cut = self.terms.cut_short(self._off_map(), s)
+        truncated = ((self.steps >= self.task.sim.episode_steps) | cut) & ~terminated
         reward = self.terms.reward(s)
         self.episode_return += reward
         final_observation = self._observe(s, advance=True)

@@ -12,6 +12,7 @@ import torch
 
 from go1exp import robot
 from go1exp.mdp.derived import slip_speed
+from go1exp.mdp.foot_impacts import impossible
 from go1exp.measures.gait import GAITS
 from go1exp.tensors.memory import Memory
 
@@ -48,7 +49,7 @@ class GaitLog(Memory):
         """Start with nothing; ``dt`` is the policy's period, s."""
         self._dt = dt
         self.sums = torch.zeros(sum(WIDTHS.values()), dtype=torch.float64, device=device)
-        self.largest = torch.zeros((), device=device)
+        self.largest, self.impossible = torch.zeros(2, device=device).unbind(0)
         self.since = torch.full((num_envs,), torch.inf, device=device)  # FR's last touchdown, s ago
         self.period = torch.zeros(num_envs, device=device)  # of its last stride, s
         self.stance_peak = torch.zeros(num_envs, LEGS, device=device)
@@ -67,6 +68,7 @@ class GaitLog(Memory):
         ended = ~s.foot_contact & (peak > 0.0)
         self.stance_peak.copy_(torch.where(s.foot_contact, peak, 0.0))
         self.largest.copy_(torch.maximum(self.largest, s.foot_peak_force.max()))
+        self.impossible.add_(impossible(s.foot_peak_force).sum())
         feet = [fast, contact, peak * ended, ended, s.foot_touchdown_speed * s.foot_touchdown, s.foot_touchdown]
         columns = [moving, landed, contact * moving, s.foot_force * moving, errors, phases]
         columns += [each.sum(-1, keepdim=True) for each in feet]
@@ -102,7 +104,8 @@ class GaitLog(Memory):
         random ones, and never less than the measure, which averages phases first. ``gait/duty_mean``, ``duty_spread``
         (largest less smallest foot), ``gait/load_share_min``: of the batch's mean force. ``contact/slip_share``,
         ``contact/peak_force``: mean over stances of the largest force, N. ``contact/touchdown_speed``: mean, m/s.
-        ``contact/largest_force``: of all, N.
+        ``contact/largest_force``: of all, N. ``contact/impossible``: steps with a force that physics cannot make
+        (``mdp/foot_impacts.py``), each the end of an episode.
         """
         sums = dict(zip(WIDTHS, self.sums.split(list(WIDTHS.values())), strict=True))
         duty, force = sums["contacts"] / sums["moving"], sums["forces"]
@@ -116,8 +119,10 @@ class GaitLog(Memory):
             "contact/peak_force": sums["peaks"] / sums["stances"],
             "contact/touchdown_speed": sums["speeds"] / sums["landings"],
             "contact/largest_force": self.largest,
+            "contact/impossible": self.impossible,
         }
         values = torch.stack([v.reshape(()).double() for v in figures.values()]).tolist()
         self.sums.zero_()
         self.largest.zero_()
+        self.impossible.zero_()
         return dict(zip(figures, values, strict=True))

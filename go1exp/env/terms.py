@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from go1exp.config import TaskConfig
+from go1exp.mdp.foot_impacts import impossible
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.schema.registry import Term
 
 Call = Callable[[Snapshot], Tensor]
 
-TIME_LIMIT, LEFT_MAP = "time limit", "left the map"
+TIME_LIMIT, LEFT_MAP, IMPOSSIBLE = "time limit", "left the map", "a force that physics cannot make"
 """Ends of an episode that are no failure."""
 
 
@@ -31,6 +32,7 @@ class StepTerms:
         sums: (R,) float64, of weighted rewards since ``core.drain_metrics``.
         failed: (N, T) bool, which terminations were true in the last step.
         left_map: (N,) bool, who was at the edge of the ground in the last step.
+        impossible: (N,) bool, whose feet met a force that physics cannot make in it (``mdp/foot_impacts.py``).
         observed: terms of the observation, in the order of their columns; those of the critic are the last ones.
         observation_size: O.
         policy_size: columns that are the policy's.
@@ -58,7 +60,7 @@ class StepTerms:
         self._terminations = task.termination
         self._termination_calls = calls("termination", task.termination)
         self.failed = torch.zeros(num_envs, len(task.termination), dtype=torch.bool, device=device)
-        self.left_map = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.left_map, self.impossible = torch.zeros(2, num_envs, dtype=torch.bool, device=device).unbind(0)
         beside = task.critic if critic else ()
         self._observation_calls, self._critic_calls = calls("observation", task.observation), calls("critic", beside)
         self._advancing, self._critic_advancing = (
@@ -77,6 +79,13 @@ class StepTerms:
         for k, term in enumerate(self._termination_calls):
             self.failed[:, k] = term(s)
         return self.failed.any(-1)
+
+    def cut_short(self, left_map: Tensor, s: Snapshot) -> Tensor:
+        """(N,) bool, whose episode ends without a failure of the robot; ``left_map`` (N,) bool."""
+        assert s.foot_peak_force is not None
+        self.left_map.copy_(left_map)
+        self.impossible.copy_(impossible(s.foot_peak_force))
+        return self.left_map | self.impossible
 
     def reward(self, s: Snapshot) -> Tensor:
         """(N,) sum of weight x term x policy period."""
@@ -113,7 +122,7 @@ class StepTerms:
         if terminated:
             return self._terminations[int(self.failed[env].int().argmax())].key
         if truncated:
-            return LEFT_MAP if self.left_map[env] else TIME_LIMIT
+            return LEFT_MAP if self.left_map[env] else IMPOSSIBLE if self.impossible[env] else TIME_LIMIT
         return None
 
     def parts(self) -> dict[str, Any]:

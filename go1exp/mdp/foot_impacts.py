@@ -12,6 +12,19 @@ from go1exp.tensors.memory import Memory
 if TYPE_CHECKING:
     from torch import Tensor
 
+IMPOSSIBLE_FORCE = 5000.0
+"""Force on a foot that no robot of 13 kg makes, N: 40 body weights. A physics step went wrong.
+
+MuJoCo Warp's height field was seen to give 300 kN now and then."""
+
+LARGEST_PRICED_FORCE = 2000.0
+"""Rewards see no larger force on a foot, N: one wrong step would outweigh a whole rollout."""
+
+
+def impossible(peak_force: Tensor) -> Tensor:
+    """(N,) bool, robots with a force on a foot that physics cannot have made; ``peak_force`` (N, 4), N."""
+    return peak_force.amax(-1) > IMPOSSIBLE_FORCE
+
 
 class FootImpacts(Memory):
     """Peak forces and touchdown speeds, (N, 4) float32; ``foot_peak_force`` and ``foot_touchdown_speed`` of a Snapshot.

@@ -27,6 +27,7 @@ from go1exp.mdp.derived import (
     is_moving,
     joint_deviation,
 )
+from go1exp.mdp.foot_impacts import LARGEST_PRICED_FORCE
 from go1exp.mdp.types import Snapshot
 from go1exp.schema.registry import Fraction, NonNegative, Positive, reward
 from go1exp.tensors.constants import constant_like
@@ -190,18 +191,22 @@ def foot_slip(s: Snapshot) -> Tensor:
 
 @reward("foot_force")
 def foot_force(s: Snapshot) -> Tensor:
-    """Forces on the feet in the last physics step: sum_i |F_i|^2, N2. Table III; ``foot_peak_force`` sees all."""
-    return s.foot_force.square().sum(-1)
+    """Forces on the feet in the last physics step: sum_i |F_i|^2, N2. Table III; ``foot_peak_force`` sees all.
+
+    A force counts for ``LARGEST_PRICED_FORCE`` at most.
+    """
+    return s.foot_force.clamp(max=LARGEST_PRICED_FORCE).square().sum(-1)
 
 
 @reward("foot_peak_force")
 def foot_peak_force(s: Snapshot) -> Tensor:
     """Hard footfalls: sum_i |F_i|^2, N2, of each foot's largest force in the policy step. Table III.
 
-    A footfall's peak lasts a few milliseconds; the last physics step shows one in several.
+    A footfall's peak lasts a few milliseconds; the last physics step shows one in several. A force counts for
+    ``LARGEST_PRICED_FORCE`` at most.
     """
     assert s.foot_peak_force is not None
-    return s.foot_peak_force.square().sum(-1)
+    return s.foot_peak_force.clamp(max=LARGEST_PRICED_FORCE).square().sum(-1)
 
 
 @reward("touchdown_speed")
