@@ -120,8 +120,9 @@ class ProcessConfig:
     Attributes:
         seed: seed of everything random.
         device: torch device of policy and update, ``auto`` for that of the environment, which is its backend's.
+        devices: GPUs of this machine that share the robots and each minibatch; more than 1 needs backend=warp.
         torch_threads: threads of torch, 0 for its own choice.
-        resume: run folder to continue; nothing but iterations, checkpoints, threads, device and backend may change.
+        resume: run folder to continue; nothing but iterations, checkpoints, threads, devices and backend may change.
         start_from: run folder, or name of a shipped policy, whose weights a new run begins with.
         plugins: files and packages with terms of your own, such as [my_terms.py] (docs/extending.md).
     """
@@ -134,6 +135,7 @@ class ProcessConfig:
     resume: str | None
     start_from: str | None = None  # runs of older versions have neither key
     plugins: str | tuple[str, ...] = ()
+    devices: Annotated[int, Field(ge=1, le=64)] = 1
 
 
 @dataclass(frozen=True)

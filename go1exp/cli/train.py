@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from go1exp.config import TrainConfig
     from go1exp.train.start import Weights
 
-RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "backend")
-"""Settings that a resumed run may change: none of them changes what was computed so far (the last three may change
+RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "devices", "backend")
+"""Settings that a resumed run may change: none of them changes what was computed so far (the last four may change
 what comes after in the last bits, and another engine rounds differently). ``backend`` and all that is in it."""
 
 

@@ -24,6 +24,9 @@ from go1exp.train.ppo import AdaptivePPO
 FORMAT = 1
 SUFFIX = ".pt"
 
+ROBOTS = ("env", "last_obs", "last_episode_starts")
+"""Parts of a checkpoint that belong to the robots; of several GPUs, each has its own."""
+
 
 class DamagedCheckpoint(Expected):
     """A checkpoint that is not whole, or none at all; the message names the file."""
@@ -43,14 +46,19 @@ def iterations_done(run: Path) -> int:
 def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
     """Write the present state as the newest checkpoint and delete all but ``keep``.
 
+    In a group all members call this, and the first one writes the state of all robots.
+
     Raises:
         OSError: if it cannot be written; the checkpoints that are there stay.
     """
     final = run / "checkpoints" / f"{ppo.iteration:06d}{SUFFIX}"
+    state = _state(ppo)
+    if not ppo.group.first:
+        return final
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         with opened(final) as file:
-            torch.save(_state(ppo), file)
+            torch.save(state, file)
     except (OSError, RuntimeError) as error:  # torch's zip writer turns some of the system's errors into its own
         number, reason = (error.errno, error.strerror) if isinstance(error, OSError) else (errno.EIO, str(error))
         raise OSError(number, f"checkpoint cannot be written: {reason}", str(final)) from error
@@ -101,8 +109,10 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     Raises:
         DamagedCheckpoint: if it lacks a part that this version's environment has; the learner is as it was.
     """
+    core = _core(ppo)
+    robots = ppo.group.part({name: state[name] for name in ROBOTS}, core.num_envs)
     try:
-        _core(ppo).load_state_dict(state["env"])
+        core.load_state_dict(robots["env"])
     except KeyError as missing:
         raise DamagedCheckpoint(
             f"a checkpoint of another version of go1exp: it has no {missing}; go on with that version, or begin a new "
@@ -116,8 +126,8 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     # SB3 makes these two when learning starts, unless the first is there already.
     ppo.ep_info_buffer = deque(state["episodes"], maxlen=ppo._stats_window_size)
     ppo.ep_success_buffer = deque(maxlen=ppo._stats_window_size)
-    ppo._last_obs = state["last_obs"].numpy()
-    ppo._last_episode_starts = state["last_episode_starts"].numpy()
+    ppo._last_obs = robots["last_obs"].numpy()
+    ppo._last_episode_starts = robots["last_episode_starts"].numpy()
     rng = state["rng"]
     torch.set_rng_state(rng["torch"])
     if rng["cuda"] is not None and torch.cuda.is_available():
@@ -139,6 +149,8 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
     version, state_words, gauss = random.getstate()
     assert ppo.ep_info_buffer is not None
     assert isinstance(ppo._last_obs, np.ndarray)
+    core, starts = _core(ppo), np.asarray(ppo._last_episode_starts)
+    mine = (core.state_dict(), torch.from_numpy(ppo._last_obs.copy()), torch.from_numpy(starts.copy()))
     return {
         "format": FORMAT,
         "iteration": ppo.iteration,
@@ -147,9 +159,7 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
         "episodes": list(ppo.ep_info_buffer),
         "policy": ppo.policy.state_dict(),
         "optimizer": ppo.optimizer_state(),
-        "env": _core(ppo).state_dict(),
-        "last_obs": torch.from_numpy(ppo._last_obs.copy()),
-        "last_episode_starts": torch.from_numpy(np.asarray(ppo._last_episode_starts).copy()),
+        **ppo.group.whole(dict(zip(ROBOTS, mine, strict=True)), core.num_envs),
         "rng": {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,

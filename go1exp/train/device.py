@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
+from go1exp import robot
 from go1exp.config import PPOConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.engine import captured
@@ -25,6 +26,7 @@ from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.train.device_buffer import DeviceRolloutBuffer
 from go1exp.train.device_update import DeviceUpdate
+from go1exp.train.group import Group, SharedNoise
 from go1exp.train.ppo import AdaptivePPO, linear_rate
 
 
@@ -34,13 +36,17 @@ class DevicePPO(AdaptivePPO):
     buffer_class: type[RolloutBuffer] = DeviceRolloutBuffer
     rollout_buffer: DeviceRolloutBuffer
 
-    def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str) -> None:
+    def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str, group: Group | None = None) -> None:
         # Each new distribution would otherwise look at its parameters, and wait for them.
         torch.distributions.Distribution.set_default_validate_args(False)
+        self.group = group or Group()
         super().__init__(config, env, seed, device)
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        self.rollout_buffer.share_with(self.group)
+        if self.group.size > 1:
+            self.policy.action_dist = SharedNoise(robot.NUM_JOINTS, self.group)
         self._observation = torch.zeros(self.n_envs, *self.rollout_buffer.obs_shape, device=self.device)
         self._starts = torch.zeros(self.n_envs, dtype=torch.bool, device=self.device)
         self._replay: Callable[[], None] | None = None
@@ -102,7 +108,7 @@ class DevicePPO(AdaptivePPO):
         for _ in range(n_rollout_steps):
             step()
             buffer.pos += 1
-            self.num_timesteps += env.num_envs
+            self.num_timesteps += env.num_envs * self.group.size
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
@@ -141,4 +147,4 @@ class DevicePPO(AdaptivePPO):
         self._close_iteration()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_update", "_replay", "_observation", "_starts"]
+        return [*super()._excluded_save_params(), "_update", "_replay", "_observation", "_starts", "group"]

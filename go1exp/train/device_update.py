@@ -1,7 +1,8 @@
 """PPO's gradient steps on the device, without a look at any value on the way.
 
 One gradient step (gather the minibatch, loss, backward pass, clipping, rate, Adam) is one CUDA graph where the
-environment's step is one. SB3's own loop reads six numbers a minibatch back, which costs more than the arithmetic.
+environment's step is one; in a group (``train/group.py``) two, between which gradients are averaged. SB3's own loop
+reads six numbers a minibatch back, which costs more than the arithmetic.
 """
 
 from __future__ import annotations
@@ -36,16 +37,26 @@ class DeviceUpdate:
 
     def __init__(self, ppo: AdaptivePPO, buffer: DeviceRolloutBuffer, captures: bool) -> None:
         self._config, self._policy, self._buffer, self._mirror = ppo.config, ppo.policy, buffer, ppo.mirror
+        self._group = buffer.group
         self._adam = ppo.policy.optimizer
         c, device = ppo.config, ppo.device
         self._rate = torch.zeros((), device=device)
         self._old_log_std = torch.zeros_like(ppo.policy.log_std)
-        self._rows = torch.zeros(ppo.batch_size, dtype=torch.int64, device=device)
+        self._rows = torch.zeros(ppo.batch_size * self._group.size, dtype=torch.int64, device=device)
+        self._build_averaged(device)
         self._figures = torch.zeros(c.epochs * c.minibatches, len(FIGURES), device=device)
         self._taken = torch.zeros(1, dtype=torch.int64, device=device)
         self._on_gpu = device.type == "cuda"
         self._captures = captures and self._on_gpu
         self._step: Callable[[], None] | None = None
+
+    def _build_averaged(self, device: torch.device) -> None:
+        """Make the memory of gradients and figures one piece, which is averaged over the group in one go."""
+        parameters = list(self._policy.parameters())
+        sizes = [p.numel() for p in parameters]
+        self._averaged = torch.zeros(sum(sizes) + len(FIGURES) - 1, device=device)
+        *gradients, self._step_figures = self._averaged.split([*sizes, len(FIGURES) - 1])
+        self._gradients = [g.view_as(p) for g, p in zip(gradients, parameters, strict=True)]
 
     def __call__(self, scheduled_rate: float) -> dict[str, list[float]]:
         """Make the steps on the full buffer and return their figures, a list each.
@@ -67,20 +78,35 @@ class DeviceUpdate:
 
     def _gradient_step(self) -> None:
         """Loss, gradients and rsl_rl's rate for one minibatch; in place, so that it can be replayed."""
-        c, policy = self._config, self._policy
-        batch = self._buffer.batch(self._rows)
-        loss = ppo_loss(policy, batch, c, self._mirror)
+        self._find_gradients()
+        self._group.average(self._averaged)
+        self._follow_gradients()
 
-        self._adam.zero_grad(set_to_none=True)
+    def _find_gradients(self) -> None:
+        """Work out gradients and figures of this member's part of the minibatch."""
+        policy, group, buffer = self._policy, self._group, self._buffer
+        batch = buffer.batch(self._rows[group.rows(len(self._rows))])
+        among = None if group.size == 1 else buffer.whole["advantages"].flatten()[self._rows]
+        loss = ppo_loss(policy, batch, self._config, self._mirror, among)
+        self._averaged.zero_()
+        for parameter, gradient in zip(policy.parameters(), self._gradients, strict=True):
+            parameter.grad = gradient
         loss.total.backward()
-        norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), c.max_grad_norm)
         with torch.no_grad():
-            means = self._buffer.current_means
+            means = buffer.current_means
             mean = policy.last_distribution.distribution.mean[: len(means)]  # without mirror images
             kl = gaussian_kl(means, self._old_log_std, mean, policy.log_std).mean()
+            self._step_figures.copy_(torch.stack((*loss, kl)))
+
+    def _follow_gradients(self) -> None:
+        """Take the step, at a rate that the divergence asks for."""
+        c = self._config
+        norm = torch.nn.utils.clip_grad_norm_(self._policy.parameters(), c.max_grad_norm)
+        with torch.no_grad():
             if c.schedule == "adaptive":
+                kl = self._step_figures[-1]
                 self._rate.copy_(adapted_rate(self._rate, kl, c.desired_kl, c.learning_rate_range))
-            figures = torch.stack((*loss, kl, torch.isfinite(norm).float()))
+            figures = torch.cat((self._step_figures, torch.isfinite(norm).float().unsqueeze(0)))
             self._figures.index_copy_(0, self._taken, figures.unsqueeze(0))
             self._taken.add_(1)
         self._adam.step()
@@ -96,7 +122,7 @@ class DeviceUpdate:
             state["step"] = state["step"].to(self._rate.device if self._on_gpu else "cpu")
 
     def _captured(self) -> Callable[[], None]:
-        """Record a gradient step as a CUDA graph; the ones that must come before it leave no trace."""
+        """Record a gradient step as CUDA graphs; the ones that must come before it leave no trace."""
         saved = [(p, p.detach().clone(), _clone(self._adam.state.get(p))) for p in self._policy.parameters()]
         rate = self._rate.clone()
         stream = torch.cuda.Stream(self._rate.device)
@@ -112,10 +138,22 @@ class DeviceUpdate:
                 parameter.copy_(value)
                 for name, kept in self._adam.state[parameter].items():
                     kept.copy_(state[name]) if state else kept.zero_()
-        self._adam.zero_grad(set_to_none=True)  # the graph makes gradients in memory of its own
+        if self._group.size == 1:
+            return self._recorded(self._gradient_step, stream)
+        find, follow = (self._recorded(part, stream) for part in (self._find_gradients, self._follow_gradients))
+
+        def step() -> None:
+            find()
+            self._group.average(self._averaged)
+            follow()
+
+        return step
+
+    def _recorded(self, work: Callable[[], None], stream: torch.cuda.Stream) -> Callable[[], None]:
+        """Record ``work`` as one CUDA graph and return the replay."""
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-            self._gradient_step()
+            work()
         return graph.replay
 
 

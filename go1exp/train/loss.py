@@ -47,12 +47,17 @@ class Loss(NamedTuple):
 
 
 def ppo_loss(
-    policy: ActorCriticPolicy, batch: RolloutBufferSamples, config: PPOConfig, mirror: SampleMirror | None = None
+    policy: ActorCriticPolicy,
+    batch: RolloutBufferSamples,
+    config: PPOConfig,
+    mirror: SampleMirror | None = None,
+    among: Tensor | None = None,
 ) -> Loss:
     """Return the clipped loss of a minibatch (Schulman et al. 2017, equations 7 and 9), without a look at any value.
 
     With ``mirror`` it is the loss of the minibatch joined with its mirror image, and the policy's
-    ``last_distribution`` has the image's rows behind those of the minibatch.
+    ``last_distribution`` has the image's rows behind those of the minibatch. ``among`` are the advantages (B,) of the
+    minibatch of which ``batch`` is a part; None if it is all of it.
     """
     collected = len(batch.actions)
     if mirror is not None:
@@ -61,7 +66,8 @@ def ppo_loss(
     values, advantage = values.flatten(), batch.advantages
     assert entropy is not None
     if config.normalize_advantage and collected > 1:
-        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        whole = advantage if among is None else among if mirror is None else among.repeat(2)
+        advantage = (advantage - whole.mean()) / (whole.std() + 1e-8)
     log_ratio = log_prob - batch.old_log_prob
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1 - config.clip_range, 1 + config.clip_range)

@@ -23,12 +23,13 @@ DEGREES_OF_FREEDOM = 6 + robot.NUM_JOINTS
 
 
 def needed_bytes(config: TrainConfig) -> int:
-    """Return a lower bound of the memory that a training takes, B: what fails for certain is refused, nothing else.
+    """Return a lower bound of the memory that a training takes on each device, B.
 
+    What fails for certain is refused, nothing else.
     Robots; the rollout once (observations of one number a term, actions, their means, six numbers a step); the layers'
     outputs of one minibatch, and of its mirror image, which wait for the backward pass.
     """
-    ppo, backend = config.ppo, config.task.backend
+    ppo, backend, devices = config.ppo, config.task.backend, config.process.devices
     per_robot = CPU_ROBOT_BYTES
     if isinstance(backend, WarpBackend):
         per_robot = FLOAT * DEGREES_OF_FREEDOM * backend.njmax + CONTACT_BYTES * backend.nconmax
@@ -36,7 +37,7 @@ def needed_bytes(config: TrainConfig) -> int:
     rollout = ppo.num_envs * ppo.steps
     samples = rollout // ppo.minibatches * (2 if ppo.symmetry else 1)
     outputs = samples * 2 * sum(ppo.hidden)
-    return ppo.num_envs * per_robot + FLOAT * (rollout * row + outputs)
+    return ppo.num_envs * per_robot // devices + FLOAT * (rollout * row + outputs // devices)
 
 
 def check(config: TrainConfig, device: torch.device) -> None:

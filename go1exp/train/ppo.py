@@ -28,6 +28,7 @@ from go1exp.config import PPOConfig
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.train import symmetry
+from go1exp.train.group import Group
 from go1exp.train.loss import ppo_loss, write_advantages
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
@@ -193,12 +194,14 @@ class AdaptivePPO(PPO):
     ``after_iteration(ppo)`` is called when an iteration is complete: rollout, update and metrics, nothing half done.
 
     Attributes:
+        group: the GPUs that train together.
         mirror: of its samples, with ``ppo.symmetry``; else None.
     """
 
     buffer_class: type[RolloutBuffer] = MeanRolloutBuffer
     rollout_buffer: MeanRolloutBuffer
     policy: GaussianPolicy
+    group = Group()
 
     def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str) -> None:
         self.config = config
@@ -213,7 +216,7 @@ class AdaptivePPO(PPO):
             env,
             learning_rate=config.learning_rate,
             n_steps=config.steps,
-            batch_size=config.num_envs * config.steps // config.minibatches,
+            batch_size=env.num_envs * config.steps // config.minibatches,
             n_epochs=config.epochs,
             gamma=config.gamma,
             gae_lambda=config.gae_lambda,

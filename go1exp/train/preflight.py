@@ -13,6 +13,9 @@ from go1exp.schema.backends import WarpBackend
 from go1exp.schema.registry import ConfigError
 from go1exp.train import memory_need, metrics
 
+LEAST_ROBOTS = 64
+"""On each of several GPUs: a tensor is taken for the robots' by its length, which no other has (``train/group.py``)."""
+
 
 def check(config: TrainConfig) -> None:
     """Refuse a training that this machine cannot run. Makes no file.
@@ -24,6 +27,7 @@ def check(config: TrainConfig) -> None:
         FileNotFoundError: if it is not there.
     """
     check_devices(config)
+    check_shares(config)
     memory_need.check(config, engine_device(config))
     metrics.check_account(config.logger)
     if any("file" in term.parameters for term, _ in drives(config.task.actuator)):
@@ -34,6 +38,28 @@ def engine_device(config: TrainConfig) -> torch.device:
     """Return the device on which the environments live."""
     backend = config.task.backend
     return torch.device(backend.device if isinstance(backend, WarpBackend) else "cpu")
+
+
+def check_shares(config: TrainConfig) -> None:
+    """Refuse a training that cannot be shared out over the GPUs asked for.
+
+    Raises:
+        ConfigError: naming what would have to be different.
+    """
+    devices, ppo, backend = config.process.devices, config.ppo, config.task.backend
+    if devices == 1:
+        return
+    problems = []
+    if not (isinstance(backend, WarpBackend) and backend.device == "cuda" and config.process.device == "auto"):
+        problems.append("needs backend=warp, backend.device=cuda and device=auto")
+    elif devices > torch.cuda.device_count():
+        problems.append(f"torch finds {torch.cuda.device_count()} CUDA devices")
+    if ppo.num_envs % devices or ppo.num_envs // devices < LEAST_ROBOTS:
+        problems.append(f"ppo.num_envs = {ppo.num_envs} must be {LEAST_ROBOTS} or more for each, as many for all")
+    if ppo.num_envs * ppo.steps // ppo.minibatches % devices:
+        problems.append(f"a minibatch ({ppo.num_envs} x {ppo.steps} / {ppo.minibatches}) must be a multiple of it")
+    if problems:
+        raise ConfigError([f"devices = {devices}: {problem}" for problem in problems])
 
 
 def check_devices(config: TrainConfig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -16,14 +17,15 @@ import torch
 from stable_baselines3.common.logger import Logger
 
 from go1exp import signals
-from go1exp.config import TrainConfig
+from go1exp.config import TrainConfig, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.env.faults import NumericalFault
 from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.files import opened, write_json
 from go1exp.schema.registry import Expected
-from go1exp.train import checkpoint, metrics, preflight, start
+from go1exp.train import checkpoint, kept_plugins, members, metrics, preflight, start
 from go1exp.train.device import DevicePPO
+from go1exp.train.group import Group
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
 
@@ -43,8 +45,8 @@ class Stopped(Expected):
         self.finished = finished
 
 
-def build(config: TrainConfig) -> AdaptivePPO:
-    """Build learner and environment.
+def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
+    """Build learner and environment, of a member of ``group`` with its share of the robots.
 
     Raises:
         ConfigError: if a device is not there.
@@ -52,15 +54,18 @@ def build(config: TrainConfig) -> AdaptivePPO:
     preflight.check_devices(config)
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)
-    spread = config.task.sim.spread_starts
-    core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=spread, critic=True)
+    group, seed = group or Group(), config.process.seed
+    mine = group.rows(config.ppo.num_envs)
+    share: dict[str, Any] = {"num_envs": mine.stop - mine.start, "first_env": mine.start}
+    core = Go1Core(config.task, seed=seed, **share, spread_starts=config.task.sim.spread_starts, critic=True)
     device = str(core.device) if config.process.device == "auto" else config.process.device
-    learner = DevicePPO if core.device.type == torch.device(device).type == "cuda" else AdaptivePPO
-    return learner(config.ppo, Go1VecEnv(core), config.process.seed, device)
+    if core.device.type == torch.device(device).type == "cuda" or group.size > 1:
+        return DevicePPO(config.ppo, Go1VecEnv(core), seed, device, group)
+    return AdaptivePPO(config.ppo, Go1VecEnv(core), seed, device)
 
 
 def train(config: TrainConfig, container: dict[str, Any], run: Path, first: start.Weights | None = None) -> AdaptivePPO:
-    """Train in ``run``, from its newest checkpoint if it has one; return the learner.
+    """Train in ``run``, from its newest checkpoint if it has one, on as many GPUs as asked for; return the learner.
 
     SIGINT, SIGTERM and SIGHUP end training after the iteration under way, with a checkpoint. A third SIGINT ends it at
     once; the checkpoints that are there stay.
@@ -76,33 +81,53 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: star
         NumericalFault: when a number stops being finite; ``fault.npz`` holds the moment.
         OSError: when metrics or a checkpoint cannot be written; what was saved before is untouched.
     """
-    ppo = _begun(config, run, first)
-    logger = metrics.make_logger(config.logger, run, ppo.iteration, container, ppo.num_timesteps)
-    ppo.set_logger(logger)
-    size = config.ppo.num_envs * config.ppo.steps
-    with Progress(ppo.iteration, config.ppo.iterations, size) as progress, _signals() as asked_to_stop:
-        ppo.after_iteration = _Closing(config, run, logger, progress, asked_to_stop)
-        left = config.ppo.iterations * size - ppo.num_timesteps
-        try:
-            if left > 0:
-                ppo.learn(left, reset_num_timesteps=ppo.iteration == 0)
-        except NumericalFault as fault:
-            _keep(fault, run)
-            raise
-        finally:
-            logger.close()
+    backend = "nccl" if preflight.engine_device(config).type == "cuda" else "gloo"
+    with members.together(config.process.devices, train_as_member, container, run, backend) as group:
+        ppo = _begun(config, run, first, group)
+        logger = metrics.make_logger(config.logger, run, ppo.iteration, container, ppo.num_timesteps)
+        size = config.ppo.num_envs * config.ppo.steps
+        with Progress(ppo.iteration, config.ppo.iterations, size) as progress, _signals() as asked_to_stop:
+            ppo.after_iteration = _Closing(config, run, logger, progress, asked_to_stop)
+            try:
+                _learn(ppo, config, logger)
+            except NumericalFault as fault:
+                _keep(fault, run)
+                raise
+            finally:
+                logger.close()
     return ppo
 
 
-def _begun(config: TrainConfig, run: Path, first: start.Weights | None) -> AdaptivePPO:
+def train_as_member(container: dict[str, Any], run: Path, group: Group) -> None:
+    """Train as another member of ``group`` than its first: without files, a log, or an ear for signals."""
+    config = parse_train(kept_plugins.with_copies(run, container))
+    ppo = _begun(config, run, None, group)
+    logger = Logger(None, [])
+    ppo.after_iteration = _Closing(config, run, logger, None, lambda: False)
+    with contextlib.suppress(Stopped):
+        _learn(ppo, config, logger)
+
+
+def _learn(ppo: AdaptivePPO, config: TrainConfig, logger: Logger) -> None:
+    """Make the iterations that are left."""
+    ppo.set_logger(logger)
+    left = config.ppo.iterations * config.ppo.num_envs * config.ppo.steps - ppo.num_timesteps
+    if left > 0:
+        ppo.learn(left, reset_num_timesteps=ppo.iteration == 0)
+
+
+def _begun(config: TrainConfig, run: Path, first: start.Weights | None, group: Group) -> AdaptivePPO:
     """Return the learner as training begins or goes on with it."""
-    ppo = build(config)
-    if checkpoint.checkpoints(run):
-        state, path = checkpoint.load_latest(run)
-        checkpoint.restore(ppo, state)
-        print(f"continuing from {path}")
+    ppo = build(config, group)
+    latest = group.agreed(checkpoint.load_latest(run)[1].name if group.first and checkpoint.checkpoints(run) else None)
+    if latest:
+        path = run / "checkpoints" / latest
+        checkpoint.restore(ppo, checkpoint.read(path))
+        if group.first:
+            print(f"continuing from {path}")
     elif first is not None:
         start.begin(ppo, first, run)
+    group.share_weights(ppo.policy)
     return ppo
 
 
@@ -110,7 +135,12 @@ class _Closing:
     """What is done after each iteration: rows, progress, checkpoint, and the end if somebody asked for it."""
 
     def __init__(
-        self, config: TrainConfig, run: Path, logger: Logger, progress: Progress, asked_to_stop: Callable[[], bool]
+        self,
+        config: TrainConfig,
+        run: Path,
+        logger: Logger,
+        progress: Progress | None,
+        asked_to_stop: Callable[[], bool],
     ) -> None:
         self.config, self.run, self.logger, self.progress = config, run, logger, progress
         self.asked_to_stop = asked_to_stop
@@ -124,12 +154,13 @@ class _Closing:
         self.logger.record("iteration", ppo.iteration)
         self.logger.record("time/steps_per_s", self.config.ppo.num_envs * steps / (now - self._clock))
         self._clock = now
-        for key, value in env.core.drain_metrics(steps).items():
+        for key, value in ppo.group.metrics(env.core.drain_metrics(steps)).items():
             self.logger.record(key, value)
-        self.progress.update(ppo.iteration, dict(self.logger.name_to_value))
+        if self.progress:
+            self.progress.update(ppo.iteration, dict(self.logger.name_to_value))
         self.logger.dump(step=ppo.num_timesteps)
         last = ppo.iteration >= self.config.ppo.iterations
-        stopping = self.asked_to_stop()
+        stopping = ppo.group.agreed(self.asked_to_stop())
         if last or stopping or ppo.iteration % self.config.checkpoint.every == 0:
             checkpoint.save(ppo, self.run, self.config.checkpoint.keep)
         if stopping:

@@ -1,0 +1,188 @@
+"""Several GPUs of one host that share a training: each has a share of the robots and of every minibatch.
+
+What is random belongs to a robot (``tensors/randomness.py``), or is drawn by all alike for all robots, of which each
+keeps its own part. The rollouts are joined after they are collected, so that a minibatch is drawn from all of them, and
+gradients are averaged before they are clipped. So a training is that of one GPU with all robots, up to the order of
+sums, and its checkpoints are too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from torch import Tensor, nn
+
+SUMMED = ("contact/impossible",)
+"""Metrics that add up over the members; the others are averaged."""
+
+LARGEST = ("contact/largest_force",)
+"""Metrics of which the largest counts."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """The members of a training, seen by one of them. Alone, nothing is exchanged.
+
+    Attributes:
+        rank: number of this member; the first one, 0, writes all files.
+        size: how many there are.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the member that logs and saves."""
+        return self.rank == 0
+
+    def rows(self, total: int) -> slice:
+        """Return which of ``total`` rows, of robots or of a minibatch, are this member's."""
+        share = total // self.size
+        return slice(self.rank * share, (self.rank + 1) * share)
+
+    def average(self, values: Tensor) -> None:
+        """Replace ``values`` by its mean over the members."""
+        if self.size > 1:
+            dist.all_reduce(values)
+            values.div_(self.size)
+
+    def join(self, mine: Tensor, out: Tensor) -> None:
+        """Write the rollouts (T, n, ...) of all members into ``out`` (T, N, ...), robots in their order."""
+        pieces = mine.new_empty(self.size, *mine.shape)
+        dist.all_gather(list(pieces.unbind(0)), mine)
+        out.view(len(mine), self.size, *mine.shape[1:]).copy_(pieces.transpose(0, 1))
+
+    def share_weights(self, module: nn.Module) -> None:
+        """Give all members the first one's parameters."""
+        if self.size > 1:
+            for parameter in module.parameters():
+                dist.broadcast(parameter.data, 0)
+
+    def agreed(self, value: Any) -> Any:
+        """Return the first member's ``value``, plain data."""
+        if self.size == 1:
+            return value
+        held = [value]
+        dist.broadcast_object_list(held, 0, group=_by_host())
+        return held[0]
+
+    def metrics(self, mine: dict[str, float]) -> dict[str, float]:
+        """Return the metrics of all robots from those of each member's."""
+        if self.size == 1:
+            return mine
+        each = self._of_all(mine)
+        return {key: _together(key, [m[key] for m in each]) for key in mine}
+
+    def whole(self, state: Any, robots: int) -> Any:
+        """Return the state of all robots, in the first member; in the others what it returns has no meaning.
+
+        Args:
+            state: of this member's robots: dictionaries, lists, plain data and tensors, which belong to robots if
+                their first dimension says so, and else are the same for all.
+            robots: how many this member has.
+        """
+        if self.size == 1:
+            return state
+        each = self._of_all(_on_host(state))
+        return joined(each, robots)
+
+    def part(self, state: Any, robots: int) -> Any:
+        """Return this member's part of what ``whole`` returned; ``robots`` are this member's."""
+        return state if self.size == 1 else _part(state, robots * self.size, self.rows(robots * self.size))
+
+    def _of_all(self, mine: Any) -> list[Any]:
+        each: list[Any] = [None] * self.size
+        dist.all_gather_object(each, mine, group=_by_host())
+        return each
+
+
+def enter(rank: int, size: int, meeting: Path, backend: str = "nccl") -> Group:
+    """Join the group of ``size`` members that meet by the file ``meeting``, which must not exist before.
+
+    Args:
+        rank: number of this member, and of its GPU.
+        size: how many there are.
+        meeting: on this host; no port is opened to other hosts for it.
+        backend: ``nccl``, or ``gloo`` between processors (for tests).
+    """
+    if backend == "nccl":
+        torch.cuda.set_device(rank)
+    dist.init_process_group(backend, init_method=f"file://{meeting}", rank=rank, world_size=size)
+    global _HOST_GROUP  # as torch's own groups, it belongs to the process
+    _HOST_GROUP = dist.new_group(backend="gloo")
+    return Group(rank, size)
+
+
+def leave() -> None:
+    """Leave the group that ``enter`` joined."""
+    dist.destroy_process_group()
+
+
+_HOST_GROUP: Any = None
+
+
+def _by_host() -> Any:
+    """Return the group that exchanges plain data through the host's memory."""
+    return _HOST_GROUP
+
+
+def _together(key: str, values: Sequence[float]) -> float:
+    if key in LARGEST:
+        return max(values)
+    return sum(values) / (1 if key in SUMMED else len(values))
+
+
+def _on_host(state: Any) -> Any:
+    """Return plain data with all tensors on the host."""
+    if isinstance(state, Tensor):
+        return state.cpu()
+    if isinstance(state, Mapping):
+        return {key: _on_host(value) for key, value in state.items()}
+    if isinstance(state, list | tuple):
+        return [_on_host(value) for value in state]
+    return state
+
+
+def joined(each: Sequence[Any], robots: int) -> Any:
+    """Join the states of members that have ``robots`` robots each."""
+    first = each[0]
+    if isinstance(first, Tensor):
+        return torch.cat(list(each)) if first.dim() and len(first) == robots else first
+    if isinstance(first, Mapping):
+        return {key: joined([state[key] for state in each], robots) for key in first}
+    if isinstance(first, list):
+        return [joined([state[k] for state in each], robots) for k in range(len(first))]
+    return first
+
+
+def _part(state: Any, total: int, rows: slice) -> Any:
+    if isinstance(state, Tensor):
+        return state[rows] if state.dim() and len(state) == total else state
+    if isinstance(state, Mapping):
+        return {key: _part(value, total, rows) for key, value in state.items()}
+    if isinstance(state, list):
+        return [_part(value, total, rows) for value in state]
+    return state
+
+
+class SharedNoise(DiagGaussianDistribution):
+    """SB3's Gaussian, whose samples for a member's robots are those that one GPU would draw for them among all."""
+
+    def __init__(self, action_dim: int, group: Group) -> None:
+        """Keep the group."""
+        super().__init__(action_dim)
+        self._group = group
+
+    def sample(self) -> Tensor:
+        """Return the samples (n, A) of this member's robots."""
+        spread = self.distribution
+        total = torch.zeros(len(spread.mean) * self._group.size, *spread.mean.shape[1:], device=spread.mean.device)
+        noise = torch.normal(total, 1.0)[self._group.rows(len(total))]
+        return spread.mean + spread.stddev * noise
