@@ -24,6 +24,9 @@ from go1exp.train.group import Group, joined
 
 SMALL = (
     *("ppo=paper", "ppo.num_envs=128", "ppo.steps=4", "ppo.hidden=[16,8]", "ppo.minibatches=2", "ppo.epochs=2"),
+    *("actuator=delay", "actuator.command=[0.0,0.02]", "effect=[strength,encoder_offset]", "event=push"),
+    *("terrain=rough", "terrain.rows=4", "terrain.cols=3", "curriculum=terrain_level"),
+    *("curriculum.terrain_level.start_level_max=3", "observation=clock"),
     *("rand=table1", "sim.episode_s=0.2", "ppo.symmetry=true", "critic=privileged", "ppo.iterations=2"),
     *("backend.threads=1", "torch_threads=1", "logger=local"),
 )
@@ -73,7 +76,7 @@ def test_two_members_train_as_one_learner_would_and_its_checkpoint_is_one_learne
 
 def test_a_state_is_joined_and_taken_apart_by_robots() -> None:
     def state(value: float) -> dict[str, Any]:
-        return {"x": torch.full((64, 2), value), "list": [torch.full((64,), value), 7], "all": torch.ones(5)}
+        return {"x": torch.full((64, 2), value), "list": [torch.full((3, 64), value), 7], "all": torch.ones(5)}
 
     states = [state(1.0), state(2.0)]
     whole = joined(states, 64)

@@ -84,8 +84,9 @@ class Group:
         """Return the state of all robots, in the first member; in the others what it returns has no meaning.
 
         Args:
-            state: of this member's robots: dictionaries, lists, plain data and tensors, which belong to robots if
-                their first dimension says so, and else are the same for all.
+            state: of this member's robots: dictionaries, lists, plain data and tensors. A dimension as long as there
+                are robots is theirs (the first, behind the time in a delay line); without one, a tensor is the same
+                for all members.
             robots: how many this member has.
         """
         if self.size == 1:
@@ -154,7 +155,7 @@ def joined(each: Sequence[Any], robots: int) -> Any:
     """Join the states of members that have ``robots`` robots each."""
     first = each[0]
     if isinstance(first, Tensor):
-        return torch.cat(list(each)) if first.dim() and len(first) == robots else first
+        return torch.cat(list(each), first.shape.index(robots)) if robots in first.shape else first
     if isinstance(first, Mapping):
         return {key: joined([state[key] for state in each], robots) for key in first}
     if isinstance(first, list):
@@ -164,7 +165,11 @@ def joined(each: Sequence[Any], robots: int) -> Any:
 
 def _part(state: Any, total: int, rows: slice) -> Any:
     if isinstance(state, Tensor):
-        return state[rows] if state.dim() and len(state) == total else state
+        return (
+            state.narrow(state.shape.index(total), rows.start, rows.stop - rows.start)
+            if total in state.shape
+            else state
+        )
     if isinstance(state, Mapping):
         return {key: _part(value, total, rows) for key, value in state.items()}
     if isinstance(state, list):
