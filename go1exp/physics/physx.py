@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from go1exp.physics.agreement import Built
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.physx_contacts import Contacts, FootFriction
 from go1exp.physics.physx_robot import APPLIED, PhysxRobot, ground_shape
@@ -255,6 +256,18 @@ class PhysxCpu(MujocoCpu):
         here = here + torch.linalg.cross(turn, torch.linalg.cross(turn, place.expand_as(turn)))
         in_trunk = here + rotate_inverse(qpos[:, 3:7], acceleration[:, :3] - gravity)
         return rotate_inverse(frame.expand(len(rows), 4), in_trunk)
+
+    # ------------------------------------------------------------------ saying what it is
+
+    def built(self) -> Built:
+        """Return what PhysX says that its first robot is."""
+        one = self._robots[0]
+        return Built(
+            joints=tuple(one.articulation.get_active_joints()[k].name for k in self._order),
+            masses={link.name: link.mass for link in one.links},
+            limits=one.articulation.get_qlimits()[self._order],
+            physics_dt=one.system.timestep,
+        )
 
     # ------------------------------------------------------------------ saving
 

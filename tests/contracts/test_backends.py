@@ -1,7 +1,7 @@
 """What every physics backend owes, on the engines that this machine has.
 
 ``warp on cpu`` runs where mujoco-warp is installed: the same kernels, compiled for the processor. ``warp on cuda``
-needs a GPU as well.
+needs a GPU as well. ``physx`` runs where sapien is installed; what its rigid contacts do is in tests/test_physx.py.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
+from go1exp.cli.engine import split as engine_of
+from go1exp.compose import compose
 from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.env.engine import make_backend
@@ -32,11 +34,17 @@ needs_warp = pytest.mark.skipif(not HAS_WARP, reason="mujoco-warp is not install
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 
 CPU = ("backend.threads=1",)
+HAS_PHYSX = importlib.util.find_spec("sapien") is not None
+needs_physx = pytest.mark.skipif(not HAS_PHYSX, reason="sapien is not installed: pip install 'go1exp[physx]'")
+
+PHYSX = ("engine=physx",)
 WARP_CPU = ("backend=warp", "backend.device=cpu", "backend.graph=false")
 WARP_CUDA = ("backend=warp",)
 ON_CPU = pytest.param(WARP_CPU, marks=needs_warp, id="warp on cpu")
 ON_CUDA = pytest.param(WARP_CUDA, marks=[needs_warp, needs_gpu, pytest.mark.gpu], id="warp on cuda")
-ENGINES = pytest.mark.parametrize("engine", [pytest.param(CPU, id="cpu"), ON_CPU, ON_CUDA])
+IN_PHYSX = pytest.param(PHYSX, marks=needs_physx, id="physx")
+MUJOCOS = pytest.mark.parametrize("engine", [pytest.param(CPU, id="cpu"), ON_CPU, ON_CUDA])
+ENGINES = pytest.mark.parametrize("engine", [pytest.param(CPU, id="cpu"), ON_CPU, ON_CUDA, IN_PHYSX])
 WARPS = pytest.mark.parametrize("engine", [ON_CPU, ON_CUDA])
 GROUNDS = pytest.mark.parametrize(
     "ground", [(), ("terrain=rough", "terrain.rows=3", "terrain.cols=3")], ids=["flat", "rough"]
@@ -53,9 +61,11 @@ def build(make_task: Callable[..., TaskConfig]) -> Build:
     """Make a backend of n robots from overrides."""
 
     def make(n: int, *overrides: str) -> PhysicsBackend:
-        task = make_task(*overrides)
+        judge = [o for o in overrides if o.startswith("engine")]
+        task = make_task(*(o for o in overrides if o not in judge))
         model, sensors = build_model(task.robot, build_terrain(task.terrain), task.sim.physics_dt)
-        return make_backend(task.backend, model, sensors, n)
+        chosen = engine_of(compose("eval", judge))[0] if judge else task.backend
+        return make_backend(chosen, model, sensors, n)
 
     return make
 

@@ -1,0 +1,25 @@
+"""Judging a policy on another engine than MuJoCo: the group ``engine``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from go1exp.schema.backends import BackendConfig
+
+GROUP = "engine"
+
+
+def split(container: dict[str, Any]) -> tuple[BackendConfig, dict[str, Any]]:
+    """Return the checked engine, and what is left of the configuration.
+
+    Raises:
+        ConfigError: with every problem of its settings.
+    """
+    from go1exp.config import parse_parts
+    from go1exp.schema.registry import ConfigError
+
+    parts, problems = parse_parts(container, (GROUP,))
+    if problems:
+        raise ConfigError(problems)
+    return parts[GROUP], {name: value for name, value in container.items() if name != GROUP}
