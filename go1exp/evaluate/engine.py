@@ -22,5 +22,5 @@ def require_agreement(task: TaskConfig) -> list[Check]:
         return []
     ground = build_terrain(TerrainConfig(kind="flat"))
     model, sensors = build_model(task.robot, ground, task.sim.physics_dt, contact=task.contact)
-    engines = [make_backend(each, model, sensors, robots_needed()) for each in (CpuBackend("cpu", 1), task.backend)]
-    return require(*engines, task.backend.name)
+    mujoco, engine = (make_backend(b, model, sensors, robots_needed()) for b in (CpuBackend("cpu", 1), task.backend))
+    return require(mujoco, engine, task.backend.name)

@@ -106,15 +106,15 @@ def robots_needed(degrees: int = 6 + robot.NUM_JOINTS) -> int:
 
 def compare(reference: PhysicsBackend, engine: PhysicsBackend) -> list[Check]:
     """Compare two engines of one compiled model with free trunks, ``robots_needed()`` robots each."""
-    mine, other = built(engine), built(reference)
-    wrong = _unlike(mine.joints, other.joints) + _unlike(sorted(mine.masses), sorted(other.masses))
+    made, model = built(engine), built(reference)
+    wrong = _unlike(made.joints, model.joints) + _unlike(sorted(made.masses), sorted(model.masses))
     worst = {"names and order": float(wrong)}
     if not wrong:
-        masses = [abs(mine.masses[k] / m - 1.0) for k, m in other.masses.items() if m > 0.0]
+        masses = [abs(made.masses[name] / mass - 1.0) for name, mass in model.masses.items() if mass > 0.0]
         worst |= {
             "link masses": max(masses),
-            "joint limits": _largest(mine.limits - other.limits),
-            "physics step": abs(mine.physics_dt / other.physics_dt - 1.0),
+            "joint limits": _largest(made.limits - model.limits),
+            "physics step": abs(made.physics_dt / model.physics_dt - 1.0),
             **_masses_and_gravity(reference, engine),
             **_fall(reference, engine),
         }
@@ -135,9 +135,9 @@ def built(engine: PhysicsBackend) -> Built:
     )
 
 
-def _unlike(mine: Sequence[str], other: Sequence[str]) -> int:
+def _unlike(names: Sequence[str], others: Sequence[str]) -> int:
     """Return the number of places at which names differ."""
-    return sum(a != b for a, b in zip_longest(mine, other))
+    return sum(a != b for a, b in zip_longest(names, others))
 
 
 def _largest(difference: Any) -> float:
@@ -187,10 +187,10 @@ def _masses_and_gravity(reference: PhysicsBackend, engine: PhysicsBackend) -> di
     """Compare mass matrix and gravity at random poses."""
     mass, gravity = [], []
     for pose in _poses(POSES, 1.0, seed=0):
-        (mine, down), (other, weight) = _response(engine, pose), _response(reference, pose)
-        scale = np.sqrt(np.diag(other))
-        mass.append(_largest((mine - other) / np.outer(scale, scale)))
-        gravity.append(_largest((down - weight)[3:]))
+        (judged, weight), (known, known_weight) = _response(engine, pose), _response(reference, pose)
+        scale = np.sqrt(np.diag(known))
+        mass.append(_largest((judged - known) / np.outer(scale, scale)))
+        gravity.append(_largest((weight - known_weight)[3:]))
     return {"mass matrix": float(np.max(mass)), "gravity torque": float(np.max(gravity))}
 
 
@@ -206,11 +206,11 @@ def _fall(reference: PhysicsBackend, engine: PhysicsBackend) -> dict[str, float]
         for _ in range(round(FALL_S / each.model.opt.timestep)):
             each.step(GAINS[0] * (stance - each.qpos[:, 7:]) - GAINS[1] * each.qvel[:, 6:])
         ends.append(_host(each.qpos))
-    mine, other = ends
+    judged, known = ends
     attitude = [Rotation.from_quat(end[:, 3:7], scalar_first=True) for end in ends]
     step = float(reference.model.opt.timestep)
     return {
-        "fall: trunk": _largest(mine[:, :3] - other[:, :3]) / step,
+        "fall: trunk": _largest(judged[:, :3] - known[:, :3]) / step,
         "fall: attitude": _largest((attitude[0] * attitude[1].inv()).magnitude()) / step,
-        "fall: joints": _largest(mine[:, 7:] - other[:, 7:]) / step,
+        "fall: joints": _largest(judged[:, 7:] - known[:, 7:]) / step,
     }

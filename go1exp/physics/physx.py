@@ -93,7 +93,7 @@ class PhysxCpu(MujocoCpu):
         Raises:
             ConfigError: if PhysX cannot give robots their own.
         """
-        if name not in (*APPLIED, *BY_MUJOCO, *DERIVED):
+        if name not in (*APPLIED, *BY_MUJOCO, *DERIVED, *self._fields):
             raise ConfigError([f"engine = physx: robots cannot differ in {name}: {RIGID.get(name, 'not supported')}"])
         live = super().field(name)
         if name in APPLIED:
@@ -233,10 +233,10 @@ class PhysxCpu(MujocoCpu):
         data = self._stale[rows]
         feet, normal = data[:, s.foot_pos_w].numpy().reshape(-1, 4, 3), read.foot_force[at]
         friction = self._fields.get("geom_friction")
-        own = self.model.geom_friction[None] if friction is None else friction[rows].numpy()
+        coefficients = self.model.geom_friction[None] if friction is None else friction[rows].numpy()
         left = self._friction.excess(out["M"][at], acceleration.numpy(), out["qfrc_smooth"][at])
-        along = self._friction(left, out["xanchor"][at], out["xaxis"][at], feet, normal, own)
-        contact = np.concatenate([read.foot_found[at][..., None], normal + along], axis=-1)
+        along = self._friction(left, out["xanchor"][at], out["xaxis"][at], feet, normal, coefficients)
+        contact = np.concatenate([read.foot_points[at][..., None], normal + along], axis=-1)
         data[:, s.foot_contact] = torch.from_numpy(contact.reshape(len(at), -1))
         data[:, s.link_contacts] = torch.from_numpy(read.links[at])
         if s.imu_acc.stop > s.imu_acc.start:
@@ -252,9 +252,9 @@ class PhysxCpu(MujocoCpu):
             body = torch.tensor(self.model.body_quat[1]).expand(len(rows), 4)
             return rotate_inverse(frame.expand(len(rows), 4), rotate_inverse(body, -gravity.expand(len(rows), 3)))
         turn, change = qvel[:, 3:6], acceleration[:, 3:6]
-        here = torch.linalg.cross(change, place.expand_as(change))
-        here = here + torch.linalg.cross(turn, torch.linalg.cross(turn, place.expand_as(turn)))
-        in_trunk = here + rotate_inverse(qpos[:, 3:7], acceleration[:, :3] - gravity)
+        arm = place.expand_as(turn)
+        of_turning = torch.linalg.cross(change, arm) + torch.linalg.cross(turn, torch.linalg.cross(turn, arm))
+        in_trunk = of_turning + rotate_inverse(qpos[:, 3:7], acceleration[:, :3] - gravity)
         return rotate_inverse(frame.expand(len(rows), 4), in_trunk)
 
     # ------------------------------------------------------------------ saying what it is
@@ -272,8 +272,19 @@ class PhysxCpu(MujocoCpu):
     # ------------------------------------------------------------------ saving
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from the state and model of any backend; what PhysX remembers of contacts begins anew."""
-        super().load_state_dict({**state, "fields": {k: v for k, v in state["fields"].items() if k not in RIGID}})
+        """Continue from the state and model of any backend; what PhysX remembers of contacts begins anew.
+
+        Raises:
+            ConfigError: if robots differ there in what PhysX cannot give them.
+        """
+        for name in state["fields"]:
+            if name in RIGID:
+                self.field(name)  # refuses
+            super().field(name)  # MuJoCo's own constants are among them
+        super().load_state_dict(state)
+        for name in APPLIED:
+            if name in self._fields:
+                self._in_force.setdefault(name, torch.full_like(self._fields[name], torch.nan))
         self._refresh_fields()
         self._put(torch.arange(self.num_envs))
 

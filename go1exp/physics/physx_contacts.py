@@ -18,19 +18,23 @@ from go1exp.physics.physx_robot import pair_friction
 from go1exp.physics.terrain_geom import FLOOR
 
 
+ROUNDING = 1e-4
+"""Depth of a contact, m, beyond which it is one although it bears nothing: its body is pushed out at another point."""
+
+
 class Contacts:
     """Contact readings of N robots.
 
     Attributes:
-        found: (N, bodies) contact points that bear load, by MuJoCo's body.
-        foot_found: (N, 4) those of the feet's spheres.
+        body_points: (N, bodies) contact points that bear load or lie below the ground, by MuJoCo's body.
+        foot_points: (N, 4) those of the feet's spheres.
         foot_force: (N, 4, 3) normal force of the ground on them, world, N.
     """
 
     def __init__(self, model: mujoco.MjModel, num_envs: int) -> None:
         """Prepare for N robots of one model."""
-        self.found = np.zeros((num_envs, model.nbody))
-        self.foot_found = np.zeros((num_envs, robot.NUM_LEGS))
+        self.body_points = np.zeros((num_envs, model.nbody))
+        self.foot_points = np.zeros((num_envs, robot.NUM_LEGS))
         self.foot_force = np.zeros((num_envs, robot.NUM_LEGS, 3))
         self._floor, self._body, self._dt = model.geom(FLOOR).id, model.geom_bodyid.tolist(), model.opt.timestep
         self._foot = {model.geom(f"{leg}_foot").id: k for k, leg in enumerate(robot.LEGS)}
@@ -39,22 +43,23 @@ class Contacts:
 
     def read(self, env: int, contacts: list[Any], shapes: dict[Any, int]) -> None:
         """Take in the contacts of one robot's last step; ``shapes`` gives the geom of each collision shape."""
-        self.found[env] = self.foot_found[env] = self.foot_force[env] = 0.0
+        self.body_points[env] = self.foot_points[env] = self.foot_force[env] = 0.0
         for contact in contacts:
-            loads = [impulse for point in contact.points if (impulse := point.impulse).any()]
+            points = [(point.impulse, point.separation) for point in contact.points]
+            loads = [impulse for impulse, gap in points if impulse.any() or gap < -ROUNDING]
             if not loads:
                 continue  # within the contact offset, and no more
             first, second = (shapes[shape] for shape in contact.shapes)
             geom, sign = (second, -1.0) if first == self._floor else (first, 1.0)  # the impulse is the first's
-            self.found[env, self._body[geom]] += len(loads)
+            self.body_points[env, self._body[geom]] += len(loads)
             if geom in self._foot:
-                self.foot_found[env, self._foot[geom]] += len(loads)
+                self.foot_points[env, self._foot[geom]] += len(loads)
                 self.foot_force[env, self._foot[geom]] += np.sum(loads, axis=0) * (sign / self._dt)
 
     @property
     def links(self) -> np.ndarray:
         """(N, 13) in the order of ``Sensors.link_contacts``."""
-        return self.found[:, self._links]
+        return self.body_points[:, self._links]
 
 
 class FootFriction:

@@ -276,8 +276,8 @@ def pair_friction(model: mujoco.MjModel, geom: int, friction: np.ndarray) -> np.
     """
     floor = model.geom(FLOOR).id
     first, second = model.geom_priority[geom], model.geom_priority[floor]
-    mine, other = friction[..., geom, 0], friction[..., floor, 0]
-    return np.maximum(mine, other) if first == second else (mine if first > second else other)
+    of_geom, of_floor = friction[..., geom, 0], friction[..., floor, 0]
+    return np.maximum(of_geom, of_floor) if first == second else (of_geom if first > second else of_floor)
 
 
 APPLIED: dict[str, Callable[[PhysxRobot, np.ndarray], None]] = {
