@@ -17,7 +17,6 @@ from go1exp import robot
 from go1exp.physics.physx_robot import pair_friction
 from go1exp.physics.terrain_geom import FLOOR
 
-
 ROUNDING = 1e-4
 """Depth of a contact, m, beyond which it is one although it bears nothing: its body is pushed out at another point."""
 
