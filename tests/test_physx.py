@@ -160,7 +160,7 @@ def test_what_touches_in_any_posture_is_what_touches_in_mujoco(
     build: Build, make_task: Callable[..., TaskConfig], ground: tuple[str, ...]
 ) -> None:
     """A field of triangles has no inside: what lies below it altogether does not count."""
-    n = 60
+    n = 100
     judged, reference = (build(n, each, *ground) for each in (PHYSX, CPU))
     rng, (low, high) = np.random.default_rng(0), robot.JOINT_POS_LIMITS.T
     qpos = np.zeros((n, 19))
@@ -177,15 +177,17 @@ def test_what_touches_in_any_posture_is_what_touches_in_mujoco(
     terrain: Terrain = build_terrain(make_task(*ground).terrain)
     above = places[..., 2] > terrain.height_at(places[..., :2])
     assert np.mean(touching[0][above] != touching[1][above]) <= (0.01 if ground else 0.0)
-    assert touching[1][above].sum() > 10
+    assert touching[1][above].sum() > 8
 
 
 @needs_physx
 def test_triangles_lie_where_the_ground_is(build: Build, make_task: Callable[..., TaskConfig]) -> None:
-    system = build(1, PHYSX, *ROUGH)._robots[0].system
+    backend = build(1, PHYSX, *ROUGH)
+    system = backend._robots[0].system
     terrain = build_terrain(make_task(*ROUGH).terrain)
-    low, high, left, right = terrain.extent
-    xy = np.random.default_rng(0).uniform([low, left], [high, right], (300, 2))
+    low, high, right, left = terrain.extent
+    xy = np.random.default_rng(0).uniform([low + 0.1, right + 0.1], [high - 0.1, left - 0.1], (300, 2))
+    xy = xy[np.linalg.norm(xy, axis=1) > 1.0]  # the robot stands in the middle
     hit = [system.raycast([*place, 5.0], [0.0, 0.0, -1.0], 10.0).position[2] for place in xy]
     heights = terrain.height_at(xy)
     np.testing.assert_allclose(hit, heights, atol=1e-5)
@@ -199,16 +201,16 @@ def test_feet_bear_the_weight_and_do_not_sink(build: Build, ground: tuple[str, .
     put(backend, *standing(2))
     loads: list[float] = []
     hold(backend, 500, lambda k: loads.append(feet(backend)[0, :, 3].sum()) if k >= 400 else None)
-    assert np.mean(loads) == pytest.approx(backend.model.body_subtreemass[1] * 9.81, rel=2e-3)
+    assert np.mean(loads) == pytest.approx(backend.model.body_subtreemass[1] * 9.81, rel=5e-3)  # it sways a little
     heights = backend.sensordata[:, backend.sensors.foot_pos_w].reshape(2, 4, 3)[..., 2]
     np.testing.assert_allclose(heights, robot.FOOT_RADIUS, atol=2e-4)
 
 
 @needs_physx
 def test_forces_on_the_feet_are_what_changes_the_momentum(build: Build) -> None:
-    """A robot that slides on its feet, then stands: friction is no output of PhysX, so it is checked by Newton's law."""
+    """A robot that slides on its feet, then stands: PhysX does not give friction, so Newton's law must."""
     backend = build(1)
-    qpos, qvel = standing(1)
+    qpos, qvel = standing(1, height=0.328)  # PhysX says nothing of how it puts feet out of the ground
     qvel[:, 0], qvel[:, 1] = 1.2, 0.4
     put(backend, qpos, qvel)
     weight = backend.model.body_subtreemass[1] * 9.81
@@ -221,11 +223,11 @@ def test_forces_on_the_feet_are_what_changes_the_momentum(build: Build) -> None:
         before = after
     force, change = np.array(force), np.array(change)
     assert np.abs(change[:, :2]).max() > 0.5 * weight
-    assert np.sqrt(np.mean((force - change) ** 2)) < 0.02 * weight
+    assert np.abs(force - change).max() < 0.01 * weight
 
 
 @needs_physx
-@pytest.mark.parametrize("coefficient", [0.4, 0.8])
+@pytest.mark.parametrize("coefficient", [0.2, 0.5])
 def test_a_sliding_robot_is_slowed_by_the_friction_of_its_feet(build: Build, coefficient: float) -> None:
     """The feet's coefficient is the contact's, whatever the ground's 1.0 says."""
     backend = build(1)
@@ -311,8 +313,8 @@ def test_a_robot_with_a_model_of_its_own_falls_as_in_mujoco(build: Build) -> Non
             hold(each, 50)
         ends.append(backend.qpos.numpy().copy())
     assert plain is not None
-    np.testing.assert_allclose(ends[0], ends[1], atol=2e-3)
-    assert np.abs(ends[1] - plain.qpos.numpy()).max() > 0.02
+    np.testing.assert_allclose(ends[0], ends[1], atol=5e-4)
+    assert np.abs(ends[1] - plain.qpos.numpy()).max() > 5e-3
 
 
 @needs_physx

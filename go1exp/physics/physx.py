@@ -72,7 +72,7 @@ class PhysxCpu(MujocoCpu):
         self._stale = self.sensordata
         self.sensordata = torch.zeros_like(self._stale)
         self._floating = model.nq > model.njnt
-        ground = ground_shape(model)
+        ground = ground_shape(model, settings)
         self._robots = [PhysxRobot(model, settings, ground) for _ in range(num_envs)]
         self._order = self._robots[0].order
         threads = min(settings.threads or os.cpu_count() or 1, num_envs)

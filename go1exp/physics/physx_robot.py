@@ -59,7 +59,7 @@ def pose(position: Any, w_x_y_z: Any) -> Any:
     return sapien.Pose(np.asarray(position, dtype=np.float32), np.asarray(w_x_y_z, dtype=np.float32))
 
 
-def ground_shape(model: mujoco.MjModel) -> Any:
+def ground_shape(model: mujoco.MjModel, settings: PhysxBackend) -> Any:
     """Return the ground as one shape that all robots' systems share: a plane, or a height field's triangles.
 
     A cell of the field is split along the diagonal along which MuJoCo splits it (``go1exp.terrain.Terrain``).
@@ -76,7 +76,13 @@ def ground_shape(model: mujoco.MjModel) -> Any:
         shape.local_pose = pose(floor.pos, floor.quat)
     else:
         raise Expected(f"engine=physx: the geom {FLOOR!r} is neither a plane nor a height field")
-    shape.set_collision_groups(FLOOR_GROUPS)
+    return _meeting(shape, FLOOR_GROUPS, settings)
+
+
+def _meeting(shape: Any, groups: list[int], settings: PhysxBackend) -> Any:
+    """Return a shape that meets what it is to meet, at no distance."""
+    shape.set_collision_groups(groups)
+    shape.contact_offset, shape.rest_offset = settings.contact_offset, 0.0
     return shape
 
 
@@ -112,9 +118,9 @@ class PhysxRobot:
         Raises:
             Expected: if the model has joints or shapes other than a Go1's.
         """
-        self._model, self.shapes = model, {ground: model.geom(FLOOR).id}
+        self._model, self._settings = model, settings
+        self.shapes = {ground: model.geom(FLOOR).id}
         physx.set_scene_config(gravity=model.opt.gravity, enable_tgs=settings.solver == "tgs")
-        physx.set_shape_config(contact_offset=settings.contact_offset, rest_offset=0.0)
         physx.set_body_config(settings.position_iterations, settings.velocity_iterations, sleep_threshold=0.0)
         self.system = physx.PhysxCpuSystem()
         self.system.timestep = model.opt.timestep
@@ -130,6 +136,7 @@ class PhysxRobot:
             entity.add_component(component)
             self._scene.add_entity(entity)
         self.articulation = self.links[0].articulation
+        self.articulation.set_root_pose(pose(model.body_pos[1], model.body_quat[1]))  # where a held one stays
         hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
         self.joints = [self.links[model.jnt_bodyid[j] - 1].joint for j in hinges]
         names = [joint.name for joint in self.articulation.get_active_joints()]
@@ -194,9 +201,8 @@ class PhysxRobot:
         else:
             raise Expected(f"engine=physx: the geom {model.geom(geom).name!r} is no sphere, capsule or box")
         shape.local_pose = pose(model.geom_pos[geom], quat(turned))
-        shape.set_collision_groups(ROBOT_GROUPS)
         self.shapes[shape], self._materials[geom] = geom, material
-        return shape
+        return _meeting(shape, ROBOT_GROUPS, self._settings)
 
     # ------------------------------------------------------------------ its own model
 
