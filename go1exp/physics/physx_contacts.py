@@ -44,16 +44,22 @@ class Contacts:
         """Take in the contacts of one robot's last step; ``shapes`` gives the geom of each collision shape."""
         self.body_points[env] = self.foot_points[env] = self.foot_force[env] = 0.0
         for contact in contacts:
-            points = [(point.impulse, point.separation) for point in contact.points]
-            loads = [impulse for impulse, gap in points if impulse.any() or gap < -ROUNDING]
-            if not loads:
-                continue  # within the contact offset, and no more
-            first, second = (shapes[shape] for shape in contact.shapes)
-            geom, sign = (second, -1.0) if first == self._floor else (first, 1.0)  # the impulse is the first's
-            self.body_points[env, self._body[geom]] += len(loads)
-            if geom in self._foot:
-                self.foot_points[env, self._foot[geom]] += len(loads)
-                self.foot_force[env, self._foot[geom]] += np.sum(loads, axis=0) * (sign / self._dt)
+            count, total = 0, [0.0, 0.0, 0.0]
+            for point in contact.points:  # plain numbers: arrays of three would take most of the time of a step
+                impulse = point.impulse.tolist()
+                if any(impulse) or point.separation < -ROUNDING:
+                    count += 1
+                    total = [a + b for a, b in zip(total, impulse, strict=True)]
+            if count:
+                self._add(env, *(shapes[shape] for shape in contact.shapes), count, total)
+
+    def _add(self, env: int, first: int, second: int, count: int, impulse: list[float]) -> None:
+        """Add the points of one pair of geoms, and the impulse on the first."""
+        geom, sign = (second, -1.0) if first == self._floor else (first, 1.0)
+        self.body_points[env, self._body[geom]] += count
+        if (leg := self._foot.get(geom)) is not None:
+            self.foot_points[env, leg] += count
+            self.foot_force[env, leg] += np.multiply(impulse, sign / self._dt)
 
     @property
     def links(self) -> np.ndarray:
