@@ -244,6 +244,23 @@ def test_a_sliding_robot_is_slowed_by_the_friction_of_its_feet(build: Build, coe
     assert slowed == pytest.approx(coefficient * np.sum(loads) * DT, rel=0.05)
 
 
+@needs_physx
+def test_a_sliding_foot_stays_on_the_ground_in_physx_and_hops_in_mujoco(build: Build) -> None:
+    """Why feet slip longer in PhysX at the end of a stance (docs/engines.md)."""
+    shares = []
+    for engine in (PHYSX, CPU):
+        backend, share = build(1, engine), 0.0
+        put(backend, *standing(1, height=0.328))
+        hold(backend, 250)
+        backend.qvel[:, 0] = 1.0
+        for _ in range(15):
+            hold(backend, 1)
+            share += (feet(backend)[0, :, 0] > 0).mean() / 15
+        shares.append(share)
+    assert shares[0] > 0.95
+    assert shares[1] < 0.8
+
+
 # ---------------------------------------------------------------------- sensors and state
 
 
@@ -401,10 +418,9 @@ def test_it_trains_nothing(make_task: Callable[..., TaskConfig]) -> None:
 def test_a_shipped_policy_walks_in_physx_as_in_mujoco() -> None:
     config, policy, _ = load_run(shipped_policies()["trot"])
     task = other_robot.replaced(config.task, other_robot.split(compose("eval", ["contact=elliptic"]))[0])
-    commands = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0))
     reports = []
     for engine in (PHYSX, CPU):
-        brief = EvalConfig(commands, 3, 3.0, 1.5, True, True, False, False, None, 5, engine=engine)
+        brief = EvalConfig(((1.0, 0.0, 0.0),), 3, 2.0, 1.0, True, True, False, False, None, 5, engine=engine)
         reports.append(evaluate(task, policy, brief))
     judged, reference = reports
     assert judged["falls"] == reference["falls"] == 0

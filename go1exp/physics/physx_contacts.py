@@ -51,7 +51,8 @@ class Contacts:
                     count += 1
                     total = [a + b for a, b in zip(total, impulse, strict=True)]
             if count:
-                self._add(env, *(shapes[shape] for shape in contact.shapes), count, total)
+                first, second = (shapes[shape] for shape in contact.shapes)
+                self._add(env, first, second, count, total)
 
     def _add(self, env: int, first: int, second: int, count: int, impulse: list[float]) -> None:
         """Add the points of one pair of geoms, and the impulse on the first."""
