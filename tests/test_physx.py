@@ -294,6 +294,46 @@ def test_what_is_written_into_the_state_is_where_the_robot_goes_on(build: Build)
 
 
 @needs_physx
+def test_a_robot_that_gets_another_centre_of_mass_leaves_the_others_alone(build: Build) -> None:
+    ends = []
+    for changed in (False, True):
+        backend = build(3)
+        backend.field("body_ipos")
+        put(backend, *standing(3, height=0.328))
+        hold(backend, 50)
+        if changed:
+            backend.field("body_ipos")[1, 1] += 0.02
+            qpos, qvel = (torch.as_tensor(a) for a in standing(3, height=0.328))
+            backend.reset(torch.tensor([False, True, False]), qpos, qvel)
+        hold(backend, 50)
+        ends.append(backend.qpos.clone())
+    assert torch.equal(ends[0][[0, 2]], ends[1][[0, 2]])
+    assert not torch.equal(ends[0][1], ends[1][1])
+
+
+@needs_physx
+def test_a_robot_starts_where_it_is_said_to_be_without_a_reset(build: Build) -> None:
+    backends = [build(1, each) for each in (PHYSX, CPU)]
+    for backend in backends:
+        backend.qpos[:] = torch.as_tensor(standing(1, height=1.0)[0])
+        backend.step(torch.zeros(1, 12, dtype=torch.float64))
+    np.testing.assert_allclose(backends[0].qpos, backends[1].qpos, atol=1e-5)
+
+
+@needs_physx
+def test_a_robot_whose_state_is_no_number_is_seen_and_can_be_reset(build: Build) -> None:
+    backend = build(2)
+    put(backend, *standing(2, height=0.328))
+    backend.qvel[1, 8] = torch.nan
+    hold(backend, 2)
+    assert torch.isfinite(backend.qpos).all(1).tolist() == [True, False]
+    put(backend, *standing(2, height=0.328))
+    hold(backend, 5)
+    assert torch.isfinite(backend.qpos).all()
+    assert torch.isfinite(backend.sensordata).all()
+
+
+@needs_physx
 def test_a_held_robot_swings_as_in_mujoco(build: Build) -> None:
     quat = (0.9689124217106447, 0.0, 0.24740395925452294, 0.0)
     held = [build(2, each, held=quat) for each in (PHYSX, CPU)]

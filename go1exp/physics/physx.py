@@ -81,7 +81,7 @@ class PhysxCpu(MujocoCpu):
         self._contacts, self._friction = Contacts(model, num_envs), FootFriction(model)
         names = ("qfrc_smooth", "qfrc_bias", "M", "xanchor", "xaxis", "qacc")
         self._out = {name: self._batch.bind(name) for name in names}
-        self._known = self.qpos.clone(), self.qvel.clone()
+        self._known = torch.full_like(self.qpos, torch.nan), torch.full_like(self.qvel, torch.nan)
         self._in_force: dict[str, Tensor] = {}
         self._trunk_centre = torch.tensor(model.body_ipos[1]).repeat(num_envs, 1)
 
@@ -106,14 +106,13 @@ class PhysxCpu(MujocoCpu):
         """Give PhysX what has changed in the robots' models since the last step."""
         for name, old in self._in_force.items():
             live = self._fields[name]
-            if torch.equal(live, old):
-                continue
-            for env in (live != old).flatten(1).any(1).nonzero().squeeze(1).tolist():
+            rows = (live != old).flatten(1).any(1)
+            for env in rows.nonzero().squeeze(1).tolist():
                 self._robots[env].set_field(name, live[env].numpy())
             old.copy_(live)
             if name == "body_ipos":
                 self._trunk_centre.copy_(live[:, 1])
-                self._known[1].fill_(torch.nan)  # PhysX keeps the velocity of the centre of mass
+                self._known[1][rows] = torch.nan  # PhysX keeps the velocity of the centre of mass
 
     # ------------------------------------------------------------------ a step
 
@@ -136,6 +135,8 @@ class PhysxCpu(MujocoCpu):
         self.qpos[rows] = qpos[rows].to(self.qpos.dtype)
         self.qvel[rows] = qvel[rows].to(self.qvel.dtype)
         self._ctrl[rows] = 0.0
+        if self._applied is not None:
+            self._applied[rows] = 0.0  # as MuJoCo does
         self._put(rows)
         state = self.qpos.clone(), self.qvel.clone()
         self._advance(rows.tolist())
