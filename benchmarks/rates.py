@@ -47,7 +47,7 @@ def main(arguments: Sequence[str]) -> None:
         raise SystemExit("usage: python -m benchmarks.rates policy=NAME [episodes=8] [out=FILE.json]")
     config, policy, about = load_run(data_root() / "assets" / "policies" / given["policy"])
     commands = grid(GRID["x"], GRID["y"], GRID["yaw"], cross=False)
-    off = dict.fromkeys(("randomize", "push", "train_ground"), False)
+    off: Any = dict.fromkeys(("randomize", "push", "train_ground"), False)
     reports = []
     print("rate  velocity   cmd. 2.0 m/s  cmd. 1.8 rad/s  RMSE xy  RMSE yaw  falls", flush=True)
     for velocity in ("exact", "estimated"):

@@ -206,6 +206,9 @@ SECTIONS: dict[str, type] = {
 }
 """Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
 
+ENGINES = ("backend", "engine")
+"""Groups of which a configuration uses one engine: the one that trains, and the one that judges."""
+
 OF_OLDER_RUNS: dict[str, Any] = {"contact": MUJOCO_CONTACT, "critic": ()}
 """Parts that runs of older versions do not name, and what they were."""
 
@@ -263,11 +266,11 @@ def parse_parts(container: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[
             problems.append(f"{name}: required, but not given")
             continue
         settings = container[name]
-        if name in SECTIONS:
-            kind = SECTIONS[name]
-            if name == "backend" and isinstance(settings, Mapping) and "name" in settings:
+        if name in SECTIONS or name in ENGINES:
+            kind = SECTIONS.get(name, CpuBackend)
+            if name in ENGINES and isinstance(settings, Mapping) and "name" in settings:
                 if settings["name"] not in BACKENDS:
-                    problems.append(unknown_name("backend.name", str(settings["name"]), BACKENDS, "engine"))
+                    problems.append(unknown_name(f"{name}.name", str(settings["name"]), BACKENDS, "engine"))
                     continue
                 kind = BACKENDS[settings["name"]]
             parts[name], complaints = _section(kind, settings, name)

@@ -375,7 +375,7 @@ def parse(verb: str, container: dict[str, Any]) -> None:
     own = {f.name for f in fields(VERBS[verb])}
     checked: Any = settings.parse(VERBS[verb], {k: v for k, v in container.items() if k in own})
     others = container.keys() - own
-    assert others <= {*RIG, *CHOICES, "excitation", "model"}
+    assert others <= {*RIG, *CHOICES, "engine", "excitation", "model"}
     problems = parse_parts(container, tuple(others - {"excitation", "model"}))[1]
     if "model" in others:
         parse_model(container["model"])

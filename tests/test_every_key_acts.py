@@ -64,6 +64,8 @@ Two traces are run in turns: while one waits, it has changed nothing that the ot
 
 EXEMPT = {
     "backend/cpu.yaml:backend.name": "the other engine is an extra: tests/contracts/test_backends.py",
+    "engine/mujoco.yaml:engine": "backend/cpu.yaml has the same keys; tests/test_physx.py shows the other engine",
+    "engine/physx.yaml:engine": "needs an extra: tests/test_physx.py shows what each key does",
     "backend/warp.yaml:backend": "needs a GPU and an extra: tests/contracts/test_backends.py",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
@@ -389,8 +391,8 @@ def parse(program: str, container: dict[str, Any]) -> Any:
 
 
 SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
-    "eval": (settings.EvalSettings, ()),
-    "play": (settings.PlaySettings, ()),
+    "eval": (settings.EvalSettings, ("engine",)),
+    "play": (settings.PlaySettings, ("engine",)),
     "record": (settings.RecordSettings, (*RIG, "excitation")),
     "record_audit": (settings.AuditSettings, ()),
     "record_import": (settings.ImportSettings, ()),

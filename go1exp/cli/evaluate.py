@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from go1exp.cli import other_robot
+from go1exp.cli import engine, other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError, Term, bind_list
@@ -26,6 +26,7 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.runs import checkpoint_file, trained
     from go1exp.cli.settings import EvalSettings, parse
 
+    judge, container = engine.split(container)
     other, container = other_robot.split(container)
     settings = parse(EvalSettings, container)
     measures = _measures(settings.measures)
@@ -44,7 +45,7 @@ def _task(container: dict[str, Any]) -> None:
 
     of_run, policy, about = load_run(run, checkpoint)
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
-    config = EvalConfig.from_settings(settings, commands=commands)
+    config = EvalConfig.from_settings(settings, commands=commands, engine=judge)
     task = other_robot.replaced(of_run.task, other)
     report = {
         "policy": about,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from go1exp.cli import other_robot
+from go1exp.cli import engine, other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.schema.registry import ConfigError
 
@@ -17,6 +17,7 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.runs import checkpoint_file, trained
     from go1exp.cli.settings import PlaySettings, parse
 
+    judge, container = engine.split(container)
     other, container = other_robot.split(container)
     settings = parse(PlaySettings, container)
     run, out = trained(settings.run, settings.policy, "play.mp4", settings.out)
@@ -27,15 +28,18 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.env.core import Go1Core
     from go1exp.evaluate import video
     from go1exp.evaluate.camera import RenderingUnavailable
+    from go1exp.evaluate.engine import require_agreement
     from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
     from go1exp.evaluate.stick import picture
 
     of_run, policy, _ = load_run(run, checkpoint)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
-    shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), **whole)
+    shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), engine=judge, **whole)
     task = other_robot.replaced(of_run.task, other)
-    core = Go1Core(evaluation_task(task, shown), 1, settings.seed, noise=settings.noise)
+    shown_task = evaluation_task(task, shown)
+    require_agreement(shown_task)
+    core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise)
     if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
         video.live(core, policy)
         return

@@ -12,7 +12,7 @@ from go1exp.mdp.types import StepResult
 from go1exp.physics.backend import PhysicsBackend
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors
-from go1exp.schema.backends import BackendConfig, CpuBackend, WarpBackend
+from go1exp.schema.backends import BackendConfig, CpuBackend, PhysxBackend, WarpBackend
 
 T = TypeVar("T")
 
@@ -38,7 +38,13 @@ def _warp(config: WarpBackend, model: Any, sensors: Sensors, num_envs: int) -> P
     return MujocoWarp(model, sensors, num_envs, device=config.device, **limits)
 
 
-BUILDERS: dict[str, Callable[..., PhysicsBackend]] = {"cpu": _cpu, "warp": _warp}
+def _physx(config: PhysxBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+    from go1exp.physics.physx import PhysxCpu  # its package is an extra
+
+    return PhysxCpu(model, sensors, num_envs, config)
+
+
+BUILDERS: dict[str, Callable[..., PhysicsBackend]] = {"cpu": _cpu, "warp": _warp, "physx": _physx}
 """How each engine is built, by the names of ``go1exp.schema.backends.BACKENDS``."""
 
 

@@ -13,12 +13,14 @@ import torch
 from go1exp.config import TaskConfig, time_rules
 from go1exp.deploy.past import PastActions
 from go1exp.env.core import Go1Core
+from go1exp.evaluate.engine import require_agreement
 from go1exp.evaluate.estimated import EstimatedVelocity
 from go1exp.evaluate.measured import described, interval
 from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy
 from go1exp.evaluate.recorder import Recorder
 from go1exp.mdp.commands import FixedVelocity
+from go1exp.schema.backends import BackendConfig
 from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.terrain import TerrainConfig
 
@@ -45,6 +47,7 @@ class EvalConfig:
         seed: seed of everything random.
         physics_dt: another physics step, s, or None for that of training.
         trunk_velocity: velocity that the policy observes: ``exact``, or ``estimated`` from the sensors by the filter.
+        engine: what moves the robots, or None for MuJoCo on the processor.
     """
 
     commands: tuple[Command, ...]
@@ -59,6 +62,7 @@ class EvalConfig:
     seed: int
     physics_dt: float | None = None
     trunk_velocity: Literal["exact", "estimated"] = "exact"
+    engine: BackendConfig | None = None
 
     @property
     def random(self) -> bool:
@@ -85,7 +89,7 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     if problems := time_rules(sim):
         raise ConfigError(problems)
     fixed = Term("command", members("command")["fixed_velocity"], {})
-    engine = task.backend.as_reference()
+    engine = config.engine or task.backend.as_reference()
     changes: dict[str, Any] = {"sim": sim, "command": fixed, "curriculum": (), "backend": engine}
     if not config.randomize:
         changes["rand"] = ()
@@ -109,10 +113,16 @@ def evaluate(
     A robot counts until it falls. Tracking figures of a command are over all its robots and the time after
     ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
     ``measures`` (``go1exp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
+    ``agreement`` says how near another engine than MuJoCo came to it before anything else was done.
+
+    Raises:
+        Expected: if that is not near enough.
     """
     count = len(config.commands) * config.episodes
     estimated = config.trunk_velocity == "estimated"
-    core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=estimated)
+    judged = evaluation_task(task, config)
+    checks = require_agreement(judged)
+    core = Go1Core(judged, count, config.seed, noise=config.noise, imu=estimated)
     see = EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
     # A policy that runs faster than it was trained sees its action of one training period ago.
     past = PastActions[torch.Tensor](task.sim.policy_dt, core.task.sim.policy_dt)
@@ -142,6 +152,8 @@ def evaluate(
                 recorder.end_step(tally.alive)
         on_step(step + 1, steps)
     report = tally.report(config)
+    if checks:
+        report["agreement"] = [dataclasses.asdict(check) for check in checks]
     if recorder:
         for k, row in enumerate(report["commands"]):
             row["measures"] = described(measures, recorder.trace(tally.distinct(k, config).numpy()))

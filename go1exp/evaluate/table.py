@@ -95,6 +95,7 @@ def _summary(report: dict[str, Any]) -> str:
         f"policy after {policy['num_timesteps'] / 1e6:.2f} M steps; RMSE over all: {rmse}; "
         f"falls {report['falls']} in {report['episodes']} episodes of {settings['duration_s']:g} s; "
         f"with {', '.join(on) if on else 'no noise, randomisation or pushes, on flat ground'}"
+        + (f"; moved by {settings['engine']['name']}" if report.get("agreement") else "")
     )
 
 

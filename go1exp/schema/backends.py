@@ -76,7 +76,39 @@ class WarpBackend:
         return CpuBackend("cpu", threads=0)
 
 
-BackendConfig = CpuBackend | WarpBackend
+@dataclass(frozen=True)
+class PhysxBackend:
+    """PhysX 5 on the processor, in single precision: it judges policies that were made with MuJoCo, and trains none.
 
-BACKENDS: dict[str, type] = {"cpu": CpuBackend, "warp": WarpBackend}
+    Attributes:
+        name: ``physx``.
+        threads: threads of the physics; 0 takes all cores. Robots are solved one by one: the same bits at any number.
+        solver: ``tgs``, which divides a step by its iterations, or ``pgs``, which repeats the whole step.
+        position_iterations: iterations of the solver in a physics step.
+        velocity_iterations: iterations after those, for speeds alone.
+        contact_offset: distance at which shapes are looked at for a contact, m; they touch at 0.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    on_gpu: ClassVar[bool] = False
+    """Whether its tensors are on a GPU."""
+    captures: ClassVar[bool] = False
+    """Whether work on its tensors is recorded once and replayed."""
+
+    name: Literal["physx"]
+    threads: Annotated[int, Field(ge=0)]
+    solver: Literal["tgs", "pgs"]
+    position_iterations: Annotated[int, Field(ge=1, le=255)]
+    velocity_iterations: Annotated[int, Field(ge=0, le=255)]
+    contact_offset: Annotated[float, Field(gt=0, le=0.1)]
+
+    def as_reference(self) -> CpuBackend:
+        """Return the settings of the engine that policies are judged on, wherever they were trained: MuJoCo's own."""
+        return CpuBackend("cpu", threads=0)
+
+
+BackendConfig = CpuBackend | WarpBackend | PhysxBackend
+
+BACKENDS: dict[str, type] = {"cpu": CpuBackend, "warp": WarpBackend, "physx": PhysxBackend}
 """By their names, which are also the choices of the group ``backend``."""

@@ -9,7 +9,7 @@ import torch
 from go1exp.config import TrainConfig
 from go1exp.effects.rules import drives
 from go1exp.env.core import Go1Core
-from go1exp.schema.backends import WarpBackend
+from go1exp.schema.backends import PhysxBackend, WarpBackend
 from go1exp.schema.registry import ConfigError
 from go1exp.train import memory_need, metrics
 
@@ -78,6 +78,8 @@ def check_devices(config: TrainConfig) -> None:
                 "backend=cpu"
             )
         wanted.append(("backend.device", backend.device, "backend=cpu"))
+    if isinstance(backend, PhysxBackend):
+        problems.append("backend = 'physx': judges policies and trains none; use backend=cpu or backend=warp")
     for key, name, instead in wanted:
         if name.startswith("cuda") and not torch.cuda.is_available():
             problems.append(f"{key} = {name!r}: torch finds no CUDA device; use {instead}")
