@@ -42,7 +42,13 @@ class Kinematics:
         self.feet, self.jacobians = np.zeros((robot.NUM_LEGS, 3)), np.zeros((robot.NUM_LEGS, 3, 3))
 
     def update(
-        self, position: np.ndarray, quat: np.ndarray, q: np.ndarray, velocity: np.ndarray, gyro: np.ndarray, qd: np.ndarray
+        self,
+        position: np.ndarray,
+        quat: np.ndarray,
+        q: np.ndarray,
+        velocity: np.ndarray,
+        gyro: np.ndarray,
+        qd: np.ndarray,
     ) -> None:
         """Take a state: trunk's place m, attitude w-x-y-z, angles rad, velocities m/s (world), rad/s (trunk), rad/s."""
         model, data = self._model, self._data

@@ -129,7 +129,9 @@ class Mpc:
         # Height below the trunk's origin of the ground, from the feet that stand now.
         down = self._down if self._down.any() else np.ones(LEGS, dtype=bool)
         below = float((flat[down, 2] - flat[down, :2] @ self._slope).mean()) - robot.FOOT_RADIUS
-        self._below = self._smoothed.height(-below, self._velocity[2] - self._slope @ (self._turned.T @ self._velocity)[:2])
+        self._below = self._smoothed.height(
+            -below, self._velocity[2] - self._slope @ (self._turned.T @ self._velocity)[:2]
+        )
         a, b = self._slope
         normal = np.array([-a, -b, 1.0]) / math.sqrt(a * a + b * b + 1.0)
         first = np.array([1.0, 0.0, a]) / math.sqrt(1.0 + a * a)
@@ -177,7 +179,9 @@ class Mpc:
         way_to = np.cumsum(reference[:, 3], axis=0) * force.dt
         reference[:, 1] = way_to
         reference[:, 1, :2] += com[:2] + self._lag
-        reference[:, 1, 2] = offset[2] + self.settings.height * math.sqrt(1 + a * a + b * b) + reference[:, 1, :2] @ self._slope
+        reference[:, 1, 2] = (
+            offset[2] + self.settings.height * math.sqrt(1 + a * a + b * b) + reference[:, 1, :2] @ self._slope
+        )
         stands = self._clock.schedule(force.steps, force.dt)
         stands[0] = self._down
         empty = ~stands.any(1)
@@ -238,7 +242,9 @@ class Mpc:
 
 def _cross(w: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return w (3,) x r (n, 3)."""
-    return np.stack([w[1] * r[:, 2] - w[2] * r[:, 1], w[2] * r[:, 0] - w[0] * r[:, 2], w[0] * r[:, 1] - w[1] * r[:, 0]], 1)
+    return np.stack(
+        [w[1] * r[:, 2] - w[2] * r[:, 1], w[2] * r[:, 0] - w[0] * r[:, 2], w[0] * r[:, 1] - w[1] * r[:, 0]], 1
+    )
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:

@@ -42,7 +42,9 @@ class Smoothed:
             return
         w, x, y, z = self.quat
         a, b, c = 0.5 * self._dt * sensed.gyro
-        turned = np.array([w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a])
+        turned = np.array(
+            [w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a]
+        )
         near = sensed.quat if turned @ sensed.quat >= 0.0 else -sensed.quat
         turned += self._attitude * (near - turned)
         self.quat = turned / np.sqrt(turned @ turned)

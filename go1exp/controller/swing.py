@@ -11,7 +11,9 @@ HIPS = np.array([[x * robot.HIP_OFFSET[0], y * (robot.HIP_OFFSET[1] + robot.LINK
 """(4, 3) points of the trunk below which feet stand: hip axes with the abduction offset, trunk frame, m."""
 
 
-def way(start: np.ndarray, end: np.ndarray, height: float, share: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def way(
+    start: np.ndarray, end: np.ndarray, height: float, share: np.ndarray, duration: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return place (n, 3), m, and velocity (n, 3), m/s, of feet on their way.
 
     Horizontally a cubic from rest to rest; vertically the same plus a bump 16 s^2 (1 - s)^2.

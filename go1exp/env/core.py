@@ -7,6 +7,7 @@ makes environment i of a batch compute exactly what it would compute alone.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -52,7 +53,13 @@ class Go1Core:
         held: attitude w-x-y-z in which the trunks are held in the air; None lets them go.
         alike: draw the effects and drives once, for all robots: one robot, many times (for a logger).
         critic: append what only the critic sees to the observations (training only).
+
+    Attributes:
+        driver: called for every physics step in place of the plant's ``step``, which it must call once itself: another
+            controller than a policy (``go1exp/controller/batch.py``). ``step`` then wants actions that nobody reads.
     """
+
+    driver: Callable[[], None] | None = None
 
     def __init__(
         self,
@@ -258,7 +265,10 @@ class Go1Core:
         self._touched.zero_()
         self._calf_touched.zero_()
         for _ in range(self.task.sim.decimation):
-            self.plant.step(target)
+            if self.driver is None:
+                self.plant.step(target)
+            else:
+                self.driver()
             feet = self._foot_contact[..., 0]
             self.feet.update(self._foot_contact[..., 1:], self._foot_vel_w)
             # Counts, largest over the substeps; a calf's contacts without those of its foot.

@@ -1,0 +1,143 @@
+"""Controllers that drive the robots of an environment, each by what its own sensors say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.controller.types import Command, Controller, Drive, Sensed
+from go1exp.env.core import Go1Core
+from go1exp.estimation import WIDTH, go1, make_filter
+from go1exp.estimation import readings as column
+from go1exp.record.tape import sample
+from go1exp.schema.registry import ConfigError
+from go1exp.sim_robot.machine import noisy
+from go1exp.tensors.rotation import rotate_inverse
+
+VELOCITY_NOISE = 0.02
+"""Half-width of the noise of the paper's Table II on the trunk's exact velocity, m/s."""
+
+
+class Driven:
+    """N controllers in place of a policy: built once, they act in every ``core.step``.
+
+    Each physics step whose time has come, every robot's sensors are read, its controller called, and the answer kept in
+    force: targets, feed-forward torques and gains. Drives without gains get the targets and torques alone.
+
+    After a ``core.step``, give ``restart`` the rows whose episodes ended.
+    """
+
+    def __init__(
+        self,
+        core: Go1Core,
+        make: Callable[[], Controller],
+        *,
+        noise: bool,
+        seed: int,
+        trunk_velocity: Literal["exact", "estimated"] = "exact",
+    ) -> None:
+        """Take over the robots of ``core``, which must have been built with ``imu=True``.
+
+        Args:
+            core: the environment; its commands (``core.command.value``) are what the robots are told.
+            make: makes one robot's controller.
+            noise: give the sensors the noise of the paper's Table II, and the feet that of a logger.
+            seed: of the noise.
+            trunk_velocity: the true one, or that of the Kalman filter.
+
+        Raises:
+            ConfigError: if the controller's period is no multiple of the physics step.
+            go1exp.estimation.EstimatorError: if the filter is wanted and not built.
+        """
+        self._core, self._plant, n = core, core.plant, core.num_envs
+        self.controllers: list[Controller] = [make() for _ in range(n)]
+        self._dt = core.task.sim.physics_dt
+        self._every = _whole(self.controllers[0].period, self._dt)
+        self._noise, self._rng = float(noise), np.random.default_rng([seed, 3])
+        self._estimates = trunk_velocity == "estimated"
+        self._filters = [make_filter(go1()) for _ in range(n)] if self._estimates else []
+        self._has_gains = hasattr(self._plant.actuator, "kp")
+        self._target, self._forward = (torch.zeros_like(self._plant.q) for _ in range(2))
+        self._kp, self._kd = (torch.zeros_like(self._plant.q) for _ in range(2))
+        self._steps = 0
+        core.driver = self._step
+
+    def action(self) -> Tensor:
+        """Return what ``core.step`` wants and nobody reads: zeros (N, 12)."""
+        return torch.zeros(self._core.num_envs, robot.NUM_JOINTS)
+
+    def restart(self, mask: Tensor) -> None:
+        """Begin anew with the robots of ``mask`` (N,) bool."""
+        for i in np.flatnonzero(mask.numpy()):
+            self.controllers[i].reset()
+            if self._estimates:
+                self._filters[i] = make_filter(go1())
+
+    def _step(self) -> None:
+        """Let the controllers act where their time has come, and advance the physics."""
+        sensed = self._sense()
+        if self._steps % self._every == 0:
+            commands = self._core.command.value.double().numpy()
+            told = [
+                one.step(_command(row), of_robot)
+                for one, row, of_robot in zip(self.controllers, commands, sensed, strict=True)
+            ]
+            self._put(told)
+        self._steps += 1
+        self._plant.step(self._target, self._forward)
+        self._core.target.copy_(self._target)
+
+    def _put(self, told: Sequence[Drive]) -> None:
+        """Put what the controllers say into force."""
+        for tensor, name in (
+            (self._target, "target"),
+            (self._forward, "feedforward"),
+            (self._kp, "kp"),
+            (self._kd, "kd"),
+        ):
+            tensor.copy_(torch.as_tensor(np.stack([getattr(one, name) for one in told])))
+        if self._has_gains:
+            self._plant.set_gains(self._kp, self._kd)
+
+    def _sense(self) -> list[Sensed]:
+        """Read the sensors of all robots."""
+        true = {name: values.cpu().double().numpy() for name, values in sample(self._plant, self._target).items()}
+        readings = noisy(true, self._noise, self._rng)
+        if self._estimates:
+            velocities = self._estimated(readings)
+        else:
+            quat, speed = (torch.as_tensor(true[name]) for name in ("base_quat", "base_lin_vel"))
+            even = self._rng.uniform(-1.0, 1.0, speed.shape) * self._noise * VELOCITY_NOISE
+            velocities = rotate_inverse(quat, speed).numpy() + even
+        names = ("q", "qd", "quat", "gyro")
+        rows = zip(*(readings[name] for name in names), velocities, readings["foot_force"], strict=True)
+        return [Sensed(*row) for row in rows]
+
+    def _estimated(self, readings: dict[str, np.ndarray]) -> np.ndarray:
+        """Return the filters' velocities (N, 3), trunk frame, m/s, after one sample each."""
+        rows = np.full((len(self._filters), WIDTH), np.nan)
+        rows[:, column.T] = self._steps * self._dt
+        places = {"quat": column.QUAT, "gyro": column.GYRO, "acc": column.ACC, "q": column.Q, "qd": column.QD}
+        for name, place in {**places, "foot_force": column.FOOT_FORCE}.items():
+            rows[:, place] = readings[name]
+        for one, row in zip(self._filters, rows, strict=True):
+            one.update(row)
+        return np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])
+
+
+def _command(row: np.ndarray) -> Command:
+    return float(row[0]), float(row[1]), float(row[2])
+
+
+def _whole(period: float, dt: float) -> int:
+    """Return how many physics steps of ``dt`` s a period has."""
+    ratio = period / dt
+    if ratio < 1.0 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
+        raise ConfigError([f"controller.period = {period:g}: must be a multiple of the physics step, {dt:g} s"])
+    return round(ratio)
