@@ -11,12 +11,13 @@ class Clock:
     A leg stands in the first ``duty`` of its cycle and swings in the rest.
 
     Attributes:
-        period: of a cycle, s; may be changed at any time, the phase goes on from where it is.
+        duty: that share.
+        period: of a cycle, s.
     """
 
-    def __init__(self, offsets: tuple[float, ...], duty: float) -> None:
+    def __init__(self, offsets: tuple[float, ...], duty: float, period: float) -> None:
         """Start at phase 0; ``offsets`` (4,) are the legs' phases then, in cycles; ``duty`` in (0, 1)."""
-        self._offsets, self.duty, self.period, self._phase = np.array(offsets), duty, 1.0, 0.0
+        self._offsets, self.duty, self.period, self._phase = np.array(offsets), duty, period, 0.0
 
     def restart(self) -> None:
         """Go back to phase 0."""
@@ -35,6 +36,11 @@ class Clock:
     def stance_time(self) -> float:
         """Time that a foot stands in each cycle, s."""
         return self.duty * self.period
+
+    @property
+    def swing_time(self) -> float:
+        """Time that a foot swings in each cycle, s."""
+        return (1.0 - self.duty) * self.period
 
     def stands(self) -> np.ndarray:
         """(4,) bool: meant to stand now."""

@@ -1,4 +1,4 @@
-"""``controller=mpc``: forces of standing feet by a convex programme, swinging feet to footholds (Di Carlo et al. 2018)."""
+"""``controller=mpc``: forces of the standing feet by a convex programme, footholds for the others (Di Carlo et al. 2018)."""
 
 from __future__ import annotations
 
@@ -7,22 +7,33 @@ import math
 import numpy as np
 
 from go1exp import robot
-from go1exp.controller.forces import Body, ForcePlan, Problem
+from go1exp.controller.feet import Feet
+from go1exp.controller.forces import ForcePlan, Problem
 from go1exp.controller.gait import Clock
+from go1exp.controller.geometry import heading, matrix, roll_pitch_yaw, skew, wrapped
+from go1exp.controller.ground import Ground, frame
 from go1exp.controller.kinematics import Kinematics
 from go1exp.controller.settings import MpcSettings
 from go1exp.controller.smoothing import Smoothed
-from go1exp.controller.swing import HIPS, solved, way
+from go1exp.controller.swing import footholds, solved, way
 from go1exp.controller.types import Command, Drive, Sensed
 
-LEGS = robot.NUM_LEGS
+LIMIT = robot.per_joint(robot.EFFORT_LIMIT)
+LOW, HIGH = robot.JOINT_POS_LIMITS.T
+MOST_CHANGE = 0.6
+"""Largest difference between a target and the joint's angle, rad."""
+MOST_SPEED = 25.0
+"""Largest joint speed that a swinging leg is told, rad/s."""
 
 
 class Mpc:
     """Walks one robot.
 
-    The world of this controller is the attitude's: z up, heading as the IMU has it; places are the integrated velocity,
-    of which only differences over a stride matter.
+    The world of this controller has z up and x where the IMU's heading is zero. Places in it are the integrated
+    velocity: only differences within a stride matter, so that drift does not.
+
+    Attributes:
+        period: time between two calls, s.
     """
 
     def __init__(self, settings: MpcSettings, inertia: str = "merged") -> None:
@@ -33,227 +44,169 @@ class Mpc:
         """
         self.settings, self.period = settings, settings.period
         self._kin = Kinematics(inertia)
-        self._body: Body = self._kin.body()
-        self._plan = ForcePlan(settings.force, self._body)
-        self._clock = Clock(settings.gait.offsets, settings.gait.duty)
+        self._plan = ForcePlan(settings.force, self._kin.body())
         self._every = max(round(settings.force.every / settings.period), 1)
-        self._limit = robot.per_joint(robot.EFFORT_LIMIT)
-        self._smoothed = Smoothed(settings.smoothing, settings.period)
+        gait, stance, smoothing = settings.gait, settings.stance, settings.smoothing
+        self._clock = Clock(gait.offsets, gait.duty, gait.period)
+        self._smoothed = Smoothed(smoothing, settings.period)
+        self._ground = Ground(stance, smoothing.height, settings.period)
+        self._feet = Feet(stance.contact_force, settings.period)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: the next call is the first one."""
-        self._clock.restart()
-        self._smoothed.restart()
-        self._tick, self._started = 0, False
-        self._place = np.zeros(3)
-        self._lag, self._heading = np.zeros(2), 0.0
-        self._lift, self._anchor = np.zeros((LEGS, 3)), np.zeros((LEGS, 3))
-        self._hold = np.zeros((LEGS, 3))
-        self._down = np.ones(LEGS, dtype=bool)
-        self._planned = np.ones(LEGS, dtype=bool)
-        self._overdue = np.zeros(LEGS)
-        self._forces = np.zeros((LEGS, 3))
-        self._slope, self._level = np.zeros(2), 0.0
+        for part in (self._clock, self._smoothed, self._ground, self._feet):
+            part.restart()
+        self._since_plan, self._first = 0, True
+        self._place, self._lag, self._heading = np.zeros(3), np.zeros(2), 0.0
+        self._forces = np.zeros((robot.NUM_LEGS, 3))
 
     def step(self, command: Command, sensed: Sensed) -> Drive:
         """Return what the drives are told until the next call."""
         self._sense(sensed)
-        fast = command[0] >= self.settings.gait.fast_speed
-        self._clock.period = self.settings.gait.fast_period if fast else self.settings.gait.period
-        if self._started:
-            self._clock.advance(self.period)
-        changed = self._touch(sensed.foot_force)
-        self._look_at_ground()
+        changed = self._feet.update(self._clock, sensed.foot_force, self._kin.feet)
+        self._ground.update(self._feet.anchor - self._place, self._feet.down, self._velocity)
+        command = self._level(command)
         self._lead(command)
-        if changed or self._tick % self._every == 0:
+        if changed or self._since_plan >= self._every:
             self._push(command)
-            self._tick = 0
-        self._tick += 1
-        self._started = True
+            self._since_plan = 0
+        self._since_plan += 1
+        self._first = False
         return self._drive(command)
 
     # ------------------------------------------------------------------ what is known
 
     def _sense(self, sensed: Sensed) -> None:
-        """Smooth the readings and put the model where they say."""
+        """Smooth the readings and put the model where they say; let time pass."""
         now = self._smoothed
         now.update(sensed)
-        self._rotation = _matrix(now.quat)
-        self._velocity = self._rotation @ now.velocity_b
-        self._rate = self._rotation @ sensed.gyro
-        if self._started:
-            self._place += self.period * self._velocity
-        self._kin.update(self._place, now.quat, now.joint_pos, self._velocity, sensed.gyro, sensed.joint_vel)
-        R = self._rotation
-        self._yaw = math.atan2(R[1, 0], R[0, 0])
-        self._roll, self._pitch = math.atan2(R[2, 1], R[2, 2]), -math.asin(max(-1.0, min(1.0, R[2, 0])))
-        c, s = math.cos(self._yaw), math.sin(self._yaw)
-        self._turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        if not self._started:
+        self._rotation = matrix(now.quat)
+        self._roll, self._pitch, self._yaw = roll_pitch_yaw(self._rotation)
+        self._turned = heading(self._yaw)
+        self._velocity, self._rate = self._rotation @ now.velocity_b, self._rotation @ sensed.gyro
+        if self._first:
             self._heading = self._yaw
-            self._anchor[:] = self._kin.feet
-            self._lift[:] = self._hold[:] = self._kin.feet
-            self._level = float(self._kin.feet[:, 2].mean()) - robot.FOOT_RADIUS
+        else:
+            self._place += self.period * self._velocity
+            self._clock.advance(self.period)
+        self._kin.update(self._place, now.quat, now.joint_pos, self._velocity, sensed.gyro, sensed.joint_vel)
+        self._ahead = self._turned.T @ self._velocity  # in the axes of the heading, like the command
 
-    def _touch(self, force: np.ndarray) -> bool:
-        """Decide which feet stand; return whether that has changed."""
-        touches = force > self.settings.stance.contact_force
-        planned, share = self._clock.stands(), self._clock.swing_share()
-        begins_swing = self._planned & ~planned
-        self._planned = planned
-        self._lift[begins_swing] = self._kin.feet[begins_swing]
-        before = self._down.copy()
-        early = ~planned & touches & (share > 0.5)
-        self._down = (self._down & ~begins_swing) | early | (planned & touches)
-        self._overdue = np.where(planned & ~self._down, self._overdue + self.period, 0.0)
-        if not self._started:
-            self._down = planned.copy()
-        landed = self._down & ~before
-        self._anchor[self._down] = self._kin.feet[self._down]
-        return bool((self._down != before).any() or landed.any())
+    def _slope(self) -> tuple[float, float]:
+        """Return the rise of the ground per m ahead and to the left."""
+        a, b = (self._turned[:2, :2].T @ self._ground.gradient).tolist()
+        return a, b
 
-    def _look_at_ground(self) -> None:
-        """Lay a plane through the places where the feet last stood: height of the ground and its slope."""
-        stance = self.settings.stance
-        feet = self._anchor - self._place
-        flat = feet @ self._turned  # heading frame
-        share = min(self.period / stance.slope_time, 1.0)
-        if stance.slope:
-            design = np.column_stack([np.ones(LEGS), flat[:, :2]])
-            _, *slope = np.linalg.lstsq(design, flat[:, 2], rcond=None)[0]
-            self._slope += share * (np.clip(slope, -1.0, 1.0) * 1.0 - self._slope)
-            steepest, most = float(np.hypot(*self._slope)), math.tan(stance.max_slope)
-            if steepest > most:
-                self._slope *= most / steepest
-        # Height below the trunk's origin of the ground, from the feet that stand now.
-        down = self._down if self._down.any() else np.ones(LEGS, dtype=bool)
-        below = float((flat[down, 2] - flat[down, :2] @ self._slope).mean()) - robot.FOOT_RADIUS
-        self._below = self._smoothed.height(
-            -below, self._velocity[2] - self._slope @ (self._turned.T @ self._velocity)[:2]
-        )
-        a, b = self._slope
-        normal = np.array([-a, -b, 1.0]) / math.sqrt(a * a + b * b + 1.0)
-        first = np.array([1.0, 0.0, a]) / math.sqrt(1.0 + a * a)
-        second = np.array([normal[1] * first[2] - normal[2] * first[1], normal[2] * first[0] - normal[0] * first[2],
-                           normal[0] * first[1] - normal[1] * first[0]])  # fmt: skip
-        self._ground = np.column_stack([first, second, normal])
+    def _level(self, command: Command) -> Command:
+        """Return the horizontal part of a velocity that is commanded along the ground."""
+        x, y, yaw = command
+        a, b = self._slope()
+        rise = (a * x + b * y) / max(math.hypot(x, y), 1e-9)
+        share = 1.0 / math.sqrt(1.0 + rise * rise)
+        return share * x, share * y, yaw
 
     def _lead(self, command: Command) -> None:
-        """Move the wanted place and heading on."""
-        wanted = np.array(command[:2])
-        here = (self._turned.T @ self._velocity)[:2]
+        """Move the wanted place and heading on, but not far away from the robot."""
+        x, y, yaw = command
         force = self.settings.force
-        self._lag += self.period * (wanted - here)
-        length = float(np.hypot(*self._lag))
+        self._lag += self.period * (np.array([x, y]) - self._ahead[:2])
+        length = math.hypot(*self._lag.tolist())
         if length > force.max_lag:
             self._lag *= force.max_lag / length
-        self._heading += self.period * command[2]
-        off = (self._heading - self._yaw + math.pi) % (2.0 * math.pi) - math.pi
+        off = wrapped(self._heading + self.period * yaw - self._yaw)
         self._heading = self._yaw + max(-force.max_turn_lag, min(force.max_turn_lag, off))
 
     # ------------------------------------------------------------------ feet on the ground
 
     def _push(self, command: Command) -> None:
-        """Plan the forces of the feet."""
-        force = self.settings.force
-        turn = self._turned.T
-        offset = turn @ (self._kin.com - self._place)
-        com = np.array([0.0, 0.0, self._below]) + offset
-        rate, velocity = turn @ self._rate, turn @ self._velocity
-        velocity = velocity + np.array([rate[1] * offset[2] - rate[2] * offset[1],
-                                        rate[2] * offset[0] - rate[0] * offset[2],
-                                        rate[0] * offset[1] - rate[1] * offset[0]])  # fmt: skip
-        state = np.array([[self._roll, self._pitch, 0.0], com, rate, velocity])
-        t = force.dt * np.arange(1, force.steps + 1)
-        reference = np.zeros((force.steps, 4, 3))
-        a, b = self._slope
-        # Roll and pitch of a trunk parallel to the ground.
-        reference[:, 0] = [math.atan2(b, 1.0), -math.atan2(a, 1.0), self._heading - self._yaw]
-        reference[:, 0, 2] += t * command[2]
-        heading = t * command[2]
-        c, s = np.cos(heading), np.sin(heading)
-        vx, vy = c * command[0] - s * command[1], s * command[0] + c * command[1]
-        reference[:, 3, 0], reference[:, 3, 1], reference[:, 3, 2] = vx, vy, a * vx + b * vy
-        reference[:, 2, 2] = command[2]
-        way_to = np.cumsum(reference[:, 3], axis=0) * force.dt
-        reference[:, 1] = way_to
-        reference[:, 1, :2] += com[:2] + self._lag
-        reference[:, 1, 2] = (
-            offset[2] + self.settings.height * math.sqrt(1 + a * a + b * b) + reference[:, 1, :2] @ self._slope
-        )
+        """Plan the forces of the feet, in axes of the heading whose origin is the ground below the trunk."""
+        turn, force = self._turned.T, self.settings.force
+        slope = self._slope()
+        trunk = np.array([0.0, 0.0, self._ground.height])
+        offset, rate = turn @ (self._kin.com - self._place), turn @ self._rate
+        com = trunk + offset
+        state = np.array([[self._roll, self._pitch, 0.0], com, rate, self._ahead + skew(rate) @ offset])
         stands = self._clock.schedule(force.steps, force.dt)
-        stands[0] = self._down
-        empty = ~stands.any(1)
-        stands[empty] = True
-        feet = (self._kin.feet - self._place) @ self._turned + [0.0, 0.0, self._below]
-        arms = feet[None] - com - 0.0 * way_to[:, None]
-        upright = turn @ self._rotation
-        problem = Problem(state, reference, arms, stands, self._ground, upright)
+        stands[0] = self._feet.down
+        stands[~stands.any(1)] = True  # a gait with phases of flight has forces to plan all the same
+        # Arms are those of now, also for later intervals: tried against arms that follow the wanted motion, with which
+        # the robot falls at 2 m/s.
+        arms = (self._kin.feet - self._place) @ self._turned + (trunk - com)
+        problem = Problem(
+            state=state,
+            reference=self._reference(command, com, offset, slope),
+            arms=np.broadcast_to(arms, (force.steps, *arms.shape)),
+            stands=stands,
+            ground=frame(*slope),
+            attitude=turn @ self._rotation,
+        )
         forces = self._plan.solve(problem)
-        if forces is not None:
-            self._forces = forces[0] @ self._turned.T
+        if forces is not None:  # else the last ones go on
+            self._forces = forces[0] @ turn
+
+    def _reference(
+        self, command: Command, com: np.ndarray, offset: np.ndarray, slope: tuple[float, float]
+    ) -> np.ndarray:
+        """Return the wanted states (K, 4, 3) of ``Problem``: the commanded velocity, parallel to the ground."""
+        x, y, yaw = command
+        a, b = slope
+        force = self.settings.force
+        t = force.dt * np.arange(1, force.steps + 1)
+        c, s = np.cos(yaw * t), np.sin(yaw * t)
+        wanted = np.zeros((force.steps, 4, 3))
+        wanted[:, 0] = math.atan(b), -math.atan(a), wrapped(self._heading - self._yaw)
+        wanted[:, 0, 2] += yaw * t
+        wanted[:, 2, 2] = yaw
+        vx, vy = c * x - s * y, s * x + c * y
+        wanted[:, 3] = np.column_stack([vx, vy, a * vx + b * vy])
+        wanted[:, 1, :2] = com[:2] + self._lag + force.dt * np.cumsum(wanted[:, 3, :2], axis=0)
+        upright = self.settings.height * math.sqrt(1.0 + a * a + b * b)  # vertical, of a height along the normal
+        wanted[:, 1, 2] = offset[2] + upright + wanted[:, 1, :2] @ slope
+        return wanted
 
     # ------------------------------------------------------------------ what the drives are told
 
     def _drive(self, command: Command) -> Drive:
         """Return forces of standing feet as torques, and targets for the swinging ones."""
-        kin, settings = self._kin, self.settings
-        q = self._smoothed.joint_pos
-        target, kp, kd = q.copy(), np.zeros(12), np.full(12, settings.stance.kd)
-        torque = kin.bias.copy()
-        stance = np.repeat(self._down, 3)
-        pushes = -(kin.jacobians.transpose(0, 2, 1) @ self._forces[:, :, None])[:, :, 0].ravel()
-        torque[stance] += pushes[stance]
-        flying = np.flatnonzero(~self._down)
-        if len(flying):
-            place, velocity = self._swing(command, flying)
-            trunk = self._velocity + _cross(self._rate, kin.feet[flying] - self._place)
-            turned = kin.jacobians[flying]
-            change = solved(turned, np.stack([place - kin.feet[flying], velocity - trunk], axis=-1))
-            columns = (3 * flying[:, None] + np.arange(3)).ravel()
-            target[columns] += np.clip(change[..., 0].ravel(), -0.6, 0.6)
-            kp[columns], kd[columns] = settings.swing.kp, settings.swing.kd
-            torque[columns] += settings.swing.kd * np.clip(change[..., 1].ravel(), -25.0, 25.0)
-        target = np.clip(target, robot.JOINT_POS_LIMITS[:, 0], robot.JOINT_POS_LIMITS[:, 1])
-        return Drive(target, kp, kd, np.clip(torque, -self._limit, self._limit))
+        kin, swing = self._kin, self.settings.swing
+        down = self._feet.down
+        # Standing legs: the weight of the leg, and tau = -J' f; their targets are their angles.
+        torque = (kin.bias.reshape(-1, 3) - down[:, None] * (self._forces[:, None] @ kin.jacobians)[:, 0]).copy()
+        target = self._smoothed.joint_pos.reshape(-1, 3).copy()
+        kp, kd = np.zeros((4, 3)), np.full((4, 3), self.settings.stance.kd)
+        legs = np.flatnonzero(~down)
+        if len(legs):
+            place, velocity = self._swing(command, legs)
+            feet = kin.feet[legs]
+            moving = self._velocity + (feet - self._place) @ skew(self._rate).T  # a foot that is fixed to the trunk
+            errors = np.empty((len(legs), 3, 2))
+            errors[:, :, 0], errors[:, :, 1] = place - feet, velocity - moving
+            change = solved(kin.jacobians[legs], errors)
+            target[legs] += _cut(change[:, :, 0], MOST_CHANGE)
+            torque[legs] += swing.kd * _cut(change[:, :, 1], MOST_SPEED)  # so that kd brakes differences only
+            kp[legs], kd[legs] = swing.kp, swing.kd
+        within = np.minimum(np.maximum(target.ravel(), LOW), HIGH)
+        return Drive(within, kp.ravel(), kd.ravel(), _cut(torque.ravel(), LIMIT))
 
     def _swing(self, command: Command, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the swinging feet ``legs`` are to be now, and how fast they are to move, in the world."""
-        swing, clock = self.settings.swing, self._clock
-        duration = (1.0 - clock.duty) * clock.period
+        """Return where the swinging feet ``legs`` are to be now (n, 3), m, and how fast (n, 3), m/s, in the world."""
+        swing, clock, late = self.settings.swing, self._clock, self._feet.overdue[legs]
+        duration = clock.swing_time
         share = clock.swing_share()[legs]
-        share = np.where(share < 0.0, 1.0, share)  # overdue: the swing has ended
-        left = (1.0 - share)[:, None] * duration
-        wanted = self._turned @ np.array([command[0], command[1], 0.0])
-        hips = HIPS[legs] @ self._turned.T
-        rate = np.array([0.0, 0.0, command[2]])
-        flat = np.array([self._velocity[0], self._velocity[1], 0.0])
-        moving = flat + _cross(rate, hips)
-        end = self._place + hips + moving * (left + 0.5 * clock.stance_time) + swing.velocity_gain * (flat - wanted)
-        local = (end - self._place) @ self._turned
-        end[:, 2] = self._place[2] - self._below + local[:, :2] @ self._slope + robot.FOOT_RADIUS - swing.depth
-        place, velocity = way(self._lift[legs], end, swing.height, share, duration)
-        late = self._overdue[legs]
-        place[:, 2] -= np.minimum(late * swing.reach_speed, swing.reach)
-        velocity[:, 2] -= np.where((late > 0) & (late * swing.reach_speed < swing.reach), swing.reach_speed, 0.0)
+        share[share < 0.0] = 1.0  # overdue: the swing has ended
+        below = footholds(swing, self._ahead, command, (1.0 - share) * duration, clock.stance_time, legs)
+        end = np.empty((len(legs), 3))
+        end[:, :2] = below
+        end[:, 2] = below @ self._slope() + (robot.FOOT_RADIUS - swing.depth - self._ground.height)
+        place, velocity = way(self._feet.lift[legs], end @ self._turned.T + self._place, swing.height, share, duration)
+        if late.any():
+            further = late * swing.reach_speed
+            place[:, 2] -= np.minimum(further, swing.reach)
+            velocity[:, 2] -= swing.reach_speed * ((late > 0.0) & (further < swing.reach))
         return place, velocity
 
 
-def _cross(w: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return w (3,) x r (n, 3)."""
-    return np.stack(
-        [w[1] * r[:, 2] - w[2] * r[:, 1], w[2] * r[:, 0] - w[0] * r[:, 2], w[0] * r[:, 1] - w[1] * r[:, 0]], 1
-    )
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) of a unit quaternion w-x-y-z."""
-    w, x, y, z = (float(v) for v in quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def _cut(values: np.ndarray, most: float | np.ndarray) -> np.ndarray:
+    """Return values within +- ``most``."""
+    return np.asarray(np.minimum(np.maximum(values, -most), most))

@@ -22,8 +22,6 @@ class GaitSettings:
         offsets: phases of FR, FL, RR, RL, in cycles.
         duty: share of a cycle in which a foot stands.
         period: of a cycle, s.
-        fast_period: of a cycle from ``fast_speed`` on, s.
-        fast_speed: commanded forward speed from which ``fast_period`` and ``fast_effort`` hold, m/s.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -31,8 +29,6 @@ class GaitSettings:
     offsets: tuple[Phase, Phase, Phase, Phase]
     duty: Annotated[float, Field(ge=0.4, le=0.9)]
     period: Annotated[float, Field(ge=0.1, le=2.0)]
-    fast_period: Annotated[float, Field(ge=0.1, le=2.0)]
-    fast_speed: NonNegative
 
 
 @dataclass(frozen=True)
