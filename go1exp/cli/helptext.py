@@ -108,12 +108,14 @@ def texts_of(verb: str) -> dict[str, str]:
 def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
     """Return what the keys of a group mean: those of a section by its class, a term by its docstring."""
     from go1exp.config import ONE_TERM, REGISTERED_AS, SECTIONS
+    from go1exp.controller.settings import CONTROLLERS
     from go1exp.schema.backends import BACKENDS
     from go1exp.schema.registry import members
     from go1exp.schema.settings import lines
 
-    if group == "backend":
-        return lines(BACKENDS[settings["name"]], "backend.")
+    engines_and_controllers = {"backend": BACKENDS, "controller": CONTROLLERS}
+    if group in engines_and_controllers:
+        return lines(engines_and_controllers[group][settings["name"]], f"{group}.")
     if group in SECTIONS:
         return lines(SECTIONS[group], f"{group}.")
     terms = members(REGISTERED_AS.get(group, group))

@@ -13,8 +13,7 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.controller.types import Command, Controller, Drive, Sensed
 from go1exp.env.core import Go1Core
-from go1exp.estimation import WIDTH, go1, make_filter
-from go1exp.estimation import readings as column
+from go1exp.estimation.many import Filters
 from go1exp.record.tape import sample
 from go1exp.schema.registry import ConfigError
 from go1exp.sim_robot.machine import noisy
@@ -30,7 +29,8 @@ class Driven:
     Each physics step whose time has come, every robot's sensors are read, its controller called, and the answer kept in
     force: targets, feed-forward torques and gains. Drives without gains get the targets and torques alone.
 
-    After a ``core.step``, give ``restart`` the rows whose episodes ended.
+    It is called like a policy, between steps: robots whose episode begins then get a new start, and the actions that
+    it returns are read by nobody. Further restarts are up to the caller: ``restart``.
     """
 
     def __init__(
@@ -61,23 +61,24 @@ class Driven:
         self._every = _whole(self.controllers[0].period, self._dt)
         self._noise, self._rng = float(noise), np.random.default_rng([seed, 3])
         self._estimates = trunk_velocity == "estimated"
-        self._filters = [make_filter(go1()) for _ in range(n)] if self._estimates else []
+        self._filters = Filters(n if self._estimates else 0)
         self._has_gains = hasattr(self._plant.actuator, "kp")
         self._target, self._forward = (torch.zeros_like(self._plant.q) for _ in range(2))
         self._kp, self._kd = (torch.zeros_like(self._plant.q) for _ in range(2))
         self._steps = 0
         core.driver = self._step
 
-    def action(self) -> Tensor:
-        """Return what ``core.step`` wants and nobody reads: zeros (N, 12)."""
-        return torch.zeros(self._core.num_envs, robot.NUM_JOINTS)
+    def __call__(self, observation: Tensor) -> Tensor:
+        """Begin anew with the robots whose episode begins; return zeros (N, 12), which nobody reads."""
+        self.restart(self._core.steps == 0)
+        return torch.zeros(len(observation), robot.NUM_JOINTS)
 
     def restart(self, mask: Tensor) -> None:
         """Begin anew with the robots of ``mask`` (N,) bool."""
         for i in np.flatnonzero(mask.numpy()):
             self.controllers[i].reset()
             if self._estimates:
-                self._filters[i] = make_filter(go1())
+                self._filters.restart(i)
 
     def _step(self) -> None:
         """Let the controllers act where their time has come, and advance the physics."""
@@ -110,7 +111,8 @@ class Driven:
         true = {name: values.cpu().double().numpy() for name, values in sample(self._plant, self._target).items()}
         readings = noisy(true, self._noise, self._rng)
         if self._estimates:
-            velocities = self._estimated(readings)
+            self._filters.update(self._steps * self._dt, readings)
+            velocities = self._filters.velocities
         else:
             quat, speed = (torch.as_tensor(true[name]) for name in ("base_quat", "base_lin_vel"))
             even = self._rng.uniform(-1.0, 1.0, speed.shape) * self._noise * VELOCITY_NOISE
@@ -118,17 +120,6 @@ class Driven:
         names = ("q", "qd", "quat", "gyro")
         rows = zip(*(readings[name] for name in names), velocities, readings["foot_force"], strict=True)
         return [Sensed(*row) for row in rows]
-
-    def _estimated(self, readings: dict[str, np.ndarray]) -> np.ndarray:
-        """Return the filters' velocities (N, 3), trunk frame, m/s, after one sample each."""
-        rows = np.full((len(self._filters), WIDTH), np.nan)
-        rows[:, column.T] = self._steps * self._dt
-        places = {"quat": column.QUAT, "gyro": column.GYRO, "acc": column.ACC, "q": column.Q, "qd": column.QD}
-        for name, place in {**places, "foot_force": column.FOOT_FORCE}.items():
-            rows[:, place] = readings[name]
-        for one, row in zip(self._filters, rows, strict=True):
-            one.update(row)
-        return np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])
 
 
 def _command(row: np.ndarray) -> Command:

@@ -1,13 +1,14 @@
-"""The settings of ``controller=mpc``, as ``conf/controller/mpc.yaml`` writes them."""
+"""The settings of the group ``controller``: what moves a robot, as ``conf/controller`` writes it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from go1exp.schema.registry import STRICT, NonNegative, Positive
+from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain, unknown_name
 
 Share = Annotated[float, Field(gt=0, lt=1)]
 Phase = Annotated[float, Field(ge=0, lt=1)]
@@ -169,3 +170,32 @@ class MpcSettings:
     swing: SwingSettings
     stance: StanceSettings
     smoothing: SmoothingSettings
+
+
+@dataclass(frozen=True)
+class PolicySettings:
+    """``conf/controller/policy.yaml``.
+
+    Attributes:
+        name: ``policy``: the one that the verb's own settings name.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: Literal["policy"]
+
+
+CONTROLLERS: dict[str, type] = {"policy": PolicySettings, "mpc": MpcSettings}
+"""By their names, which are also the choices of the group ``controller``."""
+
+
+def parse_controller(given: Any) -> MpcSettings | PolicySettings:
+    """Validate the group ``controller``; raise ConfigError with every problem."""
+    if not isinstance(given, Mapping) or given.get("name") not in CONTROLLERS:
+        name = given.get("name") if isinstance(given, Mapping) else given
+        raise ConfigError([unknown_name("controller.name", str(name), CONTROLLERS, "controller")])
+    kind = CONTROLLERS[given["name"]]
+    try:
+        return TypeAdapter(kind).validate_json(as_json(given))  # type: ignore[no-any-return]
+    except ValidationError as error:
+        raise ConfigError(explain(error, "controller", [f.name for f in fields(kind)])) from None

@@ -11,6 +11,8 @@ from typing import Any, Literal
 import torch
 
 from go1exp.config import TaskConfig, time_rules
+from go1exp.controller.batch import Driven
+from go1exp.controller.types import Controller
 from go1exp.deploy.past import PastActions
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.estimated import EstimatedVelocity
@@ -99,21 +101,30 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
 
 def evaluate(
     task: TaskConfig,
-    policy: Policy,
+    policy: Policy | None,
     config: EvalConfig,
     on_step: Callable[[int, int], None] = lambda done, total: None,
     measures: Sequence[Term] = (),
+    controller: Callable[[], Controller] | None = None,
 ) -> dict[str, Any]:
     """Run the grid and return a report of plain data.
 
     A robot counts until it falls. Tracking figures of a command are over all its robots and the time after
     ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
+    ``controller`` makes what moves one robot in place of the policy, by its own sensors.
     ``measures`` (``go1exp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
     """
     count = len(config.commands) * config.episodes
     estimated = config.trunk_velocity == "estimated"
-    core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=estimated)
-    see = EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
+    imu = estimated or controller is not None
+    core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=imu)
+    see: Policy = lambda observation: observation  # noqa: E731
+    if controller is not None:
+        sensors = {"noise": config.noise, "seed": config.seed, "trunk_velocity": config.trunk_velocity}
+        policy = Driven(core, controller, **sensors)
+    elif estimated:
+        see = EstimatedVelocity(core, config.noise, config.seed).put
+    assert policy is not None
     # A policy that runs faster than it was trained sees its action of one training period ago.
     past = PastActions[torch.Tensor](task.sim.policy_dt, core.task.sim.policy_dt)
     past_columns = columns(core.task, "previous_action") if past.cycles > 1 else None
