@@ -54,7 +54,7 @@ class Delay:
         return self.drive.kd  # type: ignore[attr-defined]
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
-        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is as late as the target."""
+        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is late as well."""
         late = self._line.advance(target, self.delay)
         if feedforward is None:
             return self.drive.torque(late, q, qd)

@@ -17,8 +17,8 @@ class Actuator(Protocol):
     def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return joint torques (N, J), N m, for targets and angles in rad and speeds in rad/s.
 
-        A drive that can be fed forward has a fourth argument ``feedforward: Tensor | None = None``, (N, J), N m: added to
-        its own torque before the limit, and as late as the target where it delays that (``TakesFeedforward``).
+        A drive that can be fed forward has a fourth argument, ``feedforward: Tensor | None = None``, (N, J), N m: added
+        to its own torque before the limit, and as late as the target where it delays that (``TakesFeedforward``).
         """
 
     def reset(self, mask: Tensor) -> None:

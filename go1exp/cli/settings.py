@@ -319,7 +319,8 @@ class BenchSettings:
     """``conf/bench.yaml``.
 
     Attributes:
-        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime) or gpu (Warp).
+        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime), mpc (controller) or gpu
+            (Warp).
         num_envs: environments of the batch.
         rounds: alternating measurements of each subject, of which the median counts.
         seconds: length of a measurement, s.
@@ -328,7 +329,7 @@ class BenchSettings:
         out: JSON file for the figures; null writes none.
     """
 
-    suite: Literal["env", "train", "actuator", "deploy", "gpu"]
+    suite: Literal["env", "train", "actuator", "deploy", "mpc", "gpu"]
     num_envs: Count
     rounds: Count
     seconds: Positive

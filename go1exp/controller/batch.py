@@ -65,7 +65,7 @@ class Driven:
         self._has_gains = hasattr(self._plant.actuator, "kp")
         self._target, self._forward = (torch.zeros_like(self._plant.q) for _ in range(2))
         self._kp, self._kd = (torch.zeros_like(self._plant.q) for _ in range(2))
-        self._steps = 0
+        self._steps, self._feeds = 0, False
         core.driver = self._step
 
     def __call__(self, observation: Tensor) -> Tensor:
@@ -78,7 +78,7 @@ class Driven:
         for i in np.flatnonzero(mask.numpy()):
             self.controllers[i].reset()
             if self._estimates:
-                self._filters.restart(i)
+                self._filters.restart(int(i))
 
     def _step(self) -> None:
         """Let the controllers act where their time has come, and advance the physics."""
@@ -91,18 +91,19 @@ class Driven:
             ]
             self._put(told)
         self._steps += 1
-        self._plant.step(self._target, self._forward)
+        self._plant.step(self._target, self._forward if self._feeds else None)
         self._core.target.copy_(self._target)
 
     def _put(self, told: Sequence[Drive]) -> None:
         """Put what the controllers say into force."""
-        for tensor, name in (
-            (self._target, "target"),
-            (self._forward, "feedforward"),
-            (self._kp, "kp"),
-            (self._kd, "kd"),
-        ):
-            tensor.copy_(torch.as_tensor(np.stack([getattr(one, name) for one in told])))
+        rows = [(self._target, [one.target for one in told])]
+        self._feeds = told[0].feedforward is not None  # all are of one kind
+        if self._feeds:
+            rows.append((self._forward, [one.feedforward for one in told]))  # type: ignore[misc]
+        if self._has_gains:
+            rows += [(self._kp, [one.kp for one in told]), (self._kd, [one.kd for one in told])]
+        for tensor, values in rows:
+            tensor.copy_(torch.as_tensor(np.stack(values)))
         if self._has_gains:
             self._plant.set_gains(self._kp, self._kd)
 

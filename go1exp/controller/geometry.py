@@ -20,7 +20,7 @@ def matrix(quat: np.ndarray) -> np.ndarray:
 
 
 def skew(w: np.ndarray) -> np.ndarray:
-    """Return the matrix (3, 3) by which w (3,) x r = skew(w) r."""
+    """Return the matrix (3, 3) whose product with r (3,) is the cross product of w (3,) and r."""
     x, y, z = w.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 

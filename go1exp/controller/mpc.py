@@ -1,4 +1,8 @@
-"""``controller=mpc``: forces of the standing feet by a convex programme, footholds for the others (Di Carlo et al. 2018)."""
+"""``controller=mpc``: a convex programme for the forces of the standing feet, footholds for the others.
+
+After Di Carlo, Wensing, Katz, Bledt, Kim, "Dynamic Locomotion in the MIT Cheetah 3 Through Convex Model-Predictive
+Control" (IROS 2018).
+"""
 
 from __future__ import annotations
 

@@ -196,6 +196,7 @@ def parse_controller(given: Any) -> MpcSettings | PolicySettings:
         raise ConfigError([unknown_name("controller.name", str(name), CONTROLLERS, "controller")])
     kind = CONTROLLERS[given["name"]]
     try:
-        return TypeAdapter(kind).validate_json(as_json(given))  # type: ignore[no-any-return]
+        checked: MpcSettings | PolicySettings = TypeAdapter(kind).validate_json(as_json(given))
     except ValidationError as error:
         raise ConfigError(explain(error, "controller", [f.name for f in fields(kind)])) from None
+    return checked

@@ -40,13 +40,13 @@ class Drive:
         target: rad.
         kp: N m/rad.
         kd: N m s/rad.
-        feedforward: N m.
+        feedforward: N m; None for none.
     """
 
     target: np.ndarray
     kp: np.ndarray
     kd: np.ndarray
-    feedforward: np.ndarray
+    feedforward: np.ndarray | None = None
 
 
 class Controller(Protocol):

@@ -238,9 +238,8 @@ class Plant:
         parts = {"actuator": self.actuator.state_dict(), "effects": self.effects.state_dict()}
         if self._rotors:
             parts["rotors"] = self._rotors.state_dict()
-        if self._fed is not None:
-            parts["fed"] = self._fed.clone()
-        return {**physics, "torque": self.torque.clone(), **parts}
+        fed = {} if self._fed is None else {"fed": self._fed.clone()}
+        return {**physics, "torque": self.torque.clone(), **parts, **fed}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``; the backend holds the model."""

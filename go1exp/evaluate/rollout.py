@@ -120,8 +120,8 @@ def evaluate(
     core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=imu)
     see: Policy = lambda observation: observation  # noqa: E731
     if controller is not None:
-        sensors = {"noise": config.noise, "seed": config.seed, "trunk_velocity": config.trunk_velocity}
-        policy = Driven(core, controller, **sensors)
+        velocity = config.trunk_velocity
+        policy = Driven(core, controller, noise=config.noise, seed=config.seed, trunk_velocity=velocity)
     elif estimated:
         see = EstimatedVelocity(core, config.noise, config.seed).put
     assert policy is not None
