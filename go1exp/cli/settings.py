@@ -319,8 +319,8 @@ class BenchSettings:
     """``conf/bench.yaml``.
 
     Attributes:
-        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime), mpc (controller) or gpu
-            (Warp).
+        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime), mpc (controller)
+            or gpu (Warp).
         num_envs: environments of the batch.
         rounds: alternating measurements of each subject, of which the median counts.
         seconds: length of a measurement, s.

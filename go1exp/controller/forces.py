@@ -77,6 +77,37 @@ class Problem:
     attitude: np.ndarray
 
 
+@dataclass(frozen=True)
+class Structure:
+    """What a programme owes to which feet stand when alone; n feet-in-intervals, three columns each.
+
+    Attributes:
+        interval: (n,) of each.
+        foot: (n,) of each.
+        mine: (3 n,) interval of each column.
+        places: (3 n, 3 n) sum over the horizon of products of two columns' shares in a place.
+        speeds: (3 n, 3 n) the same of their shares in a speed.
+        A: (4 n, 3 n) rows of the friction pyramids.
+        upper: (7 n,) upper bounds of forces and rows.
+        lower: (7 n,) lower bounds.
+        sense: (7 n,) the solver's kinds of bounds: all may be active.
+    """
+
+    interval: np.ndarray
+    foot: np.ndarray
+    mine: np.ndarray
+    places: np.ndarray
+    speeds: np.ndarray
+    A: np.ndarray
+    upper: np.ndarray
+    lower: np.ndarray
+    sense: np.ndarray
+
+
+MOST_STRUCTURES = 500
+"""Schedules whose structure is kept; a gait repeats some tens of them."""
+
+
 class ForcePlan:
     """Builds the programme and solves it."""
 
@@ -93,6 +124,8 @@ class ForcePlan:
         begun = after > 0
         speed, place = dt * begun, dt**2 * (after - 0.5) * begun
         self._speed, self._place = speed, place
+        self._inverse = np.linalg.inv(body.inertia)
+        self._structures: dict[bytes, Structure] = {}
         self._speed_speed, self._place_place = speed.T @ speed, place.T @ place
         self._times = dt * np.arange(1, steps + 1)[:, None]
         weights = settings.weights
@@ -106,27 +139,25 @@ class ForcePlan:
         x are the forces of the standing feet in the axes of the ground, interval by interval, foot by foot.
         """
         settings, body = self.settings, self._body
-        interval, foot = np.nonzero(problem.stands)
-        n = len(interval)
-        mine = np.repeat(interval, 3)
+        structure = self._structure(problem.stands)
+        mine, n = structure.mine, len(structure.interval)
         rotation = problem.attitude
-        inverse = rotation @ np.linalg.inv(body.inertia) @ rotation.T
+        inverse = rotation @ self._inverse @ rotation.T
         # Columns: what each force component does to the acceleration and to the angular acceleration.
-        r = problem.arms[interval, foot]
+        r = problem.arms[structure.interval, structure.foot]
         turn = inverse @ _crossed(r, problem.ground)
         push = np.tile(problem.ground / body.mass, (1, n))
         q_angle, q_place, q_turn, q_speed = self._weights
         free, angles = self._drift(problem)
-        both = (mine[:, None], mine[None, :])
-        H = self._place_place[both] * (turn.T @ (q_angle[:, None] * turn) + push.T @ (q_place[:, None] * push))
-        H += self._speed_speed[both] * (turn.T @ (q_turn[:, None] * turn) + push.T @ (q_speed[:, None] * push))
-        H = 2.0 * H
-        H[np.diag_indices(3 * n)] += 2.0 * settings.effort
+        H = structure.places * (turn.T @ (q_angle[:, None] * turn) + push.T @ (q_place[:, None] * push))
+        H += structure.speeds * (turn.T @ (q_turn[:, None] * turn) + push.T @ (q_speed[:, None] * push))
+        H *= 2.0
+        H.flat[:: 3 * n + 1] += 2.0 * settings.effort
         by_place, by_speed = self._place.T @ angles, self._speed.T @ free
         g = (turn * (q_angle * by_place[:, :3] + q_turn * by_speed[:, :3])[mine].T).sum(0)
         g += (push * (q_place * by_place[:, 3:] + q_speed * by_speed[:, 3:])[mine].T).sum(0)
-        g = 2.0 * g - 2.0 * settings.effort * self._share(problem, interval)
-        return H, g, *self._limits(n)
+        g = 2.0 * g - 2.0 * settings.effort * self._share(problem, structure.interval)
+        return H, g, structure.A, structure.upper, structure.lower
 
     def _drift(self, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
         """Return errors (K, 6) of (angular velocity, velocity) and of (angles, place) without any force."""
@@ -143,19 +174,40 @@ class ForcePlan:
         count = problem.stands.sum(1)[interval]
         return np.asarray((weight[None, :] / count[:, None]).ravel())
 
-    def _limits(self, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return A (4 n, 3 n) of the friction pyramids, and bounds (3 n + 4 n,) of forces and pyramids."""
+    def _structure(self, stands: np.ndarray) -> Structure:
+        """Return what depends on the schedule (K, 4) alone; kept for the next time."""
+        key = stands.tobytes()
+        if key not in self._structures:
+            if len(self._structures) >= MOST_STRUCTURES:
+                self._structures.clear()
+            self._structures[key] = self._structured(stands)
+        return self._structures[key]
+
+    def _structured(self, stands: np.ndarray) -> Structure:
+        interval, foot = np.nonzero(stands)
+        n, mine = len(interval), np.repeat(interval, 3)
+        both = (mine[:, None], mine[None, :])
         A = np.zeros((n, 4, n, 3))
         A[np.arange(n), :, np.arange(n)] = self._cone
         most = self.settings.max_force
         upper = np.concatenate([np.tile([most, most, most], n), np.zeros(4 * n)])
         lower = np.concatenate([np.tile([-most, -most, 0.0], n), np.full(4 * n, -1e30)])
-        return A.reshape(4 * n, 3 * n), upper, lower
+        return Structure(
+            interval=interval,
+            foot=foot,
+            mine=mine,
+            places=self._place_place[both],
+            speeds=self._speed_speed[both],
+            A=A.reshape(4 * n, 3 * n),
+            upper=upper,
+            lower=lower,
+            sense=np.zeros(7 * n, dtype=np.intc),
+        )
 
     def solve(self, problem: Problem) -> np.ndarray | None:
         """Return the forces (K, 4, 3) on the feet, N, in the problem's frame; None if the solver found none."""
         H, g, A, upper, lower = self.programme(problem)
-        x, _, flag, _ = self._solve(H, g, A, upper, lower, np.zeros(len(upper), dtype=np.intc))
+        x, _, flag, _ = self._solve(H, g, A, upper, lower, self._structure(problem.stands).sense)
         if flag < 1:
             return None
         forces = np.zeros((*problem.stands.shape, 3))

@@ -12,15 +12,15 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.controller.feet import Feet
-from go1exp.controller.forces import ForcePlan, Problem
+from go1exp.controller.forces import Body, ForcePlan, Problem
 from go1exp.controller.gait import Clock
 from go1exp.controller.geometry import heading, matrix, roll_pitch_yaw, skew, wrapped
 from go1exp.controller.ground import Ground, frame
-from go1exp.controller.kinematics import Kinematics
 from go1exp.controller.settings import MpcSettings
 from go1exp.controller.smoothing import Smoothed
 from go1exp.controller.swing import footholds, solved, way
 from go1exp.controller.types import Command, Drive, Sensed
+from go1exp.physics.kinematics import Kinematics
 
 LIMIT = robot.per_joint(robot.EFFORT_LIMIT)
 LOW, HIGH = robot.JOINT_POS_LIMITS.T
@@ -48,7 +48,7 @@ class Mpc:
         """
         self.settings, self.period = settings, settings.period
         self._kin = Kinematics(inertia)
-        self._plan = ForcePlan(settings.force, self._kin.body())
+        self._plan = ForcePlan(settings.force, Body(self._kin.mass, self._kin.composite_inertia()))
         self._every = max(round(settings.force.every / settings.period), 1)
         gait, stance, smoothing = settings.gait, settings.stance, settings.smoothing
         self._clock = Clock(gait.offsets, gait.duty, gait.period)

@@ -115,16 +115,9 @@ def evaluate(
     ``measures`` (``go1exp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
     """
     count = len(config.commands) * config.episodes
-    estimated = config.trunk_velocity == "estimated"
-    imu = estimated or controller is not None
+    imu = config.trunk_velocity == "estimated" or controller is not None
     core = Go1Core(evaluation_task(task, config), count, config.seed, noise=config.noise, imu=imu)
-    see: Policy = lambda observation: observation  # noqa: E731
-    if controller is not None:
-        velocity = config.trunk_velocity
-        policy = Driven(core, controller, noise=config.noise, seed=config.seed, trunk_velocity=velocity)
-    elif estimated:
-        see = EstimatedVelocity(core, config.noise, config.seed).put
-    assert policy is not None
+    act = _driven(core, controller, config) if controller else _seeing(core, policy, config)
     # A policy that runs faster than it was trained sees its action of one training period ago.
     past = PastActions[torch.Tensor](task.sim.policy_dt, core.task.sim.policy_dt)
     past_columns = columns(core.task, "previous_action") if past.cycles > 1 else None
@@ -140,7 +133,7 @@ def evaluate(
     for step in range(steps):
         if recorder and step >= settle:
             recorder.begin_step()
-        result = core.step(policy(see(observation)))
+        result = core.step(act(observation))
         core.check(result)
         observation = result.observation
         if past_columns is not None:
@@ -158,6 +151,20 @@ def evaluate(
             row["measures"] = described(measures, recorder.trace(tally.distinct(k, config).numpy()))
         report["units"] = {t.key: t.entry.traits["unit"] for t in measures}
     return report
+
+
+def _driven(core: Go1Core, make: Callable[[], Controller], config: EvalConfig) -> Policy:
+    """Let controllers drive the robots; return what they want to be called like, a policy."""
+    return Driven(core, make, noise=config.noise, seed=config.seed, trunk_velocity=config.trunk_velocity)
+
+
+def _seeing(core: Go1Core, policy: Policy | None, config: EvalConfig) -> Policy:
+    """Return the policy, which sees an estimated velocity if it is to."""
+    assert policy is not None  # or there would be a controller
+    if config.trunk_velocity == "exact":
+        return policy
+    see = EstimatedVelocity(core, config.noise, config.seed).put
+    return lambda observation: policy(see(observation))
 
 
 def _planar_velocity(core: Go1Core) -> torch.Tensor:

@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 
 from go1exp import robot
-from go1exp.controller.forces import Body
 from go1exp.physics.model import load_robot
 
 BASE = 6
@@ -64,8 +63,8 @@ class Kinematics:
             first = BASE + 3 * leg
             self.jacobians[leg] = self._whole[:, first : first + 3]
 
-    def body(self) -> Body:
-        """Return the robot in its nominal stance as one rigid body; changes the state."""
+    def composite_inertia(self) -> np.ndarray:
+        """Return the inertia (3, 3) of the robot in its nominal stance about its COM, trunk frame; changes the state."""
         model, data = self._model, self._data
         level, still = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
         self.update(still, level, robot.NOMINAL_STANCE, still, still, np.zeros(robot.NUM_JOINTS))
@@ -73,4 +72,4 @@ class Kinematics:
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
         c = self.com - data.qpos[:3]
-        return Body(self.mass, full[3:6, 3:6] - self.mass * (c @ c * np.eye(3) - np.outer(c, c)))
+        return np.asarray(full[3:6, 3:6] - self.mass * (c @ c * np.eye(3) - np.outer(c, c)))
