@@ -25,7 +25,7 @@ class Ground:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the ground: level, and as high as the feet are at the next call."""
+        """Forget the ground: at the next call it is where the feet are."""
         self.gradient, self.height = np.zeros(2), 0.0
         self._fresh = True
 
@@ -38,7 +38,8 @@ class Ground:
             velocity: (3,) of the trunk, m/s.
         """
         if self._settings.slope:
-            self.gradient = self._limited(self.gradient + self._share * (_gradient(feet) - self.gradient))
+            share = 1.0 if self._fresh else self._share
+            self.gradient = self._limited(self.gradient + share * (_gradient(feet) - self.gradient))
         a, b = self.gradient.tolist()
         below = [z - a * x - b * y for (x, y, z), stands in zip(feet.tolist(), down.tolist(), strict=True) if stands]
         vx, vy, vz = velocity.tolist()

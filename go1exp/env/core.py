@@ -56,7 +56,7 @@ class Go1Core:
     """
 
     driver: Callable[[], None] | None = None
-    """Makes each physics step in place of ``plant.step``, which it calls; actions count no more (controller/batch.py)."""
+    """Makes each physics step in place of ``plant.step``, which it calls; actions count no more. controller/batch.py"""
 
     def __init__(
         self,

@@ -64,7 +64,7 @@ class Kinematics:
             self.jacobians[leg] = self._whole[:, first : first + 3]
 
     def composite_inertia(self) -> np.ndarray:
-        """Return the inertia (3, 3) of the robot in its nominal stance about its COM, trunk frame; changes the state."""
+        """Return the robot's inertia (3, 3) in its nominal stance, about its COM, trunk frame; changes the state."""
         model, data = self._model, self._data
         level, still = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
         self.update(still, level, robot.NOMINAL_STANCE, still, still, np.zeros(robot.NUM_JOINTS))
