@@ -62,6 +62,7 @@ class Mpc:
         for part in (self._clock, self._smoothed, self._ground, self._feet):
             part.restart()
         self._since_plan, self._first = 0, True
+        self._told: Command = (0.0, 0.0, 0.0)
         self._place, self._lag, self._heading = np.zeros(3), np.zeros(2), 0.0
         self._forces = np.zeros((robot.NUM_LEGS, 3))
 
@@ -70,7 +71,7 @@ class Mpc:
         self._sense(sensed)
         changed = self._feet.update(self._clock, sensed.foot_force, self._kin.feet)
         self._ground.update(self._feet.anchor - self._place, self._feet.down, self._velocity)
-        command = self._level(command)
+        command = self._level(self._ramped(command))
         self._lead(command)
         if changed or self._since_plan >= self._every:
             self._push(command)
@@ -101,6 +102,16 @@ class Mpc:
         """Return the rise of the ground per m ahead and to the left."""
         a, b = (self._turned[:2, :2].T @ self._ground.gradient).tolist()
         return a, b
+
+    def _ramped(self, command: Command) -> Command:
+        """Return the command with its changes limited: after a jump from rest the first steps would be too long."""
+        limits = self.settings.ramp.speed, self.settings.ramp.speed, self.settings.ramp.turn
+        moved = (
+            before + max(-self.period * most, min(self.period * most, wanted - before))
+            for before, wanted, most in zip(self._told, command, limits, strict=True)
+        )
+        x, y, yaw = self._told = tuple(moved)  # type: ignore[assignment]
+        return x, y, yaw
 
     def _level(self, command: Command) -> Command:
         """Return the horizontal part of a velocity that is commanded along the ground."""

@@ -127,6 +127,21 @@ class StanceSettings:
 
 
 @dataclass(frozen=True)
+class RampSettings:
+    """How fast the command may change; an episode begins with a command to stand.
+
+    Attributes:
+        speed: of x and y each, m/s2.
+        turn: of the yaw rate, rad/s2.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    speed: Positive
+    turn: Positive
+
+
+@dataclass(frozen=True)
 class SmoothingSettings:
     """How readings are smoothed: rates carry them on, readings correct with a time constant.
 
@@ -153,6 +168,7 @@ class MpcSettings:
         name: ``mpc``.
         period: time between two ticks, s.
         height: of the trunk's origin above the ground, m.
+        ramp: how fast the command may change.
         gait: when the feet stand.
         force: the programme for their forces.
         swing: the feet in the air.
@@ -165,6 +181,7 @@ class MpcSettings:
     name: Literal["mpc"]
     period: Annotated[float, Field(ge=0.0005, le=0.02)]
     height: Annotated[float, Field(ge=0.15, le=0.4)]
+    ramp: RampSettings
     gait: GaitSettings
     force: ForceSettings
     swing: SwingSettings
