@@ -41,8 +41,8 @@ class TakesFeedforward(Actuator, Protocol):
 def takes_feedforward(actuator: Actuator) -> TypeGuard[TakesFeedforward]:
     """Return whether a drive, and the one that it may wrap, can be fed forward."""
     inner = getattr(actuator, "drive", None)
-    own = "feedforward" in inspect.signature(actuator.torque).parameters
-    return own and (inner is None or takes_feedforward(inner))
+    itself = "feedforward" in inspect.signature(actuator.torque).parameters
+    return itself and (inner is None or takes_feedforward(inner))
 
 
 @runtime_checkable

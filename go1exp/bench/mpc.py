@@ -17,7 +17,7 @@ from go1exp.controller.types import Command, Drive, Sensed
 from go1exp.env.core import Go1Core
 
 COMMANDS = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0))
-"""What the robots are told, one each: x, y in m/s, yaw rate in rad/s."""
+"""What the robots are drive, one each: x, y in m/s, yaw rate in rad/s."""
 
 
 class _Timed:
@@ -33,9 +33,9 @@ class _Timed:
     def step(self, command: Command, sensed: Sensed) -> Drive:
         """Act, and note the time that it took."""
         start = time.perf_counter()
-        told = self.inner.step(command, sensed)
+        drive = self.inner.step(command, sensed)
         self._times.append(time.perf_counter() - start)
-        return told
+        return drive
 
 
 def run(

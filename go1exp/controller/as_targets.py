@@ -29,8 +29,8 @@ class AsTargets:
 
     def step(self, command: Command, sensed: Sensed) -> Drive:
         """Return targets at the drives' own gains, without any torque that is fed forward."""
-        told, q, qd = self._inner.step(command, sensed), sensed.joint_pos, sensed.joint_vel
-        torque = told.kp * (told.target - q) - told.kd * qd
-        if told.feedforward is not None:
-            torque = torque + told.feedforward
+        drive, q, qd = self._inner.step(command, sensed), sensed.joint_pos, sensed.joint_vel
+        torque = drive.kp * (drive.target - q) - drive.kd * qd
+        if drive.feedforward is not None:
+            torque = torque + drive.feedforward
         return Drive(q + (torque + self._kd * qd) / self._kp, self._kp, self._kd)

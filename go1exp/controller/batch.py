@@ -45,7 +45,7 @@ class Driven:
         """Take over the robots of ``core``, which must have been built with ``imu=True``.
 
         Args:
-            core: the environment; its commands (``core.command.value``) are what the robots are told.
+            core: the environment; its commands (``core.command.value``) are those of the robots.
             make: makes one robot's controller.
             noise: give the sensors the noise of the paper's Table II, and the feet that of a logger.
             seed: of the noise.
@@ -85,23 +85,23 @@ class Driven:
         sensed = self._sense()
         if self._steps % self._every == 0:
             commands = self._core.command.value.double().numpy()
-            told = [
+            drives = [
                 one.step(_command(row), of_robot)
                 for one, row, of_robot in zip(self.controllers, commands, sensed, strict=True)
             ]
-            self._put(told)
+            self._put(drives)
         self._steps += 1
         self._plant.step(self._target, self._forward if self._feeds else None)
         self._core.target.copy_(self._target)
 
-    def _put(self, told: Sequence[Drive]) -> None:
+    def _put(self, drives: Sequence[Drive]) -> None:
         """Put what the controllers say into force."""
-        rows = [(self._target, [one.target for one in told])]
-        self._feeds = told[0].feedforward is not None  # all are of one kind
+        rows = [(self._target, [one.target for one in drives])]
+        self._feeds = drives[0].feedforward is not None  # all are of one kind
         if self._feeds:
-            rows.append((self._forward, [one.feedforward for one in told]))  # type: ignore[misc]
+            rows.append((self._forward, [one.feedforward for one in drives]))  # type: ignore[misc]
         if self._has_gains:
-            rows += [(self._kp, [one.kp for one in told]), (self._kd, [one.kd for one in told])]
+            rows += [(self._kp, [one.kp for one in drives]), (self._kd, [one.kd for one in drives])]
         for tensor, values in rows:
             tensor.copy_(torch.as_tensor(np.stack(values)))
         if self._has_gains:

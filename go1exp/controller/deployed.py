@@ -29,5 +29,5 @@ class Deployed:
             velocity_b=base_lin_vel,
             foot_force=state.foot_force,
         )
-        told = self._controller.step((x, y, yaw), sensed)
-        return LowCmd(told.target, told.kp, told.kd, feedforward=told.feedforward)
+        drive = self._controller.step((x, y, yaw), sensed)
+        return LowCmd(drive.target, drive.kp, drive.kd, feedforward=drive.feedforward)

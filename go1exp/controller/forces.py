@@ -84,7 +84,7 @@ class Structure:
     Attributes:
         interval: (n,) of each.
         foot: (n,) of each.
-        mine: (3 n,) interval of each column.
+        column_interval: (3 n,) interval of each column.
         places: (3 n, 3 n) sum over the horizon of products of two columns' shares in a place.
         speeds: (3 n, 3 n) the same of their shares in a speed.
         A: (4 n, 3 n) rows of the friction pyramids.
@@ -95,7 +95,7 @@ class Structure:
 
     interval: np.ndarray
     foot: np.ndarray
-    mine: np.ndarray
+    column_interval: np.ndarray
     places: np.ndarray
     speeds: np.ndarray
     A: np.ndarray
@@ -140,7 +140,7 @@ class ForcePlan:
         """
         settings, body = self.settings, self._body
         structure = self._structure(problem.stands)
-        mine, n = structure.mine, len(structure.interval)
+        column_interval, n = structure.column_interval, len(structure.interval)
         rotation = problem.attitude
         inverse = rotation @ self._inverse @ rotation.T
         # Columns: what each force component does to the acceleration and to the angular acceleration.
@@ -154,8 +154,8 @@ class ForcePlan:
         H *= 2.0
         H.flat[:: 3 * n + 1] += 2.0 * settings.effort
         by_place, by_speed = self._place.T @ angles, self._speed.T @ free
-        g = (turn * (q_angle * by_place[:, :3] + q_turn * by_speed[:, :3])[mine].T).sum(0)
-        g += (push * (q_place * by_place[:, 3:] + q_speed * by_speed[:, 3:])[mine].T).sum(0)
+        g = (turn * (q_angle * by_place[:, :3] + q_turn * by_speed[:, :3])[column_interval].T).sum(0)
+        g += (push * (q_place * by_place[:, 3:] + q_speed * by_speed[:, 3:])[column_interval].T).sum(0)
         g = 2.0 * g - 2.0 * settings.effort * self._share(problem, structure.interval)
         return H, g, structure.A, structure.upper, structure.lower
 
@@ -185,8 +185,8 @@ class ForcePlan:
 
     def _structured(self, stands: np.ndarray) -> Structure:
         interval, foot = np.nonzero(stands)
-        n, mine = len(interval), np.repeat(interval, 3)
-        both = (mine[:, None], mine[None, :])
+        n, column_interval = len(interval), np.repeat(interval, 3)
+        both = (column_interval[:, None], column_interval[None, :])
         A = np.zeros((n, 4, n, 3))
         A[np.arange(n), :, np.arange(n)] = self._cone
         most = self.settings.max_force
@@ -195,7 +195,7 @@ class ForcePlan:
         return Structure(
             interval=interval,
             foot=foot,
-            mine=mine,
+            column_interval=column_interval,
             places=self._place_place[both],
             speeds=self._speed_speed[both],
             A=A.reshape(4 * n, 3 * n),

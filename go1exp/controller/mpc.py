@@ -62,7 +62,7 @@ class Mpc:
         for part in (self._clock, self._smoothed, self._ground, self._feet):
             part.restart()
         self._since_plan, self._first = 0, True
-        self._told: Command = (0.0, 0.0, 0.0)
+        self._command: Command = (0.0, 0.0, 0.0)
         self._place, self._lag, self._heading = np.zeros(3), np.zeros(2), 0.0
         self._forces = np.zeros((robot.NUM_LEGS, 3))
 
@@ -108,9 +108,9 @@ class Mpc:
         limits = self.settings.ramp.speed, self.settings.ramp.speed, self.settings.ramp.turn
         moved = (
             before + max(-self.period * most, min(self.period * most, wanted - before))
-            for before, wanted, most in zip(self._told, command, limits, strict=True)
+            for before, wanted, most in zip(self._command, command, limits, strict=True)
         )
-        x, y, yaw = self._told = tuple(moved)  # type: ignore[assignment]
+        x, y, yaw = self._command = tuple(moved)  # type: ignore[assignment]
         return x, y, yaw
 
     def _level(self, command: Command) -> Command:
