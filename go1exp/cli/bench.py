@@ -104,7 +104,7 @@ def _mpc(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
     from go1exp.cli import controllers
     from go1exp.compose import compose
 
-    settings, _ = controllers.split({"controller": compose("record")["controller"]})
+    settings = controllers.chosen(compose("record")["controller"])
     assert settings is not None
     return mpc.run(task, settings, *timing[1:])
 

@@ -16,21 +16,20 @@ CONDITIONS = "paper"
 """Shipped policy whose robot, ground and noise another controller walks under where no run is named."""
 
 
-def split(container: dict[str, Any]) -> tuple[MpcSettings | None, dict[str, Any]]:
-    """Return the settings of another controller than a policy, None for that, and what is left of the configuration.
+def chosen(given: Any) -> MpcSettings | None:
+    """Return the settings of another controller than a policy, from a verb's group ``controller``; None for a policy.
 
     Raises:
         ConfigError: with every problem of the settings.
         go1exp.controller.forces.SolverError: if the controller's solver is not installed.
     """
-    settings = parse_controller(container.get("controller", {"name": "policy"}))
-    rest = {name: value for name, value in container.items() if name != "controller"}
+    settings = parse_controller({"name": "policy"} if given is None else given)
     if not isinstance(settings, MpcSettings):
-        return None, rest
+        return None
     from go1exp.controller.forces import solver
 
     solver()  # before anything is built
-    return settings, rest
+    return settings
 
 
 def conditions(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[TaskConfig, Path]:

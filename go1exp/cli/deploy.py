@@ -20,9 +20,9 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.settings import DeploySettings, parse
     from go1exp.schema.settings import subset
 
-    controller, container = controllers.split(container)
     other = {name: container[name] for name in CHOICES if container.get(name) is not None}
     settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in CHOICES})
+    controller = controllers.chosen(settings.controller)
     if settings.robot == "go1" and other:
         raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
 

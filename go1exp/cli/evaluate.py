@@ -26,9 +26,9 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.runs import checkpoint_file, trained
     from go1exp.cli.settings import EvalSettings, parse
 
-    controller, container = controllers.split(container)
     other, container = other_robot.split(container)
     settings = parse(EvalSettings, container)
+    controller = controllers.chosen(settings.controller)
     measures = _measures(settings.measures)
     if controller is None:
         run, out = trained(settings.run, settings.policy, "eval.json", settings.out)

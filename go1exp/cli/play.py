@@ -17,9 +17,9 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.runs import checkpoint_file, trained
     from go1exp.cli.settings import PlaySettings, parse
 
-    controller, container = controllers.split(container)
     other, container = other_robot.split(container)
     settings = parse(PlaySettings, container)
+    controller = controllers.chosen(settings.controller)
     names = (settings.run, settings.policy, "play.mp4", settings.out)
     if controller is None:
         run, out = trained(*names)
