@@ -24,6 +24,9 @@ from go1exp import cli, data_root, recording, robot
 from go1exp.audit import audit
 from go1exp.compose import compose
 from go1exp.config import parse_train
+from go1exp.controller.deployed import Deployed
+from go1exp.controller.mpc import Mpc
+from go1exp.controller.settings import MpcSettings, parse_controller
 from go1exp.deploy import go1_sdk, walk, wire
 from go1exp.deploy.bundle import load
 from go1exp.deploy.commands import (
@@ -113,7 +116,7 @@ def test_a_state_and_a_command_come_through_the_wire_bit_for_bit() -> None:
     for name, _ in wire.STATE_PARTS:
         assert getattr(again, name).tobytes() == getattr(state, name).tobytes(), name
     for damping in (False, True):
-        command = make_command(damping=damping, kp=np.arange(12.0))
+        command = make_command(damping=damping, kp=np.arange(12.0), feedforward=np.arange(12.0) - 5.0)
         data = wire.pack_command(command, 3, 1.5)
         about = wire.head(data)
         assert about is not None
@@ -121,6 +124,11 @@ def test_a_state_and_a_command_come_through_the_wire_bit_for_bit() -> None:
         assert back.damping is damping
         for name, _ in wire.COMMAND_PARTS:
             assert getattr(back, name).tobytes() == getattr(command, name).tobytes(), name
+    about = wire.head(data := wire.pack_command(make_command(), 4, 1.5))
+    assert about is not None
+    fed = wire.unpack_command(data, about).feedforward
+    assert fed is not None
+    assert not fed.any()
     with pytest.raises(ValueError, match=r"kp: has shape \(3,\)"):
         wire.pack_command(make_command(kp=np.zeros(3)), 1, 0.0)
 
@@ -298,6 +306,23 @@ def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Pat
         Robot(task, sim_config({}))
 
 
+def test_a_torque_that_is_fed_forward_moves_a_joint_until_nobody_speaks(file: str) -> None:
+    one = Robot(bundle_task(file, {}), sim_config({"start": "hung", "noise": 0.0}))
+    limp = make_command(kp=np.zeros(12), kd=np.zeros(12))
+    one.obey(dataclasses.replace(limp, feedforward=np.tile([0.0, 0.0, 5.0], 4)), 1)
+    before = one.sense()[0].joint_pos
+    for _ in range(20):
+        one.step()
+    state = one.sense()[0]
+    np.testing.assert_allclose(state.joint_torque, np.tile([0.0, 0.0, 5.0], 4))
+    assert (state.joint_pos - before).reshape(4, 3)[:, 2].min() > 0.02
+    for _ in range(20):
+        one.step()
+    assert one.braking
+    held = one.sense()[0]
+    np.testing.assert_allclose(held.joint_torque, -2.0 * held.joint_vel, atol=0.1)
+
+
 # ---------------------------------------------------------------------- the whole chain, at a time of its own
 
 
@@ -322,6 +347,17 @@ def play(
         cycles=cycle_columns,
         world=world,
     )
+
+
+def test_a_model_predictive_controller_walks_in_the_runtime(file: str, tmp_path: Path) -> None:
+    mine = parse_controller(compose("deploy", ["controller=mpc", "bundle=walk.zip"])["controller"])
+    assert isinstance(mine, MpcSettings)
+    job = {"mover": Deployed(Mpc(mine)), "truth": True}
+    done = play(file, tmp_path, job=job, rate=1.0 / mine.period, seconds=2.0)
+    assert done.output[-1] == "walked for 2.0 s, to the end"
+    x, y, _ = done.account["velocity"]["mean"]
+    assert (x, y) == (pytest.approx(0.4, abs=0.05), pytest.approx(0.0, abs=0.05))
+    assert done.recording.meta.notes.endswith("torques that are fed forward are not recorded")
 
 
 def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> None:
@@ -872,7 +908,11 @@ def test_the_sdk_is_spoken_to_as_its_example_does(monkeypatch: pytest.MonkeyPatc
     link.exchange(1.02)
     np.testing.assert_allclose([m.q for m in sdk.sent[-1][:12]], robot.NOMINAL_STANCE)
     assert (sdk.sent[-1][3].Kp, sdk.sent[-1][3].Kd, sdk.sent[-1][3].mode) == (20.0, 0.5, 0x0A)
-    link.exchange(1.07)  # the runtime has fallen silent
+    assert sdk.sent[-1][3].tau == 0.0
+    link._wanted = (make_command(feedforward=np.arange(12.0)), 1.02)
+    link.exchange(1.03)
+    assert [m.tau for m in sdk.sent[-1][:12]] == list(range(12))
+    link.exchange(1.09)  # the runtime has fallen silent
     assert sdk.sent[-1][0] == braking
     link.close()
 

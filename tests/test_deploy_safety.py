@@ -230,6 +230,25 @@ def test_targets_are_cut_to_the_peak_torque() -> None:
         assert (same | ~fine).all()
 
 
+def test_torque_that_is_fed_forward_is_cut_too_and_counts_in_what_targets_need() -> None:
+    safety = make_safety()
+    fed = np.full(12, 100.0)
+    sent = safety.review(make_state(), make_command(kp=np.zeros(12), feedforward=fed), 0.0)
+    assert sent.feedforward is not None
+    np.testing.assert_allclose(sent.feedforward, LIMIT)
+    for torque, ask in ((10.0, 0.5), (10.0, -0.3), (-20.0, -0.5), (0.0, 0.1)):
+        command = make_command(joint_target=NOMINAL + ask, feedforward=np.full(12, torque))
+        sent = safety.review(make_state(), command, 0.0)
+        asked = np.clip(KP * ask + torque, -LIMIT, LIMIT)
+        inside = (sent.joint_target > safety._low) & (sent.joint_target < safety._high)
+        found = KP * (sent.joint_target - NOMINAL) + torque
+        np.testing.assert_allclose(found[inside], asked[inside], atol=1e-9)
+    spoilt = make_command(feedforward=at(np.zeros(12), 4, np.nan))
+    assert safety.review(make_state(), spoilt, 0.0).damping
+    assert safety.fault is not None
+    assert safety.fault.message == "feedforward of FL_thigh is nan"
+
+
 def test_a_command_without_position_gain_is_not_divided_by() -> None:
     sent = make_safety().review(make_state(), make_command(kp=np.zeros(12)), 0.0)
     assert (sent.joint_target == NOMINAL).all()

@@ -186,7 +186,10 @@ def test_lag_agrees_with_scipys_solution_for_linear_pieces(drives: Callable[...,
             np.testing.assert_allclose(found[:, i, j], expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "hook"), [("torque_delay", "on_drive"), ("command_delay", "on_target")])
+@pytest.mark.parametrize(
+    ("name", "hook"),
+    [("torque_delay", "on_drive"), ("command_delay", "on_target"), ("command_delay", "on_feedforward")],
+)
 def test_a_delay_agrees_with_interpolation_in_the_past(name: str, hook: str, drives: Callable[..., DriveSetup]) -> None:
     effect = term("effect", name, {})(drives(5))
     scatter(effect, 6)

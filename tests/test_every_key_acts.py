@@ -67,6 +67,8 @@ EXEMPT = {
     "engine/mujoco.yaml:engine": "backend/cpu.yaml has the same keys; tests/test_physx.py shows the other engine",
     "engine/physx.yaml:engine": "needs an extra: tests/test_physx.py shows what each key does",
     "backend/warp.yaml:backend": "needs a GPU and an extra: tests/contracts/test_backends.py",
+    "controller/mpc.yaml:controller": "tests/test_controller.py shows what each key does",
+    "controller/policy.yaml:controller": "the name of the choice",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},

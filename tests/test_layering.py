@@ -70,6 +70,14 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
         *("gymnasium", "stable_baselines3", "hydra", "omegaconf", "go1exp.mdp", "go1exp.actuator", "go1exp.config"),
         *("go1exp.effects", *up("physics")),
     ),
+    # what moves a robot other than a policy: plain numbers, but for what drives an environment
+    "controller/": (
+        *("mujoco", "gymnasium", "stable_baselines3", "hydra", "omegaconf", "go1exp.compose"),
+        *("go1exp.config", "go1exp.actuator", "go1exp.effects", *up("physics", "env", "record", "sim_robot")),
+    ),
+    "controller/settings.py": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    "controller/types.py": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    "controller/forces.py": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     # the environment joins them
     "env/": ("mujoco", "hydra", "omegaconf", "go1exp.train", "go1exp.bench", "go1exp.cli"),
     "env/core.py": ("gymnasium", "stable_baselines3", "go1exp.compose", "go1exp.evaluate"),

@@ -58,9 +58,11 @@ class DCMotor(Gains):
         self._stall = _or(setup, stall, setup.effort_limit)
         self._speed = _or(setup, speed, setup.velocity_limit)
 
-    def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s."""
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
+        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is in the clipped sum."""
         tau = torch.sub(target, q).mul_(self.kp).addcmul_(self.kd, qd, value=-1.0)
+        if feedforward is not None:
+            tau.add_(feedforward)
         return torch.clamp(tau, *envelope(qd, self._effort, self._stall, self._speed))
 
     def reset(self, mask: Tensor) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import torch
 from pydantic import AfterValidator, Field
 
-from go1exp.actuator.setup import Actuator
+from go1exp.actuator.setup import Actuator, takes_feedforward
 from go1exp.actuator.wrapped import Drive, build
 from go1exp.drive import DriveSetup
 from go1exp.schema.registry import actuator, ordered
@@ -41,6 +41,7 @@ class Delay:
         self._range, self._random = command, setup.random
         joints = len(setup.joints)
         self._line = DelayLine(setup.num_envs, joints, command[1], setup.physics_dt, setup.dtype, setup.device)
+        self._fed: DelayLine | None = None  # feedforward on its way; only where there is any
 
     @property
     def kp(self) -> Tensor:
@@ -52,9 +53,15 @@ class Delay:
         """Speed gain (N, J) of the drive inside, live, N m s/rad; AttributeError if it has none."""
         return self.drive.kd  # type: ignore[attr-defined]
 
-    def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s."""
-        return self.drive.torque(self._line.advance(target, self.delay), q, qd)
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
+        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is late as well."""
+        late = self._line.advance(target, self.delay)
+        if feedforward is None:
+            return self.drive.torque(late, q, qd)
+        assert takes_feedforward(self.drive)  # the plant has asked
+        if self._fed is None:
+            self._fed = self._line.twin()
+        return self.drive.torque(late, q, qd, self._fed.advance(feedforward, self.delay))
 
     def reset(self, mask: Tensor) -> None:
         """Draw new delays in the rows of ``mask`` (N,) and take the next target for one long in force."""
@@ -62,14 +69,18 @@ class Delay:
         drawn = self._random.stream("actuator.delay").uniform(1, low=low, high=high).to(self.delay.dtype)
         self.delay.copy_(torch.where(mask.unsqueeze(1), drawn.clamp(low, high), self.delay))
         self._line.reset(mask)
+        if self._fed:
+            self._fed.reset(mask)
         self.drive.reset(mask)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the delays, the targets on their way and the history of the drive inside."""
-        return {"delay": self.delay.clone(), "line": self._line.state_dict(), "drive": self.drive.state_dict()}
+        state = {"delay": self.delay.clone(), "line": self._line.state_dict(), "drive": self.drive.state_dict()}
+        return state | ({"fed": self._fed.state_dict()} if self._fed else {})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``, in place."""
         self.delay.copy_(state["delay"])
         self._line.load_state_dict(state["line"])
+        self._fed = self._line.restored(state.get("fed"))
         self.drive.load_state_dict(state["drive"])

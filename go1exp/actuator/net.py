@@ -123,8 +123,17 @@ class Net(Memory):
 
     # ------------------------------------------------------------------ the step
 
-    def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s."""
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
+        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s.
+
+        ``feedforward`` is added at every step to what the net says or holds, and the sum is clipped: the recordings
+        that a net learns from have none, so that it knows nothing of how a drive would delay it.
+        """
+        made = self._made(target, q, qd)
+        return made if feedforward is None else torch.clamp(made + feedforward, -self._limit, self._limit)
+
+    def _made(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+        """(N, J) torques without feedforward."""
         if self._every > 1:
             return self._sampled(target, q, qd)
         if self._resamples:

@@ -29,9 +29,11 @@ class PD(Gains):
         self.kp, self.kd = setup.rows(kp), setup.rows(kd)
         self._limit = setup.effort_limit
 
-    def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s."""
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
+        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is in the clipped sum."""
         tau = torch.sub(target, q).mul_(self.kp).addcmul_(self.kd, qd, value=-1.0)
+        if feedforward is not None:
+            tau.add_(feedforward)
         return torch.clamp(tau, -self._limit, self._limit)
 
     def reset(self, mask: Tensor) -> None:

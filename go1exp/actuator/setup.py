@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+import inspect
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
 
 from go1exp.tensors.memory import Memory
 
@@ -14,7 +15,11 @@ class Actuator(Protocol):
     """Turns position targets into torques at the physics rate; owns whatever history that takes."""
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return joint torques (N, J), N m, for targets and angles in rad and speeds in rad/s."""
+        """Return joint torques (N, J), N m, for targets and angles in rad and speeds in rad/s.
+
+        A drive that can be fed forward has a fourth argument, ``feedforward: Tensor | None = None``, (N, J), N m: added
+        to its own torque before the limit, and as late as the target where it delays that (``TakesFeedforward``).
+        """
 
     def reset(self, mask: Tensor) -> None:
         """Forget the history of the rows of ``mask`` (N,) bool."""
@@ -24,6 +29,20 @@ class Actuator(Protocol):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue with that history."""
+
+
+class TakesFeedforward(Actuator, Protocol):
+    """An actuator to which a torque can be added, as a Go1's motors add ``LowCmd.tau``."""
+
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
+        """Return joint torques (N, J), N m, that of the law plus ``feedforward``, within the drive's limit."""
+
+
+def takes_feedforward(actuator: Actuator) -> TypeGuard[TakesFeedforward]:
+    """Return whether a drive, and the one that it may wrap, can be fed forward."""
+    inner = getattr(actuator, "drive", None)
+    itself = "feedforward" in inspect.signature(actuator.torque).parameters
+    return itself and (inner is None or takes_feedforward(inner))
 
 
 @runtime_checkable

@@ -31,6 +31,8 @@ BARS = {
     "command_p99_ms": (1.0, "the same, 99th percentile (at most)"),
     "missed_400hz": (0.1, "per cent of deadlines missed at 400 Hz (at most); idle_missed_400hz is the timer's own"),
     "policy_us": (60.0, "us for one inference, one thread (at most)"),
+    "mpc_p50_ms": (0.5, "ms for one tick of controller=mpc, one core (at most)"),
+    "mpc_p99_ms": (1.5, "the same, 99th percentile (at most)"),
     "start_s": (2.0, "seconds from the runtime's start to its first command (at most)"),
     "memory_mb": (150.0, "MB resident of the runtime (at most)"),
     "memory_per_env_kb": (100.0, "memory per environment beyond the first, kB (at most)"),
@@ -64,6 +66,8 @@ def _task(container: dict[str, Any]) -> None:
         from go1exp.bench import deploy
 
         figures = deploy.run(container, *timing)
+    elif settings.suite == "mpc":
+        figures = _mpc(config.task, timing)
     elif on_gpu:
         figures = _gpu(config, overrides, timing)
     else:
@@ -92,6 +96,17 @@ def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
     wanted = {f.name for f in fields(RecordSettings)}
     settings = parse(RecordSettings, {k: v for k, v in record.items() if k in wanted})
     return actuator.run(task, settings.sensors, settings.physics_dt, *timing)
+
+
+def _mpc(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
+    """Run the suite of the model predictive controller, with its own settings."""
+    from go1exp.bench import mpc
+    from go1exp.cli import controllers
+    from go1exp.compose import compose
+
+    settings = controllers.chosen(compose("record")["controller"])
+    assert settings is not None
+    return mpc.run(task, settings, *timing[1:])
 
 
 def _gpu(config: TrainConfig, overrides: list[str], timing: tuple[Any, ...]) -> dict[str, float]:

@@ -41,7 +41,7 @@ WORDS = {
     "robot": ("sim", "go1"),
     "trunk_velocity": ("exact", "estimated"),
     "viewer": ("auto", "clip", "live"),
-    "suite": ("env", "train", "actuator", "deploy", "gpu"),
+    "suite": ("env", "train", "actuator", "deploy", "mpc", "gpu"),
     "what": ("all", "terms", "groups"),
     "stage": ("all", *STAGES),
     "support": ("auto", "hung", "ground"),

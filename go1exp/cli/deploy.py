@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from go1exp.cli import controllers
 from go1exp.cli.app import App
 from go1exp.cli.other_robot import CHOICES
+from go1exp.controller.settings import MpcSettings
 from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.deploy.controller import Mover
 
 
 def _task(container: dict[str, Any]) -> int:
@@ -17,8 +22,19 @@ def _task(container: dict[str, Any]) -> int:
 
     other = {name: container[name] for name in CHOICES if container.get(name) is not None}
     settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in CHOICES})
+    controller = controllers.chosen(settings.controller)
     if settings.robot == "go1" and other:
         raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
+
+    if settings.robot == "go1" and controller:
+        raise ConfigError(
+            ["controller=mpc: is for robot=sim; it has never moved a real robot, nor has a person tried it"]
+        )
+    rate = settings.rate
+    if controller:
+        rate = 1.0 / controller.period
+        if settings.rate is not None and abs(settings.rate - rate) > 1e-6 * rate:
+            raise ConfigError([f"rate = {settings.rate:g}: controller=mpc runs at {rate:g} Hz (controller.period)"])
 
     from go1exp.cli.logs import remove_empty, writable
     from go1exp.deploy.commands import Wish
@@ -28,9 +44,10 @@ def _task(container: dict[str, Any]) -> int:
 
     existed = Path(settings.out).exists()
     writable(settings.out)
-    plan = subset(Plan, settings, wish=Wish(settings.command, settings.sinusoid.amplitude, settings.sinusoid.period))
+    wish = Wish(settings.command, settings.sinusoid.amplitude, settings.sinusoid.period)
+    plan = subset(Plan, settings, wish=wish, rate=rate)
     sim = dataclasses.asdict(settings.sim)
-    job = Job(settings.bundle, settings.robot, plan, settings.out, sim, other, settings.truth)
+    job = Job(settings.bundle, settings.robot, plan, settings.out, sim, other, settings.truth, _mover(controller))
     try:
         return run_job(job, lambda line: print(line, flush=True))
     except RefusedError as error:
@@ -38,6 +55,16 @@ def _task(container: dict[str, Any]) -> int:
     finally:
         if not existed:
             remove_empty(Path(settings.out))
+
+
+def _mover(controller: MpcSettings | None) -> Mover | None:
+    """Return what walks in place of the bundle's policy, if anything does."""
+    if controller is None:
+        return None
+    from go1exp.controller.deployed import Deployed
+    from go1exp.controller.mpc import Mpc
+
+    return Deployed(Mpc(controller))
 
 
 APP = App("deploy", _task)

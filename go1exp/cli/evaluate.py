@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from go1exp.cli import engine, other_robot
+from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError, Term, bind_list
@@ -29,9 +29,13 @@ def _task(container: dict[str, Any]) -> None:
     judge, container = engine.split(container)
     other, container = other_robot.split(container)
     settings = parse(EvalSettings, container)
+    controller = controllers.chosen(settings.controller)
     measures = _measures(settings.measures)
-    run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
-    checkpoint = checkpoint_file(run, settings.checkpoint)
+    if controller is None:
+        run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
+        checkpoint = checkpoint_file(run, settings.checkpoint)
+    elif settings.checkpoint:
+        raise ConfigError([f"checkpoint = {settings.checkpoint!r}: is of a policy; controller=mpc has none"])
 
     grid_is_empty = not all((settings.grid.x, settings.grid.y, settings.grid.yaw))
     if settings.grid.cross and grid_is_empty:
@@ -43,18 +47,24 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
 
-    of_run, policy, about = load_run(run, checkpoint)
+    policy, make = None, None
+    if controller is None:
+        of_run, policy, about = load_run(run, checkpoint)
+        trained_on = of_run.task
+    else:
+        trained_on, out = controllers.conditions(settings.run, settings.policy, "eval.json", settings.out)
+        make, about = controllers.maker(controller, trained_on), {"controller": dataclasses.asdict(controller)}
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
     config = EvalConfig.from_settings(settings, commands=commands, engine=judge)
-    task = other_robot.replaced(of_run.task, other)
+    task = other_robot.replaced(trained_on, other)
     report = {
         "policy": about,
         "robot": other_robot.described(other),
-        **evaluate(task, policy, config, spinner(1, "evaluating"), measures),
+        **evaluate(task, policy, config, spinner(1, "evaluating"), measures, make),
     }
     if settings.delay_margin:
         falls = report["distinct_falls"]
-        report["delay_margin"] = delay_margin(task, policy, config, falls, spinner(1, "with a delay"))
+        report["delay_margin"] = delay_margin(task, policy, config, falls, spinner(1, "with a delay"), make)
     report["bars"] = [dataclasses.asdict(verdict) for verdict in judged(report)]
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, report)

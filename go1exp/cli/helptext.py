@@ -108,12 +108,14 @@ def texts_of(verb: str) -> dict[str, str]:
 def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
     """Return what the keys of a group mean: those of a section by its class, a term by its docstring."""
     from go1exp.config import ENGINES, ONE_TERM, REGISTERED_AS, SECTIONS
+    from go1exp.controller.settings import CONTROLLERS
     from go1exp.schema.backends import BACKENDS
     from go1exp.schema.registry import members
     from go1exp.schema.settings import lines
 
-    if group in ENGINES:
-        return lines(BACKENDS[settings["name"]], f"{group}.")
+    by_name = {**dict.fromkeys(ENGINES, BACKENDS), "controller": CONTROLLERS}
+    if group in by_name:
+        return lines(by_name[group][settings["name"]], f"{group}.")
     if group in SECTIONS:
         return lines(SECTIONS[group], f"{group}.")
     terms = members(REGISTERED_AS.get(group, group))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from go1exp.cli import engine, other_robot
+from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.schema.registry import ConfigError
 
@@ -20,26 +20,37 @@ def _task(container: dict[str, Any]) -> None:
     judge, container = engine.split(container)
     other, container = other_robot.split(container)
     settings = parse(PlaySettings, container)
-    run, out = trained(settings.run, settings.policy, "play.mp4", settings.out)
+    controller = controllers.chosen(settings.controller)
+    names = (settings.run, settings.policy, "play.mp4", settings.out)
+    if controller is None:
+        run, out = trained(*names)
+        checkpoint = checkpoint_file(run, settings.checkpoint)
+    else:
+        trained_on, out = controllers.conditions(*names)
     if out.suffix.lower() not in FORMATS:
         raise ConfigError([f"out = {str(out)!r}: a clip is {' or '.join(FORMATS)}"])
-    checkpoint = checkpoint_file(run, settings.checkpoint)
 
+    from go1exp.controller.batch import Driven
     from go1exp.env.core import Go1Core
     from go1exp.evaluate import video
     from go1exp.evaluate.camera import RenderingUnavailable
     from go1exp.evaluate.engine import require_agreement
-    from go1exp.evaluate.policy import load_run
+    from go1exp.evaluate.policy import Policy, load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
     from go1exp.evaluate.stick import picture
 
-    of_run, policy, _ = load_run(run, checkpoint)
+    policy: Policy
+    if controller is None:
+        of_run, policy, _ = load_run(run, checkpoint)
+        trained_on = of_run.task
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
     shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), engine=judge, **whole)
-    task = other_robot.replaced(of_run.task, other)
+    task = other_robot.replaced(trained_on, other)
     shown_task = evaluation_task(task, shown)
     require_agreement(shown_task)
-    core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise)
+    core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise, imu=controller is not None)
+    if controller is not None:
+        policy = Driven(core, controllers.maker(controller, task), noise=settings.noise, seed=settings.seed)
     if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
         video.live(core, policy)
         return

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from go1exp.cli.app import App, spinner
 from go1exp.cli.quoting import command
+from go1exp.controller.settings import MpcSettings, parse_controller
 from go1exp.schema.registry import ConfigError, Term, bind_list
 
 if TYPE_CHECKING:
@@ -19,8 +22,11 @@ if TYPE_CHECKING:
 RIG = ("robot", "actuator", "effect", "terrain", "backend")
 """Groups of the configuration that describe the robot to be recorded."""
 
-POLICY = "policy"
-"""The excitation that is a trained policy walking."""
+POLICY, MPC = "policy", "mpc"
+"""The excitations that are a trained policy, and a model predictive controller, walking."""
+
+COMMANDS = "gentle"
+"""Random commands (``conf/command``) that a model predictive controller walks under."""
 
 
 def _motions(given: Any) -> list[Term]:
@@ -49,14 +55,18 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.settings import RecordSettings
     from go1exp.effects.rules import drive_problems, has_gains
 
-    settings, parts = parse_with_groups(RecordSettings, container, RIG, excitation=_motions)
+    readers = {"excitation": _motions, "controller": parse_controller}
+    settings, parts = parse_with_groups(RecordSettings, container, RIG, **readers)
     motions = parts["excitation"]
     problems = drive_problems(parts["actuator"], parts["effect"], robot.JOINTS)
-    if not problems and any(m.entry.name != POLICY for m in motions) and not has_gains(parts["actuator"]):
+    names = {m.entry.name for m in motions}
+    if MPC in names:
+        problems += _misfits(settings, parts)
+    if not problems and names - {POLICY} and not has_gains(parts["actuator"]):
         problems.append(f"gains: actuator {parts['actuator'].entry.name!r} has none to set; use excitation=[policy]")
-    if any(m.entry.name == POLICY for m in motions) and not (settings.run or settings.policy):
+    if POLICY in names and not (settings.run or settings.policy):
         problems.append("run: required for excitation=[policy], such as run=runs/NAME, or policy=paper")
-    if all(m.entry.name == POLICY for m in motions):
+    if names <= {POLICY, MPC}:
         problems += _unused(settings)
     if problems:
         raise ConfigError(problems)
@@ -67,14 +77,16 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.record.simulate import Rig
 
     rig = Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
-    driven = [m for m in motions if m.entry.name != POLICY]
+    driven = [m for m in motions if m.entry.name not in (POLICY, MPC)]
     episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
     out = writable(settings.out)
     if present := sorted(p.name for p in out.glob("*.parquet")):
         print(f"note: {out} holds {len(present)} recordings already; they stay, those of the same name are replaced")
     recordings = _record_motions(rig, episodes, settings)
-    if walk and len(driven) < len(motions):
+    if walk and POLICY in names:
         recordings += _record_policy(rig, walk, settings)
+    if MPC in names:
+        recordings += _record_mpc(rig, parts["controller"], settings)
     _write(out, recordings)
 
 
@@ -99,6 +111,35 @@ def _record_policy(rig: Rig, run: Path, settings: RecordSettings) -> list[Record
     walk = simulate.Walk(config.task, policy, names, settings.seconds, hang)
     show = spinner(1, "recording a policy")
     return simulate.play_policy(rig, walk, settings.sensors, settings.seed, show)
+
+
+def _misfits(settings: RecordSettings, parts: dict[str, Any]) -> list[str]:
+    """Return why a model predictive controller cannot walk this robot, and look for its solver."""
+    from go1exp.controller.forces import solver
+
+    wrong = []
+    if parts["controller"].name != MPC:
+        wrong.append(f"controller.name = {parts['controller'].name!r}: excitation=[mpc] needs controller=mpc")
+    if settings.support == "hung":
+        wrong.append("support = 'hung': excitation=[mpc] walks on the ground; use support=auto")
+    solver()
+    return wrong
+
+
+def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> list[Recording]:
+    """Let a model predictive controller walk simulated robots by targets alone; return a recording of each."""
+    from go1exp.cli import controllers
+    from go1exp.compose import compose
+    from go1exp.config import parse_train
+    from go1exp.controller.as_targets import AsTargets
+    from go1exp.record import simulate
+
+    task = parse_train(compose("train", [f"command={COMMANDS}"])).task
+    make = controllers.maker(controller, task)
+    gains = [np.array(simulate.configured(rig.actuator, name)) for name in ("kp", "kd")]
+    names = [f"mpc_{settings.seed}_{k}" for k in range(settings.episodes)]
+    walk = simulate.Walk(task, None, names, settings.seconds, None, lambda: AsTargets(make(), *gains), MPC)
+    return simulate.play_policy(rig, walk, settings.sensors, settings.seed, spinner(1, "recording a controller"))
 
 
 def _write(out: Path, recordings: list[Recording]) -> None:

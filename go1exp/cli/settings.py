@@ -44,6 +44,7 @@ class EvalSettings:
     """``conf/eval.yaml``.
 
     Attributes:
+        controller: what moves the robots: policy, the one of run or policy, or mpc.
         run: run folder to judge; or give policy.
         policy: name of a policy that comes with the package, such as paper, in place of run.
         checkpoint: file of the run; null takes the newest.
@@ -65,6 +66,7 @@ class EvalSettings:
         out: JSON file; null writes eval.json in the run folder (of a shipped policy paper_eval.json here).
     """
 
+    controller: Any = None
     run: RunFolder | None
     policy: str | None
     checkpoint: str | None
@@ -95,6 +97,7 @@ class PlaySettings:
     """``conf/play.yaml``.
 
     Attributes:
+        controller: what moves the robot: policy, the one of run or policy, or mpc.
         run: run folder to watch; or give policy.
         policy: name of a policy that comes with the package, such as paper, in place of run.
         checkpoint: file of the run; null takes the newest.
@@ -110,6 +113,7 @@ class PlaySettings:
         out: clip (.mp4, .gif); null writes play.mp4 in the run folder. A picture, .png, goes beside it.
     """
 
+    controller: Any = None
     run: RunFolder | None
     policy: str | None
     checkpoint: str | None
@@ -130,6 +134,7 @@ class RecordSettings(Wishes):
     """``conf/record.yaml`` without the groups.
 
     Attributes:
+        controller: settings of excitation=[mpc].
         excitation: motions by name (go1exp list excitation); with parameters as {chirp: {band: [0.2, 5.0]}}.
         run: run folder of the policy of excitation=[policy]; or give policy.
         policy: name of a policy that comes with the package, such as paper, in place of run.
@@ -138,6 +143,7 @@ class RecordSettings(Wishes):
         out: folder for the recordings.
     """
 
+    controller: Any = None
     excitation: Any = ()
     run: str | None
     policy: str | None
@@ -237,6 +243,7 @@ class DeploySettings(Stages):
     """``conf/deploy.yaml`` without the groups; the times of the stages are those of the runtime.
 
     Attributes:
+        controller: what moves the robot: policy, that of the bundle, or mpc (robot=sim only).
         bundle: file that go1exp export wrote.
         robot: sim, a simulated robot in another process, or go1, the real one.
         command: velocity as [x m/s, y m/s, yaw rad/s]; or FILE.csv, sinusoid, keyboard, gamepad.
@@ -251,6 +258,7 @@ class DeploySettings(Stages):
         out: folder for the logs.
     """
 
+    controller: Any = None
     bundle: Annotated[str, Field(min_length=1)]
     robot: Literal["sim", "go1"]
     command: tuple[float, float, float] | str
@@ -319,7 +327,8 @@ class BenchSettings:
     """``conf/bench.yaml``.
 
     Attributes:
-        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime) or gpu (Warp).
+        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime), mpc (controller)
+            or gpu (Warp).
         num_envs: environments of the batch.
         rounds: alternating measurements of each subject, of which the median counts.
         seconds: length of a measurement, s.
@@ -328,7 +337,7 @@ class BenchSettings:
         out: JSON file for the figures; null writes none.
     """
 
-    suite: Literal["env", "train", "actuator", "deploy", "gpu"]
+    suite: Literal["env", "train", "actuator", "deploy", "mpc", "gpu"]
     num_envs: Count
     rounds: Count
     seconds: Positive

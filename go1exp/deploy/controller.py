@@ -64,6 +64,19 @@ class Estimator(Protocol):
         """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame."""
 
 
+class Mover(Protocol):
+    """What walks the robot in place of the bundle's policy."""
+
+    def step(self, velocity: np.ndarray, state: LowState, base_lin_vel: np.ndarray) -> LowCmd:
+        """Return the command of a cycle.
+
+        Args:
+            velocity: (3,) commanded, m/s, m/s, rad/s.
+            state: the newest one.
+            base_lin_vel: (3,) estimate of the trunk's velocity in its own frame, m/s.
+        """
+
+
 CommandSource = Callable[[float], np.ndarray]
 """Time since walking began, s -> commanded velocity (3,): x and y in m/s, yaw rate in rad/s."""
 
@@ -115,6 +128,7 @@ class Controller:
         kp: np.ndarray | None = None,
         kd: np.ndarray | None = None,
         on_cycle: Callable[[Cycle], None] = lambda cycle: None,
+        mover: Mover | None = None,
     ) -> None:
         """Join the parts.
 
@@ -129,6 +143,7 @@ class Controller:
             kp: (J,) N m/rad; those of the bundle if None.
             kd: (J,) N m s/rad.
             on_cycle: called after every cycle.
+            mover: walks in place of the bundle's policy, once every cycle.
 
         Raises:
             ValueError: if neither the bundle nor the caller gives gains.
@@ -144,6 +159,7 @@ class Controller:
         self._stages = stages or Stages()
         self._lying = np.tile(LYING, len(self._nominal) // len(LYING))
         self._begin: float | None = None
+        self._mover = mover
         self._readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
         self._past = PastActions[np.ndarray](about.policy_dt, about.policy_dt if rate is None else 1.0 / rate)
         self._target = self._nominal.copy()
@@ -256,9 +272,11 @@ class Controller:
             if name in self._readings:
                 self._readings[name][0] = values
         for fault, name in (("estimator", "base_lin_vel_b"), ("command", "command")):
-            if name in self._readings and not np.isfinite(given[name]).all():
+            if (self._mover or name in self._readings) and not np.isfinite(given[name]).all():
                 self.safety.fail(fault, f"{name} is {given[name]}", now)
                 return None
+        if self._mover:
+            return self._mover.step(self._velocity, state, self._base)
         outputs = self._policy(self._readings)
         if "previous_action" in self._readings:
             self._readings["previous_action"][:] = self._past.after(outputs["action"])

@@ -126,6 +126,7 @@ class SdkLink:
                 motor.q, motor.Kp, motor.Kd = (
                     float(part[k]) for part in (command.joint_target, command.kp, command.kd)
                 )
+                motor.tau = 0.0 if command.feedforward is None else float(command.feedforward[k])
         self._guard.PositionLimit(self._command)
         self._guard.PowerProtect(self._command, self._state, POWER_LEVEL)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from go1exp.deploy import bundle as bundles
 from go1exp.deploy.commands import KEYS, make, range_array
+from go1exp.deploy.controller import Mover
 from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
@@ -21,6 +22,8 @@ from go1exp.deploy.udp import UdpLink
 from go1exp.deploy.walk import STATUS, Outcome, Plan, account, interruptible, save, velocity_errors, walk
 
 Say = Callable[[str], None]
+
+OTHER_MOVER = "; not moved by a policy: gains change, and torques that are fed forward are not recorded"
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Job:
         sim: settings of the simulated robot (``go1exp.sim_robot.machine.SimConfig``).
         other: its ``actuator`` and ``effect``, if not those of training.
         truth: also write the simulated trunk's true motion into the recording.
+        mover: walks in place of the bundle's policy.
     """
 
     bundle: str
@@ -44,6 +48,7 @@ class Job:
     sim: Mapping[str, Any] = field(default_factory=dict)
     other: Mapping[str, Any] = field(default_factory=dict)
     truth: bool = False
+    mover: Mover | None = None
 
 
 @dataclass
@@ -103,7 +108,7 @@ def run_job(job: Job, say: Say) -> int:
     ).close()  # before anything is started
     if not about.command_ranges:
         say("note: the bundle knows no range of commands, so none is cut")
-    if plan.rate is not None and abs(plan.rate * about.policy_dt - 1.0) > 1e-6:
+    if job.mover is None and plan.rate is not None and abs(plan.rate * about.policy_dt - 1.0) > 1e-6:
         say(f"note: the policy was trained at {1 / about.policy_dt:g} Hz and runs at {plan.rate:g} Hz")
     if plan.wish.command == "keyboard":
         say(KEYS)
@@ -112,7 +117,7 @@ def run_job(job: Job, say: Say) -> int:
     try:
         with interruptible(), _reached(job, say) as robot:
             contact = None if robot.simulated else "torque"
-            outcome = walk(bundle, robot.link, plan, contact=contact, on_second=say)
+            outcome = walk(bundle, robot.link, plan, contact=contact, on_second=say, mover=job.mover)
             traffic = getattr(robot.link, "traffic", None)
     except KeyboardInterrupt:
         if outcome is not None:
@@ -132,7 +137,7 @@ def run_job(job: Job, say: Say) -> int:
         simulated=robot.simulated,
         newton=robot.simulated,
         episode=_free(Path(job.out), time.strftime("walk_%Y-%m-%d_%H-%M-%S")),
-        notes="ends where the drives begin to brake",
+        notes="ends where the drives begin to brake" + (OTHER_MOVER if job.mover else ""),
     )
     files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None)
     say(str(outcome.timing))

@@ -42,19 +42,21 @@ class LowState:
 
 @dataclass(frozen=True)
 class LowCmd:
-    """Command for the drives: torque = kp (joint_target - joint_pos) - kd joint_vel.
+    """Command for the drives: torque = kp (joint_target - joint_pos) - kd joint_vel + feedforward.
 
     Attributes:
         joint_target: (J,) rad.
         kp: (J,) N m/rad.
         kd: (J,) N m s/rad.
         damping: the drives brake: kp is zero, and a link may use the damping mode of its drives.
+        feedforward: (J,) N m; None for none.
     """
 
     joint_target: np.ndarray
     kp: np.ndarray
     kd: np.ndarray
     damping: bool = False
+    feedforward: np.ndarray | None = None
 
 
 class Link(Protocol):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +23,7 @@ DEFAULT_KD = 2.0
 
 
 READ = ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
-ASKED = ("joint_target", "kp", "kd")
+ASKED = ("joint_target", "kp", "kd", "feedforward")
 """Parts of a state and of a command that must be finite."""
 
 
@@ -151,11 +151,16 @@ class Safety:
     def limited(self, state: LowState, command: LowCmd) -> LowCmd:
         """Limit targets so that they need at most the peak torque, and then to the SDK's range and the stops.
 
+        Torque that is fed forward is limited to the peak torque by itself, and counts in what targets need.
+
         If a joint moves so fast that both are not possible, the range has priority.
         """
+        if command.feedforward is not None:
+            within = np.minimum(np.maximum(command.feedforward, -self._torque_limit), self._torque_limit)
+            command = replace(command, feedforward=within)
         target = self._cut(state, command)
         self.clamped += target != command.joint_target
-        return LowCmd(target, command.kp, command.kd, command.damping)
+        return replace(command, joint_target=target)
 
     def rehearse(self, state: LowState, command: LowCmd) -> None:
         """Do the work of a review without any result, for ``Controller.rehearse``."""
@@ -166,6 +171,8 @@ class Safety:
     def _cut(self, state: LowState, command: LowCmd) -> np.ndarray:
         reach, drag = self._reach(command.kp, command.kd)
         still = state.joint_pos + drag * state.joint_vel  # (J,) the target that gives zero torque
+        if command.feedforward is not None:  # a joint without kp has no target that could make up for it
+            still = still - np.divide(command.feedforward, command.kp, out=self._zeros.copy(), where=command.kp > 0.0)
         target = np.minimum(np.maximum(command.joint_target, still - reach), still + reach)
         # The range comes last: it holds even if the torque limit asks for a target outside it.
         return np.minimum(np.maximum(target, self._low), self._high)
@@ -195,7 +202,8 @@ class Safety:
     def not_finite(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
         """A reading or a command is not finite."""
         given: list[tuple[LowState | LowCmd, str]] = [(state, name) for name in READ] if state is not None else []
-        given += [(command, name) for name in ASKED] if command is not None else []
+        if command is not None:
+            given += [(command, name) for name in ASKED if getattr(command, name) is not None]
         vectors = [getattr(message, name) for message, name in given]
         if not vectors or np.isfinite(np.concatenate(vectors)).all():
             return None

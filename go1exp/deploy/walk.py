@@ -19,7 +19,7 @@ import numpy as np
 from go1exp import signals
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.commands import Limited, Wish, make, range_array
-from go1exp.deploy.controller import Controller, Cycle, Estimator, Stages
+from go1exp.deploy.controller import Controller, Cycle, Estimator, Mover, Stages
 from go1exp.deploy.estimate import KalmanEstimator, NoEstimator, settings
 from go1exp.deploy.log import About, Log, write_cycles
 from go1exp.deploy.loop import MonotonicClock, Timing, run
@@ -92,8 +92,8 @@ class Outcome:
         return 0 if self.fault is None else STATUS.get(self.fault.name, UNKNOWN_FAULT)
 
 
-def estimator_of(bundle: Bundle, safety: Safety, contact: str | None) -> Estimator:
-    """Return the estimator that a bundle's policy wants.
+def estimator_of(bundle: Bundle, safety: Safety, contact: str | None, always: bool = False) -> Estimator:
+    """Return the estimator that a bundle's policy wants; with ``always`` one in any case.
 
     ``contact`` is ``torque`` for a robot whose feet's sensors are not calibrated; None leaves the bundle's choice.
 
@@ -103,7 +103,7 @@ def estimator_of(bundle: Bundle, safety: Safety, contact: str | None) -> Estimat
     """
     from go1exp.deploy.estimate import TORQUE
 
-    if all(port.name != "base_lin_vel_b" for port in bundle.policy.inputs):
+    if not always and all(port.name != "base_lin_vel_b" for port in bundle.policy.inputs):
         return NoEstimator()
     changes: dict[str, Any] = TORQUE if contact == "torque" else {}
     return KalmanEstimator(settings(bundle.metadata.estimator, **changes), safety.fail)
@@ -116,8 +116,9 @@ def walk(
     *,
     contact: str | None = None,
     on_second: Callable[[str], None] = lambda line: None,
+    mover: Mover | None = None,
 ) -> Outcome:
-    """Walk. The link stays open; SIGINT and SIGTERM stop the robot meanwhile.
+    """Walk, by the bundle's policy or by ``mover``. The link stays open; SIGINT and SIGTERM stop the robot meanwhile.
 
     Raises:
         go1exp.errors.Expected: if commands or the estimator cannot be had; nothing has been sent then.
@@ -126,11 +127,11 @@ def walk(
     about = bundle.metadata
     limits = about.joints, np.array(about.joint_limits), np.array(about.torque_limit)
     safety = Safety(*limits, SafetyConfig(stale=plan.stale))
-    estimator = estimator_of(bundle, safety, contact)
+    estimator = estimator_of(bundle, safety, contact, always=mover is not None)
     stop_requests: list[str] = []
     ranges = range_array(about.command_ranges)
     with contextlib.closing(make(plan.wish, ranges, safety.stop, stop_requests.append)) as commands:
-        walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests)
+        walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests, mover)
         with stopping(safety):
             clock = MonotonicClock(plan.spin, walk.rehearse)
             timing = run(walk.cycle, walk.rate, None, clock, lambda timing: on_second(walk.status(timing)))
@@ -149,6 +150,7 @@ class _Walk:
         estimator: Estimator,
         commands: Limited,
         stop_requests: list[str],
+        mover: Mover | None,
     ) -> None:
         """Join the parts of the runtime; nothing is sent yet. ``stop_requests`` fills with who asks for an end."""
         self.rate = plan.rate or 1.0 / bundle.metadata.policy_dt
@@ -164,6 +166,7 @@ class _Walk:
             rate=self.rate,
             stages=plan,
             on_cycle=self._note,
+            mover=mover,
         )
 
     def _note(self, cycle: Cycle) -> None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from go1exp.deploy.messages import LowCmd, LowState
 
-MAGIC, VERSION = b"G1XP", 1
+MAGIC, VERSION = b"G1XP", 2
 STATE, COMMAND, HELLO = 1, 2, 3
 """Kinds. A hello tells the robot the address to which it sends its states."""
 
@@ -31,7 +31,8 @@ STATE_PARTS = (
     ("imu_acc", 3),
     ("foot_force", LEGS),
 )
-COMMAND_PARTS = (("joint_target", JOINTS), ("kp", JOINTS), ("kd", JOINTS))
+COMMAND_PARTS = (("joint_target", JOINTS), ("kp", JOINTS), ("kd", JOINTS), ("feedforward", JOINTS))
+NO_TORQUE = np.zeros(JOINTS)
 _IN_FORCE = struct.Struct("<q")
 
 STATE_NUMBERS = sum(size for _, size in STATE_PARTS)
@@ -96,6 +97,8 @@ def pack_command(command: LowCmd, number: int, clock: float) -> bytes:
         ValueError: if a part has another size than a Go1's.
     """
     begin = HEAD.pack(MAGIC, VERSION, COMMAND, DAMPING if command.damping else 0, number % NUMBERS, clock)
+    if command.feedforward is None:
+        command = replace(command, feedforward=NO_TORQUE)
     return begin + _packed(command, COMMAND_PARTS)
 
 

@@ -98,8 +98,8 @@ class Effect(Memory):
     needs and no others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
-    ``on_target``, ``on_encoder``, the actuator, ``on_drive``, ``on_transmission``, ``on_gears``, then ``on_joint``,
-    ``on_friction`` and ``on_base`` beside it.
+    ``on_target`` and ``on_feedforward``, ``on_encoder``, the actuator, ``on_drive``, ``on_transmission``, ``on_gears``,
+    then ``on_joint``, ``on_friction`` and ``on_base`` beside it.
     """
 
     title: ClassVar[str] = ""
@@ -142,6 +142,10 @@ class Effect(Memory):
     def on_target(self, target: Tensor) -> Tensor:
         """Return the position target that the drive acts on."""
         return target
+
+    def on_feedforward(self, torque: Tensor) -> Tensor:
+        """Return the feed-forward torque that reaches the drive; only called where there is any (``Plant.step``)."""
+        return torque
 
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the angle and speed that the drive's encoder reads. Called more than once a step: changes nothing."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from go1exp.effects.base import Param
 from go1exp.effects.delayed import Delayed
@@ -11,6 +11,10 @@ from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from go1exp.drive import DriveSetup
+    from go1exp.schema.joint_values import JointValues
+    from go1exp.tensors.delay_line import DelayLine
 
 
 @effect("command_delay")
@@ -30,6 +34,32 @@ class CommandDelay(Delayed):
         levels=({"delay": 0.01},),
         excitation="steps",
     )
+
+    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+        """Allocate the past of targets; that of feed-forward torques is allocated with the first of them."""
+        super().__init__(setup, **values)
+        self._fed: DelayLine | None = None
+
+    def on_feedforward(self, torque: Tensor) -> Tensor:
+        """Return the feed-forward torque of ``delay`` ago: it comes with the target."""
+        if self._fed is None:
+            self._fed = self._line.twin()
+        return self._fed.advance(torque, self.delay)
+
+    def reset(self, mask: Tensor) -> None:
+        """Let the next target and torque stand for the whole past in the rows of ``mask`` (N,)."""
+        super().reset(mask)
+        if self._fed:
+            self._fed.reset(mask)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of the values and the past."""
+        return {**super().state_dict(), **({"fed": self._fed.state_dict()} if self._fed else {})}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Write values and past back."""
+        super().load_state_dict(state)
+        self._fed = self._line.restored(state.get("fed"))
 
     def on_target(self, target: Tensor) -> Tensor:
         """Return the target of ``delay`` ago."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Effect
@@ -33,11 +33,11 @@ class Delayed(Effect):
         """Let the next signal stand for the whole past in the rows of ``mask`` (N,)."""
         self._line.reset(mask)
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Any]:
         """Return copies of the values and the past."""
         return {**super().state_dict(), **self._line.state_dict()}
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Write values and past back, in place."""
         super().load_state_dict(state)
         self._line.load_state_dict(state)

@@ -16,7 +16,7 @@ from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term
 
 HOOKS = (
-    *("on_target", "on_encoder", "on_gains", "on_drive", "on_transmission", "on_gears"),
+    *("on_target", "on_feedforward", "on_encoder", "on_gains", "on_drive", "on_transmission", "on_gears"),
     *("on_joint", "on_friction", "on_base"),
 )
 
@@ -111,6 +111,12 @@ class EffectStack:
         for effect in self._acting["on_target"]:
             target = effect.on_target(target)
         return target
+
+    def on_feedforward(self, torque: Tensor) -> Tensor:
+        """Return the feed-forward torque that reaches the drives."""
+        for effect in self._acting["on_feedforward"]:
+            torque = effect.on_feedforward(torque)
+        return torque
 
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the drives' encoders read."""

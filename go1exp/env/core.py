@@ -7,6 +7,7 @@ makes environment i of a batch compute exactly what it would compute alone.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -54,6 +55,9 @@ class Go1Core:
         critic: append what only the critic sees to the observations (training only).
     """
 
+    driver: Callable[[], None] | None = None
+    """Makes each physics step in place of ``plant.step``, which it calls; actions count no more. controller/batch.py"""
+
     def __init__(
         self,
         task: TaskConfig,
@@ -68,8 +72,7 @@ class Go1Core:
         alike: bool = False,
         critic: bool = False,
     ) -> None:
-        self.task, self.num_envs, self.noise = task, num_envs, noise
-        self._spread_starts = spread_starts
+        self.task, self.num_envs, self.noise, self._spread_starts = task, num_envs, noise, spread_starts
         self.terrain = build_terrain(task.terrain)
         time, contact = task.sim, task.contact
         model, sensors = build_model(task.robot, self.terrain, time.physics_dt, contact=contact, imu=imu, held=held)
@@ -89,8 +92,7 @@ class Go1Core:
         self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self._last_action, self.target = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self.joint_acc, self.spawn = zeros(robot.NUM_JOINTS), zeros(3)
-        self.steps, self._first_step = zeros(dtype=torch.int64), zeros(dtype=torch.int64)
-        self.episode_return = zeros()
+        self.steps, self._first_step, self.episode_return = *(zeros(dtype=torch.int64) for _ in range(2)), zeros()
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
         self.reward_sums = self.terms.sums
         self.feet = Feet(num_envs, task.sim.physics_dt, self.device)
@@ -100,8 +102,7 @@ class Go1Core:
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
         self._started = False
         self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
-        self._evidence = Evidence()
-        self.captures = task.backend.captures
+        self._evidence, self.captures = Evidence(), task.backend.captures
         self._captured: CapturedStep | None = None
 
     # ------------------------------------------------------------------ construction
@@ -258,7 +259,7 @@ class Go1Core:
         self._touched.zero_()
         self._calf_touched.zero_()
         for _ in range(self.task.sim.decimation):
-            self.plant.step(target)
+            self.plant.step(target) if self.driver is None else self.driver()
             feet = self._foot_contact[..., 0]
             self.feet.update(self._foot_contact[..., 1:], self._foot_vel_w)
             # Counts, largest over the substeps; a calf's contacts without those of its foot.

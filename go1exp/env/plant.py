@@ -14,20 +14,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.actuator.setup import Actuator
+from go1exp.actuator.setup import Actuator, TakesFeedforward, takes_feedforward
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Measured
 from go1exp.effects.stack import EffectStack
 from go1exp.mdp.types import Snapshot
 from go1exp.physics.backend import PhysicsBackend
 from go1exp.robot import RobotConfig
-from go1exp.schema.registry import Term
+from go1exp.schema.registry import ConfigError, Term
 from go1exp.tensors.randomness import EnvRandom
 
 FRICTION, ARMATURE = "dof_frictionloss", "dof_armature"
@@ -86,6 +86,7 @@ class Plant:
         self._dry = self.effects.acts("on_friction") or FRICTION in self.effects.fields
         self._dry |= bool(backend.compiled(FRICTION).any())
         self._beside = self._dry or self._rotors is not None or self.effects.acts("on_joint")
+        self._fed: Tensor | None = None  # the feed-forward torque of the last step, from the first one on
         self._ease = setup.physics_dt * backend.compiled("dof_invweight0")[self._joints]
         live = [*self.effects.fields, *([FRICTION] if self._dry else []), *([ARMATURE] if self._rotors else [])]
         for name in live:
@@ -123,6 +124,8 @@ class Plant:
         self._before.copy_(torch.where(rows, self.qd, self._before))
         self._target.copy_(torch.where(rows, target, self._target))
         self.torque.masked_fill_(rows, 0.0)
+        if self._fed is not None:
+            self._fed.masked_fill_(rows, 0.0)
         self.actuator.reset(mask)
         self.effects.reset(mask)
         if self._rotors:
@@ -132,8 +135,25 @@ class Plant:
         """(N, J) joint speeds at the instant of ``q``, rad/s."""
         return torch.lerp(self._before, self.qd, 1.5)
 
-    def step(self, target: Tensor) -> None:
-        """Advance one physics step; ``target`` (N, J), rad, is in force from now on."""
+    def step(self, target: Tensor, feedforward: Tensor | None = None) -> None:
+        """Advance one physics step.
+
+        A torque that is fed forward is added where a Go1's motor adds ``LowCmd.tau``: to the drive's own torque, before
+        the drive's limit and before what effects do to a torque (``strength``, ``lag``, ...). It travels with the
+        target: where it changes it counts for half of the step, and ``command_delay`` delays both.
+
+        - ``pd``: in the sum that is clipped at the peak torque.
+        - ``dc_motor``: in the sum that is clipped at what the motor can make at that speed.
+        - ``delay``: as late as the target, then as the drive inside says.
+        - ``net``: added to what the net says or holds, and clipped at the peak torque; its history has no part of it.
+
+        Args:
+            target: (N, J) joint targets, in force from now on, rad.
+            feedforward: (N, J) torque, in force from now on, N m; None for none. Once there was one, None means zeros.
+
+        Raises:
+            go1exp.schema.registry.ConfigError: if the drive takes none.
+        """
         if self.observer:
             self.observer(target)
         effects, q, qd = self.effects, self.q, self.speed()
@@ -142,7 +162,11 @@ class Plant:
         command = effects.on_target(torch.lerp(self._target, target, 0.5))
         self._target.copy_(target)
         encoder = effects.on_encoder(q, qd)
-        self.torque.copy_(effects.on_drive(self.actuator.torque(command, *encoder), *encoder))
+        if feedforward is None and self._fed is None:
+            made = self.actuator.torque(command, *encoder)
+        else:
+            made = self._fed_forward(command, encoder, feedforward)
+        self.torque.copy_(effects.on_drive(made, *encoder))
         if self.enabled is not None:
             self.torque.mul_(self.enabled.unsqueeze(1))
         if effects.acts("on_friction"):
@@ -158,6 +182,18 @@ class Plant:
             # What is carried is this step's; constants that a reset derives from the model are the whole rotor's.
             self.backend.field(ARMATURE)[:, self._joints] = self._inertia
             self._rotors.follow(self.joint_acceleration())
+
+    def _fed_forward(self, command: Tensor, encoder: tuple[Tensor, Tensor], feedforward: Tensor | None) -> Tensor:
+        """Return the drives' torque for a target, with the torque that is fed forward."""
+        if self._fed is None:
+            if not takes_feedforward(self.actuator):
+                kind, known = type(self.actuator).__name__, "use actuator=pd, dc_motor, delay or net"
+                raise ConfigError([f"actuator: {kind} takes no feed-forward torque; {known}"])
+            self._fed = torch.zeros_like(self.torque)
+        given = torch.zeros_like(self._fed) if feedforward is None else feedforward
+        arriving = self.effects.on_feedforward(torch.lerp(self._fed, given, 0.5))
+        self._fed.copy_(given)
+        return cast("TakesFeedforward", self.actuator).torque(command, *encoder, arriving)
 
     def _act_beside(self, geared: Tensor, q: Tensor, qd: Tensor, turn: Tensor | None) -> Tensor:
         """Apply what acts on the joints beside the drive's torque ``geared``, and return what is left of that."""
@@ -202,13 +238,15 @@ class Plant:
         parts = {"actuator": self.actuator.state_dict(), "effects": self.effects.state_dict()}
         if self._rotors:
             parts["rotors"] = self._rotors.state_dict()
-        return {**physics, "torque": self.torque.clone(), **parts}
+        fed = {} if self._fed is None else {"fed": self._fed.clone()}
+        return {**physics, "torque": self.torque.clone(), **parts, **fed}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``; the backend holds the model."""
         for name in self._STATE:
             getattr(self, f"_{name}").copy_(state[name])
         self.torque.copy_(state["torque"])
+        self._fed = state["fed"].clone() if "fed" in state else None
         self.actuator.load_state_dict(state["actuator"])
         self.effects.load_state_dict(state["effects"])
         if self._rotors:

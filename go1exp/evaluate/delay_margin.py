@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from go1exp.config import TaskConfig
+from go1exp.controller.types import Controller
 from go1exp.evaluate.policy import Policy
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.schema.registry import Term, members
@@ -26,10 +27,11 @@ def delayed(task: TaskConfig, delay: float) -> TaskConfig:
 
 def delay_margin(
     task: TaskConfig,
-    policy: Policy,
+    policy: Policy | None,
     config: EvalConfig,
     falls: dict[str, Any],
     on_step: Callable[[int, int], None] = lambda done, total: None,
+    controller: Callable[[], Controller] | None = None,
 ) -> dict[str, Any]:
     """Run the grid with later and later targets until a robot falls.
 
@@ -39,6 +41,7 @@ def delay_margin(
         config: as for ``evaluate``.
         falls: ``distinct_falls`` of the grid without any further delay.
         on_step: called with the progress of each run.
+        controller: as for ``evaluate``.
 
     Returns:
         ``ms``, the largest delay without falls, None if robots fall without any; ``falls`` of each delay that was run.
@@ -47,7 +50,8 @@ def delay_margin(
     for ms in DELAYS_MS:
         if margin is None or runs[str(margin)]["count"]:
             break
-        runs[str(ms)] = evaluate(delayed(task, 1e-3 * ms), policy, config, on_step)["distinct_falls"]
+        late = delayed(task, 1e-3 * ms)
+        runs[str(ms)] = evaluate(late, policy, config, on_step, controller=controller)["distinct_falls"]
         if runs[str(ms)]["count"]:
             break
         margin = ms

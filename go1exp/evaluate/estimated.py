@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from go1exp.env.core import Go1Core
-from go1exp.estimation import WIDTH, go1, make_filter
-from go1exp.estimation import readings as column
+from go1exp.estimation.many import Filters
 from go1exp.evaluate.observed import columns
 from go1exp.record.tape import sample
 from go1exp.schema.registry import ConfigError
@@ -36,31 +35,19 @@ class EstimatedVelocity:
         if velocity_columns is None:
             raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
         self._columns = velocity_columns
-        self._filters = [make_filter(go1()) for _ in range(core.num_envs)]
+        self._filters = Filters(core.num_envs)
         self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
         self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])
         core.plant.observer = self._listen
 
     def put(self, observation: Tensor) -> Tensor:
         """Return the observation (N, O) with the estimated velocity in place of the true one."""
-        velocities = np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])
         changed = observation.clone()
-        changed[:, self._columns] = torch.as_tensor(velocities, dtype=observation.dtype)
+        changed[:, self._columns] = torch.as_tensor(self._filters.velocities, dtype=observation.dtype)
         return changed
 
     def _listen(self, target: Tensor) -> None:
         """Update every filter with a sample, before a step."""
         true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}
-        readings = noisy(true, self._noise, self._rng)
-        rows = np.full((len(self._filters), WIDTH), np.nan)
-        rows[:, column.T] = self._steps * self._dt
-        rows[:, column.QUAT], rows[:, column.GYRO], rows[:, column.ACC] = (
-            readings["quat"],
-            readings["gyro"],
-            readings["acc"],
-        )
-        rows[:, column.Q], rows[:, column.QD] = readings["q"], readings["qd"]
-        rows[:, column.FOOT_FORCE] = readings["foot_force"]
-        for one, row in zip(self._filters, rows, strict=True):
-            one.update(row)
+        self._filters.update(self._steps * self._dt, noisy(true, self._noise, self._rng))
         self._steps += 1

@@ -11,6 +11,8 @@ from typing import Any, Literal
 import torch
 
 from go1exp.config import TaskConfig, time_rules
+from go1exp.controller.batch import Driven
+from go1exp.controller.types import Controller
 from go1exp.deploy.past import PastActions
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.engine import require_agreement
@@ -103,15 +105,17 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
 
 def evaluate(
     task: TaskConfig,
-    policy: Policy,
+    policy: Policy | None,
     config: EvalConfig,
     on_step: Callable[[int, int], None] = lambda done, total: None,
     measures: Sequence[Term] = (),
+    controller: Callable[[], Controller] | None = None,
 ) -> dict[str, Any]:
     """Run the grid and return a report of plain data.
 
     A robot counts until it falls. Tracking figures of a command are over all its robots and the time after
     ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
+    ``controller`` makes what moves one robot in place of the policy, by its own sensors.
     ``measures`` (``go1exp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
     ``agreement`` says how near another engine than MuJoCo came to it before anything else was done.
 
@@ -119,11 +123,11 @@ def evaluate(
         Expected: if that is not near enough.
     """
     count = len(config.commands) * config.episodes
-    estimated = config.trunk_velocity == "estimated"
+    imu = config.trunk_velocity == "estimated" or controller is not None
     judged = evaluation_task(task, config)
     checks = require_agreement(judged)
-    core = Go1Core(judged, count, config.seed, noise=config.noise, imu=estimated)
-    see = EstimatedVelocity(core, config.noise, config.seed).put if estimated else lambda observation: observation
+    core = Go1Core(judged, count, config.seed, noise=config.noise, imu=imu)
+    act = _driven(core, controller, config) if controller else _seeing(core, policy, config)
     # A policy that runs faster than it was trained sees its action of one training period ago.
     past = PastActions[torch.Tensor](task.sim.policy_dt, core.task.sim.policy_dt)
     past_columns = columns(core.task, "previous_action") if past.cycles > 1 else None
@@ -139,7 +143,7 @@ def evaluate(
     for step in range(steps):
         if recorder and step >= settle:
             recorder.begin_step()
-        result = core.step(policy(see(observation)))
+        result = core.step(act(observation))
         core.check(result)
         observation = result.observation
         if past_columns is not None:
@@ -159,6 +163,20 @@ def evaluate(
             row["measures"] = described(measures, recorder.trace(tally.distinct(k, config).numpy()))
         report["units"] = {t.key: t.entry.traits["unit"] for t in measures}
     return report
+
+
+def _driven(core: Go1Core, make: Callable[[], Controller], config: EvalConfig) -> Policy:
+    """Let controllers drive the robots; return what they want to be called like, a policy."""
+    return Driven(core, make, noise=config.noise, seed=config.seed, trunk_velocity=config.trunk_velocity)
+
+
+def _seeing(core: Go1Core, policy: Policy | None, config: EvalConfig) -> Policy:
+    """Return the policy, which sees an estimated velocity if it is to."""
+    assert policy is not None  # or there would be a controller
+    if config.trunk_velocity == "exact":
+        return policy
+    see = EstimatedVelocity(core, config.noise, config.seed).put
+    return lambda observation: policy(see(observation))
 
 
 def _planar_velocity(core: Go1Core) -> torch.Tensor:

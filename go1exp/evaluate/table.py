@@ -91,8 +91,10 @@ def _summary(report: dict[str, Any]) -> str:
     policy, settings = report["policy"], report["settings"]
     on = [name for name in ("noise", "randomize", "push", "train_ground") if settings[name]]
     rmse = ", ".join(f"{axis} {report['rmse'][axis]:.3f}" for axis in AXES) if report["rmse"] else "-"
+    other = policy.get("controller")
+    who = f"controller {other['name']}" if other else f"policy after {policy['num_timesteps'] / 1e6:.2f} M steps"
     return (
-        f"policy after {policy['num_timesteps'] / 1e6:.2f} M steps; RMSE over all: {rmse}; "
+        f"{who}; RMSE over all: {rmse}; "
         f"falls {report['falls']} in {report['episodes']} episodes of {settings['duration_s']:g} s; "
         f"with {', '.join(on) if on else 'no noise, randomisation or pushes, on flat ground'}"
         + (f"; moved by {settings['engine']['name']}" if report.get("agreement") else "")

@@ -1,4 +1,4 @@
-"""The excitation ``policy``: not a fixed motion, but a policy in closed loop."""
+"""The excitations ``policy`` and ``mpc``: not fixed motions, but walks in closed loop."""
 
 from __future__ import annotations
 
@@ -11,3 +11,9 @@ from go1exp.schema.registry import excitation
 def policy(*_: Any) -> None:
     """A trained policy walks under random commands (needs ``run``)."""
     raise NotImplementedError("a policy is played in closed loop, by go1exp.record.simulate.play_policy")
+
+
+@excitation("mpc", closed_loop=True)
+def mpc(*_: Any) -> None:
+    """A model predictive controller walks under random commands, by position targets alone; needs no policy."""
+    raise NotImplementedError("a controller is played in closed loop, by go1exp.record.simulate.play_policy")

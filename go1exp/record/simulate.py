@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from go1exp import __version__, robot
 from go1exp.config import TaskConfig, time_rules
+from go1exp.controller.batch import Driven
+from go1exp.controller.types import Controller
 from go1exp.effects.rules import drives, has_gains
 from go1exp.env.core import Go1Core
 from go1exp.env.engine import make_backend
@@ -204,17 +206,21 @@ class Walk:
 
     Attributes:
         trained: the task that it was trained in.
-        policy: observations (N, O) -> actions (N, 12).
+        policy: observations (N, O) -> actions (N, 12); or None, and ``controller``.
         names: names of the episodes, one robot each.
         seconds: length of each, s.
         hang: roll and pitch of a held trunk, rad, if the feet are to be in the air; None on the ground.
+        controller: makes what moves one robot in place of the policy, by its sensors without noise.
+        excitation: what the recordings call it.
     """
 
     trained: TaskConfig
-    policy: Callable[[torch.Tensor], torch.Tensor]
+    policy: Callable[[torch.Tensor], torch.Tensor] | None
     names: Sequence[str]
     seconds: float
     hang: tuple[float, float] | None
+    controller: Callable[[], Controller] | None = None
+    excitation: str = "policy"
 
 
 def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
@@ -225,6 +231,8 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
     held = None if walk.hang is None else held_quat(walk.hang)
     core = Go1Core(policy_task(rig, walk.trained, walk.seconds), len(walk.names), seed, imu=True, held=held, alike=True)
     observation = core.reset()
+    policy = walk.policy if walk.controller is None else Driven(core, walk.controller, noise=False, seed=seed)
+    assert policy is not None
     per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
     samples_per_step = round(core.task.sim.policy_dt * sensors.rate_hz)
     if not math.isclose(samples_per_step, core.task.sim.policy_dt * sensors.rate_hz, rel_tol=1e-6):
@@ -237,7 +245,7 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
     rows = np.full(len(walk.names), steps * samples_per_step)
     walking = torch.ones(len(walk.names), dtype=torch.bool)
     for step in range(steps):
-        result = core.step(walk.policy(observation))
+        result = core.step(policy(observation))
         observation = result.observation
         fell = walking & (result.terminated | result.truncated)
         rows[fell.numpy()] = (step + 1) * samples_per_step
@@ -252,9 +260,9 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
             sensors,
             base="floating" if held is None else "fixed",
             base_quat=held,
-            kp=_configured(rig.actuator, "kp"),
-            kd=_configured(rig.actuator, "kd"),
-            excitation="policy",
+            kp=configured(rig.actuator, "kp"),
+            kd=configured(rig.actuator, "kd"),
+            excitation=walk.excitation,
             episode=name,
             repeat_of=None,
         )
@@ -262,7 +270,7 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
     return recordings
 
 
-def _configured(actuator: Term, gain: str) -> tuple[float, ...] | None:
+def configured(actuator: Term, gain: str) -> tuple[float, ...] | None:
     """Return a gain as configured, per joint, without the effects on it; None if the actuator has no gains."""
     value = next((term.parameters[gain] for term, _ in drives(actuator) if gain in term.parameters), None)
     return None if value is None else tuple(float(v) for v in spread(value, robot.JOINTS))

@@ -74,6 +74,7 @@ class Robot:
         self.clock, self.braking = 0.0, False
         self._commanded, self._in_force = -np.inf, 0
         self._measured = self.clock, self._in_force
+        self._fed: torch.Tensor | None = None  # from the first feed-forward torque on
         self._place()
 
     def _place(self) -> None:
@@ -111,6 +112,9 @@ class Robot:
         self._commanded, self._in_force = self.clock, number
         self.braking = command.damping
         self._target = torch.tensor(command.joint_target, dtype=self._plant.q.dtype).unsqueeze(0)
+        if self._fed is not None or (command.feedforward is not None and command.feedforward.any()):
+            fed = np.zeros(robot.NUM_JOINTS) if command.feedforward is None else command.feedforward
+            self._fed = torch.tensor(fed, dtype=self._plant.q.dtype).unsqueeze(0)
         self._set_gains(command.kp, command.kd)
 
     def step(self) -> None:
@@ -118,6 +122,8 @@ class Robot:
         if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE + 1e-9:
             self.braking = True
             self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
+            if self._fed is not None:
+                self._fed = torch.zeros_like(self._fed)
         self._measured = self.clock, self._in_force
         self._advance()
         self.clock = round(self.clock / TICK + 1) * TICK  # a whole number of ticks: no rounding adds up
@@ -135,7 +141,7 @@ class Robot:
         blocks, readings = backend.sensors, backend.sensordata
         # Foot forces are one tick old: the estimator's ``settle`` was chosen with such readings.
         feet = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))[..., 1:].norm(dim=-1)
-        plant.step(self._target)
+        plant.step(self._target, self._fed)
         speed = 0.5 * (half + backend.qvel)
         floats = pose.shape[1] > robot.NUM_JOINTS
         rate = speed[:, 3:6] if floats else readings[:, blocks.imu_gyro]

@@ -197,7 +197,7 @@ class Server:
             self.counts.old += 1
             return
         command = wire.unpack_command(data, about)
-        if not all(np.isfinite(values).all() for values in (command.joint_target, command.kp, command.kd)):
+        if not all(np.isfinite(getattr(command, name)).all() for name, _ in wire.COMMAND_PARTS):
             self.counts.foreign += 1
             return
         self._last = about.number

@@ -26,11 +26,24 @@ class DelayLine(Memory):
         self, num_envs: int, joints: int, longest: float, dt: float, dtype: torch.dtype, device: torch.device
     ) -> None:
         """Allocate for delays up to ``longest`` s of a signal sampled every ``dt`` s."""
-        self._dt = dt
+        self._dt, self._longest = dt, longest
         self._depth = math.ceil(longest / dt - 1e-9) + 2
         self._past = torch.zeros(self._depth, num_envs, joints, dtype=dtype, device=device)
         self._newest = torch.zeros(1, dtype=torch.int64, device=device)
         self._age = torch.zeros(num_envs, 1, dtype=torch.int64, device=device)
+
+    def twin(self) -> DelayLine:
+        """Return an empty line for another signal (N, J) of the same kind."""
+        _, n, joints = self._past.shape
+        return DelayLine(n, joints, self._longest, self._dt, self._past.dtype, self._past.device)
+
+    def restored(self, state: dict[str, Tensor] | None) -> DelayLine | None:
+        """Return a twin with the state of one; None for None."""
+        if state is None:
+            return None
+        twin = self.twin()
+        twin.load_state_dict(state)
+        return twin
 
     def reset(self, mask: Tensor) -> None:
         """Let the next sample stand for the whole past in the rows of ``mask`` (N,)."""

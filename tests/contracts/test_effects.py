@@ -479,6 +479,7 @@ def calls(effect: Effect, n: int, k: int) -> Iterator[tuple[str, tuple[Any, ...]
     three = [joint_noise(n, 1.0, k + j)[:, :3] for j in (3, 4, 5)]
     given: dict[str, tuple[Tensor, ...]] = {
         "on_target": (q,),
+        "on_feedforward": (torque,),
         "on_encoder": (q, qd),
         "on_gains": (torque.abs(), qd.abs()),
         "on_drive": (torque, q, qd),

@@ -1,0 +1,53 @@
+"""What moves the robot of a verb: the policy that it names, or another controller (group ``controller``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from go1exp.controller.settings import MpcSettings, parse_controller
+
+if TYPE_CHECKING:
+    from go1exp.config import TaskConfig
+    from go1exp.controller.types import Controller
+
+CONDITIONS = "paper"
+"""Shipped policy whose robot, ground and noise another controller walks under where no run is named."""
+
+
+def chosen(given: Any) -> MpcSettings | None:
+    """Return the settings of another controller than a policy, from a verb's group ``controller``; None for a policy.
+
+    Raises:
+        ConfigError: with every problem of the settings.
+        go1exp.controller.forces.SolverError: if the controller's solver is not installed.
+    """
+    settings = parse_controller({"name": "policy"} if given is None else given)
+    if not isinstance(settings, MpcSettings):
+        return None
+    from go1exp.controller.forces import solver
+
+    solver()  # before anything is built
+    return settings
+
+
+def conditions(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[TaskConfig, Path]:
+    """Return the task in which another controller walks, and the file for results; arguments as ``runs.trained``'s.
+
+    The task is that of the run or the shipped policy that is named, else that of ``CONDITIONS``.
+    """
+    from go1exp.cli.runs import trained
+    from go1exp.config import parse_train
+    from go1exp.train import run_folder
+
+    named = run is not None or policy is not None
+    folder, place = trained(run, policy if named else CONDITIONS, file, out)
+    return parse_train(run_folder.read_config(folder)).task, place if out else Path(f"mpc_{file}")
+
+
+def maker(settings: MpcSettings, task: TaskConfig) -> Callable[[], Controller]:
+    """Return what makes one robot's controller."""
+    from go1exp.controller.mpc import Mpc
+
+    return lambda: Mpc(settings, task.robot.inertia)
