@@ -199,6 +199,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "eval:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "play:run": lambda walk: [str(walk.trained("other", "seed=5"))],
     "play:out": lambda walk: ["other.gif"],
+    "play:physics_dt": lambda walk: [0.5 * SMALL["train"]["sim.physics_dt"]],
     "eval:physics_dt": lambda walk: [0.5 * SMALL["train"]["sim.physics_dt"]],
     "eval:measures": lambda walk: [["stride_rate"]],
     "eval:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],

@@ -109,6 +109,8 @@ class PlaySettings:
         randomize: randomise the robot as in training; false takes the nominal robot.
         push: push the robot as in training.
         train_ground: use the ground of training; false is flat.
+        physics_dt: another physics step, s, such as 0.002 for a policy trained with coarser steps; null keeps that of
+            training.
         seed: seed of everything random.
         out: clip (.mp4, .gif); null writes play.mp4 in the run folder. A picture, .png, goes beside it.
     """
@@ -125,6 +127,7 @@ class PlaySettings:
     randomize: bool
     push: bool
     train_ground: bool
+    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
     seed: Annotated[int, Field(ge=0)]
     out: str | None
 
