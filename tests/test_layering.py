@@ -22,7 +22,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
 
 FOREIGN = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra")
-OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "export", "sim_robot", "bench", "cli")
+OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "export", "sim_robot", "bench", "protocol", "cli")
 
 
 def up(*but: str) -> tuple[str, ...]:
@@ -113,6 +113,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "sim_robot/settings.py": (*FOREIGN, "torch", "go1exp.config", *up("sim_robot")),
     "evaluate/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
+    "protocol/": ("mujoco", "hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
 }
 """File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""
 

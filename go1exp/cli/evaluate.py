@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 from go1exp.cli import other_robot
@@ -22,13 +23,36 @@ def _measures(given: Any) -> list[Term]:
     return bind_list("measure", given, "measures")
 
 
+def _protocols(settings: Any, protocols: list[Any], other: dict[str, Any]) -> None:
+    """Play what is not the grid."""
+    from go1exp.cli.protocols import play
+    from go1exp.cli.subjects import named
+    from go1exp.protocol.playing import Rates
+
+    subject = named(settings.run, settings.policy, settings.bundle, settings.checkpoint, "protocols")
+    folder = Path(settings.folder or subject.folder)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError([f"folder = {str(folder)!r}: is a file"])
+    play(protocols, subject, folder, other, Rates(settings.seed, settings.policy_dt, settings.physics_dt))
+
+
 def _task(container: dict[str, Any]) -> None:
+    from go1exp.choices import config_folder, load
+    from go1exp.cli.protocols import chosen as protocols_chosen
     from go1exp.cli.runs import checkpoint_file, trained
     from go1exp.cli.settings import EvalSettings, parse
 
     other, container = other_robot.split(container)
+    choice = {"protocol": container.pop("protocol")}
     settings = parse(EvalSettings, container)
+    protocols, grid_too = protocols_chosen({**container, **choice}, load(config_folder() / "eval.yaml"))
     measures = _measures(settings.measures)
+    if protocols:
+        _protocols(settings, protocols, other)
+    if not grid_too:
+        return
+    if settings.bundle is not None:
+        raise ConfigError([f"bundle = {settings.bundle!r}: protocol=grid takes run or policy; choose another protocol"])
     run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
 

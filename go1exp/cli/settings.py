@@ -46,6 +46,7 @@ class EvalSettings:
     Attributes:
         run: run folder to judge; or give policy.
         policy: name of a policy that comes with the package, such as paper, in place of run.
+        bundle: file that go1exp export wrote, in place of run; not for protocol=grid.
         checkpoint: file of the run; null takes the newest.
         grid: commanded velocities.
         episodes: episodes of each command, all at once.
@@ -63,10 +64,13 @@ class EvalSettings:
         delay_margin: also run the grid with targets 10, 20, 30 and 40 ms late, until a robot falls.
         seed: seed of everything random.
         out: JSON file; null writes eval.json in the run folder (of a shipped policy paper_eval.json here).
+        folder: for the files of other protocols than the grid; null takes protocols in the run folder (of a shipped
+            policy paper_protocols here).
     """
 
     run: RunFolder | None
     policy: str | None
+    bundle: str | None
     checkpoint: str | None
     grid: Grid
     episodes: Count
@@ -83,6 +87,7 @@ class EvalSettings:
     delay_margin: bool
     seed: Annotated[int, Field(ge=0)]
     out: str | None
+    folder: str | None
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""

@@ -232,6 +232,7 @@ importer = partial(register, "importer")
 effect = partial(register, "effect")
 excitation = partial(register, "excitation")
 measure = partial(register, "measure")
+protocol = partial(register, "protocol")
 
 
 def members(group: str) -> dict[str, Entry]:

@@ -1,0 +1,110 @@
+"""Who is judged: a run, a shipped policy or a bundle, as it is named on the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from go1exp.cli import other_robot
+from go1exp.cli.runs import checkpoint_file, run_folder, shipped_policies, trained
+from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.config import TaskConfig
+    from go1exp.protocol.drivers import Driver
+
+
+@dataclass(frozen=True)
+class Named:
+    """A subject whose files are there.
+
+    Attributes:
+        label: name in reports.
+        folder: where its results go unless the user says.
+        run: run folder, of a run or of a shipped policy.
+        checkpoint: one of its checkpoints; None takes the newest.
+        bundle: file, in place of a run.
+    """
+
+    label: str
+    folder: Path
+    run: Path | None = None
+    checkpoint: Path | None = None
+    bundle: Path | None = None
+
+
+def named(run: str | None, policy: str | None, bundle: str | None, checkpoint: str | None, file: str) -> Named:
+    """Return the subject of three keys of which one is given; ``file`` is what its results are called.
+
+    Raises:
+        ConfigError: unless there is exactly one, or if it is not there.
+    """
+    if bundle is None:
+        folder, out = trained(run, policy, file, None)
+        return Named(policy or folder.name, out, run=folder, checkpoint=checkpoint_file(folder, checkpoint))
+    others = [f"{key} = {value!r}" for key, value in (("run", run), ("policy", policy)) if value is not None]
+    if others:
+        raise ConfigError([f"bundle = {bundle!r} and {' and '.join(others)}: only one of them"])
+    if checkpoint is not None:
+        raise ConfigError([f"checkpoint = {checkpoint!r}: a bundle has only one"])
+    return _bundle(bundle, file)
+
+
+def _bundle(bundle: str, file: str) -> Named:
+    path = Path(bundle)
+    if not path.is_file():
+        raise ConfigError([f"bundle = {bundle!r}: there is no such file; go1exp export writes one"])
+    return Named(path.stem, Path(f"{path.stem}_{file}"), bundle=path)
+
+
+def word(given: str, file: str) -> Named:
+    """Return the subject that one word names: a bundle's file, a run folder, or a shipped policy."""
+    if given.endswith(".zip"):
+        return _bundle(given, file)
+    if given in shipped_policies():
+        return named(None, given, None, None, file)
+    if Path(given).is_dir():
+        return dataclasses.replace(named(str(run_folder(given)), None, None, None, file), label=given.rstrip("/"))
+    known = ", ".join(shipped_policies())
+    raise ConfigError([f"subjects: {given!r} is no run folder, no bundle (.zip), and no shipped policy ({known})"])
+
+
+def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = None) -> Driver:
+    """Load what drives the robots.
+
+    Args:
+        subject: who.
+        other: choices of another robot (``other_robot.split``).
+        robot_of: the task whose robot, drives, effects, contact and randomisation are taken; None takes its own.
+
+    Raises:
+        ConfigError: if a run's configuration is not one that this version knows.
+        go1exp.deploy.archive.BundleError: if a bundle is damaged or was changed.
+    """
+    from go1exp.protocol.drivers import BundleDriver, PolicyDriver
+
+    if subject.bundle is not None:
+        from go1exp.config import parse_train
+        from go1exp.deploy.bundle import load
+
+        bundle = load(subject.bundle)
+        task = _robot(parse_train(bundle.config).task, other, robot_of)
+        about = {"bundle": str(subject.bundle), "sha256": bundle.seal, **dataclasses.asdict(bundle.metadata.trained)}
+        return BundleDriver(subject.label, task, bundle, about)
+    from go1exp.evaluate.policy import load_run
+
+    assert subject.run is not None
+    of_run, policy, about = load_run(subject.run, subject.checkpoint)
+    return PolicyDriver(subject.label, _robot(of_run.task, other, robot_of), policy, about)
+
+
+SAME = ("robot", "actuator", "effect", "contact", "rand", "termination")
+"""Parts of a task that are the robot's and not the policy's."""
+
+
+def _robot(task: TaskConfig, other: dict[str, Any], robot_of: TaskConfig | None) -> TaskConfig:
+    if robot_of is not None:
+        task = dataclasses.replace(task, **{part: getattr(robot_of, part) for part in SAME})
+    return other_robot.replaced(task, other)
