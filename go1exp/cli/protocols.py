@@ -40,8 +40,10 @@ def chosen(container: dict[str, Any], plain: dict[str, Any]) -> tuple[list[Chose
     changed = [key for key in GRID_ONLY if not grid and key in plain and container.get(key) != plain[key]]
     if changed:
         raise ConfigError(
-            [f"{key} = {container[key]!r}: is of protocol=grid; others have keys of their own ({_example(key, protocols)})"
-             for key in changed]
+            [
+                f"{key} = {container[key]!r}: is of protocol=grid; others have keys of their own ({_example(key, protocols)})"
+                for key in changed
+            ]
         )
     return protocols, grid
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 from go1exp.protocol.claims import Claim
-from go1exp.protocol.quantities import LIFE, Column, Derived, Row
+from go1exp.protocol.quantities import FINGERPRINT, LIFE, Column, Derived, Row
 from go1exp.schema.registry import ConfigError, Term, as_json, bind_list, explain, find, members, unknown_name
 from go1exp.schema.settings import settings
 
@@ -132,8 +132,11 @@ class Protocol:
 
 def lives(motion: Motion) -> list[Row]:
     """Return the columns that tell of each robot's life, one row for each."""
-    told = zip(motion.fell, motion.left_map, motion.moving_s, strict=True)
-    return [{"fell": bool(fell), "left_map": bool(left), "moving_s": round(float(s), 4)} for fell, left, s in told]
+    told = zip(motion.fell, motion.left_map, motion.moving_s, motion.fingerprint, strict=True)
+    return [
+        {"fell": bool(fell), "left_map": bool(left), "moving_s": round(float(s), 4), FINGERPRINT: float(mark)}
+        for fell, left, s, mark in told
+    ]
 
 
 # ---------------------------------------------------------------------- from a configuration

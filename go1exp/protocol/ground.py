@@ -51,7 +51,9 @@ Field = NDArray[np.float64]
 
 
 def _slope(x: Field, y: Field, difficulty: float, rng: np.random.Generator) -> Field:
-    return np.broadcast_to(np.tan(np.radians(difficulty)) * np.clip(x, 0.0, COURSE), np.broadcast_shapes(x.shape, y.shape))
+    return np.broadcast_to(
+        np.tan(np.radians(difficulty)) * np.clip(x, 0.0, COURSE), np.broadcast_shapes(x.shape, y.shape)
+    )
 
 
 def _stairs(x: Field, y: Field, difficulty: float, rng: np.random.Generator) -> Field:

@@ -20,6 +20,9 @@ Condition = tuple[Any, ...]
 ROBOT = "robot"
 """Column with the robot's number in its condition: the same number is the same robot in all conditions' draws."""
 
+FINGERPRINT = "fingerprint"
+"""Column with a number that two robots share only if they did the same, bit for bit."""
+
 DIGITS = 6
 """Significant digits in the file."""
 
@@ -79,11 +82,9 @@ def distinct(rows: Iterable[Row], keys: Sequence[str], random: bool) -> list[Row
     seen: set[Any] = set()
     kept = []
     for row in rows:
-        condition = tuple(row[k] for k in keys)
-        # NaN is not itself: as text it is.
-        did = repr([v for k, v in row.items() if k != ROBOT]) if random else None
-        if (condition, did) not in seen:
-            seen.add((condition, did))
+        what = (*(row[k] for k in keys), row[FINGERPRINT] if random else None)
+        if what not in seen:
+            seen.add(what)
             kept.append(row)
     return kept
 
@@ -166,5 +167,9 @@ def add_measures(rows: Sequence[Row], measures: Mapping[str, Any], legs: Sequenc
         if each is None or each.dtype.kind == "U":
             continue
         for row, value in zip(rows, each, strict=True):
-            parts = {name: value} if np.ndim(value) == 0 else {f"{name}_{leg}": v for leg, v in zip(legs, value, strict=True)}
+            parts = (
+                {name: value}
+                if np.ndim(value) == 0
+                else {f"{name}_{leg}": v for leg, v in zip(legs, value, strict=True)}
+            )
             row |= {k: float(v) if np.isfinite(v) else None for k, v in parts.items()}

@@ -101,6 +101,12 @@ class Motion:
         moving = self.alive & np.any(self.command != 0.0, axis=-1)
         return np.asarray(moving.sum(0) * self.dt, dtype=np.float64)
 
+    @property
+    def fingerprint(self) -> Array:
+        """(N,) sums over what each robot did, which are equal to the bit only if that is."""
+        did = np.abs(self.velocity).sum(-1) + self.height
+        return np.asarray(np.where(self.alive, did, 0.0).sum(0), dtype=np.float64)
+
 
 @dataclass(frozen=True)
 class Setting:

@@ -78,7 +78,9 @@ def claims_table(result: Result) -> Table:
         where = condition_text(v.condition) + (f" (worst of {v.of})" if v.of > 1 else "")
         value = interval_text(v.figure.estimate, v.figure.low, v.figure.high)
         name = v.name.replace("_", " ")
-        rows.append([name, {"word": v.word}, v.claim.quantity, limits(v.claim), value, v.figure.n, where, v.claim.source])
+        rows.append(
+            [name, {"word": v.word}, v.claim.quantity, limits(v.claim), value, v.figure.n, where, v.claim.source]
+        )
     header = ["claim", "verdict", "figure", "limit", "value [95 %]", "n", "where", "limit's source"]
     note = "reached: the whole interval keeps the limit; not told: n is too small to say." if rows else "None."
     return {"title": "Claims", "note": note, "header": header, "rows": rows}
@@ -103,22 +105,27 @@ def figure_tables(entries: Sequence[Mapping[str, Any]], units: Mapping[str, tupl
             ]
         else:
             header = ["condition", *(_named(name, units, those) for name in names)]
-            rows = [
-                [condition_text(e["condition"]), *(_cell(e["figures"].get(name)) for name in names)] for e in those
-            ]
+            rows = [[condition_text(e["condition"]), *(_cell(e["figures"].get(name)) for name in names)] for e in those]
         tables.append({"title": title, "note": "", "header": header, "rows": rows})
     return tables
 
 
 def _named(name: str, units: Mapping[str, tuple[str, str]], entries: Sequence[Mapping[str, Any]]) -> str:
-    unit = units[name][0] if name in units else next(e["figures"][name]["unit"] for e in entries if name in e["figures"])
+    unit = (
+        units[name][0] if name in units else next(e["figures"][name]["unit"] for e in entries if name in e["figures"])
+    )
     return f"{name} ({unit})" if unit else name
 
 
 def condition_text(condition: Mapping[str, Any]) -> str:
     """Write a condition."""
-    return ", ".join(f"{k.replace('_', ' ')} {v:g}" if isinstance(v, float) else f"{k.replace('_', ' ')} {v}"
-                     for k, v in condition.items()) or "all"
+    return (
+        ", ".join(
+            f"{k.replace('_', ' ')} {v:g}" if isinstance(v, float) else f"{k.replace('_', ' ')} {v}"
+            for k, v in condition.items()
+        )
+        or "all"
+    )
 
 
 def _cell(figure: Mapping[str, Any] | None) -> str:

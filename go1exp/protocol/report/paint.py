@@ -22,7 +22,9 @@ MEASURED, COMMANDED, ERROR, NOMINAL = "#0072b2", "#1d2125", "#d55e00", "#009e73"
 AXES = ("vx (m/s)", "vy (m/s)", "yaw rate (rad/s)")
 
 
-def panels(rows: int, columns: int = 1, height: float = 1.5, width: float = WIDTH, **options: Any) -> tuple[Figure, Any]:
+def panels(
+    rows: int, columns: int = 1, height: float = 1.5, width: float = WIDTH, **options: Any
+) -> tuple[Figure, Any]:
     """Return a figure and its axes, rows x columns as ``squeeze=False`` gives them; ``height`` in inches of a row."""
     from matplotlib.figure import Figure as Made
 
@@ -46,8 +48,14 @@ def intervals(axes: Axes, x: Any, entries: Any, name: str, colour: str, label: s
     below = [m - (m if f["low"] is None else f["low"]) for m, (_, f) in zip(middle, shown, strict=True)]
     above = [(m if f["high"] is None else f["high"]) - m for m, (_, f) in zip(middle, shown, strict=True)]
     style = {"marker": "o", "ms": 3.5, "lw": 1.2, "capsize": 2, "elinewidth": 0.9, **options}
-    axes.errorbar(at, middle, yerr=[[max(v, 0.0) for v in below], [max(v, 0.0) for v in above]], color=colour,
-                  label=label, **style)
+    axes.errorbar(
+        at,
+        middle,
+        yerr=[[max(v, 0.0) for v in below], [max(v, 0.0) for v in above]],
+        color=colour,
+        label=label,
+        **style,
+    )
 
 
 def legend(figure: Figure, axes: Axes, columns: int = 3) -> None:
