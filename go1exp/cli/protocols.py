@@ -39,12 +39,8 @@ def chosen(container: dict[str, Any], plain: dict[str, Any]) -> tuple[list[Chose
     protocols, grid = checked(container.get("protocol"))
     changed = [key for key in GRID_ONLY if not grid and key in plain and container.get(key) != plain[key]]
     if changed:
-        raise ConfigError(
-            [
-                f"{key} = {container[key]!r}: is of protocol=grid; others have keys of their own ({_example(key, protocols)})"
-                for key in changed
-            ]
-        )
+        rule = "is of protocol=grid; others have keys of their own"
+        raise ConfigError([f"{key} = {container[key]!r}: {rule} ({_example(key, protocols)})" for key in changed])
     return protocols, grid
 
 
@@ -60,8 +56,8 @@ def refuse(protocols: Sequence[Chosen], driver: Driver) -> None:
     """Refuse protocols that a driver cannot play; raise ConfigError."""
     problems = []
     for c in protocols:
-        if not c.protocol.velocities_fixed:
-            problems += driver.problems(c.protocol.trunk_velocity, f"protocol.{c.key}.trunk_velocity")
+        for key, velocity in c.protocol.seen().items():
+            problems += driver.problems(velocity, f"protocol.{c.key}.{key}")
     if problems:
         raise ConfigError(problems)
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from go1exp.protocol.stage import Motion, Stage
 
 Count = Annotated[int, Field(ge=1)]
+TrunkVelocity = Literal["exact", "estimated"]
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Protocol:
     robots: Count
     noise: bool
     randomize: bool
-    trunk_velocity: Literal["exact", "estimated"]
+    trunk_velocity: TrunkVelocity
     measures: tuple[Any, ...]
     claims: dict[str, Claim]
 
@@ -81,8 +82,6 @@ class Protocol:
     """Figures of a robot beside those that all protocols have."""
     always: ClassVar[tuple[str, ...]] = ()
     """Measures that it cannot do without."""
-    velocities_fixed: ClassVar[bool] = False
-    """Whether it says itself what the policy sees of the velocity."""
 
     def terms(self) -> list[Term]:
         """Return the measures; raise ConfigError naming those that do not exist."""
@@ -95,6 +94,10 @@ class Protocol:
         from go1exp.protocol.quantities import columns_of
 
         return (*LIFE, *self.own, *columns_of(self.terms(), robot.LEGS))
+
+    def seen(self) -> dict[str, TrunkVelocity]:
+        """Return what policies see of the trunk's velocity in it, by the key that says so."""
+        return {"trunk_velocity": self.trunk_velocity}
 
     def derived(self, rows: Sequence[Row]) -> list[Derived]:
         """Return the figures of all robots together."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,9 +19,8 @@ from go1exp.evaluate.estimated import TERM, EstimatedVelocity
 from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy
 from go1exp.export.trace import readings
+from go1exp.protocol.base import TrunkVelocity
 from go1exp.sim_robot.machine import noisy
-
-TrunkVelocity = Literal["exact", "estimated"]
 
 
 class Pilot(Protocol):

@@ -16,11 +16,11 @@ import pyarrow.parquet as pq
 
 from go1exp import __version__
 from go1exp.files import replacing, write_json, write_text
-from go1exp.measures.statistics import bootstrap_interval
+from go1exp.measures.statistics import Interval, bootstrap_interval
 from go1exp.protocol.base import Chosen, Played
 from go1exp.protocol.claims import Verdict, judged
 from go1exp.protocol.drivers import Driver, Progress
-from go1exp.protocol.quantities import Row, distinct, plain, resampled, summary
+from go1exp.protocol.quantities import Derived, Row, about, distinct, plain, resampled, summary
 from go1exp.protocol.stage import Setting, Stage
 
 
@@ -68,10 +68,10 @@ def play(
     chosen: Chosen,
     driver: Driver,
     rates: Rates,
-    about: dict[str, Any] | None = None,
+    origin: dict[str, Any] | None = None,
     on_step: Progress = lambda done, total: None,
 ) -> Result:
-    """Play a protocol and judge it."""
+    """Play a protocol and judge it; ``origin`` is what a report shall say beside that of the driver."""
     began, protocol = time.monotonic(), chosen.protocol
     setting = Setting(
         protocol.noise, protocol.randomize, protocol.trunk_velocity, rates.seed, rates.policy_dt, rates.physics_dt
@@ -83,7 +83,7 @@ def play(
     repeats, played.rows = len(played.rows) - len(rows), rows
     figures = summarised(chosen, rows)
     stage.finished()
-    told = {"driver": driver.about, "rates": dataclasses.asdict(rates), "go1exp": __version__, **(about or {})}
+    told = {"driver": driver.about, "rates": dataclasses.asdict(rates), "go1exp": __version__, **(origin or {})}
     verdicts = judged(protocol.claims, figures)
     return Result(chosen, driver.label, told, played, repeats, figures, verdicts, time.monotonic() - began)
 
@@ -92,12 +92,17 @@ def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return every figure of a protocol's rows with n and interval: by condition, then those of all robots together."""
     protocol = chosen.protocol
     entries = summary(rows, protocol.keys, protocol.columns())
-    n, some = resampled(rows)
     for derived in protocol.derived(rows):
-        interval = bootstrap_interval(lambda robots, derived=derived: derived.of(some(robots)), n)  # type: ignore[misc]
+        interval = thresholds(derived, rows)
         figures = {derived.name: plain(interval, derived.unit)}
-        entries.append({"condition": dict(derived.condition), "n": n, "figures": figures})
+        entries.append({"condition": dict(derived.condition), "n": interval.n, "figures": figures})
     return entries
+
+
+def thresholds(derived: Derived, rows: Sequence[Row]) -> Interval:
+    """Return a figure of all robots together with its interval."""
+    n, some = resampled(about(rows, derived.condition))
+    return bootstrap_interval(lambda robots: derived.of(some(robots)), n)
 
 
 def as_json(result: Result) -> dict[str, Any]:

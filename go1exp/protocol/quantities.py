@@ -89,6 +89,11 @@ def distinct(rows: Iterable[Row], keys: Sequence[str], random: bool) -> list[Row
     return kept
 
 
+def about(rows: Iterable[Row], condition: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of which a condition is true."""
+    return [row for row in rows if all(row.get(k) == v for k, v in condition.items())]
+
+
 def by_condition(rows: Iterable[Row], keys: Sequence[str]) -> dict[Condition, list[Row]]:
     """Return the rows of each condition, in the order in which those come."""
     found: dict[Condition, list[Row]] = {}

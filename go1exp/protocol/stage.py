@@ -21,8 +21,9 @@ from go1exp.evaluate.recorder import Recorder
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.measures.trace import Trace
+from go1exp.protocol.base import TrunkVelocity
 from go1exp.protocol.disturbances import Impulses, Kicker, heading
-from go1exp.protocol.drivers import Driver, Progress, TrunkVelocity
+from go1exp.protocol.drivers import Driver, Progress
 from go1exp.schema.registry import Entry, Term, members
 from go1exp.terrain import TerrainConfig
 
@@ -162,8 +163,11 @@ class Stage:
 
     def run(self, plan: Plan) -> Motion:
         """Play a plan from its first to its last step."""
-        session = Session(self, plan)
-        return session.run(len(plan.command))
+        return self.session(plan).run(len(plan.command))
+
+    def session(self, plan: Plan) -> Session:
+        """Return a plan's robots at the start, to be played piece by piece."""
+        return Session(self, plan)
 
     def task(self, plan: Plan) -> TaskConfig:
         """Return the environment of a plan."""

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from go1exp.protocol.kinds import corners, energy, gait, kicks, sinusoid
+from go1exp.protocol.kinds import corners, energy, gait, hardware, kicks, push_map, rate, sinusoid, terrain
 
-__all__ = ["corners", "energy", "gait", "kicks", "sinusoid"]
+__all__ = ["corners", "energy", "gait", "hardware", "kicks", "push_map", "rate", "sinusoid", "terrain"]

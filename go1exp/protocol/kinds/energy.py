@@ -86,10 +86,10 @@ class Energy(Steady):
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw the cost over speed, and torque over speed."""
-        cost = "Positive mechanical work, and all of it, over weight and way; commands straight ahead and back; 95 % intervals."
+        cost = "Positive mechanical work, and all of it, over weight and way; straight ahead and back; 95 % intervals."
         dots = (
-            "Dots: all robots and commands, drawn at random, and the 50 largest torques. Solid: peak torque and top speed. Dashed:"
-            " the motors' line from peak torque at rest to top speed, which is pessimistic."
+            "Dots: all robots and commands, drawn at random, and the 50 largest torques."
+            " Solid: peak torque and top speed. Dashed: the motors' line from peak torque at rest to top speed, which is pessimistic."
         )
         return [
             Drawing("cost", "Cost of transport over speed", cost, partial(_cost, {"": summary})),

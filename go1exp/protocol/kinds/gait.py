@@ -75,8 +75,10 @@ class Gait(Steady):
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw gait diagrams, phases on the circle, and figures over speed."""
         feet = played.curves["feet"]
-        diagram = f"Bars: a foot is on the ground; one robot that stays up, the last {SHOWN:g} s of each command (Hildebrand)."
-        circle = "Touchdown of each foot in FR's stride, one dot for each robot; up is 0, clockwise. A trot has FL and RR opposite of FR."
+        diagram = f"Bars: a foot is on the ground; one robot that stays up, the last {SHOWN:g} s (Hildebrand)."
+        circle = (
+            "Touchdowns in FR's stride, a dot for each robot; up is 0, clockwise. In a trot FL and RR are opposite."
+        )
         speed = "Commands straight ahead, with 95 % intervals over robots."
         return [
             Drawing("diagram", "Gait diagram", diagram, partial(_diagram, feet)),

@@ -129,7 +129,7 @@ class Kicks(Protocol):
     def _row(self, motion: Motion, n: int, k: int, of_robot: Row) -> Row:
         """Return what one kick did to one robot."""
         start = self.starts()[n, k]
-        begin, end = (int(round(s / motion.dt)) for s in (start, start + self.every_s))
+        begin, end = (round(float(s) / motion.dt) for s in (start, start + self.every_s))
         end = min(end, len(motion.t))
         alive = motion.alive[:end, n]
         row = {**of_robot, "impulse": float(self.impulses[k]), "robot": n, "up": bool(alive[-1])}
@@ -151,9 +151,9 @@ class Kicks(Protocol):
         return {**row, "recovered": back is not None, "recovery_s": back}
 
     def back(self, height: NDArray[Any], velocity: NDArray[Any], begin: int, rest: slice, dt: float) -> float | None:
-        """Return the time (s) after step ``begin`` from which height (T,) and velocity (T, 2) stay near those of ``rest``.
+        """Return the time (s) after step ``begin`` from which height (T,) and velocity (T, 2) stay near.
 
-        None if they do not for ``recovery.hold_s``.
+        Near their means over the steps ``rest``. None if they do not for ``recovery.hold_s``.
         """
         rule = self.recovery
         near = np.abs(_smooth(height, rule.smooth_s, dt) - height[rest].mean()) < rule.height
@@ -182,7 +182,7 @@ class Kicks(Protocol):
         return {**kept, "kicks": kicks, "nominal": float(motion.height[rest, n].mean()), "dt": motion.dt}
 
     def _after(self, motion: Motion, k: int) -> dict[str, Any]:
-        """Return height and lateral velocity around one kick, over the robots that are up before it, to the pushed side."""
+        """Return height, and velocity to the pushed side, around one kick, of the robots that are up before it."""
         starts, dt = self.starts()[:, k], motion.dt
         steps = np.arange(-round(1.0 / dt), round((self.every_s - 0.5) / dt))
         rows = np.round(starts / dt).astype(int)[None, :] + steps[:, None]
@@ -211,7 +211,7 @@ class Kicks(Protocol):
         run, around = played.curves["run"], played.curves["kicks"]
         rate = f"{1.0 / run['dt']:.0f} Hz"
         one = "One robot: height of the trunk, its nominal height before the first kick, speed; dotted: kicks."
-        every = "All robots up before a kick, at the time since it: median, 10th to 90th percentile; velocity to the side of the force."
+        every = "Robots up before a kick, by the time since it: median, 10th to 90th percentile."
         return [
             Drawing("run", f"Height and speed under kicks, at {rate}", one, partial(_run, run, 1)),
             Drawing(

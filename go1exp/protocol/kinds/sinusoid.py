@@ -103,8 +103,8 @@ class Sinusoid(Protocol):
             Drawing(
                 f"sine{k}",
                 f"Amplitude {name}",
-                "Black: commanded; blue: measured, thin of one robot, thick the mean of those still up, with the 10th to"
-                " 90th percentile; orange: error of the mean.",
+                "Black: commanded; blue: measured, thin of one robot, thick the mean of those still up with the 10th"
+                " to 90th percentile; orange: error of the mean.",
                 partial(_rows, curve),
             )
             for k, (name, curve) in enumerate(played.curves["sines"].items())

@@ -36,8 +36,9 @@ def page(result: Result) -> str:
             f"{count} rows, one for each robot in each condition"
             + (f"; {result.repeats} repeated another one bit for bit and do not count" if result.repeats else "")
             + f"; {result.seconds:.0f} s.",
-            "Figures: mean over robots with Student's 95 % interval; shares with Wilson's; falls per moving robot-minute"
-            " with Garwood's; thresholds by the bootstrap over robots. Square brackets: interval; n: robots with a value.",
+            "Figures: mean over robots with Student's 95 % interval; shares with Wilson's; falls per moving robot-"
+            "minute with Garwood's; thresholds by the bootstrap over robots. In brackets: interval; n: robots with a"
+            " value.",
         ],
         settings=json.dumps(settings, indent=1, default=str),
     )
