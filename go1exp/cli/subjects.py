@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from go1exp.cli import other_robot
 from go1exp.cli.runs import checkpoint_file, run_folder, shipped_policies, trained
@@ -57,6 +58,38 @@ def _bundle(bundle: str, file: str) -> Named:
     if not path.is_file():
         raise ConfigError([f"bundle = {bundle!r}: there is no such file; go1exp export writes one"])
     return Named(path.stem, Path(f"{path.stem}_{file}"), bundle=path)
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How a subject is played, where that differs from the protocol and from its training.
+
+    Attributes:
+        policy_dt: period of the policy, s; None keeps it.
+        trunk_velocity: what the policy sees of it; None keeps it.
+    """
+
+    policy_dt: float | None = None
+    trunk_velocity: Literal["exact", "estimated"] | None = None
+
+
+def varied(given: str, file: str) -> tuple[Named, Variation]:
+    """Return the subject of a word such as trot, trot@100hz, runs/NAME@estimated, trot@100hz@estimated.
+
+    Raises:
+        ConfigError: if it is not there, or is varied in a way that is not known.
+    """
+    name, *changes = given.split("@")
+    variation = Variation()
+    for change in changes:
+        rate = re.fullmatch(r"(\d+(?:\.\d+)?)hz", change)
+        if rate and 10.0 <= float(rate[1]) <= 1000.0:
+            variation = dataclasses.replace(variation, policy_dt=1.0 / float(rate[1]))
+        elif change == "exact" or change == "estimated":
+            variation = dataclasses.replace(variation, trunk_velocity=change)
+        else:
+            raise ConfigError([f"subjects: {given!r}: after @ comes a rate of 10 to 1000 hz, exact or estimated"])
+    return dataclasses.replace(word(name, file), label=given), variation
 
 
 def word(given: str, file: str) -> Named:

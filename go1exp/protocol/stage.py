@@ -48,6 +48,8 @@ class Plan:
         steer: turn the robots back into their lanes: yaw rate per rad of heading and per m beside the lane; None
             does not.
         trunk_velocity: what the policy sees of it; None keeps that of the stage.
+        finish: way along the world's x, m, after which a robot is done: when all are, or are down, it ends; None plays
+            all steps.
     """
 
     command: Array
@@ -59,6 +61,7 @@ class Plan:
     listen_from: int | None = None
     steer: tuple[float, float] | None = None
     trunk_velocity: TrunkVelocity | None = None
+    finish: float | None = None
 
     @property
     def robots(self) -> int:
@@ -272,7 +275,7 @@ class Session:
         dt, first = core.task.sim.policy_dt, self.step
         kept: dict[str, Any] = {name: np.zeros((steps, n)) for name in ("height", "way", "front_right")}
         kept |= {"velocity": np.zeros((steps, n, 3)), "alive": np.zeros((steps, n), bool)}
-        kept["command"] = np.zeros((steps, n, 3))
+        kept["command"], finished = np.zeros((steps, n, 3)), np.zeros(n, bool)
         for row in range(steps):
             kept["command"][row] = self._command.value.numpy()
             listening = self._recorder is not None and self.step >= (plan.listen_from or 0)
@@ -287,7 +290,13 @@ class Session:
             self._keep(kept, row)
             self.step += 1
             self._stage.count(n)
-        t = (first + 1 + np.arange(steps)) * dt
+            if plan.finish is not None and ((kept["way"][row] >= plan.finish) | ~self._alive | finished).all():
+                kept = {name: values[: row + 1] for name, values in kept.items()}
+                self._stage.count(n * (steps - row - 1))
+                break
+            if plan.finish is not None:
+                finished |= kept["way"][row] >= plan.finish
+        t = (first + 1 + np.arange(len(kept["way"]))) * dt
         trace = self._recorder.trace(slice(None)) if self._recorder else None
         return Motion(dt=dt, t=t, fell=self._fell.copy(), left_map=self._left.copy(), trace=trace, **kept)
 

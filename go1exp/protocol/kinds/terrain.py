@@ -92,7 +92,9 @@ class OnTerrain(Protocol):
                 t = stage.times(self.duration(speed))
                 command = np.tile(np.array([speed, 0.0, 0.0]), (len(t), len(levels) * self.robots, 1))
                 listen = 0 if self.terms() else None
-                plan = Plan(command, ground=lanes, friction=friction, steer=self.steer, listen_from=listen)
+                plan = Plan(
+                    command, ground=lanes, friction=friction, steer=self.steer, listen_from=listen, finish=goal()
+                )
                 motion = stage.run(plan)
                 those = self._rows(motion, name, speed, levels)
                 self.measure(motion, those)
