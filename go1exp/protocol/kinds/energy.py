@@ -89,7 +89,7 @@ class Energy(Steady):
         cost = "Positive mechanical work, and all of it, over weight and way; straight ahead and back; 95 % intervals."
         dots = (
             "Dots: all robots and commands, drawn at random, and the 50 largest torques."
-            " Solid: peak torque and top speed. Dashed: the motors' line from peak torque at rest to top speed, which is"
+            " Solid: peak torque and top speed. Dashed: the line from peak torque at rest to top speed, which is"
             " pessimistic."
         )
         return [
