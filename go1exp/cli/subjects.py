@@ -60,6 +60,9 @@ def _bundle(bundle: str, file: str) -> Named:
     return Named(path.stem, Path(f"{path.stem}_{file}"), bundle=path)
 
 
+VELOCITIES: dict[str, Literal["exact", "estimated"]] = {"exact": "exact", "estimated": "estimated"}
+
+
 @dataclass(frozen=True)
 class Variation:
     """How a subject is played, where that differs from the protocol and from its training.
@@ -85,8 +88,8 @@ def varied(given: str, file: str) -> tuple[Named, Variation]:
         rate = re.fullmatch(r"(\d+(?:\.\d+)?)hz", change)
         if rate and 10.0 <= float(rate[1]) <= 1000.0:
             variation = dataclasses.replace(variation, policy_dt=1.0 / float(rate[1]))
-        elif change == "exact" or change == "estimated":
-            variation = dataclasses.replace(variation, trunk_velocity=change)
+        elif change in VELOCITIES:
+            variation = dataclasses.replace(variation, trunk_velocity=VELOCITIES[change])
         else:
             raise ConfigError([f"subjects: {given!r}: after @ comes a rate of 10 to 1000 hz, exact or estimated"])
     return dataclasses.replace(word(name, file), label=given), variation

@@ -93,7 +93,8 @@ def judged(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) ->
         for entry in summary:
             figure = entry["figures"].get(claim.quantity)
             if figure is not None and all(entry["condition"].get(k) == v for k, v in claim.where.items()):
-                interval = Interval(*(_number(figure[k]) for k in ("estimate", "low", "high")), figure["n"])
+                estimate, low, high = (_number(figure[k]) for k in ("estimate", "low", "high"))
+                interval = Interval(estimate, low, high, figure["n"])
                 found.append(Verdict(name, verdict(interval, claim), claim, interval, entry["condition"], 0))
         if not found:
             nothing = Interval(math.nan, math.nan, math.nan, 0)

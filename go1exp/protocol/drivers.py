@@ -41,17 +41,19 @@ class Pilot(Protocol):
 
 
 class Driver(Protocol):
-    """Something that drives robots, before there are any.
+    """Something that drives robots, before there are any."""
 
-    Attributes:
-        label: name in reports.
-        task: the robot, rates and observations that it was made for.
-        about: plain data on its origin, for reports.
-    """
+    @property
+    def label(self) -> str:
+        """Name in reports."""
 
-    label: str
-    task: TaskConfig
-    about: dict[str, Any]
+    @property
+    def task(self) -> TaskConfig:
+        """The robot, rates and observations that it was made for."""
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Plain data on its origin, for reports."""
 
     def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:
         """Return why it cannot be played so, each beginning with the ``key`` that asks for it."""

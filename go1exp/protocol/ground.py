@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ WAVE_LENGTH = 1.0
 BOX = 0.45
 """Edge of a box, m (Isaac Lab)."""
 
-Field = NDArray[np.float64]
+Field = NDArray[Any]
 
 
 def _slope(x: Field, y: Field, difficulty: float, rng: np.random.Generator) -> Field:

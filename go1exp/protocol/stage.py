@@ -296,7 +296,7 @@ class Session:
                 break
             if plan.finish is not None:
                 finished |= kept["way"][row] >= plan.finish
-        t = (first + 1 + np.arange(len(kept["way"]))) * dt
+        t = np.asarray((first + 1 + np.arange(len(kept["way"]))) * dt, dtype=np.float64)
         trace = self._recorder.trace(slice(None)) if self._recorder else None
         return Motion(dt=dt, t=t, fell=self._fell.copy(), left_map=self._left.copy(), trace=trace, **kept)
 

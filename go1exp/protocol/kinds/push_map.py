@@ -91,7 +91,7 @@ class PushMap(Protocol):
         unkicked = session.run(len(t) - settle)
         robot = np.arange(self.count)
         direction, phase = robot // (self.phases * self.robots), robot // self.robots % self.phases
-        stride = [touchdowns(unkicked, n) for n in robot]
+        stride = [touchdowns(unkicked, n) for n in range(self.count)]
         start = np.array([a + (b - a) * phase[n] / self.phases for n, (a, b) in enumerate(stride)])
         angle = 2.0 * np.pi * direction / self.directions
 

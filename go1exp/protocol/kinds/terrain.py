@@ -67,7 +67,7 @@ class OnTerrain(Protocol):
             raise ValueError("\n".join(wrong))
 
     @property
-    def ladders(self) -> dict[str, tuple[float, ...]]:
+    def ladders(self) -> dict[GroundName, tuple[float, ...]]:
         """Return the grounds that are played."""
         return {name: levels for name, levels in self.grounds.items() if levels is not None}
 
@@ -104,7 +104,7 @@ class OnTerrain(Protocol):
     def _rows(self, motion: Motion, name: str, speed: float, levels: Sequence[float]) -> list[Row]:
         """Return a row for each robot: robot i walks lane i modulo the number of lanes."""
         there = (motion.way >= goal()) & motion.alive
-        passed, first = there.any(0), there.argmax(0)
+        passed, first = np.asarray(there.any(0)), np.asarray(there.argmax(0))
         rows = lives(motion)
         for n, row in enumerate(rows):
             row |= {"ground": name, "speed": float(speed), "difficulty": float(levels[n % len(levels)])}

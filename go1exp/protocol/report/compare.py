@@ -7,11 +7,11 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from go1exp.protocol.comparing import Difference
+from go1exp.protocol.comparing import Difference, Word
 from go1exp.protocol.playing import Result
 from go1exp.protocol.report.html import Table, condition_text, falls, interval_text, rendered
 
-ORDER = ("better", "worse", "not told apart")
+ORDER: tuple[Word, ...] = ("better", "worse", "not told apart")
 
 NOTES = (
     "The same protocol, seed and, robot by robot, the same draws for all. Differences are other less first, of robots"
