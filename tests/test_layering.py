@@ -289,11 +289,12 @@ def test_terms_are_registered_in_the_order_of_the_source() -> None:
     import go1exp.excitations
     import go1exp.importers
     import go1exp.measures
+    import go1exp.protocol.kinds
     import go1exp.record.policy  # noqa: F401  (registers every member)
 
     groups = registry.groups()
     expected = {"reward", "observation", "rand", "command", "event", "termination", "curriculum", "actuator"}
-    assert expected | {"effect", "excitation", "importer", "measure"} <= set(groups)
+    assert expected | {"effect", "excitation", "importer", "measure", "protocol"} <= set(groups)
     for name, file in RELATIVE.items():
         found = list(decorated(file))
         for group in {g for g, _ in found}:

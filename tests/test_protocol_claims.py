@@ -59,7 +59,7 @@ def test_a_claim_is_judged_by_its_worst_condition() -> None:
         row["error"] += 0.01 * (n % 5)
     entries = summary(rows, ("speed",), (Column("error", "m", "an error"),))
     everywhere = judged({"small": MOST}, entries)[0]
-    assert (everywhere.word, everywhere.condition, everywhere.of) == ("not reached", {"speed": 2.0}, 2)
+    assert (everywhere.word, everywhere.condition, everywhere.conditions) == ("not reached", {"speed": 2.0}, 2)
     where = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here", where={"speed": 1.0})
     assert judged({"small": where}, entries)[0].word == "reached"
     nowhere = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here", where={"speed": 7.0})

@@ -25,9 +25,11 @@ from go1exp.protocol.disturbances import Impulses
 from go1exp.protocol.drivers import PolicyDriver
 from go1exp.protocol.kinds.corners import step_answer
 from go1exp.protocol.kinds.push_map import largest_survived
-from go1exp.protocol.playing import Rates, Result, play, write
+from go1exp.protocol.playing import Rates, play
 from go1exp.protocol.quantities import FINGERPRINT, ROBOT
 from go1exp.protocol.report.compare import page as comparison
+from go1exp.protocol.report.writing import write
+from go1exp.protocol.result import Result
 from go1exp.protocol.stage import Plan, Setting, Stage, fitting_step
 from go1exp.schema.registry import ConfigError, members
 
@@ -108,7 +110,7 @@ def test_a_protocol_makes_rows_json_and_a_page(
     assert rows
     for row in rows:
         assert {*keys, ROBOT, "fell", "left_map", "moving_s", FINGERPRINT} <= row.keys()
-    assert {c.name for c in one.chosen.protocol.own} <= {k for row in rows for k in row} & columns
+    assert {c.name for c in one.chosen.protocol.robot_columns} <= {k for row in rows for k in row} & columns
     content = json.loads(json_file.read_text())  # NaN would not be JSON
     assert "NaN" not in json_file.read_text()
     for entry in content["summary"]:

@@ -12,7 +12,7 @@ from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.protocol.base import Chosen
-    from go1exp.protocol.playing import Result
+    from go1exp.protocol.result import Result
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -68,8 +68,8 @@ def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any])
     """Write page, JSON and rows, and print the verdicts."""
     from go1exp.files import write_json, write_text
     from go1exp.protocol import comparing
-    from go1exp.protocol.playing import as_json, finite, write_rows
     from go1exp.protocol.report.compare import page
+    from go1exp.protocol.result import as_json, finite, write_rows
 
     differences = {
         key: [d for r in results[1:] for d in comparing.compared(results[0], r)] for key, results in plays.items()
@@ -93,17 +93,17 @@ def lines(differences: dict[str, Any]) -> list[str]:
     """Return what a terminal shows: what is told apart, and how many figures are not."""
     from go1exp.protocol.report.html import condition_text, interval_text
 
-    found = []
+    text_lines = []
     for key, those in differences.items():
         for subject in dict.fromkeys(d.subject for d in those):
-            mine = [d for d in those if d.subject == subject]
-            told = [d for d in mine if d.word != "not told apart"]
-            found.append(f"{key}: {subject}: {len(told)} figures told apart, {len(mine) - len(told)} not")
-            for d in told:
+            of_subject = [d for d in those if d.subject == subject]
+            clear = [d for d in of_subject if d.word != "not told apart"]
+            text_lines.append(f"{key}: {subject}: {len(clear)} figures told apart, {len(of_subject) - len(clear)} not")
+            for d in clear:
                 change = interval_text(d.difference.estimate, d.difference.low, d.difference.high)
                 where = condition_text(d.condition)
-                found.append(f"  {d.word:7} {d.quantity} {d.first:.3g} -> {d.other:.3g}, {change} ({where})")
-    return found
+                text_lines.append(f"  {d.word:7} {d.quantity} {d.first:.3g} -> {d.other:.3g}, {change} ({where})")
+    return text_lines
 
 
 APP = App("compare", _task)

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from go1exp.cli.subjects import Named
     from go1exp.protocol.base import Chosen
     from go1exp.protocol.drivers import Driver
-    from go1exp.protocol.playing import Rates, Result
+    from go1exp.protocol.playing import Rates
+    from go1exp.protocol.result import Result
 
 GRID_ONLY = (
     *("grid", "episodes", "duration_s", "settle_s", "noise", "randomize", "push", "train_ground", "trunk_velocity"),
@@ -46,17 +47,19 @@ def chosen(container: dict[str, Any], plain: dict[str, Any]) -> tuple[list[Chose
 
 def _example(key: str, protocols: Sequence[Chosen]) -> str:
     first = protocols[0]
-    own = {"episodes": "robots", "grid": "claims", "out": ""}.get(key, key)
+    equivalent = {"episodes": "robots", "grid": "claims", "out": ""}.get(key, key)
     if key == "out":
         return "their folder is folder="
-    return f"protocol.{first.key}.{own}" if hasattr(first.protocol, own) else "go1exp eval --help protocol"
+    return (
+        f"protocol.{first.key}.{equivalent}" if hasattr(first.protocol, equivalent) else "go1exp eval --help protocol"
+    )
 
 
 def refuse(protocols: Sequence[Chosen], driver: Driver) -> None:
     """Refuse protocols that a driver cannot play; raise ConfigError."""
     problems = []
     for c in protocols:
-        for key, velocity in c.protocol.seen().items():
+        for key, velocity in c.protocol.policy_velocities().items():
             problems += driver.problems(velocity, f"protocol.{c.key}.{key}")
     if problems:
         raise ConfigError(problems)
@@ -66,7 +69,7 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
     """Play protocols one after the other, write what came of each, and print the verdicts."""
     from go1exp.cli.subjects import driver
     from go1exp.protocol.playing import play as played
-    from go1exp.protocol.playing import write
+    from go1exp.protocol.report.writing import write
 
     drives = driver(subject, other)
     refuse(protocols, drives)
@@ -83,9 +86,9 @@ def lines(result: Result) -> list[str]:
     from go1exp.protocol.claims import limits
     from go1exp.protocol.report.html import condition_text, falls, interval_text
 
-    found = [f"{result.chosen.key}: {result.label}, {result.seconds:.0f} s; {falls(result)}"]
+    text_lines = [f"{result.chosen.key}: {result.label}, {result.seconds:.0f} s; {falls(result)}"]
     for v in result.verdicts:
         value = interval_text(v.figure.estimate, v.figure.low, v.figure.high)
         where = condition_text(v.condition)
-        found.append(f"  {v.word:12} {v.claim.quantity} {value}, {limits(v.claim)}, n {v.figure.n} ({where})")
-    return [*found, *(f"  note: {note}" for note in result.played.notes)]
+        text_lines.append(f"  {v.word:12} {v.claim.quantity} {value}, {limits(v.claim)}, n {v.figure.n} ({where})")
+    return [*text_lines, *(f"  note: {note}" for note in result.played.notes)]

@@ -10,6 +10,7 @@ from pydantic import Field
 from go1exp.deploy.controller import Stages
 from go1exp.fit.settings import FitSettings
 from go1exp.gap.result import GapSettings
+from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
 from go1exp.schema import settings as schema
 from go1exp.schema.registry import NonNegative, Positive
@@ -93,32 +94,6 @@ class EvalSettings:
         """Check what concerns two settings."""
         if self.settle_s >= self.duration_s:
             raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
-
-
-@settings
-class CompareSettings:
-    """``conf/compare.yaml`` without the groups.
-
-    Attributes:
-        subjects: two or more, each a shipped policy, a run folder or a bundle (.zip); with @100hz at that rate, with
-            @estimated or @exact velocity. All others are compared with the first.
-        same_robot: all on the robot of the first: its drives, effects, contact, randomisation and falls; false takes
-            each one's own.
-        seed: seed of everything random, the same for all.
-        physics_dt: another physics step, s; null keeps that of training.
-        folder: for compare.html, compare.json and the rows.
-    """
-
-    subjects: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=2)]
-    same_robot: bool
-    seed: Annotated[int, Field(ge=0)]
-    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
-    folder: Annotated[str, Field(min_length=1)]
-
-    def __post_init__(self) -> None:
-        """Check what concerns two settings."""
-        if len(set(self.subjects)) < len(self.subjects):
-            raise ValueError(f"subjects = {list(self.subjects)}: each only once")
 
 
 @settings

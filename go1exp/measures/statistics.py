@@ -139,8 +139,8 @@ def logistic_fit(x: ArrayLike, success: ArrayLike) -> Logistic | None:
         return float(fit.sum() + 0.5 * ((values[1] - np.log(8.0)) / 2.0) ** 2)
 
     start = np.array([float(won.mean()), np.log(8.0)])
-    found = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
-    return Logistic(float(at.min() + span * found.x[0]), float(np.exp(found.x[1]) / span))
+    solution = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
+    return Logistic(float(at.min() + span * solution.x[0]), float(np.exp(solution.x[1]) / span))
 
 
 # ---------------------------------------------------------------------- pairs

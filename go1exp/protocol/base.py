@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, TypeAdapter, ValidationError
 
 from go1exp.protocol.claims import Claim
 from go1exp.protocol.quantities import FINGERPRINT, LIFE, Column, Derived, Row
+from go1exp.protocol.signals import TrunkVelocity
 from go1exp.schema.registry import ConfigError, Term, as_json, bind_list, explain, find, members, unknown_name
 from go1exp.schema.settings import settings
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from go1exp.protocol.stage import Motion, Stage
 
 Count = Annotated[int, Field(ge=1)]
-TrunkVelocity = Literal["exact", "estimated"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Protocol:
 
     keys: ClassVar[tuple[str, ...]] = ()
     """Columns that say the condition of a row."""
-    own: ClassVar[tuple[Column, ...]] = ()
+    robot_columns: ClassVar[tuple[Column, ...]] = ()
     """Figures of a robot beside those that all protocols have."""
     always: ClassVar[tuple[str, ...]] = ()
     """Measures that it cannot do without."""
@@ -93,9 +93,9 @@ class Protocol:
         from go1exp import robot
         from go1exp.protocol.quantities import columns_of
 
-        return (*LIFE, *self.own, *columns_of(self.terms(), robot.LEGS))
+        return (*LIFE, *self.robot_columns, *columns_of(self.terms(), robot.LEGS))
 
-    def seen(self) -> dict[str, TrunkVelocity]:
+    def policy_velocities(self) -> dict[str, TrunkVelocity]:
         """Return what policies see of the trunk's velocity in it, by the key that says so."""
         return {"trunk_velocity": self.trunk_velocity}
 
@@ -135,10 +135,10 @@ class Protocol:
 
 def lives(motion: Motion) -> list[Row]:
     """Return the columns that tell of each robot's life, one row for each."""
-    told = zip(motion.fell, motion.left_map, motion.moving_s, motion.fingerprint, strict=True)
+    lives_of_robots = zip(motion.fell, motion.left_map, motion.moving_s, motion.fingerprint, strict=True)
     return [
         {"fell": bool(fell), "left_map": bool(left), "moving_s": round(float(s), 4), FINGERPRINT: float(mark)}
-        for fell, left, s, mark in told
+        for fell, left, s, mark in lives_of_robots
     ]
 
 
@@ -165,17 +165,17 @@ def chosen(given: Any) -> tuple[list[Chosen], bool]:
     """
     if not isinstance(given, Mapping) or not given:
         raise ConfigError([f"protocol = {given!r}: choose at least one, such as protocol=sinusoid"])
-    found, problems = [], list[str]()
+    selected, problems = [], list[str]()
     for key, value in given.items():
         if key == GRID and value in ({}, None):
             continue
         try:
-            found.append(_one(str(key), value))
+            selected.append(_one(str(key), value))
         except ConfigError as error:
             problems += error.problems
     if problems:
         raise ConfigError(problems)
-    return found, GRID in given
+    return selected, GRID in given
 
 
 def _one(key: str, value: Any) -> Chosen:

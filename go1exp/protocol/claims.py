@@ -58,7 +58,7 @@ class Verdict:
     claim: Claim
     figure: Interval
     condition: Mapping[str, Any]
-    of: int
+    conditions: int
 
 
 def verdict(figure: Interval, claim: Claim) -> Word:
@@ -89,19 +89,19 @@ def judged(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) ->
     """Return a verdict on each claim: that of its worst condition (``quantities.summary``); not told if it has none."""
     verdicts = []
     for name, claim in claims.items():
-        found = []
+        candidates = []
         for entry in summary:
             figure = entry["figures"].get(claim.quantity)
             if figure is not None and all(entry["condition"].get(k) == v for k, v in claim.where.items()):
                 estimate, low, high = (_number(figure[k]) for k in ("estimate", "low", "high"))
                 interval = Interval(estimate, low, high, figure["n"])
-                found.append(Verdict(name, verdict(interval, claim), claim, interval, entry["condition"], 0))
-        if not found:
+                candidates.append(Verdict(name, verdict(interval, claim), claim, interval, entry["condition"], 0))
+        if not candidates:
             nothing = Interval(math.nan, math.nan, math.nan, 0)
             verdicts.append(Verdict(name, "not told", claim, nothing, claim.where, 0))
             continue
-        worst = min(found, key=lambda v: (ORDER.index(v.word), -_finite(_excess(v.figure.estimate, claim))))
-        verdicts.append(Verdict(name, worst.word, claim, worst.figure, worst.condition, len(found)))
+        worst = min(candidates, key=lambda v: (ORDER.index(v.word), -_finite(_excess(v.figure.estimate, claim))))
+        verdicts.append(Verdict(name, worst.word, claim, worst.figure, worst.condition, len(candidates)))
     return verdicts
 
 

@@ -17,8 +17,8 @@ from go1exp.measures.statistics import (
     paired_share_interval,
     pairs_needed,
 )
-from go1exp.protocol.playing import Result
 from go1exp.protocol.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
+from go1exp.protocol.result import Result
 
 Word = Literal["better", "worse", "not told apart"]
 
@@ -66,18 +66,18 @@ def compared(first: Result, other: Result) -> list[Difference]:
     """Return every figure with a better direction of ``other`` against ``first``, of the same protocol."""
     protocol = first.chosen.protocol
     columns = [c for c in protocol.columns() if c.better is not None and c.how != "phase"]
-    found = []
+    differences = []
     of_first, of_other = (by_condition(r.played.rows, protocol.keys) for r in (first, other))
     for condition in [c for c in of_first if c in of_other]:
         pairs = _pairs(of_first[condition], of_other[condition])
         named = dict(zip(protocol.keys, condition, strict=True))
         for column in columns:
             if pairs[0] and any(column.name in row for row in pairs[0]):
-                found.append(_difference(other.label, column, named, *pairs))
+                differences.append(_difference(other.label, column, named, *pairs))
     for a, b in zip(protocol.derived(first.played.rows), protocol.derived(other.played.rows), strict=True):
         if a.better is not None:
-            found.append(_of_all(other.label, a, b, first.played.rows, other.played.rows))
-    return found
+            differences.append(_of_all(other.label, a, b, first.played.rows, other.played.rows))
+    return differences
 
 
 def _pairs(first: Sequence[Row], other: Sequence[Row]) -> tuple[list[Row], list[Row]]:
@@ -95,10 +95,10 @@ def _difference(
     a, b = a[both], b[both]
     between = paired_share_interval(a, b) if column.how == "share" else paired_mean_interval(b - a, DRAWS)
     assert column.better is not None
-    told = word(between, column.better)
-    needed = pairs_needed(b - a) if told == "not told apart" else None
+    verdict = word(between, column.better)
+    needed = pairs_needed(b - a) if verdict == "not told apart" else None
     means = (float(a.mean()), float(b.mean())) if len(a) else (math.nan, math.nan)
-    return Difference(subject, column.name, column.unit, condition, *means, between, told, needed)
+    return Difference(subject, column.name, column.unit, condition, *means, between, verdict, needed)
 
 
 def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: Sequence[Row]) -> Difference:
@@ -106,18 +106,20 @@ def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: S
     groups = [by_condition(about(rows, a.condition), (ROBOT,)) for rows in (first, other)]
     robots = [key for key in groups[0] if key in groups[1]]
 
-    def drawn(which: int, some: NDArray[np.intp]) -> list[Row]:
-        return [row for k in some for row in groups[which][robots[k]]]
+    def drawn(which: int, sample: NDArray[np.intp]) -> list[Row]:
+        return [row for k in sample for row in groups[which][robots[k]]]
 
     everyone = np.arange(len(robots))
-    between = bootstrap_interval(lambda some: b.of(drawn(1, some)) - a.of(drawn(0, some)), len(robots), DRAWS // 5)
+    between = bootstrap_interval(
+        lambda sample: b.function(drawn(1, sample)) - a.function(drawn(0, sample)), len(robots), DRAWS // 5
+    )
     assert a.better is not None
-    told, needed = word(between, a.better), None
+    verdict, needed = word(between, a.better), None
     half = 0.5 * (between.high - between.low)
-    if told == "not told apart" and math.isfinite(half) and between.estimate:
+    if verdict == "not told apart" and math.isfinite(half) and between.estimate:
         needed = max(2, math.ceil(between.n * (half * POWER / between.estimate) ** 2))
-    pair = (a.of(drawn(0, everyone)), b.of(drawn(1, everyone))) if robots else (math.nan, math.nan)
-    return Difference(subject, a.name, a.unit, dict(a.condition), *pair, between, told, needed)
+    pair = (a.function(drawn(0, everyone)), b.function(drawn(1, everyone))) if robots else (math.nan, math.nan)
+    return Difference(subject, a.name, a.unit, dict(a.condition), *pair, between, verdict, needed)
 
 
 POWER = (1.96 + 0.842) / 1.96

@@ -56,7 +56,7 @@ class Kicker:
 
     def use(self, impulses: Impulses) -> None:
         """Take other kicks from now on."""
-        self._of = impulses
+        self._impulses = impulses
         self._count = max(1, round(impulses.duration / self._dt))
         shape = np.sin(np.pi * (np.arange(self._count) + 0.5) / self._count)
         self._share = shape / shape.sum() / self._dt  # their sum times the step is exactly 1
@@ -76,19 +76,19 @@ class Kicker:
 
     def _wrench(self) -> Tensor | None:
         """(N, 6) force in the world and torque in the trunk's frame of this step, None if there is none."""
-        of = self._of
-        step = np.round((self.time - of.start) / self._dt)
-        active = (step >= 0) & (step < self._count) & (of.size != 0.0)
+        impulses = self._impulses
+        step = np.round((self.time - impulses.start) / self._dt)
+        active = (step >= 0) & (step < self._count) & (impulses.size != 0.0)
         if not active.any():
             return None
         quat = self._state.base_quat_w
         now = heading(quat).numpy()[:, None]
-        self._angle = np.where(active & np.isnan(self._angle), now + of.direction, self._angle)
+        self._angle = np.where(active & np.isnan(self._angle), now + impulses.direction, self._angle)
         index = np.where(active, step, 0).astype(int)
-        size = np.where(active, of.size * self._share[index], 0.0)
+        size = np.where(active, impulses.size * self._share[index], 0.0)
         angle = np.nan_to_num(self._angle)
         planar = np.stack([(size * np.cos(angle)).sum(1), (size * np.sin(angle)).sum(1)], 1)
         force = torch.zeros(len(quat), 3, dtype=quat.dtype)
         force[:, :2] = torch.from_numpy(planar)
-        arm = torch.tensor(of.point, dtype=quat.dtype).expand(len(quat), 3)
+        arm = torch.tensor(impulses.point, dtype=quat.dtype).expand(len(quat), 3)
         return torch.cat([force, torch.linalg.cross(arm, rotate_inverse(quat, force))], 1)

@@ -19,7 +19,7 @@ from go1exp.evaluate.estimated import TERM, EstimatedVelocity
 from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy
 from go1exp.export.trace import readings
-from go1exp.protocol.base import TrunkVelocity
+from go1exp.protocol.signals import TrunkVelocity
 from go1exp.sim_robot.machine import noisy
 
 
@@ -89,24 +89,26 @@ class _PolicyPilot:
         # A policy that runs faster than it was trained sees its action of one training period ago.
         self._past = PastActions[Tensor](driver.task.sim.policy_dt, core.task.sim.policy_dt)
         self._columns = columns(core.task, "previous_action") if self._past.cycles > 1 else None
-        self._seen: Tensor | None = None
+        self._past_action: Tensor | None = None
 
     def __call__(self, observation: Tensor) -> Tensor:
         if self._columns is not None:
             observation = observation.clone()
-            observation[:, self._columns] = 0.0 if self._seen is None else self._seen
+            observation[:, self._columns] = 0.0 if self._past_action is None else self._past_action
         if self._filter is not None:
             observation = self._filter.put(observation)
         action = self._policy(observation)
         if self._columns is not None:
-            self._seen = self._past.after(action.clamp(-self._core.task.action.clip, self._core.task.action.clip))
+            self._past_action = self._past.after(
+                action.clamp(-self._core.task.action.clip, self._core.task.action.clip)
+            )
         return action
 
     def save(self) -> Any | None:
-        return None if self._filter else copy.deepcopy((self._past, self._seen))
+        return None if self._filter else copy.deepcopy((self._past, self._past_action))
 
     def load(self, state: Any) -> None:
-        self._past, self._seen = copy.deepcopy(state)
+        self._past, self._past_action = copy.deepcopy(state)
 
 
 @dataclass(frozen=True)
@@ -142,12 +144,12 @@ class _BundlePilot:
         self._bundle, self._core = driver.bundle, core
         self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
         self._past = PastActions[np.ndarray](driver.bundle.metadata.policy_dt, core.task.sim.policy_dt)
-        self._seen = np.zeros((core.num_envs, 12), np.float32)
+        self._past_action = np.zeros((core.num_envs, 12), np.float32)
         self._rng = np.random.default_rng([seed, 3])
 
     def __call__(self, observation: Tensor) -> Tensor:
         now = {name: values.numpy() for name, values in readings(self._core).items()}
-        now["previous_action"] = self._seen
+        now["previous_action"] = self._past_action
         if self._core.noise:
             zeros = {"acc": np.zeros((len(observation), 3)), "foot_force": np.zeros((len(observation), 4))}
             read = noisy({short: now[name] for name, short in NOISY.items()} | zeros, 1.0, self._rng)
@@ -155,14 +157,14 @@ class _BundlePilot:
         if self._filter is not None:
             now["base_lin_vel_b"] = self._filter.velocities().astype(np.float32)
         action = self._bundle.policy(now)["action"]
-        self._seen = self._past.after(action)
+        self._past_action = self._past.after(action)
         return torch.from_numpy(action)
 
     def save(self) -> Any | None:
-        return None if self._filter else copy.deepcopy((self._past, self._seen, self._rng))
+        return None if self._filter else copy.deepcopy((self._past, self._past_action, self._rng))
 
     def load(self, state: Any) -> None:
-        self._past, self._seen, self._rng = copy.deepcopy(state)
+        self._past, self._past_action, self._rng = copy.deepcopy(state)
 
 
 Progress = Callable[[int, int], None]

@@ -71,7 +71,7 @@ class Derived:
     meaning: str
     condition: Mapping[str, Any]
     better: Literal["lower", "higher"] | None
-    of: Callable[[Sequence[Row]], float]
+    function: Callable[[Sequence[Row]], float]
 
 
 def distinct(rows: Iterable[Row], keys: Sequence[str], random: bool) -> list[Row]:
@@ -79,12 +79,12 @@ def distinct(rows: Iterable[Row], keys: Sequence[str], random: bool) -> list[Row
 
     Where nothing is random all did the same, whatever the last bits of a batched matrix product say.
     """
-    seen: set[Any] = set()
+    known_marks: set[Any] = set()
     kept = []
     for row in rows:
         what = (*(row[k] for k in keys), row[FINGERPRINT] if random else None)
-        if what not in seen:
-            seen.add(what)
+        if what not in known_marks:
+            known_marks.add(what)
             kept.append(row)
     return kept
 
@@ -96,10 +96,10 @@ def about(rows: Iterable[Row], condition: Mapping[str, Any]) -> list[Row]:
 
 def by_condition(rows: Iterable[Row], keys: Sequence[str]) -> dict[Condition, list[Row]]:
     """Return the rows of each condition, in the order in which those come."""
-    found: dict[Condition, list[Row]] = {}
+    entries_so_far: dict[Condition, list[Row]] = {}
     for row in rows:
-        found.setdefault(tuple(row[k] for k in keys), []).append(row)
-    return found
+        entries_so_far.setdefault(tuple(row[k] for k in keys), []).append(row)
+    return entries_so_far
 
 
 def values(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
@@ -111,8 +111,8 @@ def figure(rows: Sequence[Row], column: Column) -> Interval:
     """Return the figure of one column."""
     each = values(rows, column.name)
     if column.how == "share":
-        told = each[np.isfinite(each)]
-        return share_interval(int(told.sum()), len(told))
+        known = each[np.isfinite(each)]
+        return share_interval(int(known.sum()), len(known))
     return (phase_interval if column.how == "phase" else mean_interval)(each)
 
 
@@ -154,7 +154,7 @@ BETTER: dict[str, Literal["lower", "higher"]] = {
 
 def columns_of(terms: Sequence[Term], legs: Sequence[str]) -> list[Column]:
     """Return the columns of measures, one for each foot where they have a value per foot; names have none."""
-    found = []
+    entries_so_far = []
     for term in terms:
         unit, doc = str(term.entry.traits["unit"]), term.entry.doc.removesuffix(".")
         if unit == "name":
@@ -162,8 +162,8 @@ def columns_of(terms: Sequence[Term], legs: Sequence[str]) -> list[Column]:
         unit = "" if unit == "-" else unit
         how: Literal["mean", "phase"] = "phase" if term.entry.traits.get("circular") else "mean"
         names = [f"{term.key}_{leg}" for leg in legs] if per_foot(term.entry) else [term.key]
-        found += [Column(name, unit, doc, how, BETTER.get(term.entry.name)) for name in names]
-    return found
+        entries_so_far += [Column(name, unit, doc, how, BETTER.get(term.entry.name)) for name in names]
+    return entries_so_far
 
 
 def add_measures(rows: Sequence[Row], measures: Mapping[str, Any], legs: Sequence[str]) -> None:

@@ -14,6 +14,9 @@ from go1exp.schema.settings import settings
 Velocity = tuple[float, float, float]
 """x and y in m/s, yaw rate in rad/s, body frame."""
 
+TrunkVelocity = Literal["exact", "estimated"]
+"""What a policy sees of the trunk's velocity."""
+
 
 @settings
 class Constant:
@@ -88,15 +91,15 @@ def phasors(values: ArrayLike, t: ArrayLike, period: float) -> NDArray[np.comple
     that a period need not be a whole number of samples. The first period is dropped: it has the start in it.
     """
     t, values = np.asarray(t, dtype=np.float64), np.asarray(values, dtype=np.float64)
-    omega, found = 2.0 * np.pi / period, []
+    omega, projections = 2.0 * np.pi / period, []
     whole = int(np.floor((t[-1] + (t[1] - t[0])) / period + 1e-6)) if len(t) > 1 else 0
     for k in range(1, whole):
         rows = (t >= k * period - 1e-9) & (t < (k + 1) * period - 1e-9)
         basis = np.column_stack([np.ones(rows.sum()), np.cos(omega * t[rows]), np.sin(omega * t[rows])])
         flat = values[rows].reshape(rows.sum(), -1)
         _, real, minus_imaginary = np.linalg.lstsq(basis, flat, rcond=None)[0]
-        found.append((real - 1j * minus_imaginary).reshape(values.shape[1:]))
-    return np.array(found, dtype=complex).reshape(len(found), *values.shape[1:])
+        projections.append((real - 1j * minus_imaginary).reshape(values.shape[1:]))
+    return np.array(projections, dtype=complex).reshape(len(projections), *values.shape[1:])
 
 
 def response(

@@ -21,9 +21,9 @@ from go1exp.evaluate.recorder import Recorder
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.measures.trace import Trace
-from go1exp.protocol.base import TrunkVelocity
 from go1exp.protocol.disturbances import Impulses, Kicker, heading
 from go1exp.protocol.drivers import Driver, Progress
+from go1exp.protocol.signals import TrunkVelocity
 from go1exp.schema.registry import Entry, Term, members
 from go1exp.terrain import TerrainConfig
 
@@ -250,8 +250,8 @@ class Session:
         pilot = self._pilot.save()
         if pilot is None:
             return None
-        own = [self.step, self._alive.copy(), self._fell.copy(), self._left.copy(), self._observation.clone()]
-        return self.core.state_dict(), pilot, own, self._kicker.time if self._kicker else 0.0
+        counters = [self.step, self._alive.copy(), self._fell.copy(), self._left.copy(), self._observation.clone()]
+        return self.core.state_dict(), pilot, counters, self._kicker.time if self._kicker else 0.0
 
     def load(self, state: Any | None, step: int) -> None:
         """Be back at ``step``, where ``save`` was called; without a state, by playing everything up to it again."""

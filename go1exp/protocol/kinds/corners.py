@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp.protocol.base import Drawing, Played
-from go1exp.protocol.kinds.steady import ERRORS, Steady, told
+from go1exp.protocol.kinds.steady import ERRORS, Steady, command_text
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.report import paint
 from go1exp.schema.registry import protocol
@@ -30,7 +30,7 @@ RISEN = 0.9
 class Corners(Steady):
     """Fastest, slowest and combined commands as steps from rest: what is reached, how quickly, errors, falls."""
 
-    own: ClassVar[tuple[Column, ...]] = (
+    robot_columns: ClassVar[tuple[Column, ...]] = (
         *ERRORS,
         Column("answer", "", "share of the command that is reached, along the command", better="higher"),
         Column("rise_s", "s", "time from the step until 90 % of what is reached", better="lower"),
@@ -50,18 +50,18 @@ class Corners(Steady):
 
     def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
         """Return the mean share of each command that is reached, over time."""
-        found = {}
+        shares = {}
         for k, command in enumerate(self.commands):
             robots, c = slice(k * self.robots, (k + 1) * self.robots), np.array(command)
             if not c.any():
                 continue
             along = np.where(motion.alive[:, robots], motion.velocity[:, robots] @ c / (c @ c), np.nan)
-            some = np.isfinite(along).any(1)
+            up_steps = np.isfinite(along).any(1)
             mean = np.full(len(along), np.nan)
-            mean[some] = np.nanmean(along[some], axis=1)
-            name = told(dict(zip(("x", "y", "yaw"), map(float, command), strict=True)))
-            found[name] = [None if np.isnan(v) else round(float(v), 4) for v in mean]
-        return {"t": [round(float(v), 4) for v in motion.t], "along": found}
+            mean[up_steps] = np.nanmean(along[up_steps], axis=1)
+            name = command_text(dict(zip(("x", "y", "yaw"), map(float, command), strict=True)))
+            shares[name] = [None if np.isnan(v) else round(float(v), 4) for v in mean]
+        return {"t": [round(float(v), 4) for v in motion.t], "along": shares}
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw what is reached, and the steps."""
@@ -115,7 +115,7 @@ def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
             ax.plot([low, high], [at, at], color=colour, lw=1.4)
             ax.plot([f["estimate"]], [at], "o", ms=4, color=colour, label=who if k == 0 else "")
     ax.axvline(1.0, color="#999999", lw=0.8)
-    ax.set_yticks(range(len(first)), [told(e["condition"]) for e in first], fontsize=7)
+    ax.set_yticks(range(len(first)), [command_text(e["condition"]) for e in first], fontsize=7)
     ax.invert_yaxis()
     ax.set_xlabel("share of the command")
     if len(summaries) > 1:

@@ -45,7 +45,7 @@ POWER = (
 class Energy(Steady):
     """Cost of transport, heat, power, saturation, and torque over speed inside the motors' envelope, over commands."""
 
-    own: ClassVar[tuple[Column, ...]] = (
+    robot_columns: ClassVar[tuple[Column, ...]] = (
         *ERRORS,
         Column("cost_of_transport_abs", "", "the cost with |tau qd|: what is braked is not won back", better="lower"),
         Column(
@@ -76,13 +76,13 @@ class Energy(Steady):
         trace = motion.trace
         assert trace is not None
         speed, torque = trace.need("joint_vel")[trace.counts], trace.need("joint_torque")[trace.counts]
-        rng, found = np.random.default_rng(0), {}
+        rng, dots = np.random.default_rng(0), {}
         for k, kind in enumerate(robot.JOINT_KINDS):
             both = np.stack([speed[:, k::3].ravel(), torque[:, k::3].ravel()], 1)
-            some = both[rng.permutation(len(both))[:POINTS]]
+            sample = both[rng.permutation(len(both))[:POINTS]]
             extremes = both[np.argsort(-np.abs(both[:, 1]))[:50]]
-            found[kind] = np.concatenate([some, extremes]).round(3).tolist()
-        return {"scatter": found}
+            dots[kind] = np.concatenate([sample, extremes]).round(3).tolist()
+        return {"scatter": dots}
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw the cost over speed, and torque over speed."""
@@ -113,10 +113,10 @@ def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:
         per_way = 1.0 / np.where(way >= 0.1, weight * way, np.nan)
     share = np.abs(torque) / robot.per_joint(robot.EFFORT_LIMIT)
     counted = np.where(trace.counts, power, np.nan)
-    some = trace.counts.any(0)
+    sample = trace.counts.any(0)
     high = {name: np.full(trace.robots, np.nan) for name in ("power_p99", "power_max")}
-    high["power_p99"][some] = np.nanpercentile(counted[:, some], 99.0, axis=0)
-    high["power_max"][some] = np.nanmax(counted[:, some], axis=0)
+    high["power_p99"][sample] = np.nanpercentile(counted[:, sample], 99.0, axis=0)
+    high["power_max"][sample] = np.nanmax(counted[:, sample], axis=0)
     return {
         "cost_of_transport_abs": mean_over(power, trace.moving) * per_way,
         "heat_per_way": mean_over((torque**2).sum(-1), trace.moving) * per_way,

@@ -12,7 +12,7 @@ from go1exp import robot
 from go1exp.measures.gait import touchdown_phase
 from go1exp.measures.runs import find_runs
 from go1exp.protocol.base import Drawing, Played
-from go1exp.protocol.kinds.steady import ERRORS, Steady, told
+from go1exp.protocol.kinds.steady import ERRORS, Steady, command_text
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.report import paint
 from go1exp.schema.registry import protocol
@@ -32,7 +32,7 @@ SHOWN = 1.5
 class Gait(Steady):
     """Phases, duty, stride rate, clearance, loads, impacts and slip of the feet, over commands; gait diagrams."""
 
-    own: ClassVar[tuple[Column, ...]] = (
+    robot_columns: ClassVar[tuple[Column, ...]] = (
         *ERRORS,
         Column("stride_length", "m", "way of the trunk in a stride"),
         Column("symmetry", "", "largest difference of duty between left and right, over their mean", better="lower"),
@@ -55,7 +55,7 @@ class Gait(Steady):
         """Return stances of the first robot of each command, and the phases of all."""
         trace = motion.trace
         assert trace is not None
-        phases, found = touchdown_phase(trace), {}
+        phases, feet = touchdown_phase(trace), {}
         samples = round(SHOWN / trace.contact_dt)
         for k, command in enumerate(self.commands):
             robots = slice(k * self.robots, (k + 1) * self.robots)
@@ -68,9 +68,9 @@ class Gait(Steady):
                 for c, a, b in zip(runs.column, runs.start, runs.stop, strict=True)
             ]
             phase = [[None if np.isnan(v) else round(float(v), 4) for v in row] for row in phases[robots]]
-            name = told(dict(zip(("x", "y", "yaw"), map(float, command), strict=True)))
-            found[name] = {"stances": stances, "phases": phase}
-        return {"feet": found}
+            name = command_text(dict(zip(("x", "y", "yaw"), map(float, command), strict=True)))
+            feet[name] = {"stances": stances, "phases": phase}
+        return {"feet": feet}
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw gait diagrams, phases on the circle, and figures over speed."""

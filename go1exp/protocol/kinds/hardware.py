@@ -37,7 +37,7 @@ class Hardware(Steady):
     delays_ms: Annotated[tuple[Annotated[float, Field(gt=0, le=LATEST_MS)], ...], Field(min_length=1)]
 
     keys: ClassVar[tuple[str, ...]] = (*AXES, "delay_ms")
-    own: ClassVar[tuple[Column, ...]] = (
+    robot_columns: ClassVar[tuple[Column, ...]] = (
         *ERRORS,
         Column("power_p99", "W", "sum over joints of |tau qd|, 99th percentile over steps", better="lower"),
         Column("power_max", "W", "the same, largest", better="lower"),
@@ -61,12 +61,12 @@ class Hardware(Steady):
             row["delay_ms"] = 0.0
         t = stage.times(self.duration_s)
         each = len(self.commands) * self.robots
-        told = np.repeat(np.array(self.commands), self.robots, axis=0)
-        command = np.tile(told, (len(t), len(self.delays_ms), 1)) * (t >= self.rest_s - 1e-9)[:, None, None]
+        velocities = np.repeat(np.array(self.commands), self.robots, axis=0)
+        command = np.tile(velocities, (len(t), len(self.delays_ms), 1)) * (t >= self.rest_s - 1e-9)[:, None, None]
         delay = np.repeat(np.array(self.delays_ms) * 1e-3, each)
         rows = lives(stage.run(Plan(command, delay=delay)))
         for n, row in enumerate(rows):
-            velocity = map(float, told[n % each])
+            velocity = map(float, velocities[n % each])
             row |= {**dict(zip(AXES, velocity, strict=True)), "robot": n % self.robots}
             row["delay_ms"] = float(self.delays_ms[n // each])
         played.rows += rows
@@ -109,8 +109,8 @@ def _margin(rows: Sequence[Row]) -> float:
     return held
 
 
-def _items(of: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
-    verdicts = [v for v in judged(of.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
+def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
+    verdicts = [v for v in judged(hardware.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
     figure, axes = paint.panels(1, height=0.5 + 0.26 * max(len(verdicts), 1))
     ax = axes[0, 0]
     tones = {"reached": "#00705a", "close": "#8a5a00", "not reached": "#a63f00", "not told": "#59616a"}

@@ -77,7 +77,7 @@ class Kicks(Protocol):
     recovery: Recovery
 
     keys: ClassVar[tuple[str, ...]] = ("impulse",)
-    own: ClassVar[tuple[Column, ...]] = (
+    robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("survived", "", "of those still up before this kick", "share", "higher"),
         Column("up", "", "still up after this kick, of all", "share", "higher"),
         Column(
@@ -191,20 +191,20 @@ class Kicks(Protocol):
         rows = np.minimum(rows, len(motion.t) - 1)
         alive = motion.alive[rows, robots][:, keep]
         sign = np.where(np.arange(self.robots) % 2, -1.0, 1.0)
-        found: dict[str, Any] = {
+        curves: dict[str, Any] = {
             "impulse": float(self.impulses[k]),
             "t": (steps * dt).round(4).tolist(),
             "n": int(keep.sum()),
         }
         for name, values in (("height", motion.height), ("speed", motion.velocity[..., 1] * sign)):
             each = np.where(alive, values[rows, robots][:, keep], np.nan)
-            some = np.isfinite(each).any(1)
+            up_steps = np.isfinite(each).any(1)
             bands = np.full((3, len(steps)), np.nan)
-            if some.any():
-                bands[0, some] = np.nanmedian(each[some], axis=1)
-                bands[1:, some] = np.nanpercentile(each[some], (10.0, 90.0), axis=1)
-            found[name] = [[None if np.isnan(x) else round(float(x), 4) for x in b] for b in bands]
-        return found
+            if up_steps.any():
+                bands[0, up_steps] = np.nanmedian(each[up_steps], axis=1)
+                bands[1:, up_steps] = np.nanpercentile(each[up_steps], (10.0, 90.0), axis=1)
+            curves[name] = [[None if np.isnan(x) else round(float(x), 4) for x in b] for b in bands]
+        return curves
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw the paper's figure, at the policy's rate and at 25 Hz, and what all robots did."""

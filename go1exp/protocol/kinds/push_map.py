@@ -59,7 +59,9 @@ class PushMap(Protocol):
     watch_s: Annotated[float, Field(ge=0.5)]
 
     keys: ClassVar[tuple[str, ...]] = ("direction_deg",)
-    own: ClassVar[tuple[Column, ...]] = (Column("impulse", "N s", "largest impulse that is survived", better="higher"),)
+    robot_columns: ClassVar[tuple[Column, ...]] = (
+        Column("impulse", "N s", "largest impulse that is survived", better="higher"),
+    )
 
     @property
     def count(self) -> int:
@@ -99,7 +101,7 @@ class PushMap(Protocol):
             kicks = Impulses(start[:, None], impulse[:, None], angle[:, None], self.push_s, self.point)
             return self._trial(session, state, settle, kicks, start, len(t) - settle)
 
-        found = largest_survived(survives, self.count, self.largest, self.halvings)
+        figures = largest_survived(survives, self.count, self.largest, self.halvings)
         rows = lives(walked)
         for n, row in enumerate(rows):
             up = bool(unkicked.alive[-1, n])
@@ -108,8 +110,8 @@ class PushMap(Protocol):
                 "robot": int(phase[n] * self.robots + n % self.robots),
             }
             row |= {"phase": float(phase[n] / self.phases), "fell": not up and not unkicked.left_map[n]}
-            row["impulse"] = float(found[n]) if up else None
-        censored = int((found >= self.largest).sum())
+            row["impulse"] = float(figures[n]) if up else None
+        censored = int((figures >= self.largest).sum())
         notes = [f"{censored} robots survived the largest impulse of {self.largest:g} N s: theirs may be larger."]
         return Played(rows, {}, notes if censored else [])
 
@@ -126,7 +128,7 @@ class PushMap(Protocol):
     def derived(self, rows: Sequence[Row]) -> list[Derived]:
         """Return median and 10th percentile of each direction, and the area within the medians."""
         angles = sorted({row["direction_deg"] for row in rows})
-        found = [
+        figures = [
             Derived(name, "N s", meaning, {"direction_deg": angle}, "higher", partial(_percentile, percent=percent))
             for angle in angles
             for name, percent, meaning in (
@@ -135,7 +137,7 @@ class PushMap(Protocol):
             )
         ]
         area = Derived("area", "(N s)^2", "area within the medians of all directions", {}, "higher", _area)
-        return [*found, area, Derived("weakest", "N s", "smallest median of all directions", {}, "higher", _weakest)]
+        return [*figures, area, Derived("weakest", "N s", "smallest median of all directions", {}, "higher", _weakest)]
 
     def derived_names(self) -> list[str]:
         """Return their names."""
@@ -212,8 +214,8 @@ def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     ax = axes[0, 0]
     for k, (who, summary) in enumerate(summaries.items()):
         for name, style in (("impulse_median", "-"), ("impulse_p10", ":")):
-            found = [(e["condition"]["direction_deg"], e["figures"][name]) for e in summary if name in e["figures"]]
-            shown = [(np.radians(a), f) for a, f in found if f["estimate"] is not None]
+            figures = [(e["condition"]["direction_deg"], e["figures"][name]) for e in summary if name in e["figures"]]
+            shown = [(np.radians(a), f) for a, f in figures if f["estimate"] is not None]
             if not shown or (style == ":" and len(summaries) > 1):
                 continue
             angle = np.array([a for a, _ in shown] + [shown[0][0] + 2 * np.pi])
@@ -240,11 +242,13 @@ def _phases(rows: Sequence[Row]) -> Figure:
     each = [values([r for r in rows if r["phase"] == p], "impulse") for p in phases]
     each = [e[np.isfinite(e)] for e in each]
     at = [p for p, e in zip(phases, each, strict=True) if len(e)]
-    some = [e for e in each if len(e)]
+    defined = [e for e in each if len(e)]
     ax = axes[0, 0]
-    if some:
-        paint.band(ax, at, [np.quantile(e, 0.1) for e in some], [np.quantile(e, 0.9) for e in some], paint.MEASURED)
-        ax.plot(at, [np.median(e) for e in some], "-o", ms=3.5, color=paint.MEASURED)
+    if defined:
+        paint.band(
+            ax, at, [np.quantile(e, 0.1) for e in defined], [np.quantile(e, 0.9) for e in defined], paint.MEASURED
+        )
+        ax.plot(at, [np.median(e) for e in defined], "-o", ms=3.5, color=paint.MEASURED)
     ax.set(xlabel="phase of FR (cycles)", ylabel="impulse (N s)")
     ax.set_ylim(bottom=0.0)
     return figure

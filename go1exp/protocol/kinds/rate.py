@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from go1exp.protocol.base import Drawing, Played, Protocol, TrunkVelocity, lives
+from go1exp.protocol.base import Drawing, Played, Protocol, lives
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
-from go1exp.protocol.signals import Signal
+from go1exp.protocol.signals import Signal, TrunkVelocity
 from go1exp.schema.registry import NonNegative, Positive, protocol
 from go1exp.schema.settings import settings
 
@@ -49,7 +49,7 @@ class Rate(Protocol):
     slower_faster: tuple[float, float]
 
     keys: ClassVar[tuple[str, ...]] = ("velocity", "rate_hz", "delay_ms")
-    own: ClassVar[tuple[Column, ...]] = (
+    robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("rmse_xy", "m/s", "root mean square error of the horizontal velocity, gait included", better="lower"),
         Column("rmse_yaw", "rad/s", "that of the yaw rate", better="lower"),
         Column("target_rate", "rad/s", "root mean square of the change of targets over time", better="lower"),
@@ -66,7 +66,7 @@ class Rate(Protocol):
         if wrong:
             raise ValueError("\n".join(wrong))
 
-    def seen(self) -> dict[str, TrunkVelocity]:
+    def policy_velocities(self) -> dict[str, TrunkVelocity]:
         """Return what policies see of the velocity."""
         return {"velocities": "estimated" if "estimated" in self.velocities else "exact"}
 
@@ -102,7 +102,7 @@ class Rate(Protocol):
             row |= {"velocity": velocity, "rate_hz": float(rate)}
             row |= {"delay_ms": float(self.delays_ms[n // self.robots]), "robot": n % self.robots}
             if not motion.alive[-1, n]:
-                row |= dict.fromkeys(c.name for c in self.own)
+                row |= dict.fromkeys(c.name for c in self.robot_columns)
                 continue
             change = np.diff(target[:, n].astype(np.float64), axis=0) / motion.dt
             row |= {"rmse_xy": _rms(np.linalg.norm(error[:, n, :2], axis=-1)), "rmse_yaw": _rms(error[:, n, 2])}

@@ -28,15 +28,15 @@ EVERY = 2
 
 
 def _columns() -> tuple[Column, ...]:
-    found = []
+    collected = []
     for axis, unit in zip(AXES, ("m/s", "m/s", "rad/s"), strict=True):
-        found += [
+        collected += [
             Column(f"gain_{axis}", "", f"amplitude of {axis} over that of its command"),
             Column(f"lag_{axis}", "s", f"time by which {axis} comes after its command", better="lower"),
             Column(f"coherence_{axis}", "", f"how alike the periods of {axis} are", better="higher"),
             Column(f"rmse_{axis}", unit, f"root mean square error of {axis}, gait included", better="lower"),
         ]
-    return tuple(found)
+    return tuple(collected)
 
 
 @protocol("sinusoid")
@@ -53,7 +53,7 @@ class Sinusoid(Protocol):
     ladder: Annotated[tuple[Sine, ...], Field(min_length=1)]
 
     keys: ClassVar[tuple[str, ...]] = ("amplitude", "period")
-    own: ClassVar[tuple[Column, ...]] = _columns()
+    robot_columns: ClassVar[tuple[Column, ...]] = _columns()
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
@@ -99,7 +99,7 @@ class Sinusoid(Protocol):
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw the paper's rows for each sine, and gain and lag over frequency."""
-        found = [
+        collected = [
             Drawing(
                 f"sine{k}",
                 f"Amplitude {name}",
@@ -110,7 +110,7 @@ class Sinusoid(Protocol):
             for k, (name, curve) in enumerate(played.curves["sines"].items())
         ]
         bode = "Gain and lag of each axis with 95 % intervals over robots; one line for each amplitude."
-        return [Drawing("bode", "Gain and lag over frequency", bode, partial(_bode, {"": summary})), *found]
+        return [Drawing("bode", "Gain and lag over frequency", bode, partial(_bode, {"": summary})), *collected]
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw gain and lag of all subjects."""

@@ -65,8 +65,8 @@ class Steady(Protocol):
         rows = lives(motion)
         error = _error(motion, settle)
         for n, row in enumerate(rows):
-            told = self.commands[n // self.robots]
-            row |= {**dict(zip(AXES, map(float, told), strict=True)), "robot": n % self.robots}
+            velocity = self.commands[n // self.robots]
+            row |= {**dict(zip(AXES, map(float, velocity), strict=True)), "robot": n % self.robots}
             row |= {
                 f"rmse_{axis}": float(v) if np.isfinite(v) else None for axis, v in zip(AXES, error[n], strict=True)
             }
@@ -90,6 +90,6 @@ def _error(motion: Motion, settle: int) -> np.ndarray:
     return np.sqrt(np.divide(square, count, out=np.full(square.shape, np.nan), where=count > 0))
 
 
-def told(condition: Mapping[str, Any]) -> str:
+def command_text(condition: Mapping[str, Any]) -> str:
     """Write a command of one or more axes, such as x 0.5, yaw 1."""
     return ", ".join(f"{axis} {condition[axis]:g}" for axis in AXES if condition[axis]) or "stand"

@@ -47,7 +47,7 @@ class OnTerrain(Protocol):
     ground_seed: Annotated[int, Field(ge=0)]
 
     keys: ClassVar[tuple[str, ...]] = ("ground", "speed", "difficulty")
-    own: ClassVar[tuple[Column, ...]] = (
+    robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("passed", "", "came to the end of its lane in time, without a fall", "share", "higher"),
         Column(
             "speed_kept", "", "mean speed along the lane over the commanded one, of those that passed", better="higher"
@@ -103,8 +103,8 @@ class OnTerrain(Protocol):
 
     def _rows(self, motion: Motion, name: str, speed: float, levels: Sequence[float]) -> list[Row]:
         """Return a row for each robot: robot i walks lane i modulo the number of lanes."""
-        there = (motion.way >= goal()) & motion.alive
-        passed, first = np.asarray(there.any(0)), np.asarray(there.argmax(0))
+        arrived = (motion.way >= goal()) & motion.alive
+        passed, first = np.asarray(arrived.any(0)), np.asarray(arrived.argmax(0))
         rows = lives(motion)
         for n, row in enumerate(rows):
             row |= {"ground": name, "speed": float(speed), "difficulty": float(levels[n % len(levels)])}
@@ -116,15 +116,15 @@ class OnTerrain(Protocol):
 
     def derived(self, rows: Sequence[Row]) -> list[Derived]:
         """Return where half and where 95 % succeed, of each ground and speed."""
-        found = []
+        figures = []
         for name, levels in self.ladders.items():
             for speed in self.speeds:
                 for key, share in SHARES.items():
                     text = f"difficulty that {share:.0%} pass, at the ladder's end where all or none do"
-                    of = partial(_where, share=share, top=float(levels[-1]))
+                    function = partial(_where, share=share, top=float(levels[-1]))
                     condition = {"ground": name, "speed": float(speed)}
-                    found.append(Derived(key, UNITS[name], text, condition, "higher", of))
-        return found
+                    figures.append(Derived(key, UNITS[name], text, condition, "higher", function))
+        return figures
 
     def derived_names(self) -> list[str]:
         """Return their names."""

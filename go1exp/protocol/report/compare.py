@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from go1exp.protocol.comparing import Difference, Word
-from go1exp.protocol.playing import Result
 from go1exp.protocol.report.html import Table, condition_text, falls, interval_text, rendered
+from go1exp.protocol.result import Result
 
 ORDER: tuple[Word, ...] = ("better", "worse", "not told apart")
 

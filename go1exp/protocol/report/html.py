@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from go1exp.gap.report.svg import draw
 from go1exp.protocol.base import Drawing, Protocol
 from go1exp.protocol.claims import limits
-from go1exp.protocol.playing import Result
+from go1exp.protocol.result import Result
 
 Table = dict[str, Any]
 
@@ -68,15 +68,15 @@ def falls(result: Result) -> str:
 
 def meanings(protocol: Protocol) -> dict[str, tuple[str, str]]:
     """Return the unit and the meaning of each figure by its name."""
-    found = {c.name: (c.unit, c.meaning) for c in protocol.columns()}
-    return {**found, "falls_per_minute": ("1/min", "falls per moving robot-minute")}
+    units = {c.name: (c.unit, c.meaning) for c in protocol.columns()}
+    return {**units, "falls_per_minute": ("1/min", "falls per moving robot-minute")}
 
 
 def claims_table(result: Result) -> Table:
     """Return the verdicts as a table."""
     rows = []
     for v in result.verdicts:
-        where = condition_text(v.condition) + (f" (worst of {v.of})" if v.of > 1 else "")
+        where = condition_text(v.condition) + (f" (worst of {v.conditions})" if v.conditions > 1 else "")
         value = interval_text(v.figure.estimate, v.figure.low, v.figure.high)
         name = v.name.replace("_", " ")
         rows.append(
