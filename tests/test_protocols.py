@@ -32,6 +32,7 @@ from go1exp.protocol.report.writing import write
 from go1exp.protocol.result import Result
 from go1exp.protocol.stage import Plan, Setting, Stage, fitting_step
 from go1exp.schema.registry import ConfigError, members
+from tests.test_every_key_acts import unread
 
 SMALL = {
     "sinusoid": ("robots=2", "duration_s=0.8", "ladder=[{amplitude:[0.5,0.3,0.5],period:0.4}]", "claims={}"),
@@ -136,6 +137,17 @@ def test_a_subject_is_not_told_apart_from_itself(name: str, driver: PolicyDriver
     assert {d.word for d in differences} == {"not told apart"}
     assert all(d.difference.estimate == 0.0 or math.isnan(d.difference.estimate) for d in differences)
     assert "not told apart" in comparison({name: [one, again]}, {name: differences}, {})
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_key_of_a_protocol_is_read(name: str, driver: PolicyDriver) -> None:
+    def work() -> None:
+        one = play(small(name), driver, Rates(seed=1))
+        one.chosen.protocol.drawings(one.played, one.summary)
+
+    kind: Any = members("protocol")[name].target
+    velocity = [f"{kind.__name__}.trunk_velocity"] if name == "rate" else []  # it has velocities in its place
+    assert [key for key in unread([kind], work) if key not in velocity] == []
 
 
 def test_robots_of_the_nominal_protocol_count_once(driver: PolicyDriver) -> None:

@@ -27,12 +27,13 @@ def _protocols(settings: Any, protocols: list[Any], other: dict[str, Any]) -> No
     """Play what is not the grid."""
     from go1exp.cli.protocols import play
     from go1exp.cli.subjects import named
-    from go1exp.protocol.playing import Rates
 
     subject = named(settings.run, settings.policy, settings.bundle, settings.checkpoint, "protocols")
     folder = Path(settings.folder or subject.folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {str(folder)!r}: is a file"])
+    from go1exp.protocol.playing import Rates
+
     play(protocols, subject, folder, other, Rates(settings.seed, settings.policy_dt, settings.physics_dt))
 
 
@@ -51,6 +52,8 @@ def _task(container: dict[str, Any]) -> None:
         _protocols(settings, protocols, other)
     if not grid_too:
         return
+    if settings.folder is not None and not protocols:
+        raise ConfigError([f"folder = {settings.folder!r}: is of other protocols; the file of protocol=grid is out="])
     if settings.bundle is not None:
         raise ConfigError([f"bundle = {settings.bundle!r}: protocol=grid takes run or policy; choose another protocol"])
     run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
