@@ -75,6 +75,14 @@ def test_falls_are_counted_per_moving_minute() -> None:
     assert figures["fell"]["low"] == pytest.approx(known.low, rel=1e-5)
 
 
+def test_what_is_not_defined_of_a_robot_does_not_count() -> None:
+    """A robot that was down before has no fall of its own, and is not in the share."""
+    rows = [{"a": 1, "robot": n, "fell": None if n > 9 else n < 3, "moving_s": 30.0 * (n <= 9)} for n in range(20)]
+    figures = summary(rows, ("a",), (FELL, MOVING))[0]["figures"]
+    assert (figures["fell"]["n"], figures["fell"]["estimate"]) == (10, pytest.approx(0.3))
+    assert figures["falls_per_minute"]["estimate"] == pytest.approx(3 / 5.0)
+
+
 def test_only_robots_that_did_the_same_are_repeats() -> None:
     rows = [{"a": a, "robot": n, FINGERPRINT: mark} for a in (1, 2) for n, mark in enumerate((0.5, 0.7, 0.5))]
     assert [(r["a"], r["robot"]) for r in distinct(rows, ("a",), True)] == [(1, 0), (1, 1), (2, 0), (2, 1)]

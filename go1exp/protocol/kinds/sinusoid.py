@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 AXES = ("x", "y", "yaw")
 
-EVERY = 2
-"""Of the steps this one is kept for drawings."""
+EVERY = 4
+"""Of so many steps one is kept for drawings."""
 
 
 def _columns() -> tuple[Column, ...]:
