@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 
 import go1exp.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.cli import compare, evaluate, subjects
+from go1exp.cli.helptext import show
 from go1exp.cli.plugins import begin
 from go1exp.compose import compose
 from go1exp.config import parse_train
@@ -22,9 +24,11 @@ from go1exp.train import run_folder, trainer
 from tests.small_run import SMALL
 from tests.test_cli import assert_refused
 
-QUICK = ("protocol=corners", "protocol.corners.robots=2", "protocol.corners.duration_s=0.3")
-QUICK += ("protocol.corners.settle_s=0.2", "protocol.corners.rest_s=0.1", "protocol.corners.claims={}")
-QUICK += ("protocol.corners.commands=[[0.5,0.0,0.0]]",)
+QUICK = (
+    *("protocol=corners", "protocol.corners.robots=2", "protocol.corners.duration_s=0.3"),
+    *("protocol.corners.settle_s=0.2", "protocol.corners.rest_s=0.1", "protocol.corners.claims={}"),
+    "protocol.corners.commands=[[0.5,0.0,0.0]]",
+)
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +120,13 @@ def test_seed_and_rates_act_on_every_protocol(run: Path, tmp_path: Path) -> None
 def test_results_lie_in_the_run_folder_unless_the_user_says(run: Path) -> None:
     evaluate.APP.task(begin("eval", compose("eval", [*QUICK, f"run={run}"])))
     assert (run / "protocols" / "corners.html").is_file()
+
+
+def test_the_help_says_what_the_keys_of_a_protocol_are(capsys: pytest.CaptureFixture[str]) -> None:
+    show("eval", "go1exp eval", ["protocol", "protocol=kicks"])
+    shown = capsys.readouterr().out
+    assert re.search(r"protocol\.kicks\.robots=200 +robots of each condition", shown)
+    assert re.search(r"protocol\.kicks\.recovery\.height=0\.015\s+largest difference", shown)
 
 
 # ---------------------------------------------------------------------- comparisons

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -176,6 +176,13 @@ def chosen(given: Any) -> tuple[list[Chosen], bool]:
     if problems:
         raise ConfigError(problems)
     return selected, GRID in given
+
+
+def kinds(given: Mapping[str, Any]) -> dict[str, type]:
+    """Return the classes of the protocols of a configuration by their keys there, for the help."""
+    names = {key: value.get("term", key) if isinstance(value, Mapping) else key for key, value in given.items()}
+    known = members("protocol")
+    return {key: cast(type, known[name].target) for key, name in names.items() if name in known}
 
 
 def _one(key: str, value: Any) -> Chosen:

@@ -123,7 +123,9 @@ def summary(rows: Sequence[Row], keys: Sequence[str], columns: Sequence[Column])
         figures = {c.name: plain(figure(those, c), c.unit) for c in columns if any(c.name in row for row in those)}
         if FELL.name in figures and MOVING.name in figures:
             minutes = float(np.nansum(values(those, MOVING.name))) / 60.0
-            figures["falls_per_minute"] = plain(rate_interval(int(np.nansum(values(those, FELL.name))), minutes), "1/min")
+            figures["falls_per_minute"] = plain(
+                rate_interval(int(np.nansum(values(those, FELL.name))), minutes), "1/min"
+            )
         entries.append({"condition": dict(zip(keys, condition, strict=True)), "n": len(those), "figures": figures})
     return entries
 
