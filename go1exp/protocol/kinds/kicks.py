@@ -283,7 +283,9 @@ def _success(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     for w, (who, summary) in enumerate(summaries.items()):
         at = [e["condition"]["impulse"] * (1.0 + 0.01 * w) for e in summary]
         for k, (name, text) in enumerate(names if len(summaries) == 1 else names[1:2]):
-            paint.intervals(ax, at, summary, name, paint.COLOURS[w + k], f"{who}: {text}" if who else text)
+            paint.intervals(
+                ax, [x * 1.015**k for x in at], summary, name, paint.COLOURS[w + k], f"{who}: {text}" if who else text
+            )
     ax.set(xlabel="impulse (N s)", ylabel="share of robots", ylim=(-0.03, 1.03))
     paint.legend(figure, ax, columns=2)
     return figure

@@ -87,10 +87,14 @@ def claims_table(result: Result) -> Table:
     return {"title": "Claims", "note": note, "header": header, "rows": rows}
 
 
-def figure_tables(entries: Sequence[Mapping[str, Any]], units: Mapping[str, tuple[str, str]]) -> list[Table]:
-    """Return the figures, a table for each set of conditions: one row for each figure, one column for each condition.
+ACROSS = 4
+"""Most columns of figures in a table, so that it fits on paper."""
 
-    Conditions that are many become rows instead.
+
+def figure_tables(entries: Sequence[Mapping[str, Any]], units: Mapping[str, tuple[str, str]]) -> list[Table]:
+    """Return the figures in tables, by what their conditions are made of.
+
+    A row is a figure and a column a condition; where conditions are many, the other way round.
     """
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     for entry in entries:
@@ -98,16 +102,29 @@ def figure_tables(entries: Sequence[Mapping[str, Any]], units: Mapping[str, tupl
     tables = []
     for keys, those in groups.items():
         names = list(dict.fromkeys(name for e in those for name in e["figures"]))
+        labels = [_named(name, units, those) for name in names]
+        where = [condition_text(e["condition"]) for e in those]
+        cells = [[_cell(e["figures"].get(name)) for e in those] for name in names]
         title = "Figures by " + ", ".join(k for k in keys if k != "*") if keys != ("*",) else "Figures of all"
-        if len(names) > 1 and len(those) <= 8:
-            header = ["figure", *(condition_text(e["condition"]) for e in those)]
-            rows: list[list[Any]] = [
-                [_named(name, units, those), *(_cell(e["figures"].get(name)) for e in those)] for name in names
-            ]
+        if len(those) <= MANY and len(names) > 1:
+            tables += _split(title, "figure", labels, where, cells)
         else:
-            header = ["condition", *(_named(name, units, those) for name in names)]
-            rows = [[condition_text(e["condition"]), *(_cell(e["figures"].get(name)) for name in names)] for e in those]
-        tables.append({"title": title, "note": "", "header": header, "rows": rows})
+            tables += _split(title, "condition", where, labels, [list(column) for column in zip(*cells, strict=True)])
+    return tables
+
+
+MANY = 8
+"""More conditions than these are rows."""
+
+
+def _split(title: str, corner: str, rows: Sequence[str], columns: Sequence[str], cells: Any) -> list[Table]:
+    """Return tables of at most ``ACROSS`` columns beside the first."""
+    tables = []
+    for k in range(0, len(columns), ACROSS):
+        part = slice(k, k + ACROSS)
+        lines = [[row, *line[part]] for row, line in zip(rows, cells, strict=True)]
+        header = [corner, *columns[part]]
+        tables.append({"title": title if not k else f"{title}, continued", "note": "", "header": header, "rows": lines})
     return tables
 
 
