@@ -25,12 +25,13 @@ from go1exp.protocol.disturbances import Impulses
 from go1exp.protocol.drivers import PolicyDriver
 from go1exp.protocol.kinds.corners import step_answer
 from go1exp.protocol.kinds.push_map import largest_survived
+from go1exp.protocol.plan import Plan
 from go1exp.protocol.playing import Rates, play
 from go1exp.protocol.quantities import FINGERPRINT, ROBOT
 from go1exp.protocol.report.compare import page as comparison
 from go1exp.protocol.report.writing import write
 from go1exp.protocol.result import Result
-from go1exp.protocol.stage import Plan, Setting, Stage, fitting_step
+from go1exp.protocol.stage import Setting, Stage, fitting_step
 from go1exp.schema.registry import ConfigError, members
 from tests.test_every_key_acts import unread
 

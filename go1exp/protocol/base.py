@@ -17,7 +17,8 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion, Stage
+    from go1exp.protocol.plan import Motion
+    from go1exp.protocol.stage import Stage
 
 Count = Annotated[int, Field(ge=1)]
 

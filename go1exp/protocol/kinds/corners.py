@@ -19,7 +19,7 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion
+    from go1exp.protocol.plan import Motion
 
 RISEN = 0.9
 """Share of the reached velocity at which a step counts as risen."""

@@ -23,7 +23,7 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion
+    from go1exp.protocol.plan import Motion
 
 SATURATED = 0.99
 """Share of the peak torque from which on a drive counts as saturated."""

@@ -21,7 +21,7 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion
+    from go1exp.protocol.plan import Motion
 
 SHOWN = 1.5
 """Time of the gait diagram, s."""

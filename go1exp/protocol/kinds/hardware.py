@@ -22,7 +22,8 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion, Stage
+    from go1exp.protocol.plan import Motion
+    from go1exp.protocol.stage import Stage
 
 
 @protocol("hardware")
@@ -54,7 +55,7 @@ class Hardware(Steady):
 
     def play(self, stage: Stage) -> Played:
         """Play the commands as they are, and all of them again with late targets, for falls alone."""
-        from go1exp.protocol.stage import Plan
+        from go1exp.protocol.plan import Plan
 
         played = Steady.play(self, stage)
         for row in played.rows:

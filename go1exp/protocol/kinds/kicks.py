@@ -20,7 +20,8 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion, Stage
+    from go1exp.protocol.plan import Motion
+    from go1exp.protocol.stage import Stage
 
 COARSE = 0.04
 """Period of the paper's plot, 25 Hz, s."""
@@ -111,7 +112,7 @@ class Kicks(Protocol):
     def play(self, stage: Stage) -> Played:
         """Kick all robots, odd ones from the other side."""
         from go1exp.protocol.disturbances import Impulses
-        from go1exp.protocol.stage import Plan
+        from go1exp.protocol.plan import Plan
 
         t = stage.times(self.duration_s)
         side = np.where(np.arange(self.robots) % 2, np.pi, 0.0) + np.radians(self.direction_deg)

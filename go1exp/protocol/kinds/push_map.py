@@ -20,7 +20,8 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion, Session, Stage
+    from go1exp.protocol.plan import Motion
+    from go1exp.protocol.stage import Session, Stage
 
 Array = NDArray[np.float64]
 
@@ -81,7 +82,7 @@ class PushMap(Protocol):
     def play(self, stage: Stage) -> Played:
         """Let all walk once; from where they are then, kick them again and again, each in its own phase."""
         from go1exp.protocol.disturbances import Impulses
-        from go1exp.protocol.stage import Plan
+        from go1exp.protocol.plan import Plan
 
         t = stage.times(self.settle_s + self._look_s + self.watch_s)
         command = np.repeat(self.command.at(t)[:, None], self.count, 1)

@@ -19,7 +19,8 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion, Stage
+    from go1exp.protocol.plan import Motion
+    from go1exp.protocol.stage import Stage
 
 LATEST_MS = 60.0
 """What the effect ``command_delay`` allows."""
@@ -77,7 +78,7 @@ class Rate(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Play each rate with each velocity, all delays as one batch."""
-        from go1exp.protocol.stage import Plan
+        from go1exp.protocol.plan import Plan
 
         rows: list[Row] = []
         delay = np.repeat(np.array(self.delays_ms) * 1e-3, self.robots)

@@ -19,7 +19,8 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion, Stage
+    from go1exp.protocol.plan import Motion
+    from go1exp.protocol.stage import Stage
 
 AXES = ("x", "y", "yaw")
 
@@ -67,7 +68,7 @@ class Sinusoid(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Play all sines as one batch: the robots of one are neighbours."""
-        from go1exp.protocol.stage import Plan
+        from go1exp.protocol.plan import Plan
 
         t = stage.times(self.duration_s)
         command = np.concatenate([np.repeat(s.at(t)[:, None], self.robots, 1) for s in self.ladder], 1)

@@ -15,7 +15,8 @@ from go1exp.schema.registry import NonNegative, Positive
 from go1exp.schema.settings import settings
 
 if TYPE_CHECKING:
-    from go1exp.protocol.stage import Motion, Stage
+    from go1exp.protocol.plan import Motion
+    from go1exp.protocol.stage import Stage
 
 AXES = ("x", "y", "yaw")
 
@@ -55,7 +56,7 @@ class Steady(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Play all commands as one batch."""
-        from go1exp.protocol.stage import Plan
+        from go1exp.protocol.plan import Plan
 
         t = stage.times(self.duration_s)
         signals = [Constant(velocity=c, rest=self.rest_s).at(t) for c in self.commands]

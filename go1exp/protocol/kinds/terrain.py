@@ -20,7 +20,8 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from go1exp.protocol.stage import Motion, Stage
+    from go1exp.protocol.plan import Motion
+    from go1exp.protocol.stage import Stage
 
 SHARES = {"at_half": 0.5, "at_95": 0.95}
 
@@ -82,7 +83,7 @@ class OnTerrain(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Play each ground at each speed, all difficulties as one batch."""
-        from go1exp.protocol.stage import Plan
+        from go1exp.protocol.plan import Plan
 
         rows: list[Row] = []
         for name, levels in self.ladders.items():
