@@ -40,7 +40,6 @@ def _protocols(settings: Any, protocols: list[Any], other: dict[str, Any]) -> No
 def _task(container: dict[str, Any]) -> None:
     from go1exp.choices import config_folder, load
     from go1exp.cli.protocols import chosen as protocols_chosen
-    from go1exp.cli.runs import checkpoint_file, trained
     from go1exp.cli.settings import EvalSettings, parse
 
     other, container = other_robot.split(container)
@@ -48,21 +47,33 @@ def _task(container: dict[str, Any]) -> None:
     settings = parse(EvalSettings, container)
     protocols, grid_too = protocols_chosen({**container, **choice}, load(config_folder() / "eval.yaml"))
     measures = _measures(settings.measures)
+    if not protocols and settings.folder is not None:
+        raise ConfigError([f"folder = {settings.folder!r}: is of other protocols; the file of protocol=grid is out="])
+    files = _files_of_grid(settings) if grid_too else None
     if protocols:
         _protocols(settings, protocols, other)
-    if not grid_too:
-        return
-    if settings.folder is not None and not protocols:
-        raise ConfigError([f"folder = {settings.folder!r}: is of other protocols; the file of protocol=grid is out="])
+    if files:
+        _grid(settings, measures, other, *files)
+
+
+def _files_of_grid(settings: Any) -> tuple[Path, Path | None, Path]:
+    """Return run, checkpoint and report of the grid; raise ConfigError if they are not there, or if it is none."""
+    from go1exp.cli.runs import checkpoint_file, trained
+
     if settings.bundle is not None:
         raise ConfigError([f"bundle = {settings.bundle!r}: protocol=grid takes run or policy; choose another protocol"])
     run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
     checkpoint = checkpoint_file(run, settings.checkpoint)
-
     grid_is_empty = not all((settings.grid.x, settings.grid.y, settings.grid.yaw))
     if settings.grid.cross and grid_is_empty:
         raise ConfigError(["grid: with cross=true every axis needs at least one value, such as grid.yaw=[0.0]"])
+    return run, checkpoint, out
 
+
+def _grid(
+    settings: Any, measures: list[Term], other: dict[str, Any], run: Path, checkpoint: Path | None, out: Path
+) -> None:
+    """Play the grid of constant commands."""
     from go1exp.evaluate import table
     from go1exp.evaluate.bars import judged
     from go1exp.evaluate.delay_margin import delay_margin
