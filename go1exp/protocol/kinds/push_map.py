@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 LONGEST_STRIDE = 0.6
 """Time after the start in which two touchdowns of FR are looked for, twice, s."""
 
+LEAST_SWING = 0.05
+"""s."""
+
 GUESS = 0.36
 """Stride of a robot that shows none, s."""
 
@@ -179,9 +182,11 @@ def largest_survived(
 def touchdowns(motion: Motion, n: int) -> tuple[float, float]:
     """Return the times of the first two touchdowns of robot ``n``'s foot FR, s; guesses where it has none."""
     on = motion.front_right[:, n]
-    landed = np.flatnonzero((on[1:] > 0) & (on[1:] < motion.dt + 1e-9) & (on[:-1] <= motion.dt)) + 1
+    steps = max(1, round(LEAST_SWING / motion.dt))
+    # Shorter times in the air are bounces and no swings.
+    in_air = np.convolve(on == 0.0, np.ones(steps), "full")[: len(on)] > steps - 0.5
+    landed = 1 + np.flatnonzero((on[1:] > 0.0) & in_air[:-1])
     times = motion.t[landed] - on[landed]
-    times = times[np.append(True, np.diff(times) > 0.1)] if len(times) else times  # bounces are no strides
     first = float(times[0]) if len(times) else float(motion.t[0])
     if first > motion.t[0] + LONGEST_STRIDE:
         first = float(motion.t[0])
