@@ -336,6 +336,14 @@ def test_a_robot_comes_back_when_it_does(driver: PolicyDriver) -> None:
         ("rate protocol.rate.slower_faster=[50.0,75.0]", "rates_hz has no 75"),
         ("corners protocol.corners.settle_s=9.0", "settle_s = 9.0: must lie between"),
         ("terrain protocol.terrain.grounds.waves=[0.2,0.1]", "grounds.waves = [0.2, 0.1]: must rise"),
+        ("kicks protocol.kicks.impulses=[5.0,6.0,5.0]", "protocol.kicks.impulses: has 5.0 twice"),
+        ("rate protocol.rate.delays_ms=[5.0,5.0]", "protocol.rate.delays_ms: has 5.0 twice"),
+        (
+            "gait protocol.gait.commands=[[1.0,0.0,0.0],[1.0,0.0,0.0]]",
+            "protocol.gait.commands: has (1.0, 0.0, 0.0) twice",
+        ),
+        ("hardware protocol.hardware.delays_ms=[20.0,10.0]", "delays_ms = [20.0, 10.0]: must rise"),
+        ("hardware protocol.hardware.settle_s=9.0", "settle_s = 9.0: must lie between"),
         ("kicks +protocol.nothing={}", "protocol.nothing: unknown protocol 'nothing'"),
     ],
 )

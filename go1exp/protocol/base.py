@@ -134,6 +134,12 @@ class Protocol:
             add_measures(rows, measured(motion.trace, self.terms()), robot.LEGS)
 
 
+def repeated(name: str, values: Sequence[Any]) -> list[str]:
+    """Return a complaint about a setting that has a value twice: its robots would be one condition."""
+    twice = [v for k, v in enumerate(values) if v in values[:k]]
+    return [f"{name}: has {twice[0]} twice"] if twice else []
+
+
 def lives(motion: Motion) -> list[Row]:
     """Return the columns that tell of each robot's life, one row for each."""
     lives_of_robots = zip(motion.fell, motion.left_map, motion.moving_s, motion.fingerprint, strict=True)

@@ -49,6 +49,12 @@ class Hardware(Steady):
         *("touchdown_speed_p95", "peak_force_p95"),
     )
 
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        Steady.__post_init__(self)
+        if sorted(set(self.delays_ms)) != list(self.delays_ms):
+            raise ValueError(f"delays_ms = {list(self.delays_ms)}: must rise")
+
     def steps(self, stage: Stage) -> float:
         """Return policy steps times robots."""
         return Steady.steps(self, stage) * (1 + len(self.delays_ms))

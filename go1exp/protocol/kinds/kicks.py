@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from go1exp.protocol.base import Drawing, Played, Protocol, lives
+from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.report import paint
 from go1exp.protocol.signals import Signal
@@ -94,6 +94,11 @@ class Kicks(Protocol):
         Column("peak_speed", "m/s", "largest change of the horizontal velocity, falls left out"),
         Column("peak_speed_25hz", "m/s", "the same of samples at 25 Hz"),
     )
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if wrong := repeated("impulses", self.impulses):
+            raise ValueError(wrong[0])
 
     @property
     def duration_s(self) -> float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from go1exp.protocol.base import Drawing, Played, Protocol, lives
+from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
 from go1exp.protocol.signals import Signal, TrunkVelocity
@@ -59,7 +59,8 @@ class Rate(Protocol):
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
-        wrong = []
+        wrong = repeated("rates_hz", self.rates_hz) + repeated("delays_ms", self.delays_ms)
+        wrong += repeated("velocities", self.velocities)
         if self.settle_s >= self.duration_s:
             wrong.append(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
         if missing := [r for r in self.slower_faster if r not in self.rates_hz]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from go1exp.protocol.base import Drawing, Played, Protocol, lives
+from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.report import paint
 from go1exp.protocol.signals import Sine, response
@@ -61,6 +61,8 @@ class Sinusoid(Protocol):
         longest = max(sine.period for sine in self.ladder)
         if self.duration_s < 2.0 * longest:
             raise ValueError(f"duration_s = {self.duration_s}: must be at least two periods, {2 * longest:g}")
+        if wrong := repeated("ladder", [f"{label(sine)} at {sine.period:g} s" for sine in self.ladder]):
+            raise ValueError(wrong[0])
 
     def steps(self, stage: Stage) -> float:
         """Return policy steps times robots."""

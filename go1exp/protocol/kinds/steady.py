@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from go1exp.protocol.base import Played, Protocol, lives
+from go1exp.protocol.base import Played, Protocol, lives, repeated
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.signals import Constant, Velocity
 from go1exp.schema.registry import NonNegative, Positive
@@ -49,6 +49,8 @@ class Steady(Protocol):
         if not self.rest_s <= self.settle_s < self.duration_s:
             order = f"rest_s = {self.rest_s} and duration_s = {self.duration_s}"
             raise ValueError(f"settle_s = {self.settle_s}: must lie between {order}")
+        if wrong := repeated("commands", self.commands):
+            raise ValueError(wrong[0])
 
     def steps(self, stage: Stage) -> float:
         """Return policy steps times robots."""

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from go1exp.measures.statistics import Logistic, logistic_fit
-from go1exp.protocol.base import Drawing, Played, Protocol, lives
+from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.protocol.ground import UNITS, GroundName, Lanes, goal
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
@@ -62,6 +62,7 @@ class OnTerrain(Protocol):
             for name, levels in self.ladders.items()
             if sorted(set(levels)) != list(levels)
         ]
+        wrong += repeated("speeds", self.speeds)
         if not self.ladders:
             wrong = ["grounds: at least one is needed"]
         if wrong:
