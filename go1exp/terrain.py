@@ -108,6 +108,10 @@ class TerrainConfig:
         """Shares of columns with boxes, bumps, ramps and without relief."""
         return self.boxes_proportion, self.bumps_proportion, self.ramps_proportion, self.flat_proportion
 
+    def build(self) -> Terrain:
+        """Build the ground; a subclass may build another kind."""
+        return _build(self)
+
     def difficulty(self, row: int) -> float:
         """Return the difficulty of a row, 0 (easiest) to 1."""
         return row / (self.rows - 1) if self.rows > 1 else 0.0
@@ -166,6 +170,11 @@ class Terrain:
 
 def build_terrain(config: TerrainConfig) -> Terrain:
     """Build the ground that `config` describes; the same config gives the same heights."""
+    return config.build()
+
+
+def _build(config: TerrainConfig) -> Terrain:
+    """Build a plane or a field of tiles."""
     if config.kind == "flat":
         return Terrain(np.zeros((2, 2)), -0.5, -0.5, 1.0, np.zeros((1, 1, 3)), ("flat",), config)
 
@@ -176,7 +185,7 @@ def build_terrain(config: TerrainConfig) -> Terrain:
         for col, tile_type in enumerate(types):
             j, i = edge + col * tile, edge + row * tile
             heights[j : j + tile + 1, i : i + tile + 1] = _tile(config, tile_type, row, col)
-    heights = _as_stored(heights)
+    heights = as_stored(heights)
 
     x0, y0 = (-0.5 * (n - 1) * config.resolution for n in heights.shape[::-1])
     origins = np.zeros((config.rows, config.cols, 3))
@@ -244,7 +253,7 @@ def _unit_bumps(config: TerrainConfig, size: int, rng: np.random.Generator) -> F
     return erf(noise / math.sqrt(2.0 * np.mean(noise**2)))
 
 
-def _as_stored(heights: FloatArray) -> FloatArray:
+def as_stored(heights: FloatArray) -> FloatArray:
     """Round heights to what MuJoCo keeps, which is float32 in 0..1 times the span; exact zeros stay exact zeros.
 
     The change is at most half a float32 step of the span (6e-8 m for 2 m); without it contacts and `height_at` would

@@ -18,6 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import go1exp.importers
+import go1exp.protocol.kinds
 import go1exp.record.policy  # noqa: F401  (registers every importer and excitation)
 from go1exp import cli, data_root
 from go1exp.cli import listing, settings
@@ -30,6 +31,7 @@ from go1exp.compose import compose, hydra_for
 from go1exp.config import TrainConfig, parse_parts, parse_train
 from go1exp.env.core import Go1Core
 from go1exp.gap.robots.description import parse_model
+from go1exp.protocol.base import chosen
 from go1exp.schema import plugins, registry
 from go1exp.schema.registry import Term
 from tests.test_extending import files as files_of_extending
@@ -375,8 +377,10 @@ def parse(verb: str, container: dict[str, Any]) -> None:
     own = {f.name for f in fields(VERBS[verb])}
     checked: Any = settings.parse(VERBS[verb], {k: v for k, v in container.items() if k in own})
     others = container.keys() - own
-    assert others <= {*RIG, *CHOICES, "engine", "excitation", "model"}
-    problems = parse_parts(container, tuple(others - {"excitation", "model"}))[1]
+    assert others <= {*RIG, *CHOICES, "engine", "excitation", "model", "protocol"}
+    problems = parse_parts(container, tuple(others - {"excitation", "model", "protocol"}))[1]
+    if "protocol" in others:
+        chosen(container["protocol"])
     if "model" in others:
         parse_model(container["model"])
     if "excitation" in others:

@@ -62,6 +62,8 @@ Trace = Generator[tuple[str, Any], None, None]
 Two traces are run in turns: while one waits, it has changed nothing that the other could see.
 """
 
+COMPARE = ("subjects", "same_robot", "seed", "physics_dt", "folder", "plugins", "hydra")
+
 EXEMPT = {
     "backend/cpu.yaml:backend.name": "the other engine is an extra: tests/contracts/test_backends.py",
     "engine/mujoco.yaml:engine": "backend/cpu.yaml has the same keys; tests/test_physx.py shows the other engine",
@@ -74,6 +76,12 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     "deploy.yaml:hydra": "Hydra's own settings",
+    **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},
+    **{f"eval.yaml:{key}": "not of the grid: tests/test_protocol_commands.py" for key in ("bundle", "folder")},
+    **{
+        f"protocol/{file.stem}.yaml:protocol": "tests/test_protocols.py shows that each key is read"
+        for file in (CONF / "protocol").glob("*.yaml")
+    },
     **{
         f"{verb}.yaml:plugins": "tests/test_plugins.py shows what it does"
         for verb in (
@@ -394,7 +402,7 @@ def parse(program: str, container: dict[str, Any]) -> Any:
 
 
 SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
-    "eval": (settings.EvalSettings, ("engine",)),
+    "eval": (settings.EvalSettings, ("engine", "protocol")),
     "play": (settings.PlaySettings, ("engine",)),
     "record": (settings.RecordSettings, (*RIG, "excitation")),
     "record_audit": (settings.AuditSettings, ()),

@@ -22,7 +22,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
 
 FOREIGN = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra")
-OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "export", "sim_robot", "bench", "cli")
+OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "export", "sim_robot", "bench", "protocol", "cli")
 
 
 def up(*but: str) -> tuple[str, ...]:
@@ -121,6 +121,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "sim_robot/settings.py": (*FOREIGN, "torch", "go1exp.config", *up("sim_robot")),
     "evaluate/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
+    "protocol/": ("mujoco", "hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
 }
 """File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""
 
@@ -296,11 +297,12 @@ def test_terms_are_registered_in_the_order_of_the_source() -> None:
     import go1exp.excitations
     import go1exp.importers
     import go1exp.measures
+    import go1exp.protocol.kinds
     import go1exp.record.policy  # noqa: F401  (registers every member)
 
     groups = registry.groups()
     expected = {"reward", "observation", "rand", "command", "event", "termination", "curriculum", "actuator"}
-    assert expected | {"effect", "excitation", "importer", "measure"} <= set(groups)
+    assert expected | {"effect", "excitation", "importer", "measure", "protocol"} <= set(groups)
     for name, file in RELATIVE.items():
         found = list(decorated(file))
         for group in {g for g, _ in found}:

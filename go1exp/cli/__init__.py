@@ -12,6 +12,7 @@ import sys
 from types import FrameType
 
 from go1exp import signals
+from go1exp.cli.verbs import LISTS as LISTS
 from go1exp.cli.verbs import MODULES as MODULES
 from go1exp.cli.verbs import ONE_BLAS_THREAD as ONE_BLAS_THREAD
 from go1exp.cli.verbs import POSITIONAL as POSITIONAL
@@ -110,8 +111,8 @@ def _by_name(verb: str, arguments: list[str]) -> list[str]:
             words.append(word)
     named = []
     for key in keys:
-        if key == "files" and words:
-            return [*options, *settings, f"files=[{','.join(quoted(w) for w in words)}]"]
+        if key in LISTS and words:
+            return [*options, *settings, f"{key}=[{','.join(quoted(w) for w in words)}]"]
         if words:
             named.append(f"{key}={quoted(words.pop(0))}")
     return [*options, *settings, *named, *words]

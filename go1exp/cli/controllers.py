@@ -37,13 +37,35 @@ def conditions(run: str | None, policy: str | None, file: str, out: str | None) 
 
     The task is that of the run or the shipped policy that is named, else that of ``CONDITIONS``.
     """
+    return task_of(robot_of(run, policy)), place(run, policy, file, out)
+
+
+def robot_of(run: str | None, policy: str | None) -> Path:
+    """Return the folder of the run whose robot another controller moves.
+
+    Raises:
+        ConfigError: if there is no such run or policy.
+    """
     from go1exp.cli.runs import trained
+
+    named = run is not None or policy is not None
+    return trained(run, policy if named else CONDITIONS, "", None)[0]
+
+
+def place(run: str | None, policy: str | None, file: str, out: str | None) -> Path:
+    """Return where results go: ``out``, or ``mpc_FILE`` here."""
+    from go1exp.cli.runs import trained
+
+    named = run is not None or policy is not None
+    return trained(run, policy if named else CONDITIONS, file, out)[1] if out else Path(f"mpc_{file}")
+
+
+def task_of(run: Path) -> TaskConfig:
+    """Return the task of a run folder."""
     from go1exp.config import parse_train
     from go1exp.train import run_folder
 
-    named = run is not None or policy is not None
-    folder, place = trained(run, policy if named else CONDITIONS, file, out)
-    return parse_train(run_folder.read_config(folder)).task, place if out else Path(f"mpc_{file}")
+    return parse_train(run_folder.read_config(run)).task
 
 
 def maker(settings: MpcSettings, task: TaskConfig) -> Callable[[], Controller]:

@@ -118,6 +118,11 @@ def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
         return lines(by_name[group][settings["name"]], f"{group}.")
     if group in SECTIONS:
         return lines(SECTIONS[group], f"{group}.")
+    if group == "protocol":
+        import go1exp.protocol.kinds  # noqa: F401  (registers them)
+        from go1exp.protocol.base import kinds
+
+        return {k: v for key, kind in kinds(settings).items() for k, v in lines(kind, f"{group}.{key}.").items()}
     terms = members(REGISTERED_AS.get(group, group))
     if group in ONE_TERM:
         return {f"{group}.term": terms[settings["term"]].doc}

@@ -15,6 +15,7 @@ def _task(container: dict[str, Any]) -> None:
     import go1exp.excitations
     import go1exp.importers
     import go1exp.measures
+    import go1exp.protocol.kinds
     import go1exp.record.policy  # noqa: F401  (registers every member)
     from go1exp.cli.settings import ListSettings, parse
     from go1exp.schema import plugins, registry

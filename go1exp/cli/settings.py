@@ -10,6 +10,7 @@ from pydantic import Field
 from go1exp.deploy.controller import Stages
 from go1exp.fit.settings import FitSettings
 from go1exp.gap.result import GapSettings
+from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
 from go1exp.schema import settings as schema
 from go1exp.schema.registry import NonNegative, Positive
@@ -47,6 +48,7 @@ class EvalSettings:
         controller: what moves the robots: policy, the one of run or policy, or mpc.
         run: run folder to judge; or give policy.
         policy: name of a policy that comes with the package, such as paper, in place of run.
+        bundle: file that go1exp export wrote, in place of run; not for protocol=grid.
         checkpoint: file of the run; null takes the newest.
         grid: commanded velocities.
         episodes: episodes of each command, all at once.
@@ -64,11 +66,14 @@ class EvalSettings:
         delay_margin: also run the grid with targets 10, 20, 30 and 40 ms late, until a robot falls.
         seed: seed of everything random.
         out: JSON file; null writes eval.json in the run folder (of a shipped policy paper_eval.json here).
+        folder: for the files of other protocols than the grid; null takes protocols in the run folder (of a shipped
+            policy paper_protocols here).
     """
 
     controller: Any = None
     run: RunFolder | None
     policy: str | None
+    bundle: str | None
     checkpoint: str | None
     grid: Grid
     episodes: Count
@@ -85,6 +90,7 @@ class EvalSettings:
     delay_margin: bool
     seed: Annotated[int, Field(ge=0)]
     out: str | None
+    folder: str | None
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
@@ -351,6 +357,7 @@ class BenchSettings:
 
 EXAMPLES = {
     "run": "run=runs/NAME",
+    "subjects": "go1exp compare trot paper protocol=kicks",
     "files": "go1exp record audit recordings/NAME.parquet",
     "file": "go1exp export check runs/NAME/bundle.zip",
     "source": "go1exp record import go2_in_air PATH",
@@ -363,6 +370,7 @@ EXAMPLES = {
 
 SETTINGS: dict[str, type] = {
     "eval": EvalSettings,
+    "compare": CompareSettings,
     "play": PlaySettings,
     "record": RecordSettings,
     "record_audit": AuditSettings,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from go1exp.env.core import Go1Core
@@ -43,8 +44,12 @@ class EstimatedVelocity:
     def put(self, observation: Tensor) -> Tensor:
         """Return the observation (N, O) with the estimated velocity in place of the true one."""
         changed = observation.clone()
-        changed[:, self._columns] = torch.as_tensor(self._filters.velocities, dtype=observation.dtype)
+        changed[:, self._columns] = torch.as_tensor(self.velocities(), dtype=observation.dtype)
         return changed
+
+    def velocities(self) -> NDArray[np.float64]:
+        """Return the estimated velocities of the trunks in their own frames (N, 3), m/s; zero until a filter runs."""
+        return self._filters.velocities
 
     def _listen(self, target: Tensor) -> None:
         """Update every filter with a sample, before a step."""

@@ -1,11 +1,12 @@
-"""Intervals: of a mean over robots, and of a share of falls."""
+"""Intervals of figures over robots: means, phases, shares, rates, thresholds, differences between pairs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 LEVEL = 0.95
 
@@ -58,3 +59,129 @@ def share_interval(count: int, n: int, level: float = LEVEL) -> Interval:
         return Interval(np.nan, np.nan, np.nan, 0)
     bounds = stats.binomtest(count, n).proportion_ci(level, method="wilson")
     return Interval(count / n, float(bounds.low), float(bounds.high), n)
+
+
+# ---------------------------------------------------------------------- counts, medians, curves
+
+
+def rate_interval(count: int, exposure: float, level: float = LEVEL) -> Interval:
+    """Return ``count`` / ``exposure`` with the exact Poisson interval (Garwood 1936); n is the count."""
+    from scipy import stats
+
+    if not exposure > 0:
+        return Interval(np.nan, np.nan, np.nan, count)
+    tail = 0.5 * (1.0 - level)
+    low = stats.chi2.ppf(tail, 2 * count) / 2.0 if count else 0.0
+    high = stats.chi2.ppf(1.0 - tail, 2 * count + 2) / 2.0
+    return Interval(count / exposure, float(low / exposure), float(high / exposure), count)
+
+
+def bootstrap_interval(
+    function: Callable[[NDArray[np.intp]], float], n: int, draws: int = 400, level: float = LEVEL, seed: int = 0
+) -> Interval:
+    """Return ``function`` of all of n robots, with its percentile interval over robots drawn with replacement.
+
+    Args:
+        function: a figure of the robots with these numbers (n,), each in 0 to n - 1; NaN where it is not defined.
+        n: robots.
+        draws: how many samples.
+        level: of the interval.
+        seed: of the draws.
+    """
+    estimate = float(function(np.arange(n))) if n else np.nan
+    if n < 2 or not np.isfinite(estimate):
+        return Interval(estimate, np.nan, np.nan, n)
+    rng = np.random.default_rng(seed)
+    each = np.array([function(rng.integers(n, size=n)) for _ in range(draws)])
+    each = each[np.isfinite(each)]
+    if len(each) < 0.5 * draws:  # mostly undefined: nothing can be said
+        return Interval(estimate, np.nan, np.nan, n)
+    low, high = np.quantile(each, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
+    return Interval(estimate, float(low), float(high), n)
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """Share of successes at x: 1 / (1 + exp(slope (x - middle))); ``middle`` is where half succeed."""
+
+    middle: float
+    slope: float
+
+    def __call__(self, x: ArrayLike) -> NDArray[np.float64]:
+        """Return the share at ``x``."""
+        from scipy.special import expit
+
+        return np.asarray(expit(-self.slope * (np.asarray(x, dtype=np.float64) - self.middle)))
+
+    def where(self, share: float) -> float:
+        """Return the x at which that share succeeds."""
+        return self.middle - float(np.log(share / (1.0 - share))) / self.slope
+
+
+def logistic_fit(x: ArrayLike, success: ArrayLike) -> Logistic | None:
+    """Fit falling success (E,) of 0 or 1 against x (E,) by maximum likelihood; None where all or none succeed.
+
+    A Gaussian prior on the logarithm of the slope, wide by a factor of e^2 about eight over the range of x, keeps
+    the fit finite where success and failure do not overlap.
+    """
+    from scipy import optimize
+
+    at, won = np.asarray(x, dtype=np.float64), np.asarray(success, dtype=np.float64)
+    if not len(at) or won.min() == won.max() or at.min() == at.max():
+        return None
+    span = float(np.ptp(at))
+    levels, level = np.unique(at, return_inverse=True)
+    wins, trials = np.bincount(level, won), np.bincount(level)
+
+    def loss(values: NDArray[np.float64]) -> float:
+        logit = -np.exp(values[1]) * ((levels - at.min()) / span - values[0])
+        fit = wins * np.logaddexp(0.0, -logit) + (trials - wins) * np.logaddexp(0.0, logit)
+        return float(fit.sum() + 0.5 * ((values[1] - np.log(8.0)) / 2.0) ** 2)
+
+    start = np.array([float(won.mean()), np.log(8.0)])
+    solution = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
+    return Logistic(float(at.min() + span * solution.x[0]), float(np.exp(solution.x[1]) / span))
+
+
+# ---------------------------------------------------------------------- pairs
+
+
+def paired_mean_interval(difference: ArrayLike, draws: int = 2000, level: float = LEVEL) -> Interval:
+    """Return the mean of one difference per robot with its bootstrap interval over robots; NaNs are left out."""
+    each = np.asarray(difference, dtype=np.float64).ravel()
+    each = each[np.isfinite(each)]
+    return bootstrap_interval(lambda robots: float(each[robots].mean()), len(each), draws, level)
+
+
+def paired_share_interval(first: ArrayLike, second: ArrayLike, level: float = LEVEL) -> Interval:
+    """Return the share of ``second`` less that of ``first``, of the same robots, with Agresti and Min's interval.
+
+    Half a robot is added to each of the four outcomes of a pair (Agresti and Min, Statistics in Medicine 24, 2005),
+    so that no interval has the width zero, as the bootstrap's has where all pairs agree.
+    """
+    from scipy import stats
+
+    a, b = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
+    n = len(a)
+    if not n:
+        return Interval(np.nan, np.nan, np.nan, 0)
+    gained, lost, all_of = (~a & b).sum() + 0.5, (a & ~b).sum() + 0.5, n + 2.0
+    middle = (gained - lost) / all_of
+    spread = np.sqrt((gained + lost - (gained - lost) ** 2 / all_of) / all_of**2)
+    half = float(stats.norm.ppf(0.5 + 0.5 * level) * spread)
+    return Interval(float(b.mean() - a.mean()), max(middle - half, -1.0), min(middle + half, 1.0), n)
+
+
+def pairs_needed(difference: ArrayLike, power: float = 0.8, level: float = LEVEL) -> int | None:
+    """Return how many robots would tell a mean difference like the one seen from zero; None if it is zero.
+
+    The normal approximation of a paired test: ((z_level + z_power) sd / mean)^2.
+    """
+    from scipy import stats
+
+    each = np.asarray(difference, dtype=np.float64).ravel()
+    each = each[np.isfinite(each)]
+    if len(each) < 2 or each.mean() == 0.0:
+        return None
+    z = float(stats.norm.ppf(0.5 + 0.5 * level) + stats.norm.ppf(power))
+    return max(2, int(np.ceil((z * each.std(ddof=1) / each.mean()) ** 2)))

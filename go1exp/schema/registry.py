@@ -145,7 +145,9 @@ class Entry:
     @cached_property
     def schema(self) -> type[BaseModel]:
         """Pydantic model of the parameters."""
-        scope = vars(sys.modules[self.target.__module__])
+        # Parameters that a class has of another one are annotated in the words of that one's module.
+        homes = reversed(inspect.getmro(self.target)) if inspect.isclass(self.target) else (self.target,)
+        scope = {name: value for home in homes for name, value in vars(sys.modules[home.__module__]).items()}
         fields: dict[str, Any] = {}
         for name, p in self.parameters.items():
             # Only these annotations are evaluated: the positional ones name tensors, which need no import here.
@@ -232,6 +234,7 @@ importer = partial(register, "importer")
 effect = partial(register, "effect")
 excitation = partial(register, "excitation")
 measure = partial(register, "measure")
+protocol = partial(register, "protocol")
 
 
 def members(group: str) -> dict[str, Entry]:

@@ -1,0 +1,109 @@
+"""``go1exp compare``."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from go1exp.cli import other_robot
+from go1exp.cli.app import App, spinner
+from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.protocol.base import Chosen
+    from go1exp.protocol.result import Result
+
+
+def _task(container: dict[str, Any]) -> None:
+    import go1exp.protocol.kinds  # noqa: F401  (registers them)
+    from go1exp.cli.settings import CompareSettings, parse
+    from go1exp.cli.subjects import driver, varied
+    from go1exp.protocol.base import chosen
+
+    other, container = other_robot.split(container)
+    protocols, grid = chosen(container.pop("protocol"))
+    settings = parse(CompareSettings, container)
+    if grid:
+        raise ConfigError(
+            ["protocol=grid: go1exp compare plays others, such as protocol=sinusoid; go1exp eval the grid"]
+        )
+    subjects = [varied(given, "") for given in settings.subjects]
+    folder = Path(settings.folder)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError([f"folder = {settings.folder!r}: is a file"])
+
+    from go1exp.cli.protocols import refuse
+    from go1exp.protocol.playing import Rates, play
+
+    first = driver(subjects[0][0], other)
+    robot_of = first.task if settings.same_robot else None
+    drivers = [first, *(driver(named, other, robot_of) for named, _ in subjects[1:])]
+    of_each = [_with(protocols, how.trunk_velocity) for _, how in subjects]
+    for theirs, drives in zip(of_each, drivers, strict=True):
+        refuse(theirs, drives)
+    plays: dict[str, list[Result]] = {}
+    origin = {"robot": other_robot.described(other), "robot_of": settings.subjects[0] if robot_of else "each its own"}
+    for k, protocol in enumerate(protocols):
+        results = []
+        for theirs, drives, (_, how) in zip(of_each, drivers, subjects, strict=True):
+            show = spinner(1, f"{protocol.key}: {drives.label}")
+            rates = Rates(settings.seed, how.policy_dt, settings.physics_dt, how.engine)
+            results.append(play(theirs[k], drives, rates, origin, show))
+        plays[protocol.key] = results
+    _report(plays, folder, {**dataclasses.asdict(settings), **origin})
+
+
+def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:
+    """Return the protocols with another velocity, where a subject asks for that."""
+    if trunk_velocity is None:
+        return protocols
+    return [
+        dataclasses.replace(c, protocol=dataclasses.replace(c.protocol, trunk_velocity=trunk_velocity))
+        for c in protocols
+    ]
+
+
+def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any]) -> None:
+    """Write page, JSON and rows, and print the verdicts."""
+    from go1exp.files import write_json, write_text
+    from go1exp.protocol import comparing
+    from go1exp.protocol.report.compare import page
+    from go1exp.protocol.result import as_json, finite, write_rows
+
+    differences = {
+        key: [d for r in results[1:] for d in comparing.compared(results[0], r)] for key, results in plays.items()
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for key, results in plays.items():
+        rows = [{"subject": r.label, **row} for r in results for row in r.played.rows]
+        write_rows(folder / f"{key}.parquet", rows, {"protocol": key})
+    content = {
+        **about,
+        "differences": {key: [comparing.as_json(d) for d in those] for key, those in differences.items()},
+        "results": {key: [{**as_json(r), "curves": {}} for r in results] for key, results in plays.items()},
+    }
+    write_json(folder / "compare.json", finite(content), indent=1, allow_nan=False)
+    write_text(folder / "compare.html", page(plays, differences, about))
+    print("\n".join(lines(differences)))
+    print(f"written to {folder / 'compare.html'}, {folder / 'compare.json'}, rows beside them")
+
+
+def lines(differences: dict[str, Any]) -> list[str]:
+    """Return what a terminal shows: what is told apart, and how many figures are not."""
+    from go1exp.protocol.report.html import condition_text, interval_text
+
+    text_lines = []
+    for key, those in differences.items():
+        for subject in dict.fromkeys(d.subject for d in those):
+            of_subject = [d for d in those if d.subject == subject]
+            clear = [d for d in of_subject if d.word != "not told apart"]
+            text_lines.append(f"{key}: {subject}: {len(clear)} figures told apart, {len(of_subject) - len(clear)} not")
+            for d in clear:
+                change = interval_text(d.difference.estimate, d.difference.low, d.difference.high)
+                where = condition_text(d.condition)
+                text_lines.append(f"  {d.word:7} {d.quantity} {d.first:.3g} -> {d.other:.3g}, {change} ({where})")
+    return text_lines
+
+
+APP = App("compare", _task)

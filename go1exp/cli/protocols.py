@@ -1,0 +1,108 @@
+"""``go1exp eval protocol=...``: everything but the grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from go1exp.cli import other_robot
+from go1exp.cli.app import spinner
+from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.cli.subjects import Named
+    from go1exp.protocol.base import Chosen
+    from go1exp.protocol.drivers import Driver
+    from go1exp.protocol.playing import Rates
+    from go1exp.protocol.result import Result
+
+RATES = "rate"
+"""Protocol of nothing but policies."""
+
+GRID_ONLY = (
+    *("grid", "episodes", "duration_s", "settle_s", "noise", "randomize", "push", "train_ground", "trunk_velocity"),
+    *("measures", "delay_margin", "out"),
+)
+"""Keys of ``go1exp eval`` that are the grid's."""
+
+
+def chosen(container: dict[str, Any], plain: dict[str, Any]) -> tuple[list[Chosen], bool]:
+    """Return the protocols of a configuration, and whether the grid is among them.
+
+    Args:
+        container: the configuration.
+        plain: ``conf/eval.yaml`` as it stands, to see which keys have been changed.
+
+    Raises:
+        ConfigError: with every problem; also for keys of the grid where it is not played.
+    """
+    import go1exp.protocol.kinds  # noqa: F401  (registers them)
+    from go1exp.protocol.base import chosen as checked
+
+    protocols, grid = checked(container.get("protocol"))
+    changed = [key for key in GRID_ONLY if not grid and key in plain and container.get(key) != plain[key]]
+    if changed:
+        rule = "is of protocol=grid; others have keys of their own"
+        raise ConfigError([f"{key} = {container[key]!r}: {rule} ({_example(key, protocols)})" for key in changed])
+    return protocols, grid
+
+
+def _example(key: str, protocols: Sequence[Chosen]) -> str:
+    first = protocols[0]
+    equivalent = {"episodes": "robots", "grid": "claims", "out": ""}.get(key, key)
+    if key == "out":
+        return "their folder is folder="
+    return (
+        f"protocol.{first.key}.{equivalent}" if hasattr(first.protocol, equivalent) else "go1exp eval --help protocol"
+    )
+
+
+def refuse(protocols: Sequence[Chosen], driver: Driver) -> None:
+    """Refuse protocols that a driver cannot play; raise ConfigError."""
+    problems = []
+    for c in protocols:
+        for key, velocity in c.protocol.policy_velocities().items():
+            problems += driver.problems(velocity, f"protocol.{c.key}.{key}")
+    if driver.senses and len(protocols) == 1 and protocols[0].key == RATES:
+        problems.append(f"protocol={RATES}: varies the rate of a policy; {driver.label} has one of its own")
+    if problems:
+        raise ConfigError(problems)
+
+
+def playable(protocols: Sequence[Chosen], driver: Driver) -> list[Chosen]:
+    """Return the protocols that a driver can play, and say which one of several it cannot."""
+    if driver.senses and any(c.key == RATES for c in protocols):
+        print(f"{RATES}: not played, it varies the rate of a policy; {driver.label} has one of its own\n")
+        return [c for c in protocols if c.key != RATES]
+    return list(protocols)
+
+
+def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[str, Any], rates: Rates) -> None:
+    """Play protocols one after the other, write what came of each, and print the verdicts."""
+    from go1exp.cli.subjects import driver
+    from go1exp.protocol.playing import play as played
+    from go1exp.protocol.report.writing import write
+
+    drives = driver(subject, other)
+    refuse(protocols, drives)
+    protocols = playable(protocols, drives)
+    for k, c in enumerate(protocols):
+        show = spinner(1, f"{c.key} ({k + 1} of {len(protocols)})")
+        result = played(c, drives, rates, {"robot": other_robot.described(other)}, show)
+        files = write(result, folder)
+        print("\n".join(lines(result)))
+        print(f"  written to {', '.join(map(str, files))}\n", flush=True)
+
+
+def lines(result: Result) -> list[str]:
+    """Return what a terminal shows of a result."""
+    from go1exp.protocol.claims import limits
+    from go1exp.protocol.report.html import condition_text, falls, interval_text
+
+    text_lines = [f"{result.chosen.key}: {result.label}, {result.seconds:.0f} s; {falls(result)}"]
+    for v in result.verdicts:
+        value = interval_text(v.figure.estimate, v.figure.low, v.figure.high)
+        where = condition_text(v.condition)
+        text_lines.append(f"  {v.word:12} {v.claim.quantity} {value}, {limits(v.claim)}, n {v.figure.n} ({where})")
+    return [*text_lines, *(f"  note: {note}" for note in result.played.notes)]

@@ -1,0 +1,190 @@
+"""Who is judged: a run, a shipped policy, a bundle or another controller, as it is named on the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from go1exp.choices import choice_files, config_folder, load
+from go1exp.cli import controllers, engine, other_robot
+from go1exp.cli.runs import checkpoint_file, run_folder, shipped_policies, trained
+from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.config import TaskConfig
+    from go1exp.controller.settings import MpcSettings
+    from go1exp.protocol.drivers import Driver
+    from go1exp.schema.backends import BackendConfig
+
+
+@dataclass(frozen=True)
+class Named:
+    """A subject whose files are there.
+
+    Attributes:
+        label: name in reports.
+        folder: where its results go unless the user says.
+        run: run folder, of a run or of a shipped policy.
+        checkpoint: one of its checkpoints; None takes the newest.
+        bundle: file, in place of a run.
+        controller: in place of a policy; ``run`` then says whose robot it moves.
+    """
+
+    label: str
+    folder: Path
+    run: Path | None = None
+    checkpoint: Path | None = None
+    bundle: Path | None = None
+    controller: MpcSettings | None = None
+
+
+def driven(controller: MpcSettings, run: str | None, policy: str | None, bundle: str | None, file: str) -> Named:
+    """Return the subject that another controller is, on the robot of a run or shipped policy.
+
+    Raises:
+        ConfigError: if that is not there, or a bundle is named.
+    """
+    if bundle is not None:
+        raise ConfigError([f"bundle = {bundle!r}: is a policy; controller=mpc takes none"])
+    folder = controllers.place(run, policy, file, None)
+    return Named("mpc", folder, run=controllers.robot_of(run, policy), controller=controller)
+
+
+def named(run: str | None, policy: str | None, bundle: str | None, checkpoint: str | None, file: str) -> Named:
+    """Return the subject of three keys of which one is given; ``file`` is what its results are called.
+
+    Raises:
+        ConfigError: unless there is exactly one, or if it is not there.
+    """
+    if bundle is None:
+        folder, out = trained(run, policy, file, None)
+        return Named(policy or folder.name, out, run=folder, checkpoint=checkpoint_file(folder, checkpoint))
+    others = [f"{key} = {value!r}" for key, value in (("run", run), ("policy", policy)) if value is not None]
+    if others:
+        raise ConfigError([f"bundle = {bundle!r} and {' and '.join(others)}: only one of them"])
+    if checkpoint is not None:
+        raise ConfigError([f"checkpoint = {checkpoint!r}: a bundle has only one"])
+    return _bundle(bundle, file)
+
+
+def _bundle(bundle: str, file: str) -> Named:
+    path = Path(bundle)
+    if not path.is_file():
+        raise ConfigError([f"bundle = {bundle!r}: there is no such file; go1exp export writes one"])
+    return Named(path.stem, Path(f"{path.stem}_{file}"), bundle=path)
+
+
+VELOCITIES: dict[str, Literal["exact", "estimated"]] = {"exact": "exact", "estimated": "estimated"}
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How a subject is played, where that differs from the protocol and from its training.
+
+    Attributes:
+        policy_dt: period of the policy, s; None keeps it.
+        trunk_velocity: what the policy sees of it; None keeps it.
+        engine: physics engine; None is MuJoCo.
+    """
+
+    policy_dt: float | None = None
+    engine: BackendConfig | None = None
+    trunk_velocity: Literal["exact", "estimated"] | None = None
+
+
+def varied(given: str, file: str) -> tuple[Named, Variation]:
+    """Return the subject of a word such as trot, mpc, trot@100hz, runs/NAME@estimated, trot@100hz@physx.
+
+    Raises:
+        ConfigError: if it is not there, or is varied in a way that is not known.
+    """
+    name, *changes = given.split("@")
+    variation = Variation()
+    for change in changes:
+        rate = re.fullmatch(r"(\d+(?:\.\d+)?)hz", change)
+        if rate and 10.0 <= float(rate[1]) <= 1000.0:
+            variation = dataclasses.replace(variation, policy_dt=1.0 / float(rate[1]))
+        elif change in VELOCITIES:
+            variation = dataclasses.replace(variation, trunk_velocity=VELOCITIES[change])
+        elif change in _choices("engine"):
+            moves, _ = engine.split({"engine": load(_choices("engine")[change])})
+            variation = dataclasses.replace(variation, engine=moves)
+        else:
+            known = f"a rate of 10 to 1000 hz, exact, estimated, {' or '.join(_choices('engine'))}"
+            raise ConfigError([f"subjects: {given!r}: after @ comes {known}"])
+    return dataclasses.replace(word(name, file), label=given), variation
+
+
+def _choices(group: str) -> dict[str, Path]:
+    return choice_files(group, [config_folder()])
+
+
+def word(given: str, file: str) -> Named:
+    """Return the subject that one word names: a bundle's file, a run folder, or a shipped policy."""
+    if given == "mpc":
+        settings = controllers.chosen(load(_choices("controller")[given]))
+        assert settings is not None
+        return driven(settings, None, None, None, file)
+    if given.endswith(".zip"):
+        return _bundle(given, file)
+    if given in shipped_policies():
+        return named(None, given, None, None, file)
+    if Path(given).is_dir():
+        return dataclasses.replace(named(str(run_folder(given)), None, None, None, file), label=given.rstrip("/"))
+    known = ", ".join(shipped_policies())
+    raise ConfigError(
+        [f"subjects: {given!r} is no run folder, no bundle (.zip), no shipped policy ({known}), and not mpc"]
+    )
+
+
+def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = None) -> Driver:
+    """Load what drives the robots.
+
+    Args:
+        subject: who.
+        other: choices of another robot (``other_robot.split``).
+        robot_of: the task whose robot, drives, effects, contact and randomisation are taken; None takes its own.
+
+    Raises:
+        ConfigError: if a run's configuration is not one that this version knows.
+        go1exp.deploy.archive.BundleError: if a bundle is damaged or was changed.
+    """
+    from go1exp.protocol.drivers import BundleDriver, PolicyDriver
+
+    if subject.bundle is not None:
+        from go1exp.config import parse_train
+        from go1exp.deploy.bundle import load
+
+        bundle = load(subject.bundle)
+        task = _robot(parse_train(bundle.config).task, other, robot_of)
+        about = {"bundle": str(subject.bundle), "sha256": bundle.seal, **dataclasses.asdict(bundle.metadata.trained)}
+        return BundleDriver(subject.label, task, bundle, about)
+    assert subject.run is not None
+    if subject.controller is not None:
+        return _controlled(subject, subject.controller, other, robot_of)
+    from go1exp.evaluate.policy import load_run
+
+    of_run, policy, about = load_run(subject.run, subject.checkpoint)
+    return PolicyDriver(subject.label, _robot(of_run.task, other, robot_of), policy, about)
+
+
+def _controlled(subject: Named, controller: MpcSettings, other: dict[str, Any], robot_of: TaskConfig | None) -> Driver:
+    from go1exp.protocol.drivers import ControllerDriver
+
+    assert subject.run is not None
+    task = _robot(controllers.task_of(subject.run), other, robot_of)
+    about = {"controller": dataclasses.asdict(controller), "robot_of_run": str(subject.run)}
+    return ControllerDriver(subject.label, task, controllers.maker(controller, task), about)
+
+
+SAME = ("robot", "actuator", "effect", "contact", "rand", "termination")
+"""Parts of a task that are the robot's and not the policy's."""
+
+
+def _robot(task: TaskConfig, other: dict[str, Any], robot_of: TaskConfig | None) -> TaskConfig:
+    if robot_of is not None:
+        task = dataclasses.replace(task, **{part: getattr(robot_of, part) for part in SAME})
+    return other_robot.replaced(task, other)

@@ -1,0 +1,176 @@
+"""``go1exp eval protocol=...`` and ``go1exp compare`` as commands: files, refusals, bundles, what each key does."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import go1exp.protocol.kinds  # noqa: F401  (registers them)
+from go1exp.cli import compare, evaluate, subjects
+from go1exp.cli.helptext import show
+from go1exp.cli.plugins import begin
+from go1exp.compose import compose
+from go1exp.config import parse_train
+from go1exp.deploy.archive import BundleError
+from go1exp.export.build import build
+from go1exp.schema.registry import ConfigError
+from go1exp.train import run_folder, trainer
+from tests.small_run import SMALL
+from tests.test_cli import assert_refused
+
+QUICK = (
+    *("protocol=corners", "protocol.corners.robots=2", "protocol.corners.duration_s=0.3"),
+    *("protocol.corners.settle_s=0.2", "protocol.corners.rest_s=0.1", "protocol.corners.claims={}"),
+    "protocol.corners.commands=[[0.5,0.0,0.0]]",
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two tiny iterations, randomised as in Table I."""
+    folder = tmp_path_factory.mktemp("protocols") / "run"
+    container = compose("train", [*SMALL, "rand=table1", "terrain=flat"])
+    run_folder.write(folder, container)
+    trainer.train(parse_train(container), container, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bundle(run: Path) -> Path:
+    file = run / "bundle.zip"
+    file.write_bytes(build(run, seconds=0.1))
+    return file
+
+
+def evaluated(folder: Path, *overrides: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Rows and numbers of a small protocol."""
+    evaluate.APP.task(begin("eval", compose("eval", [*QUICK, f"folder={folder}", *overrides])))
+    return pq.read_table(folder / "corners.parquet").to_pylist(), json.loads((folder / "corners.json").read_text())
+
+
+def compared(folder: Path, *overrides: str) -> dict[str, Any]:
+    compare.APP.task(begin("compare", compose("compare", [*QUICK, f"folder={folder}", *overrides])))
+    assert {f.name for f in folder.iterdir()} == {"compare.html", "compare.json", "corners.parquet"}
+    content: dict[str, Any] = json.loads((folder / "compare.json").read_text())
+    return content
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("eval policy=trot protocol=sinusoids", ("sinusoids", "did you mean 'sinusoid'")),
+        ("eval policy=trot protocol=sinusoid noise=true", ("noise = True", "protocol.sinusoid.noise")),
+        ("eval policy=trot protocol=kicks episodes=3", ("episodes = 3", "protocol.kicks.robots")),
+        ("eval policy=trot folder=there", ("folder = 'there'", "out=")),
+        ("eval policy=trot protocol.kicks.robots=3", ("protocol.kicks",)),
+        ("eval policy=trot protocol=kicks protocol.kicks.measures=[strides]", ("unknown measure term 'strides'",)),
+        ("eval bundle=nowhere.zip protocol=kicks", ("bundle = 'nowhere.zip'", "no such file")),
+        ("eval bundle=a.zip policy=trot protocol=kicks", ("only one of them",)),
+        ("eval bundle=a.zip", ("protocol=grid takes run or policy",)),
+        ("eval protocol=kicks", ("run: required",)),
+        ("compare trot", ("subjects = ['trot']", "at least 2")),
+        ("compare", ("subjects: required, such as go1exp compare trot paper protocol=kicks",)),
+        ("compare trot trot", ("each only once",)),
+        ("compare trot nothing", ("'nothing' is no run folder, no bundle (.zip), and no shipped policy",)),
+        ("compare trot trot@5hz", ("'trot@5hz': after @ comes a rate of 10 to 1000 hz",)),
+        ("compare trot paper protocol=grid", ("protocol=grid", "go1exp eval")),
+    ],
+)
+def test_what_is_wrong_is_said_at_once(arguments: str, said: tuple[str, ...], tmp_path: Path) -> None:
+    assert_refused(tmp_path, arguments.split(), *said)
+
+
+def test_a_bundle_plays_what_its_run_plays(run: Path, bundle: Path, tmp_path: Path) -> None:
+    """By ONNX from readings, but for rounding; with noise it is the sensors'."""
+    quiet = "protocol.corners.noise=false"
+    ours, about = evaluated(tmp_path / "run", f"run={run}", quiet)
+    theirs, about_bundle = evaluated(tmp_path / "bundle", f"bundle={bundle}", quiet)
+    for a, b in zip(ours, theirs, strict=True):
+        assert a["rmse_x"] == pytest.approx(b["rmse_x"], abs=1e-3)
+    assert about_bundle["driver"]["sha256"] != about["driver"].get("sha256")
+    noisy, _ = evaluated(tmp_path / "noisy", f"bundle={bundle}")
+    assert [r["rmse_x"] for r in noisy] != [r["rmse_x"] for r in theirs]
+
+
+def test_a_bundle_that_was_changed_is_refused_before_anything_is_played(bundle: Path, tmp_path: Path) -> None:
+    content = bytearray(bundle.read_bytes())
+    content[len(content) // 2] ^= 1
+    changed = tmp_path / "changed.zip"
+    changed.write_bytes(bytes(content))
+    with pytest.raises(BundleError, match=r"changed\.zip"):
+        evaluated(tmp_path / "out", f"bundle={changed}")
+    assert not (tmp_path / "out").exists()
+
+
+def test_seed_and_rates_act_on_every_protocol(run: Path, tmp_path: Path) -> None:
+    plain, about = evaluated(tmp_path / "a", f"run={run}")
+    assert evaluated(tmp_path / "b", f"run={run}")[0] == plain
+    for k, change in enumerate(("seed=7", "policy_dt=0.01", "physics_dt=0.001", "effect=coulomb")):
+        rows, changed = evaluated(tmp_path / f"{k}", f"run={run}", change)
+        assert [r["rmse_x"] for r in rows] != [r["rmse_x"] for r in plain]
+        assert changed != about
+
+
+def test_results_lie_in_the_run_folder_unless_the_user_says(run: Path) -> None:
+    evaluate.APP.task(begin("eval", compose("eval", [*QUICK, f"run={run}"])))
+    assert (run / "protocols" / "corners.html").is_file()
+
+
+def test_the_help_says_what_the_keys_of_a_protocol_are(capsys: pytest.CaptureFixture[str]) -> None:
+    show("eval", "go1exp eval", ["protocol", "protocol=kicks"])
+    shown = capsys.readouterr().out
+    assert re.search(r"protocol\.kicks\.robots=200 +robots of each condition", shown)
+    assert re.search(r"protocol\.kicks\.recovery\.height=0\.015\s+largest difference", shown)
+
+
+# ---------------------------------------------------------------------- comparisons
+
+
+def test_a_comparison_pairs_robots_and_says_where_it_comes_from(run: Path, bundle: Path, tmp_path: Path) -> None:
+    content = compared(tmp_path / "c", f"subjects=[{run},{run}@100hz,{run}@estimated,{bundle}]")
+    subjects_of = {d["subject"] for d in content["differences"]["corners"]}
+    assert subjects_of == {f"{run}@100hz", f"{run}@estimated", str(bundle)}
+    assert content["robot_of"] == str(run)
+    rows = pq.read_table(tmp_path / "c" / "corners.parquet").to_pylist()
+    by_subject = {s: [r["rmse_x"] for r in rows if r["subject"] == s] for s in {r["subject"] for r in rows}}
+    assert len({tuple(v) for v in by_subject.values()}) == 4
+    assert {len(v) for v in by_subject.values()} == {2}
+
+
+def test_the_same_subject_under_another_name_is_equal(run: Path, tmp_path: Path) -> None:
+    content = compared(tmp_path / "c", f"subjects=[{run},{run}@exact]")
+    assert {d["verdict"] for d in content["differences"]["corners"]} == {"not told apart"}
+    assert all(d["difference"]["estimate"] in (0.0, None) for d in content["differences"]["corners"])
+
+
+def test_same_robot_seed_and_physics_step_act(run: Path, tmp_path: Path) -> None:
+    pair = f"subjects=[trot,{run}]"
+    rows = {}
+    for name, change in {
+        "plain": (),
+        "own": ("same_robot=false",),
+        "seed": ("seed=5",),
+        "dt": ("physics_dt=0.001",),
+    }.items():
+        compared(tmp_path / name, pair, *change)
+        every = pq.read_table(tmp_path / name / "corners.parquet").to_pylist()
+        rows[name] = {s: [r["rmse_x"] for r in every if r["subject"] == s] for s in ("trot", str(run))}
+    assert rows["plain"]["trot"] == rows["own"]["trot"]
+    assert rows["plain"][str(run)] != rows["own"][str(run)]
+    for name in ("seed", "dt"):
+        assert rows[name]["trot"] != rows["plain"]["trot"]
+
+
+def test_words_name_subjects(run: Path, bundle: Path) -> None:
+    named, variation = subjects.varied(f"{run}@100hz@estimated", "x")
+    assert (named.run, variation.policy_dt, variation.trunk_velocity) == (run, 0.01, "estimated")
+    assert subjects.word(str(bundle), "x").bundle == bundle
+    assert np.isclose(subjects.varied("trot@33.3hz", "x")[1].policy_dt or 0.0, 1 / 33.3)
+    with pytest.raises(ConfigError, match="after @ comes"):
+        subjects.varied("trot@fast", "x")

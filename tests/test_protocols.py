@@ -1,0 +1,372 @@
+"""Every registered protocol in a small size: rows, JSON, page, figures, comparison; what the stage does; refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from torch import Tensor
+
+import go1exp.protocol.kinds  # noqa: F401  (registers them)
+from go1exp.compose import compose
+from go1exp.config import TaskConfig
+from go1exp.protocol import comparing
+from go1exp.protocol.base import Chosen, chosen
+from go1exp.protocol.disturbances import Impulses
+from go1exp.protocol.drivers import PolicyDriver
+from go1exp.protocol.kinds.corners import step_answer
+from go1exp.protocol.kinds.push_map import largest_survived
+from go1exp.protocol.plan import Plan
+from go1exp.protocol.playing import Rates, play
+from go1exp.protocol.quantities import FINGERPRINT, ROBOT
+from go1exp.protocol.report.compare import page as comparison
+from go1exp.protocol.report.writing import write
+from go1exp.protocol.result import Result
+from go1exp.protocol.stage import Setting, Stage, fitting_step
+from go1exp.schema.registry import ConfigError, members
+from tests.test_every_key_acts import unread
+
+SMALL = {
+    "sinusoid": ("robots=2", "duration_s=0.8", "ladder=[{amplitude:[0.5,0.3,0.5],period:0.4}]", "claims={}"),
+    "kicks": ("robots=2", "impulses=[3.0]", "first_s=2.0", "every_s=2.0", "jitter_s=0.1"),
+    "gait": ("robots=2", "duration_s=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0],[1.0,0.0,0.0]]"),
+    "corners": ("robots=2", "duration_s=0.6", "settle_s=0.4", "rest_s=0.2", "commands=[[0.5,0.0,0.0]]"),
+    "energy": ("robots=2", "duration_s=0.6", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]"),
+    "hardware": ("robots=2", "duration_s=0.4", "settle_s=0.2", "commands=[[0.5,0.0,0.0]]", "delays_ms=[20.0]"),
+    "rate": ("robots=2", "duration_s=0.3", "settle_s=0.1", "rates_hz=[50.0,100.0]", "delays_ms=[0.0]"),
+    "push_map": ("robots=1", "directions=3", "phases=1", "settle_s=1.0", "watch_s=0.5", "halvings=1"),
+    "terrain": (
+        *("robots=1", "speeds=[8.0]", "slack=1.0", "grounds={slope_up:[5.0,10.0],gravel:[0.01,0.02]}"),
+        "measures=[stride_rate]",
+    ),
+}
+"""Overrides that make each protocol quick; a new one needs a line."""
+
+
+@pytest.fixture(scope="module")
+def driver(make_task: Callable[..., TaskConfig]) -> PolicyDriver:
+    """Robots that sway on the spot."""
+    step = [0]
+
+    def sway(observation: Tensor) -> Tensor:
+        step[0] += 1
+        swing = 0.4 * math.sin(0.3 * step[0])
+        return torch.tensor([0.0, swing, -swing] * 4).repeat(len(observation), 1)
+
+    return PolicyDriver("sway", make_task("backend.threads=1", "sim.physics_dt=0.005", "rand=table1"), sway)
+
+
+def small(name: str, *more: str) -> Chosen:
+    container = compose("eval", [f"protocol={name}"])["protocol"]
+    given = {name: dict(container[name])}
+    if name == "terrain":
+        given[name].pop("grounds")
+    overrides = [f"++protocol.{name}.{o}" for o in (*SMALL[name], *more)]
+    if name == "terrain":
+        overrides.insert(0, "~protocol.terrain.grounds")
+    (one,), grid = chosen(compose("eval", [f"protocol={name}", *overrides])["protocol"])
+    assert not grid
+    return one
+
+
+@pytest.fixture(scope="module")
+def results(driver: PolicyDriver) -> dict[str, Result]:
+    """What came of each protocol, played once."""
+    return {}
+
+
+def result(name: str, driver: PolicyDriver, results: dict[str, Result]) -> Result:
+    if name not in results:
+        results[name] = play(small(name), driver, Rates(seed=1))
+    return results[name]
+
+
+EVERY = list(members("protocol"))
+
+
+def test_every_protocol_has_a_file_and_a_small_size() -> None:
+    assert set(EVERY) == set(SMALL)
+    for name in EVERY:
+        (one,), _ = chosen(compose("eval", [f"protocol={name}"])["protocol"])
+        assert one.kind == name
+        assert one.protocol.claims
+
+
+class Tags(HTMLParser):
+    """Notes which elements are open."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        if tag not in ("meta", "br"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: Any) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+
+def unclosed(page: str) -> list[str]:
+    """Elements of a page that are not closed in order."""
+    tags = Tags()
+    tags.feed(page)
+    return tags.wrong + tags.open
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_protocol_makes_rows_json_and_a_page(
+    name: str, driver: PolicyDriver, results: dict[str, Result], tmp_path: Path
+) -> None:
+    one = result(name, driver, results)
+    rows_file, json_file, page_file = write(one, tmp_path)
+    rows = pq.read_table(rows_file).to_pylist()
+    keys, columns = one.chosen.protocol.keys, {c.name for c in one.chosen.protocol.columns()}
+    assert rows
+    for row in rows:
+        assert {*keys, ROBOT, "fell", "left_map", "moving_s", FINGERPRINT} <= row.keys()
+    assert {c.name for c in one.chosen.protocol.robot_columns} <= {k for row in rows for k in row} & columns
+    content = json.loads(json_file.read_text())  # NaN would not be JSON
+    assert "NaN" not in json_file.read_text()
+    for entry in content["summary"]:
+        for figure in entry["figures"].values():
+            assert {"estimate", "low", "high", "n", "unit"} <= figure.keys()
+            if figure["low"] is not None:
+                assert figure["low"] <= figure["high"]
+    assert len(content["claims"]) == len(one.chosen.protocol.claims)
+    text = page_file.read_text()
+    outside = set(re.findall(r'(?:src|href)="([^"#][^"]*)"', text))
+    assert all(link.startswith("data:") for link in outside)
+    assert "<script" not in text
+    drawn = one.chosen.protocol.drawings(one.played, one.summary)
+    assert text.count("<svg") == len(drawn) > 0
+    assert unclosed(text) == []
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_subject_is_not_told_apart_from_itself(name: str, driver: PolicyDriver, results: dict[str, Result]) -> None:
+    one = result(name, driver, results)
+    again = dataclasses.replace(one, label="again")
+    differences = comparing.compared(one, again)
+    assert {d.word for d in differences} == {"not told apart"}
+    assert all(d.difference.estimate == 0.0 or math.isnan(d.difference.estimate) for d in differences)
+    assert "not told apart" in comparison({name: [one, again]}, {name: differences}, {})
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_key_of_a_protocol_is_read(name: str, driver: PolicyDriver) -> None:
+    def work() -> None:
+        one = play(small(name), driver, Rates(seed=1))
+        one.chosen.protocol.drawings(one.played, one.summary)
+
+    kind: Any = members("protocol")[name].target
+    velocity = [f"{kind.__name__}.trunk_velocity"] if name == "rate" else []  # it has velocities in its place
+    assert [key for key in unread([kind], work) if key not in velocity] == []
+
+
+def test_robots_of_the_nominal_protocol_count_once(driver: PolicyDriver) -> None:
+    still = play(small("corners", "noise=false", "randomize=false", "robots=3"), driver, Rates(seed=1))
+    assert (len(still.played.rows), still.repeats) == (1, 2)
+    random = play(small("corners", "robots=3"), driver, Rates(seed=1))
+    assert (len(random.played.rows), random.repeats) == (3, 0)
+
+
+def test_a_better_subject_is_called_better_and_a_worse_one_worse(
+    driver: PolicyDriver, results: dict[str, Result]
+) -> None:
+    """Rows whose difference is known: every error is 0.1 less, one of which robots is missing."""
+    one = result("gait", driver, results)
+    rows = [{**row, "rmse_x": row["rmse_x"] - 0.1, "fell": True} for row in one.played.rows if row[ROBOT] < 99]
+    other = dataclasses.replace(one, label="other", played=dataclasses.replace(one.played, rows=rows[:-1]))
+    found = {(d.quantity, tuple(d.condition.values())): d for d in comparing.compared(one, other)}
+    d = found["rmse_x", (0.5, 0.0, 0.0)]
+    assert (d.word, d.difference.n) == ("better", 2)
+    assert d.difference.estimate == pytest.approx(-0.1)
+    assert found["rmse_x", (1.0, 0.0, 0.0)].difference.n == 1
+    assert found["rmse_x", (1.0, 0.0, 0.0)].word == "not told apart"
+
+
+# ---------------------------------------------------------------------- the stage
+
+
+def stage(driver: PolicyDriver, **changes: Any) -> Stage:
+    return Stage(driver, Setting(**{"noise": True, "randomize": True, "trunk_velocity": "exact", "seed": 1, **changes}))
+
+
+class Listening:
+    """A policy that keeps the command that it sees."""
+
+    def __init__(self) -> None:
+        self.seen: list[Tensor] = []
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        self.seen.append(observation.clone())
+        return torch.zeros(len(observation), 12)
+
+
+def test_a_command_is_seen_in_the_step_that_it_is_for(make_task: Callable[..., TaskConfig]) -> None:
+    policy = Listening()
+    task = make_task("backend.threads=1", "sim.physics_dt=0.005")
+    command = np.zeros((6, 1, 3))
+    command[:, 0, 0] = np.arange(6) * 0.1
+    quiet = stage(PolicyDriver("listens", task, policy), noise=False, randomize=False)
+    motion = quiet.run(Plan(command))
+    np.testing.assert_allclose(motion.command[:, 0, 0], command[:, 0, 0], atol=1e-7)
+    seen = torch.cat(policy.seen).numpy()
+    column = [c for c in range(seen.shape[1]) if np.allclose(seen[:, c], command[:, 0, 0], atol=1e-6)]
+    assert len(column) == 1
+
+
+def test_a_session_that_is_put_back_does_the_same_again(driver: PolicyDriver) -> None:
+    """Bit for bit, and another kick does something else; also where the driver must play it all again."""
+    nothing = np.zeros((2, 1))
+    task = driver.task
+    plain = PolicyDriver("stands", task, lambda observation: torch.zeros(len(observation), 12))
+    session = stage(plain).session(Plan(np.zeros((20, 2, 3)), impulses=Impulses(nothing, nothing, nothing, 0.05)))
+    session.run(8)
+    state = session.save()
+    first = session.run(12)
+    session.load(state, 8)
+    assert np.array_equal(session.run(12).velocity, first.velocity)
+    session.load(state, 8)
+    session.use(Impulses(nothing + 0.2, nothing + 5.0, nothing, 0.05))
+    assert np.abs(session.run(12).velocity - first.velocity).max() > 0.2
+    session.load(None, 8)
+    session.use(Impulses(nothing, nothing, nothing, 0.05))
+    assert np.array_equal(session.run(12).velocity, first.velocity)
+
+
+def test_a_kick_moves_a_robot_by_its_momentum(driver: PolicyDriver) -> None:
+    """In the air, before it touches: m dv is the impulse, whatever the legs do."""
+    task = dataclasses.replace(driver.task, rand=())
+    plain = PolicyDriver("stands", task, lambda observation: torch.zeros(len(observation), 12))
+    kick = Impulses(np.zeros((1, 1)), np.full((1, 1), 6.4), np.full((1, 1), np.pi / 2), 0.02)
+    quiet = stage(plain, noise=False, randomize=False)
+    session = quiet.session(Plan(np.zeros((1, 1, 3)), impulses=kick))
+    session.core.backend.qpos[:, 2] += 1.0
+    session.run(1)
+    model = session.core.backend.model
+    import mujoco
+
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = session.core.backend.qpos[0].numpy(), session.core.backend.qvel[0].numpy()
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    mass = float(model.body_subtreemass[1])
+    np.testing.assert_allclose(mass * data.subtree_linvel[1, :2], [0.0, 6.4], atol=0.01)
+
+
+@pytest.mark.parametrize(("rate", "step"), [(25, 0.002), (100 / 3, 0.002), (200, 0.005 / 3), (400, 0.00125)])
+def test_the_physics_step_fits_the_rate(rate: float, step: float) -> None:
+    assert fitting_step(1.0 / rate, 0.002) == pytest.approx(step)
+
+
+def test_a_driver_that_cannot_be_put_back_plays_it_all_again(driver: PolicyDriver) -> None:
+    """The filter of an estimated velocity cannot: the map is that of kicks on the same walk all the same."""
+    one = play(small("push_map", "trunk_velocity=estimated", "watch_s=0.5"), driver, Rates(seed=1))
+    assert [row["impulse"] is not None for row in one.played.rows] == [not row["fell"] for row in one.played.rows]
+
+
+# ---------------------------------------------------------------------- searches and answers
+
+
+def test_bisection_finds_known_thresholds() -> None:
+    known = np.array([0.0, 0.1, 7.3, 30.0, 59.9, 75.0])
+    tries = []
+
+    def survives(impulse: np.ndarray) -> np.ndarray:
+        tries.append(impulse)
+        return impulse <= known
+
+    found = largest_survived(survives, len(known), 60.0, 8)
+    assert len(tries) == 9
+    np.testing.assert_allclose(found[:-1], known[:-1], atol=60.0 / 2**8)
+    assert (found <= np.minimum(known, 60.0)).all()
+    assert found[-1] == 60.0
+
+
+def test_the_answer_to_a_step_is_that_of_a_first_order_lag() -> None:
+    dt, lag = 0.02, 0.3
+    t = np.arange(300) * dt
+    along = np.where(t >= 1.0, 0.8 * (1.0 - np.exp(-(t - 1.0) / lag)), 0.0)
+    answer = step_answer(along, 50, 200, dt)
+    assert answer["answer"] == pytest.approx(0.8, abs=1e-3)
+    assert answer["rise_s"] == pytest.approx(lag * math.log(10.0), abs=2 * dt)
+    assert answer["overshoot"] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_robot_comes_back_when_it_does(driver: PolicyDriver) -> None:
+    kicks: Any = small("kicks", "recovery={height:0.015,speed:0.15,hold_s:0.5,smooth_s:0.0}").protocol
+    dt = 0.02
+    t = np.arange(400) * dt
+    height = 0.3 - 0.1 * ((t >= 4.0) & (t < 4.7))
+    velocity = np.zeros((400, 2))
+    rest = slice(100, 200)
+    assert kicks.back(height, velocity, 200, rest, dt) == pytest.approx(0.7, abs=dt)
+    assert kicks.back(np.where(t >= 4.0, 0.2, 0.3), velocity, 200, rest, dt) is None
+    assert kicks.back(height * 0 + 0.3, velocity, 200, rest, dt) == 0.0
+
+
+# ---------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ("sinusoid protocol.sinusoid.measures=[strid_rate]", "protocol.sinusoid.measures.strid_rate: unknown measure"),
+        ("kicks protocol.kicks.claims.first_kick.quantity=survivd", "did you mean 'survived'"),
+        ("kicks protocol.kicks.robots=0", "protocol.kicks.robots = 0"),
+        ("kicks +protocol.kicks.robot=4", "protocol.kicks.robot"),
+        ("sinusoid protocol.sinusoid.duration_s=5.0", "must be at least two periods"),
+        ("rate protocol.rate.slower_faster=[50.0,75.0]", "rates_hz has no 75"),
+        ("corners protocol.corners.settle_s=9.0", "settle_s = 9.0: must lie between"),
+        ("terrain protocol.terrain.grounds.waves=[0.2,0.1]", "grounds.waves = [0.2, 0.1]: must rise"),
+        ("kicks protocol.kicks.impulses=[5.0,6.0,5.0]", "protocol.kicks.impulses: has 5.0 twice"),
+        ("rate protocol.rate.delays_ms=[5.0,5.0]", "protocol.rate.delays_ms: has 5.0 twice"),
+        (
+            "gait protocol.gait.commands=[[1.0,0.0,0.0],[1.0,0.0,0.0]]",
+            "protocol.gait.commands: has (1.0, 0.0, 0.0) twice",
+        ),
+        ("hardware protocol.hardware.delays_ms=[20.0,10.0]", "delays_ms = [20.0, 10.0]: must rise"),
+        ("hardware protocol.hardware.settle_s=9.0", "settle_s = 9.0: must lie between"),
+        ("kicks +protocol.nothing={}", "protocol.nothing: unknown protocol 'nothing'"),
+    ],
+)
+def test_a_wrong_protocol_is_refused_in_words(overrides: str, said: str) -> None:
+    name, *rest = overrides.split(" ")
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        chosen(compose("eval", [f"protocol={name}", *rest])["protocol"])
+
+
+def test_a_policy_that_does_not_see_the_velocity_is_refused(driver: PolicyDriver) -> None:
+    without = tuple(t for t in driver.task.observation if t.entry.name != "base_linear_velocity")
+    blind = PolicyDriver("blind", dataclasses.replace(driver.task, observation=without), driver.policy)
+    from go1exp.cli.protocols import refuse
+
+    with pytest.raises(ConfigError, match=r"protocol.rate.velocities = 'estimated': the policy of blind"):
+        refuse([small("rate")], blind)
+    refuse([small("kicks")], blind)
+
+
+def test_paper_is_all_of_the_papers() -> None:
+    found, grid = chosen(compose("eval", ["protocol=paper"])["protocol"])
+    assert [c.key for c in found] == ["sinusoid", "kicks", "terrain", "rate"]
+    terrain: Any = found[2].protocol
+    assert list(terrain.ladders) == ["slope_up", "slope_down", "gravel"]
+    assert not grid
+    assert chosen(compose("eval", [])["protocol"]) == ([], True)
