@@ -24,6 +24,10 @@ from go1exp.schema import registry
 PROGRAM = "import sys; from go1exp.cli import main; sys.exit(main())"
 
 
+POLICIES = ("paper", "robust", "trot")
+"""Shipped ones."""
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A user's folder with runs, recordings, an effect of their own and groups of their own."""
@@ -76,12 +80,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("train --config-dir mi", {"mine/"}),
         ("train --help rew", {"reward"}),
         ("train resume=runs/f", {"resume=runs/flat"}),
-        ("train start_from=", {f"start_from={f}" for f in ("paper", "trot", "gap/", "logs/", "mine/", "runs/")}),
+        (
+            "train start_from=",
+            {f"start_from={f}" for f in ("paper", "robust", "trot", "gap/", "logs/", "mine/", "runs/")},
+        ),
         ("train --he", {"--help"}),
         ("eval run=r", {"run=runs/"}),
         ("eval run=runs/", {"run=runs/flat", "run=runs/rough one"}),
         ("eval run=runs/flat checkpoint=0", {"checkpoint=000400.pt"}),
-        ("eval policy=", {"policy=paper", "policy=trot"}),
+        ("eval policy=", {f"policy={name}" for name in POLICIES}),
         ("eval noise=", {"noise=true", "noise=false"}),
         ("eval epis", {"episodes="}),
         ("eval rob", set()),

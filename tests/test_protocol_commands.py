@@ -77,7 +77,7 @@ def compared(folder: Path, *overrides: str) -> dict[str, Any]:
         ("compare trot", ("subjects = ['trot']", "at least 2")),
         ("compare", ("subjects: required, such as go1exp compare trot paper protocol=kicks",)),
         ("compare trot trot", ("each only once",)),
-        ("compare trot nothing", ("'nothing' is no run folder, no bundle (.zip), and no shipped policy",)),
+        ("compare trot nothing", ("'nothing' is no run folder, no bundle (.zip), no shipped policy",)),
         ("compare trot trot@5hz", ("'trot@5hz': after @ comes a rate of 10 to 1000 hz",)),
         ("compare trot paper protocol=grid", ("protocol=grid", "go1exp eval")),
     ],

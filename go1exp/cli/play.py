@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.cli.settings import PlaySettings
+    from go1exp.env.core import Go1Core
+    from go1exp.evaluate.policy import Policy
 
 FORMATS = (".mp4", ".gif")
 """Endings of a clip's file; the picture beside it is a .png."""
@@ -32,12 +38,9 @@ def _task(container: dict[str, Any]) -> None:
 
     from go1exp.controller.batch import Driven
     from go1exp.env.core import Go1Core
-    from go1exp.evaluate import video
-    from go1exp.evaluate.camera import RenderingUnavailable
     from go1exp.evaluate.engine import require_agreement
-    from go1exp.evaluate.policy import Policy, load_run
+    from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
-    from go1exp.evaluate.stick import picture
 
     policy: Policy
     if controller is None:
@@ -51,6 +54,15 @@ def _task(container: dict[str, Any]) -> None:
     core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise, imu=controller is not None)
     if controller is not None:
         policy = Driven(core, controllers.maker(controller, task), noise=settings.noise, seed=settings.seed)
+    _show(core, policy, settings, out)
+
+
+def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path) -> None:
+    """Open the live viewer, or write clip and picture."""
+    from go1exp.evaluate import video
+    from go1exp.evaluate.camera import RenderingUnavailable
+    from go1exp.evaluate.stick import picture
+
     if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
         video.live(core, policy)
         return

@@ -150,7 +150,7 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
     assert ppo.ep_info_buffer is not None
     assert isinstance(ppo._last_obs, np.ndarray)
     core, starts = _core(ppo), np.asarray(ppo._last_episode_starts)
-    mine = (core.state_dict(), torch.from_numpy(ppo._last_obs.copy()), torch.from_numpy(starts.copy()))
+    local = (core.state_dict(), torch.from_numpy(ppo._last_obs.copy()), torch.from_numpy(starts.copy()))
     return {
         "format": FORMAT,
         "iteration": ppo.iteration,
@@ -159,7 +159,7 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
         "episodes": list(ppo.ep_info_buffer),
         "policy": ppo.policy.state_dict(),
         "optimizer": ppo.optimizer_state(),
-        **ppo.group.whole(dict(zip(ROBOTS, mine, strict=True)), core.num_envs),
+        **ppo.group.whole(dict(zip(ROBOTS, local, strict=True)), core.num_envs),
         "rng": {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,

@@ -56,7 +56,7 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
         self.group = group
         if group.size > 1:
             wide = (self.buffer_size, self.n_envs * group.size)
-            self.whole = {name: mine.new_zeros(*wide, *mine.shape[2:]) for name, mine in self.data.items()}
+            self.whole = {name: local.new_zeros(*wide, *local.shape[2:]) for name, local in self.data.items()}
 
     def store(self, **step: Tensor) -> None:
         """Keep one step: values (N, ...) by the names of ``data``. The caller counts with ``pos``."""
@@ -85,8 +85,8 @@ class DeviceRolloutBuffer(MeanRolloutBuffer):
         )
         torch.add(d["advantages"], d["values"], out=d["returns"])
         if self.whole is not d:
-            for name, mine in d.items():
-                self.group.join(mine, self.whole[name])
+            for name, local in d.items():
+                self.group.join(local, self.whole[name])
 
     def episodes(self, most: int) -> list[dict[str, float]]:
         """Return return ``r`` and length ``l`` of the newest episodes, up to ``most``, oldest first."""

@@ -53,11 +53,11 @@ class Group:
             dist.all_reduce(values)
             values.div_(self.size)
 
-    def join(self, mine: Tensor, out: Tensor) -> None:
+    def join(self, local: Tensor, out: Tensor) -> None:
         """Write the rollouts (T, n, ...) of all members into ``out`` (T, N, ...), robots in their order."""
-        pieces = mine.new_empty(self.size, *mine.shape)
-        dist.all_gather(list(pieces.unbind(0)), mine)
-        out.view(len(mine), self.size, *mine.shape[1:]).copy_(pieces.transpose(0, 1))
+        pieces = local.new_empty(self.size, *local.shape)
+        dist.all_gather(list(pieces.unbind(0)), local)
+        out.view(len(local), self.size, *local.shape[1:]).copy_(pieces.transpose(0, 1))
 
     def share_weights(self, module: nn.Module) -> None:
         """Give all members the first one's parameters."""
@@ -73,12 +73,12 @@ class Group:
         dist.broadcast_object_list(held, 0, group=_by_host())
         return held[0]
 
-    def metrics(self, mine: dict[str, float]) -> dict[str, float]:
+    def metrics(self, local: dict[str, float]) -> dict[str, float]:
         """Return the metrics of all robots from those of each member's."""
         if self.size == 1:
-            return mine
-        each = self._of_all(mine)
-        return {key: _together(key, [m[key] for m in each]) for key in mine}
+            return local
+        each = self._of_all(local)
+        return {key: _together(key, [m[key] for m in each]) for key in local}
 
     def whole(self, state: Any, robots: int) -> Any:
         """Return the state of all robots, in the first member; in the others what it returns has no meaning.
@@ -98,9 +98,9 @@ class Group:
         """Return this member's part of what ``whole`` returned; ``robots`` are this member's."""
         return state if self.size == 1 else _part(state, robots * self.size, self.rows(robots * self.size))
 
-    def _of_all(self, mine: Any) -> list[Any]:
+    def _of_all(self, local: Any) -> list[Any]:
         each: list[Any] = [None] * self.size
-        dist.all_gather_object(each, mine, group=_by_host())
+        dist.all_gather_object(each, local, group=_by_host())
         return each
 
 

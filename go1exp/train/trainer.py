@@ -55,8 +55,8 @@ def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
     if config.process.torch_threads:
         torch.set_num_threads(config.process.torch_threads)
     group, seed = group or Group(), config.process.seed
-    mine = group.rows(config.ppo.num_envs)
-    share: dict[str, Any] = {"num_envs": mine.stop - mine.start, "first_env": mine.start}
+    local = group.rows(config.ppo.num_envs)
+    share: dict[str, Any] = {"num_envs": local.stop - local.start, "first_env": local.start}
     core = Go1Core(config.task, seed=seed, **share, spread_starts=config.task.sim.spread_starts, critic=True)
     device = str(core.device) if config.process.device == "auto" else config.process.device
     if core.device.type == torch.device(device).type == "cuda" or group.size > 1:
