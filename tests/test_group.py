@@ -74,6 +74,26 @@ def test_two_members_train_as_one_learner_would_and_its_checkpoint_is_one_learne
     assert ppo.iteration == 3
 
 
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_two_gpus_train_as_one_does(tmp_path: Path) -> None:
+    """Where it hangs, ``PYTHONFAULTHANDLER=1`` and ``NCCL_DEBUG=INFO`` say where."""
+    task = (
+        "backend=warp",
+        "observation=clock",
+        "ppo.num_envs=512",
+        "ppo.iterations=3",
+        "ppo.minibatches=4",
+        "logger=local",
+    )
+    for devices in (1, 2):
+        run = [sys.executable, "-m", "go1exp.cli", "train", *task, f"devices={devices}"]
+        subprocess.run([*run, f"hydra.run.dir={tmp_path / str(devices)}"], timeout=240, check=True)
+    one, two = (checkpoint.load_latest(tmp_path / str(devices))[0] for devices in (1, 2))
+    for name, value in one["policy"].items():
+        assert_close(two["policy"][name], value, rtol=1e-2, atol=1e-3, msg=name)
+    assert one["last_obs"].shape == two["last_obs"].shape
+
+
 def test_a_state_is_joined_and_taken_apart_by_robots() -> None:
     def state(value: float) -> dict[str, Any]:
         return {"x": torch.full((64, 2), value), "list": [torch.full((3, 64), value), 7], "all": torch.ones(5)}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ import torch
 import torch.distributed as dist
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from torch import Tensor, nn
+
+PATIENCE = 180.0
+"""Time after which a member that waits for the others gives up, s; kernels are compiled in the first iteration."""
 
 SUMMED = ("contact/impossible",)
 """Metrics that add up over the members; the others are averaged."""
@@ -115,7 +119,9 @@ def enter(rank: int, size: int, meeting: Path, backend: str = "nccl") -> Group:
     """
     if backend == "nccl":
         torch.cuda.set_device(rank)
-    dist.init_process_group(backend, init_method=f"file://{meeting}", rank=rank, world_size=size)
+    dist.init_process_group(
+        backend, init_method=f"file://{meeting}", rank=rank, world_size=size, timeout=timedelta(seconds=PATIENCE)
+    )
     global _HOST_GROUP  # as torch's own groups, it belongs to the process
     _HOST_GROUP = dist.new_group(backend="gloo")
     return Group(rank, size)
