@@ -37,8 +37,8 @@ FILE = data_root() / "conf/controller/mpc.yaml"
 
 
 def given(**changes: Any) -> dict[str, Any]:
-    """What the file says, with other values under ``a__b``."""
-    content: dict[str, Any] = yaml.safe_load(FILE.read_text())
+    """What the file says, with other values under ``a__b``; it walks at once."""
+    content: dict[str, Any] = yaml.safe_load(FILE.read_text()) | {"stand": 0.0}
     for key, value in changes.items():
         *path, last = key.split("__")
         place = content
@@ -323,6 +323,7 @@ def leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 OTHER: dict[str, Any] = {
+    "stand": 0.1,
     "period": 0.004,
     "height": 0.29,
     "swing__reach": 0.01,
@@ -346,6 +347,18 @@ EVERY = [(key, value) for key, value in leaves(given()) if key != "name"]
 @pytest.fixture(scope="module")
 def usual() -> np.ndarray:
     return told(Mpc(settings()))
+
+
+def test_it_stands_before_it_walks(usual: np.ndarray) -> None:
+    later = told(Mpc(settings(stand=0.1)), 60)
+    assert (later[:50, :12] == robot.NOMINAL_STANCE).all()
+    assert (later[:50, 12:24] > 0.0).all()
+    assert not later[:50, 36:].any()
+    assert (later[50] != later[49]).any()
+    one = Mpc(settings(stand=0.1))
+    told(one, 60)
+    one.reset()
+    np.testing.assert_array_equal(told(one, 60), later)
 
 
 def test_a_new_start_is_a_new_start(usual: np.ndarray) -> None:

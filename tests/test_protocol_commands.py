@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 from pathlib import Path
@@ -15,6 +16,8 @@ import go1exp.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.cli import compare, evaluate, subjects
 from go1exp.cli.helptext import show
 from go1exp.cli.plugins import begin
+from go1exp.cli.protocols import chosen as protocols_chosen
+from go1exp.cli.protocols import playable
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.deploy.archive import BundleError
@@ -79,6 +82,10 @@ def compared(folder: Path, *overrides: str) -> dict[str, Any]:
         ("compare trot trot", ("each only once",)),
         ("compare trot nothing", ("'nothing' is no run folder, no bundle (.zip), no shipped policy",)),
         ("compare trot trot@5hz", ("'trot@5hz': after @ comes a rate of 10 to 1000 hz",)),
+        ("compare trot mpc@mujco", ("'mpc@mujco': after @ comes", "mujoco or physx")),
+        ("eval controller=mpc protocol=rate", ("protocol=rate: varies the rate of a policy; mpc has one of its own",)),
+        ("eval controller=mpc bundle=a.zip protocol=kicks", ("bundle = 'a.zip': is a policy",)),
+        ("eval controller=mpc policy=trott protocol=kicks", ("unknown shipped policy 'trott'",)),
         ("compare trot paper protocol=grid", ("protocol=grid", "go1exp eval")),
     ],
 )
@@ -96,6 +103,31 @@ def test_a_bundle_plays_what_its_run_plays(run: Path, bundle: Path, tmp_path: Pa
     assert about_bundle["driver"]["sha256"] != about["driver"].get("sha256")
     noisy, _ = evaluated(tmp_path / "noisy", f"bundle={bundle}")
     assert [r["rmse_x"] for r in noisy] != [r["rmse_x"] for r in theirs]
+
+
+def test_another_controller_plays_and_is_compared(run: Path, tmp_path: Path) -> None:
+    rows, about = evaluated(tmp_path / "mpc", "controller=mpc", f"run={run}", "protocol.corners.noise=false")
+    assert about["driver"]["controller"]["name"] == "mpc"
+    assert [row["fell"] for row in rows] == [False, False]
+    content = compared(tmp_path / "both", f"subjects=[mpc,{run}]")
+    assert [result["subject"] for result in content["results"]["corners"]] == ["mpc", str(run)]
+
+
+def test_of_several_protocols_a_controller_leaves_out_the_rates(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    driver = subjects.driver(subjects.word("mpc", ""), {})
+    protocols, _ = protocols_chosen(compose("eval", ["protocol=[rate,corners]"]), {})
+    assert [c.key for c in playable(protocols, driver)] == ["corners"]
+    assert "rate: not played" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(importlib.util.find_spec("sapien") is None, reason="needs the extra physx")
+def test_another_engine_plays(run: Path, tmp_path: Path) -> None:
+    here, _ = evaluated(tmp_path / "here", f"run={run}")
+    there, about = evaluated(tmp_path / "there", f"run={run}", "engine=physx")
+    assert about["rates"]["engine"]["name"] == "physx"
+    assert [r["rmse_x"] for r in here] != [r["rmse_x"] for r in there]
+    content = compared(tmp_path / "both", f"subjects=[{run},{run}@physx]")
+    assert len(content["results"]["corners"]) == 2
 
 
 def test_a_bundle_that_was_changed_is_refused_before_anything_is_played(bundle: Path, tmp_path: Path) -> None:

@@ -64,10 +64,16 @@ def refuse(protocols: Sequence[Chosen], driver: Driver) -> None:
     for c in protocols:
         for key, velocity in c.protocol.policy_velocities().items():
             problems += driver.problems(velocity, f"protocol.{c.key}.{key}")
-    if driver.senses and len(protocols) == 1 and protocols[0].key == RATES:
-        problems.append(f"protocol={RATES}: varies the rate of a policy; {driver.label} has one of its own")
     if problems:
         raise ConfigError(problems)
+    if driver.senses:
+        refuse_rates_alone(protocols, driver.label)
+
+
+def refuse_rates_alone(protocols: Sequence[Chosen], controller: str) -> None:
+    """Raise ConfigError if nothing is to be played but the rates of a policy, by a controller with one of its own."""
+    if [c.key for c in protocols] == [RATES]:
+        raise ConfigError([f"protocol={RATES}: varies the rate of a policy; {controller} has one of its own"])
 
 
 def playable(protocols: Sequence[Chosen], driver: Driver) -> list[Chosen]:

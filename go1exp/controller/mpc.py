@@ -30,6 +30,12 @@ MOST_SPEED = 25.0
 """Largest joint speed that a swinging leg is told, rad/s."""
 
 
+STANDING = Drive(
+    robot.NOMINAL_STANCE, np.full(robot.NUM_JOINTS, 60.0), np.full(robot.NUM_JOINTS, 2.0), np.zeros(robot.NUM_JOINTS)
+)
+"""The nominal stance, before the first step: 60 N m/rad and 2 N m s/rad hold the trunk to some millimetres (chosen)."""
+
+
 class Mpc:
     """Walks one robot.
 
@@ -61,13 +67,16 @@ class Mpc:
         """Forget everything: the next call is the first one."""
         for part in (self._clock, self._smoothed, self._ground, self._feet):
             part.restart()
-        self._since_plan, self._first = 0, True
+        self._since_plan, self._first, self._stands = 0, True, round(self.settings.stand / self.period)
         self._command: Command = (0.0, 0.0, 0.0)
         self._place, self._lag, self._heading = np.zeros(3), np.zeros(2), 0.0
         self._forces = np.zeros((robot.NUM_LEGS, 3))
 
     def step(self, command: Command, sensed: Sensed) -> Drive:
         """Return what the drives are told until the next call."""
+        if self._stands:
+            self._stands -= 1
+            return STANDING
         self._sense(sensed)
         changed = self._feet.update(self._clock, sensed.foot_force, self._kin.feet)
         self._ground.update(self._feet.anchor - self._place, self._feet.down, self._velocity)

@@ -166,6 +166,7 @@ class MpcSettings:
 
     Attributes:
         name: ``mpc``.
+        stand: time for which the robot first stands, its drives at the nominal stance, s: it may begin in any pose.
         period: time between two ticks, s.
         height: of the trunk's origin above the ground, m.
         ramp: how fast the command may change.
@@ -179,6 +180,7 @@ class MpcSettings:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     name: Literal["mpc"]
+    stand: Annotated[float, Field(ge=0.0, le=5.0)]
     period: Annotated[float, Field(ge=0.0005, le=0.02)]
     height: Annotated[float, Field(ge=0.15, le=0.4)]
     ramp: RampSettings
