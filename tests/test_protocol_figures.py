@@ -7,11 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+import go1exp.protocol.kinds  # noqa: F401  (registers them)
 from go1exp import robot
+from go1exp.compose import compose
+from go1exp.config import parse_train
 from go1exp.measures.trace import Trace
+from go1exp.protocol.base import chosen
 from go1exp.protocol.kinds import gait, hardware, push_map, rate, terrain
 from go1exp.protocol.kinds.energy import effort
 from go1exp.protocol.plan import Motion
+from go1exp.protocol.stage import delay_of_effects
 
 STEPS, DT = 100, 0.02
 
@@ -98,11 +103,32 @@ def test_where_half_pass_stays_within_the_ladder() -> None:
     assert terrain._where(rows(10), 0.95, 15.0) < terrain._where(rows(10), 0.5, 15.0)
 
 
+def test_the_lag_counts_from_the_instant_of_the_command() -> None:
+    """A velocity that follows 0.15 s late, at the ends of the steps at whose starts the commands are given."""
+    protocol: Any = chosen(compose("eval", ["protocol=sinusoid", "protocol.sinusoid.robots=1"])["protocol"])[0][
+        0
+    ].protocol
+    sine, steps = protocol.ladder[3], 1750
+    end = (1 + np.arange(steps)) * DT
+    command, velocity = sine.at(end - DT)[:, None], sine.at(end - 0.15)[:, None]
+    row: dict[str, Any] = {"fell": False, "left_map": False}
+    protocol._answers(motion(t=end, command=command, velocity=velocity), slice(0, 1), sine, [row], {})
+    for axis in ("x", "y", "yaw"):
+        assert row[f"lag_{axis}"] == pytest.approx(0.15, abs=2e-3)
+        assert row[f"gain_{axis}"] == pytest.approx(1.0, abs=2e-3)
+
+
+def test_a_delay_of_the_robots_own_stays() -> None:
+    task = parse_train(compose("train", ["effect=command_delay", "effect.command_delay.delay=0.015"])).task
+    assert delay_of_effects(task) == pytest.approx(0.015)
+    assert delay_of_effects(parse_train(compose("train", [])).task) == 0.0
+
+
 def test_the_delay_margin_ends_where_the_first_robot_falls() -> None:
     rows = [{"delay_ms": d, "fell": d >= 30.0 and n == 1, "robot": n} for d in (0.0, 10.0, 20.0, 30.0) for n in (0, 1)]
     assert hardware._margin(rows) == 20.0
     assert hardware._margin([r for r in rows if r["delay_ms"] < 30.0]) == 20.0
-    assert np.isnan(hardware._margin([{**r, "fell": True} for r in rows]))
+    assert hardware._margin([{**r, "fell": True} for r in rows]) == 0.0  # beyond the limit, and not unknown
 
 
 def test_the_gain_of_a_faster_rate_is_paired() -> None:

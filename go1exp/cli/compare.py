@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
+from go1exp.cli.protocols import RATES
 from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
+    from go1exp.cli.subjects import Named, Variation
     from go1exp.protocol.base import Chosen
     from go1exp.protocol.result import Result
 
@@ -29,6 +31,8 @@ def _task(container: dict[str, Any]) -> None:
             ["protocol=grid: go1exp compare plays others, such as protocol=sinusoid; go1exp eval the grid"]
         )
     subjects = [varied(given, "") for given in settings.subjects]
+    if any(c.kind == RATES for c in protocols):
+        _refuse_rates(subjects)
     folder = Path(settings.folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {settings.folder!r}: is a file"])
@@ -52,6 +56,14 @@ def _task(container: dict[str, Any]) -> None:
             results.append(play(theirs[k], drives, rates, origin, show))
         plays[protocol.key] = results
     _report(plays, folder, {**dataclasses.asdict(settings), **origin})
+
+
+def _refuse_rates(subjects: list[tuple[Named, Variation]]) -> None:
+    """Raise ConfigError naming a subject whose rate or velocity is not that which protocol=rate varies."""
+    for named, how in subjects:
+        if named.controller or how.policy_dt or how.trunk_velocity:
+            reason = "has a rate of its own" if named.controller else f"is varied in what protocol={RATES} varies"
+            raise ConfigError([f"subjects: {named.label} {reason}; leave {RATES} out, also of protocol=paper"])
 
 
 def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:

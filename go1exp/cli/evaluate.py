@@ -39,13 +39,13 @@ class _Judged:
 
 def _protocols(settings: Any, protocols: list[Any], judged: _Judged) -> None:
     """Play what is not the grid."""
-    from go1exp.cli.protocols import play, refuse_rates_alone
+    from go1exp.cli.protocols import play, refuse_rates
     from go1exp.cli.subjects import driven, named
 
+    refuse_rates(protocols, judged.controller.name if judged.controller else None, settings.policy_dt)
     if judged.controller is None:
         subject = named(settings.run, settings.policy, settings.bundle, settings.checkpoint, "protocols")
     else:
-        refuse_rates_alone(protocols, judged.controller.name)
         subject = driven(judged.controller, settings.run, settings.policy, settings.bundle, "protocols")
     folder = Path(settings.folder or subject.folder)
     if folder.exists() and not folder.is_dir():

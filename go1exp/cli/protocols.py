@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from go1exp.protocol.result import Result
 
 RATES = "rate"
-"""Protocol of nothing but policies."""
+"""Kind of protocol that only policies can play."""
 
 GRID_ONLY = (
     *("grid", "episodes", "duration_s", "settle_s", "noise", "randomize", "push", "train_ground", "trunk_velocity"),
@@ -66,21 +66,28 @@ def refuse(protocols: Sequence[Chosen], driver: Driver) -> None:
             problems += driver.problems(velocity, f"protocol.{c.key}.{key}")
     if problems:
         raise ConfigError(problems)
-    if driver.senses:
-        refuse_rates_alone(protocols, driver.label)
 
 
-def refuse_rates_alone(protocols: Sequence[Chosen], controller: str) -> None:
-    """Raise ConfigError if nothing is to be played but the rates of a policy, by a controller with one of its own."""
-    if [c.key for c in protocols] == [RATES]:
+def refuse_rates(protocols: Sequence[Chosen], controller: str | None, policy_dt: float | None) -> None:
+    """Raise ConfigError where the rates of a policy cannot be varied.
+
+    Args:
+        protocols: what is to be played.
+        controller: name of another controller with a rate of its own, or None.
+        policy_dt: the period that is asked for, s, or None.
+    """
+    kinds = [c.kind for c in protocols]
+    if controller is not None and set(kinds) == {RATES}:
         raise ConfigError([f"protocol={RATES}: varies the rate of a policy; {controller} has one of its own"])
+    if policy_dt is not None and RATES in kinds:
+        raise ConfigError([f"policy_dt = {policy_dt:g}: protocol={RATES} has rates of its own, rates_hz"])
 
 
 def playable(protocols: Sequence[Chosen], driver: Driver) -> list[Chosen]:
     """Return the protocols that a driver can play, and say which one of several it cannot."""
-    if driver.senses and any(c.key == RATES for c in protocols):
+    if driver.senses and any(c.kind == RATES for c in protocols):
         print(f"{RATES}: not played, it varies the rate of a policy; {driver.label} has one of its own\n")
-        return [c for c in protocols if c.key != RATES]
+        return [c for c in protocols if c.kind != RATES]
     return list(protocols)
 
 

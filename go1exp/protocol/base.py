@@ -81,6 +81,8 @@ class Protocol:
     """Columns that say the condition of a row."""
     robot_columns: ClassVar[tuple[Column, ...]] = ()
     """Figures of a robot beside those that all protocols have."""
+    alike: ClassVar[bool] = True
+    """Whether the robots of a condition do the same where nothing is random."""
     always: ClassVar[tuple[str, ...]] = ()
     """Measures that it cannot do without."""
 

@@ -57,7 +57,7 @@ def play(
     stage = Stage(driver, setting, on_step)
     stage.expect(protocol.steps(stage))
     played = protocol.play(stage)
-    rows = distinct(played.rows, protocol.keys, protocol.noise or protocol.randomize)
+    rows = distinct(played.rows, protocol.keys, protocol.noise or protocol.randomize or not protocol.alike)
     repeats, played.rows = len(played.rows) - len(rows), rows
     figures = summarised(chosen, rows)
     stage.finished()

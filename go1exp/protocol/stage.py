@@ -28,9 +28,6 @@ from go1exp.protocol.signals import TrunkVelocity
 from go1exp.schema.backends import BackendConfig
 from go1exp.schema.registry import Entry, Term, members
 
-LONGEST_STEP = 0.002
-"""Physics step unless a protocol asks for a rate that it does not divide, s."""
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -148,7 +145,8 @@ class Session:
         self._kicker = Kicker(self.core.backend, task.sim.physics_dt, plan.impulses) if plan.impulses else None
         if plan.delay is not None:  # before the first reset, which puts effects into force
             late: Tensor = self.core.plant.effects.effects[DELAY].delay  # type: ignore[attr-defined]
-            late.copy_(torch.from_numpy(plan.delay)[:, None].expand_as(late))
+            usual = delay_of_effects(stage.driver.task)
+            late.copy_(torch.from_numpy(plan.delay + usual)[:, None].expand_as(late))
         assert isinstance(self.core.command, _Scheduled)
         self._command, self._coming = self.core.command, 0
         self._command.source = self._next_command
@@ -253,6 +251,11 @@ class Session:
         kept["way"][row] = s.base_pos_w[:, 0].numpy() - self._start[:, 0]
         kept["alive"][row] = self._alive
         kept["front_right"][row] = s.foot_contact_time[:, 0].numpy()
+
+
+def delay_of_effects(task: TaskConfig) -> float:
+    """Return by how much the targets of a task's robots come late by its effects, s, without their spread."""
+    return sum(float(e.parameters["delay"]) for e in task.effect if e.entry.name == DELAY)
 
 
 def fitting_step(policy_dt: float, physics_dt: float) -> float:

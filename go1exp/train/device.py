@@ -87,7 +87,9 @@ class DevicePPO(AdaptivePPO):
             return self._collect_step
         if self._replay is None:
             before = self._observation.clone(), self._starts.clone(), torch.cuda.get_rng_state(self.device)
+            self.group.meet()
             self._replay, _ = captured(self._core(), self._collect_step)
+            self.group.meet()
             self._observation.copy_(before[0])
             self._starts.copy_(before[1])
             torch.cuda.set_rng_state(before[2], self.device)

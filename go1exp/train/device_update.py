@@ -140,7 +140,9 @@ class DeviceUpdate:
                     kept.copy_(state[name]) if state else kept.zero_()
         if self._group.size == 1:
             return self._recorded(self._gradient_step, stream)
+        self._group.meet()
         find, follow = (self._recorded(part, stream) for part in (self._find_gradients, self._follow_gradients))
+        self._group.meet()
 
         def step() -> None:
             find()

@@ -8,6 +8,7 @@ sums, and its checkpoints are too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -23,7 +24,7 @@ PATIENCE = 180.0
 """Time after which a member that waits for the others gives up, s; kernels are compiled in the first iteration."""
 
 SUMMED = ("contact/impossible",)
-"""Metrics that add up over the members; the others are averaged."""
+"""Metrics that add up over the members; of others it is the mean of the members that have one."""
 
 LARGEST = ("contact/largest_force",)
 """Metrics of which the largest counts."""
@@ -69,6 +70,16 @@ class Group:
             for parameter in module.parameters():
                 dist.broadcast(parameter.data, 0)
 
+    def meet(self) -> None:
+        """Wait until the devices of all members have done everything so far.
+
+        An exchange on a GPU waits for the other's, which may not come while that one still compiles or records.
+        """
+        if self.size > 1:
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            dist.barrier(group=_by_host())
+
     def agreed(self, value: Any) -> Any:
         """Return the first member's ``value``, plain data."""
         if self.size == 1:
@@ -112,24 +123,33 @@ def enter(rank: int, size: int, meeting: Path, backend: str = "nccl") -> Group:
     """Join the group of ``size`` members that meet by the file ``meeting``, which must not exist before.
 
     Args:
-        rank: number of this member, and of its GPU.
+        rank: number of this member.
         size: how many there are.
         meeting: on this host; no port is opened to other hosts for it.
         backend: ``nccl``, or ``gloo`` between processors (for tests).
     """
-    if backend == "nccl":
-        torch.cuda.set_device(rank)
+    patience = timedelta(seconds=PATIENCE)
+    device = torch.device("cuda", torch.cuda.current_device()) if backend == "nccl" else None
     dist.init_process_group(
-        backend, init_method=f"file://{meeting}", rank=rank, world_size=size, timeout=timedelta(seconds=PATIENCE)
+        # With a device NCCL's links are made now, and not in the first exchange.
+        *(backend, f"file://{meeting}"),
+        rank=rank,
+        world_size=size,
+        timeout=patience,
+        device_id=device,
     )
     global _HOST_GROUP  # as torch's own groups, it belongs to the process
-    _HOST_GROUP = dist.new_group(backend="gloo")
-    return Group(rank, size)
+    _HOST_GROUP = dist.new_group(backend="gloo", timeout=patience)
+    group = Group(rank, size)
+    group.average(torch.zeros(1, device=device))
+    group.meet()
+    return group
 
 
 def leave() -> None:
-    """Leave the group that ``enter`` joined."""
-    dist.destroy_process_group()
+    """Leave the group that ``enter`` joined, if it did."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
 
 
 _HOST_GROUP: Any = None
@@ -143,7 +163,8 @@ def _by_host() -> Any:
 def _together(key: str, values: Sequence[float]) -> float:
     if key in LARGEST:
         return max(values)
-    return sum(values) / (1 if key in SUMMED else len(values))
+    known = [v for v in values if not math.isnan(v)]
+    return sum(known) / (1 if key in SUMMED else len(known)) if known else math.nan
 
 
 def _on_host(state: Any) -> Any:

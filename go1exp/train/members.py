@@ -8,7 +8,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
@@ -56,8 +56,7 @@ def together(size: int, work: Work, container: dict[str, Any], run: Path, backen
         spawn = multiprocessing.get_context("spawn")
         arguments = (size, meeting, backend, work, container, run)
         others = [spawn.Process(target=_member, args=(rank, *arguments), daemon=True) for rank in range(1, size)]
-        for other in others:
-            other.start()
+        _start(others)
         done = threading.Event()
         threading.Thread(target=_watch, args=(others, done, run), daemon=True).start()
         try:
@@ -65,7 +64,8 @@ def together(size: int, work: Work, container: dict[str, Any], run: Path, backen
             done.set()
             for other in others:
                 other.join(LEAVING)
-            group.leave()
+        except Expected:
+            raise
         except RuntimeError as error:  # of an exchange, where the others' end is seen at once
             for other in others:
                 other.join(1.0)
@@ -76,6 +76,23 @@ def together(size: int, work: Work, container: dict[str, Any], run: Path, backen
             done.set()
             for other in others:
                 other.kill()
+            group.leave()
+
+
+def _start(others: Sequence[BaseProcess]) -> None:
+    """Start the processes, each of which sees one GPU, the next one of those that this one sees."""
+    name = "CUDA_VISIBLE_DEVICES"
+    before = os.environ.get(name)
+    visible = before.split(",") if before else [str(k) for k in range(len(others) + 1)]
+    try:
+        for other, device in zip(others, visible[1:], strict=False):
+            os.environ[name] = device
+            other.start()
+    finally:
+        if before is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = before
 
 
 def _member(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import time
@@ -104,8 +103,13 @@ def train_as_member(container: dict[str, Any], run: Path, group: Group) -> None:
     ppo = _begun(config, run, None, group)
     logger = Logger(None, [])
     ppo.after_iteration = _Closing(config, run, logger, None, lambda: False)
-    with contextlib.suppress(Stopped):
+    try:
         _learn(ppo, config, logger)
+    except NumericalFault as fault:
+        _keep(fault, run)
+        raise
+    except Stopped:
+        pass
 
 
 def _learn(ppo: AdaptivePPO, config: TrainConfig, logger: Logger) -> None:

@@ -107,8 +107,8 @@ class Hardware(Steady):
 
 
 def _margin(rows: Sequence[Row]) -> float:
-    """Return the largest delay (ms) up to which none of the rows fell; NaN if one did without any."""
-    held = np.nan
+    """Return the largest delay (ms) up to which none of the rows fell; 0 also if one did without any."""
+    held = 0.0
     for delay in sorted({row["delay_ms"] for row in rows}):
         if any(row["fell"] for row in rows if row["delay_ms"] == delay):
             break

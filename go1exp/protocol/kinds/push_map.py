@@ -62,6 +62,7 @@ class PushMap(Protocol):
     halvings: Count
     watch_s: Annotated[float, Field(ge=0.5)]
 
+    alike: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("direction_deg",)
     robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("impulse", "N s", "largest impulse that is survived", better="higher"),
@@ -106,7 +107,7 @@ class PushMap(Protocol):
             return self._trial(session, state, settle, kicks, start, len(t) - settle)
 
         figures = largest_survived(survives, self.count, self.largest, self.halvings)
-        rows = lives(walked)
+        rows, later = lives(walked), lives(unkicked)
         for n, row in enumerate(rows):
             up = bool(unkicked.alive[-1, n])
             row |= {
@@ -114,6 +115,7 @@ class PushMap(Protocol):
                 "robot": int(phase[n] * self.robots + n % self.robots),
             }
             row |= {"phase": float(phase[n] / self.phases), "fell": not up and not unkicked.left_map[n]}
+            row["moving_s"] += later[n]["moving_s"]
             row["impulse"] = float(figures[n]) if up else None
         censored = int((figures >= self.largest).sum())
         notes = [f"{censored} robots survived the largest impulse of {self.largest:g} N s: theirs may be larger."]

@@ -89,7 +89,8 @@ class Sinusoid(Protocol):
     def _answers(self, motion: Motion, robots: slice, sine: Sine, rows: Sequence[Row], condition: Row) -> None:
         """Write what became of the robots of one sine into their rows."""
         command, velocity = motion.command[:, robots], motion.velocity[:, robots]
-        gain, lag, coherence = response(velocity, command, motion.t - motion.dt, sine.period)
+        gain, lag, coherence = response(velocity, command, motion.t, sine.period)
+        lag = lag + motion.dt  # a command is that of a step's start, a velocity that of its end
         rmse = np.sqrt(((velocity - command)[motion.t > sine.period] ** 2).mean(0))
         for n, row in enumerate(rows):
             row |= {**condition, "robot": n}

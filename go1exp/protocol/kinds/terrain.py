@@ -47,6 +47,7 @@ class OnTerrain(Protocol):
     gravel_friction: PositiveRange
     ground_seed: Annotated[int, Field(ge=0)]
 
+    alike: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("ground", "speed", "difficulty")
     robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("passed", "", "came to the end of its lane in time, without a fall", "share", "higher"),
