@@ -68,7 +68,7 @@ def _verdicts(differences: Mapping[str, Sequence[Difference]]) -> list[tuple[str
         told = [(key, d) for key, those in differences.items() for d in those if d.word == word]
         names = dict.fromkeys(f"{key}, {d.subject}: {d.quantity}" for key, d in told)
         times = [sum(f"{key}, {d.subject}: {d.quantity}" == name for key, d in told) for name in names]
-        text = "; ".join(f"{name} ({n})" if n > 1 else name for name, n in zip(names, times, strict=True))
+        text = "; ".join(f"{name} (in {n} conditions)" if n > 1 else name for name, n in zip(names, times, strict=True))
         if told:
             lines.append((f"{word}: {len(told)}", text if word != ORDER[-1] else "figures, listed below"))
     return lines
@@ -89,7 +89,8 @@ def _table(key: str, differences: Sequence[Difference], first: str, means: Meani
     nothing = _nothing(differences)
     subjects = list(dict.fromkeys(d.subject for d in differences))
     rows, above = [], ""
-    for d in sorted(differences, key=lambda d: ORDER.index(d.word)):
+    figures = list(dict.fromkeys(d.quantity for d in differences))
+    for d in sorted(differences, key=lambda d: (ORDER.index(d.word), figures.index(d.quantity))):
         if d.quantity in nothing:
             continue
         name = f"{d.quantity} ({d.unit})" if d.unit else d.quantity

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,18 +24,23 @@ UNTOLD = ("moving_s",)
 """Figures of the rows that a page sums up in its head."""
 
 VERDICTS = (
-    "Judged is the whole 95 % interval, in brackets, not its middle. reached: all of it keeps the limit; close: it"
-    " misses by less than the claim's tolerance; not reached: it misses by more; not told: it is too wide to say, play"
-    " more robots. n: robots that the value is from."
+    "Judged is the whole 95 % interval, in brackets, not the value alone. reached: all of it keeps the limit; close: it"
+    " misses by no more than the claim's tolerance; not reached: all of it misses, the value by more than that; not"
+    " told: it is too wide to say, play more robots. n: robots that the value is from."
 )
 
 
 def meanings(result: Result) -> dict[str, tuple[str, str]]:
     """Return the unit and the meaning of each figure by its name."""
     protocol = result.chosen.protocol
-    units = {c.name: (c.unit, c.meaning) for c in protocol.columns()}
+    units = {c.name: (c.unit, _plain(c.meaning)) for c in protocol.columns()}
     derived = {d.name: (d.unit, d.meaning) for d in protocol.derived(result.played.rows)}
     return {**units, "falls_per_minute": ("1/min", "falls per moving robot-minute"), **derived}
+
+
+def _plain(docstring: str) -> str:
+    """Return the words of a measure's docstring without the shape of its values and without markup."""
+    return re.sub(r" \((?:N|S|4|,| )+\)", "", docstring).replace("`", "")
 
 
 def claims_table(result: Result, means: Meanings) -> Table:
@@ -42,14 +48,24 @@ def claims_table(result: Result, means: Meanings) -> Table:
     rows = []
     for v in result.verdicts:
         where = condition_text(v.condition) + (f" (worst of {v.conditions})" if v.conditions > 1 else "")
-        unit, meaning = means.get(v.claim.quantity, ("", ""))
-        limit = f"{limits(v.claim)} {unit}".rstrip()
+        limit = f"{limits(v.claim)} {_unit(v.claim.quantity, _about(result.summary, v.condition))}".rstrip()
+        meaning = means.get(v.claim.quantity, ("", ""))[1]
         value = spread(v.figure.estimate, v.figure.low, v.figure.high, f"n {v.figure.n}")
         name = v.name.replace("_", " ")
         figure = {"name": v.claim.quantity, "note": meaning}
         rows.append([name, {"word": v.word}, value, limit, figure, where, v.claim.source])
     header = ["claim", "verdict", "value [95 %] n", "limit", "figure", "where", "limit's source"]
     return {"title": "Claims", "note": VERDICTS if rows else "None.", "header": header, "rows": rows}
+
+
+def _about(entries: Sequence[Entry], condition: Mapping[str, Any]) -> list[Entry]:
+    return [e for e in entries if e["condition"] == condition]
+
+
+def _unit(name: str, entries: Sequence[Entry]) -> str:
+    """Return the unit of a figure in some entries; none where they differ, as difficulties of grounds do."""
+    units = {e["figures"][name]["unit"] for e in entries if name in e["figures"]}
+    return units.pop() if len(units) == 1 else ""
 
 
 def spread(estimate: float | None, low: float | None, high: float | None, count: str) -> dict[str, str]:
@@ -70,14 +86,15 @@ def figure_tables(entries: Sequence[Entry], means: Meanings) -> list[Table]:
     for keys, those in groups.items():
         names = _names(those)
         where = [condition_text(e["condition"]) for e in those]
-        cells = [[_cell(name, e["figures"].get(name)) for e in those] for name in names]
+        heads = {name: _unit(name, those) for name in names}
+        cells = [[_cell(name, e["figures"].get(name), heads[name]) for e in those] for name in names]
         title = f"Numbers by {keys_text(keys)}" if keys else "Numbers of all robots together"
         if len(those) <= MANY:
-            labels = _explained(names, means)
+            labels = _explained(heads, means)
             tables += _split(title, "figure", labels, where if keys else ["value [95 %] n"], cells)
         else:
             across: list[list[Any]] = [list(column) for column in zip(*cells, strict=True)]
-            parts = _split(title, "condition", where, [_named(name, means) for name in names], across)
+            parts = _split(title, "condition", where, [_named(*head) for head in heads.items()], across)
             for k, part in enumerate(parts):
                 part["note"] = _glossary(names[k * ACROSS : (k + 1) * ACROSS], means)
             tables += parts
@@ -114,17 +131,16 @@ def _split(title: str, corner: str, rows: Sequence[Any], columns: Sequence[str],
     return tables
 
 
-def _named(name: str, means: Meanings) -> str:
-    unit = means.get(name, ("", ""))[0]
+def _named(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
-def _explained(names: Sequence[str], means: Meanings) -> list[dict[str, str]]:
+def _explained(units: Mapping[str, str], means: Meanings) -> list[dict[str, str]]:
     """Return the heads of rows, each with what it means where the row above it does not say so already."""
     heads, above = [], ""
-    for name in names:
+    for name, unit in units.items():
         meaning = means.get(name, ("", ""))[1]
-        heads.append({"name": _named(name, means), "note": "" if meaning == above else meaning})
+        heads.append({"name": _named(name, unit), "note": "" if meaning == above else meaning})
         above = meaning
     return heads
 
@@ -133,9 +149,11 @@ def _glossary(names: Sequence[str], means: Meanings) -> str:
     return "; ".join(f"{name}: {means[name][1]}" for name in names if name in means) + "."
 
 
-def _cell(name: str, figure: Mapping[str, Any] | None) -> Any:
+def _cell(name: str, figure: Mapping[str, Any] | None, unit: str) -> Any:
+    """Return a cell, with the figure's unit where the head of its row or column has none."""
     if figure is None:
         return ""
     # A rate of falls has no number of robots: what it is from are the falls.
     count = f"falls {figure['n']}" if name == "falls_per_minute" else f"n {figure['n']}"
-    return spread(figure["estimate"], figure["low"], figure["high"], count)
+    cell = spread(figure["estimate"], figure["low"], figure["high"], count)
+    return cell if unit else {**cell, "value": f"{cell['value']} {figure['unit']}".rstrip()}
