@@ -21,7 +21,7 @@ from go1exp.protocol.claims import judged
 from go1exp.protocol.playing import summarised
 from go1exp.protocol.report.compare import page as comparison
 from go1exp.protocol.report.html import page
-from go1exp.protocol.report.tables import claims_table, figure_tables, meanings
+from go1exp.protocol.report.tables import ACROSS, claims_table, figure_tables, meanings
 from go1exp.protocol.report.words import condition_text, interval_text, number
 from go1exp.protocol.result import Result
 
@@ -83,6 +83,7 @@ def test_numbers_and_conditions_in_words() -> None:
     assert condition_text({"y": 0.0, "yaw": 0.0}) == "y 0 m/s, yaw 0 rad/s"
     assert condition_text({"ground": "slope_up", "difficulty": 5.0}) == "ground slope up, difficulty 5 deg"
     assert condition_text({"ground": "gravel", "difficulty": 0.02}) == "ground gravel, difficulty 0.02 m"
+    assert condition_text({"rate_hz": 100.0 / 3.0}) == "rate 33.33 Hz"
     assert condition_text({}) == "all"
 
 
@@ -98,6 +99,9 @@ def test_tables_have_no_row_without_a_figure_and_one_row_for_a_condition() -> No
             table["rows"]
         )
         assert all(len(row) == len(table["header"]) for row in table["rows"])
+    widths = [len(table["header"]) - 1 for table in tables if table["header"][0] == "condition"]
+    assert max(widths) <= ACROSS
+    assert max(widths) - min(widths) <= len(widths)  # no table for the last figure alone
     assert not any("left_map" in table["header"] for table in tables)  # nobody did
 
 

@@ -65,12 +65,12 @@ def _verdicts(differences: Mapping[str, Sequence[Difference]]) -> list[tuple[str
     """Return each word with the figures that have it, for the page's head."""
     lines = []
     for word in ORDER:
-        told = [(key, d) for key, those in differences.items() for d in those if d.word == word]
-        names = dict.fromkeys(f"{key}, {d.subject}: {d.quantity}" for key, d in told)
-        times = [sum(f"{key}, {d.subject}: {d.quantity}" == name for key, d in told) for name in names]
+        of_word = [(key, d) for key, those in differences.items() for d in those if d.word == word]
+        names = dict.fromkeys(f"{key}, {d.subject}: {d.quantity}" for key, d in of_word)
+        times = [sum(f"{key}, {d.subject}: {d.quantity}" == name for key, d in of_word) for name in names]
         text = "; ".join(f"{name} (in {n} conditions)" if n > 1 else name for name, n in zip(names, times, strict=True))
-        if told:
-            lines.append((f"{word}: {len(told)}", text if word != ORDER[-1] else "figures, listed below"))
+        if of_word:
+            lines.append((f"{word}: {len(of_word)}", text if word != ORDER[-1] else "figures, listed below"))
     return lines
 
 
@@ -111,5 +111,5 @@ def _table(key: str, differences: Sequence[Difference], first: str, means: Meani
 def _nothing(differences: Sequence[Difference]) -> list[str]:
     """Return the figures that are 0 with all subjects in all conditions."""
     names = dict.fromkeys(d.quantity for d in differences)
-    some = {d.quantity for d in differences if d.first != 0.0 or d.other != 0.0}
-    return [name for name in names if name not in some]
+    not_zero = {d.quantity for d in differences if d.first != 0.0 or d.other != 0.0}
+    return [name for name in names if name not in not_zero]

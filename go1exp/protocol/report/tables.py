@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -25,8 +26,8 @@ UNTOLD = ("moving_s",)
 
 VERDICTS = (
     "Judged is the whole 95 % interval, in brackets, not the value alone. reached: all of it keeps the limit; close: it"
-    " misses by no more than the claim's tolerance; not reached: all of it misses, the value by more than that; not"
-    " told: it is too wide to say, play more robots. n: robots that the value is from."
+    " misses, or may miss, by no more than the claim's tolerance; not reached: all of it misses, the value by more than"
+    " that; not told: it is too wide to say, play more robots. n: robots that the value is from."
 )
 
 
@@ -95,8 +96,8 @@ def figure_tables(entries: Sequence[Entry], means: Meanings) -> list[Table]:
         else:
             across: list[list[Any]] = [list(column) for column in zip(*cells, strict=True)]
             parts = _split(title, "condition", where, [_named(*head) for head in heads.items()], across)
-            for k, part in enumerate(parts):
-                part["note"] = _glossary(names[k * ACROSS : (k + 1) * ACROSS], means)
+            for part, chosen in zip(parts, _parts(len(names)), strict=True):
+                part["note"] = _glossary(names[chosen], means)
             tables += parts
     return tables
 
@@ -120,14 +121,19 @@ def _names(entries: Sequence[Entry]) -> list[str]:
     return [*first, *(name for name in names if name not in (*first, *left_out))]
 
 
+def _parts(count: int) -> list[slice]:
+    """Cut ``count`` columns into as few parts of at most ``ACROSS`` as there can be, about equally wide."""
+    wide = math.ceil(count / math.ceil(count / ACROSS))
+    return [slice(k, k + wide) for k in range(0, count, wide)]
+
+
 def _split(title: str, corner: str, rows: Sequence[Any], columns: Sequence[str], cells: Any) -> list[Table]:
     """Return tables of at most ``ACROSS`` columns beside the first, without rows that are empty."""
     tables = []
-    for k in range(0, len(columns), ACROSS):
-        part = slice(k, k + ACROSS)
+    for part in _parts(len(columns)):
         lines = [[row, *line[part]] for row, line in zip(rows, cells, strict=True) if any(line[part])]
-        header = [corner, *columns[part]]
-        tables.append({"title": title if not k else f"{title}, continued", "note": "", "header": header, "rows": lines})
+        named = title if not part.start else f"{title}, continued"
+        tables.append({"title": named, "note": "", "header": [corner, *columns[part]], "rows": lines})
     return tables
 
 

@@ -41,7 +41,7 @@ def _value(key: str, value: Any, condition: Mapping[str, Any]) -> str:
     word, unit = KEYS.get(key, (key.replace("_", " "), ""))
     if key == "difficulty":
         unit = UNITS.get(str(condition.get("ground")), "")
-    text = f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
+    text = f"{value:.4g}" if isinstance(value, float) else str(value).replace("_", " ")
     return f"{word} {text} {unit}".rstrip() if key != "amplitude" else f"{word} {text}"
 
 
