@@ -103,7 +103,7 @@ def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any])
 
 def lines(differences: dict[str, Any]) -> list[str]:
     """Return what a terminal shows: what is told apart, and how many figures are not."""
-    from go1exp.protocol.report.html import condition_text, interval_text
+    from go1exp.protocol.report.words import condition_text, interval_text
 
     text_lines = []
     for key, those in differences.items():

@@ -111,7 +111,7 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
 def lines(result: Result) -> list[str]:
     """Return what a terminal shows of a result."""
     from go1exp.protocol.claims import limits
-    from go1exp.protocol.report.html import condition_text, falls, interval_text
+    from go1exp.protocol.report.words import condition_text, falls, interval_text
 
     text_lines = [f"{result.chosen.key}: {result.label}, {result.seconds:.0f} s; {falls(result)}"]
     for v in result.verdicts:

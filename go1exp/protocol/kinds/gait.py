@@ -75,9 +75,10 @@ class Gait(Steady):
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw gait diagrams, phases on the circle, and figures over speed."""
         feet = played.curves["feet"]
-        diagram = f"Bars: a foot is on the ground; one robot that stays up, the last {SHOWN:g} s (Hildebrand)."
+        diagram = f"Bars: a foot is on the ground; one robot that stays up, the last {SHOWN:g} s. Commands: m/s, rad/s."
         circle = (
-            "Touchdowns in FR's stride, a dot for each robot; up is 0, clockwise. In a trot FL and RR are opposite."
+            "Touchdowns in FR's stride (cycles), a dot for each robot; up is 0, clockwise. In a trot FL and RR"
+            " are opposite, RL is with FR. Commands: m/s, rad/s."
         )
         speed = "Commands straight ahead, with 95 % intervals over robots."
         return [
@@ -132,7 +133,7 @@ def _circle(feet: Mapping[str, Any]) -> Figure:
         ax.set_theta_direction(-1)
         ax.set_ylim(0.0, 1.1)
         ax.set_yticks([])
-        ax.set_xticks(np.arange(4) * np.pi / 2, ["0", ".25", ".5", ".75"], fontsize=6)
+        ax.set_xticks(np.arange(4) * np.pi / 2, ["0", "¼", "½", "¾"], fontsize=7)
         ax.set_title(name, fontsize=7)
     for ax in axes.flat[len(feet) :]:
         ax.remove()

@@ -98,8 +98,11 @@ class Hardware(Steady):
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw each item against its limit, and falls over the delay."""
-        bars = "Worst command's figure over its limit, with its 95 % interval; beyond the line the limit is missed."
-        delay = "Robots of all commands that fell."
+        bars = (
+            "Worst command's figure over its upper limit, with its 95 % interval; beyond the line the limit is missed."
+            " Green: reached; brown: close; red: not reached; grey: not told."
+        )
+        delay = "Share of robots of all commands that fell, with Wilson's 95 % interval."
         return [
             Drawing("items", "Items against their limits", bars, partial(_items, self, summary)),
             Drawing("delay", "Falls with late targets", delay, partial(_falls, played.rows)),

@@ -152,7 +152,10 @@ class PushMap(Protocol):
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw the map, and what the phase does."""
         polar = "Largest impulse survived, N s; up is forward: median with its 95 % interval, 10th percentile."
-        phase = "Median over directions by the phase of FR's stride at which the kick begins (touchdown is 0)."
+        phase = (
+            "Median over robots and directions, 10th to 90th percentile, by the phase of FR's stride at which the kick"
+            " begins; it touches down at 0."
+        )
         return [
             Drawing("map", "Impulse map", polar, partial(_map, {"": summary})),
             Drawing("phase", "By gait phase", phase, partial(_phases, played.rows)),

@@ -170,7 +170,7 @@ def _over_rate(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
         axes[0, column].set_title(f"{velocity} velocity", loc="left")
         ticks = sorted({c["rate_hz"] for c in first})
         axes[-1, column].set_xscale("log")
-        axes[-1, column].set_xticks(ticks, [f"{t:.0f}" for t in ticks], fontsize=6)
+        axes[-1, column].set_xticks(ticks, [f"{t:.0f}" for t in ticks], fontsize=6.5)
         axes[-1, column].minorticks_off()
         axes[-1, column].set_xlabel("rate (Hz)")
     paint.legend(figure, axes[0, 0])

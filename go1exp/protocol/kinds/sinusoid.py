@@ -106,19 +106,22 @@ class Sinusoid(Protocol):
         collected = [
             Drawing(
                 f"sine{k}",
-                f"Amplitude {name}",
+                f"Velocity, amplitude {name}",
                 "Black: commanded; blue: measured, thin of one robot, thick the mean of those still up with the 10th"
                 " to 90th percentile; orange: error of the mean.",
                 partial(_rows, curve),
             )
             for k, (name, curve) in enumerate(played.curves["sines"].items())
         ]
-        bode = "Gain and lag of each axis with 95 % intervals over robots; one line for each amplitude."
+        bode = (
+            "Gain 1 and lag 0 are perfect. 95 % intervals over robots; one line for each amplitude: x (m/s), y (m/s),"
+            " yaw (rad/s); side by side to be seen."
+        )
         return [Drawing("bode", "Gain and lag over frequency", bode, partial(_bode, {"": summary})), *collected]
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw gain and lag of all subjects."""
-        text = "Gain and lag of each axis with 95 % intervals; colours are subjects, all amplitudes."
+        text = "Gain 1 and lag 0 are perfect. 95 % intervals; colours are subjects, all amplitudes."
         return [Drawing("bode", "Gain and lag over frequency", text, partial(_bode, dict(summaries)))]
 
 

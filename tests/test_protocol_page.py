@@ -1,0 +1,182 @@
+"""Pages of protocols and of comparisons: what stands in their tables, and that a phone shows all of it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import go1exp.protocol.kinds  # noqa: F401  (registers them)
+from go1exp.compose import compose
+from go1exp.protocol import comparing
+from go1exp.protocol.base import Played, chosen
+from go1exp.protocol.claims import judged
+from go1exp.protocol.playing import summarised
+from go1exp.protocol.report.compare import page as comparison
+from go1exp.protocol.report.html import page
+from go1exp.protocol.report.tables import ACROSS, claims_table, figure_tables, meanings
+from go1exp.protocol.report.words import condition_text, interval_text, number
+from go1exp.protocol.result import Result
+
+PHONE = 390
+"""Width, CSS pixels."""
+
+
+def made(name: str, label: str, rows: Callable[[Any], list[dict[str, Any]]], *overrides: str) -> Result:
+    """Return a result with these rows, of nobody who walked."""
+    (one,), _ = chosen(compose("eval", [f"protocol={name}", *(f"protocol.{name}.{o}" for o in overrides)])["protocol"])
+    those = rows(one.protocol)
+    figures = summarised(one, those)
+    verdicts = judged(one.protocol.claims, figures)
+    return Result(one, label, {"seed": 1}, Played(those), 0, figures, verdicts, 1.0)
+
+
+def hardware(protocol: Any) -> list[dict[str, Any]]:
+    """Three robots of each command and delay, with every figure where targets are in time."""
+    rows = []
+    for delay in (0.0, *protocol.delays_ms):
+        for x, y, yaw in protocol.commands:
+            for n in range(3):
+                row = {"x": x, "y": y, "yaw": yaw, "delay_ms": delay, "robot": n, "fell": delay > 20.0 and n == 0}
+                row |= {"left_map": False, "moving_s": 8.0, "fingerprint": float(n)}
+                names = [c.name for c in protocol.columns() if c.name not in row] if delay == 0.0 else []
+                rows.append({**row, **{name: 0.3 + 0.01 * n for name in names}})
+    return rows
+
+
+def rate(error: float) -> Callable[[Any], list[dict[str, Any]]]:
+    """Return rows of four robots of each rate and delay with about this error."""
+
+    def rows(protocol: Any) -> list[dict[str, Any]]:
+        return [
+            {"velocity": velocity, "rate_hz": hz, "delay_ms": delay, "robot": n, "fell": False, "left_map": False}
+            | {"moving_s": 5.0, "fingerprint": float(n), "rmse_xy": error + 0.01 * n, "rmse_yaw": 0.1 - 0.01 * n}
+            | {"target_rate": 5.0 + n, "torque_rms": 4.0 + n}
+            for velocity in protocol.velocities
+            for hz in protocol.rates_hz
+            for delay in protocol.delays_ms
+            for n in range(4)
+        ]
+
+    return rows
+
+
+def compared_page() -> str:
+    few = ("rates_hz=[50.0,100.0]", "delays_ms=[0.0]")
+    first, other = (made("rate", label, rate(e), *few) for label, e in (("a first one", 0.1), ("another one", 0.3)))
+    return comparison({"rate": [first, other]}, {"rate": comparing.compared(first, other)}, {"seed": 1})
+
+
+def test_numbers_and_conditions_in_words() -> None:
+    assert [number(v) for v in (0.12345, 5.55e-17, 2362.4, 1.5e7)] == ["0.123", "0", "2362", "1.5e+07"]
+    assert interval_text(0.5, 0.25, 1.0) == "0.5 [0.25, 1]"
+    assert interval_text(0.5, None, None) == "0.5"
+    assert interval_text(None, None, None) == "–"
+    assert condition_text({"x": 0.5, "y": 0.0, "yaw": 0.0, "delay_ms": 10.0}) == "x 0.5 m/s, delay 10 ms"
+    assert condition_text({"y": 0.0, "yaw": 0.0}) == "y 0 m/s, yaw 0 rad/s"
+    assert condition_text({"ground": "slope_up", "difficulty": 5.0}) == "ground slope up, difficulty 5 deg"
+    assert condition_text({"ground": "gravel", "difficulty": 0.02}) == "ground gravel, difficulty 0.02 m"
+    assert condition_text({"rate_hz": 100.0 / 3.0}) == "rate 33.33 Hz"
+    assert condition_text({}) == "all"
+
+
+def test_tables_have_no_row_without_a_figure_and_one_row_for_a_condition() -> None:
+    one = made("hardware", "trot", hardware)
+    tables = figure_tables(one.summary, meanings(one))
+    conditions = len({(r["x"], r["y"], r["yaw"], r["delay_ms"]) for r in one.played.rows})
+    assert len(tables[0]["rows"]) == conditions
+    assert tables[0]["header"][1:3] == ["fell", "falls_per_minute (1/min)"]
+    for table in tables:
+        assert all(any(row[1:]) for row in table["rows"])
+        assert len({row[0] if isinstance(row[0], str) else row[0]["name"] for row in table["rows"]}) == len(
+            table["rows"]
+        )
+        assert all(len(row) == len(table["header"]) for row in table["rows"])
+    widths = [len(table["header"]) - 1 for table in tables if table["header"][0] == "condition"]
+    assert max(widths) <= ACROSS
+    assert max(widths) - min(widths) <= len(widths)  # no table for the last figure alone
+    assert not any("left_map" in table["header"] for table in tables)  # nobody did
+
+
+def test_the_head_says_the_verdicts() -> None:
+    one = made("hardware", "trot", hardware)
+    head = page(one).split("</header>")[0]
+    for v in one.verdicts:
+        assert v.name.replace("_", " ") in head
+    for word in {v.word for v in one.verdicts}:
+        assert f"{word}: {sum(v.word == word for v in one.verdicts)}<" in head
+    assert re.search(
+        r"worse: 4<.*rate, another one: rmse_xy \(in 4 conditions\)", compared_page().split("</header>")[0]
+    )
+
+
+def test_units_are_those_of_the_ground() -> None:
+    """Where half pass is an angle on slopes and a height on gravel."""
+    (one,), _ = chosen(compose("eval", ["protocol=terrain"])["protocol"])
+    half = {
+        "slope_up": {"estimate": 20.0, "low": 18.0, "high": 22.0, "n": 4, "unit": "deg"},
+        "gravel": {"estimate": 0.05, "low": 0.04, "high": 0.06, "n": 4, "unit": "m"},
+    }
+    summary = [{"condition": {"ground": g, "speed": 1.0}, "figures": {"at_half": f}} for g, f in half.items()]
+    verdicts = judged(one.protocol.claims, summary)
+    result = Result(one, "trot", {}, Played([]), 0, summary, verdicts, 1.0)
+    claims = {row[0]: row for row in claims_table(result, meanings(result))["rows"]}
+    assert claims["incline"][3] == "at least 15 deg"
+    (table,) = figure_tables(summary, meanings(result))
+    assert table["header"] == ["figure", "ground slope up, speed 1 m/s", "ground gravel, speed 1 m/s"]
+    assert [row[0]["name"] for row in table["rows"]] == ["at_half"]
+    assert [cell["value"] for cell in table["rows"][0][1:]] == ["20 deg", "0.05 m"]
+
+
+def test_meanings_are_words() -> None:
+    for unit, meaning in meanings(made("hardware", "trot", hardware)).values():
+        assert meaning
+        assert "`" not in meaning
+        assert "(N" not in meaning
+        assert unit != "-"
+
+
+# ---------------------------------------------------------------------- in a browser
+
+MEASURE = """
+<script>addEventListener("load", () => {
+  const seen = [...document.querySelectorAll("body, body *:not(svg *), svg text")];
+  const wide = seen.filter(e => { const r = e.getBoundingClientRect();
+    return r.right > innerWidth + 0.5 || r.left < -0.5 || !e.closest("svg") && e.scrollWidth > e.clientWidth + 1; });
+  const say = e => e.tagName + " " + e.textContent.trim().slice(0, 40);
+  parent.postMessage({width: innerWidth, all: seen.length, page: document.documentElement.scrollWidth,
+    wide: wide.map(say)}, "*");
+});</script>
+"""
+
+FRAME = """<!DOCTYPE html><body><script>addEventListener("message", e => {
+  const text = document.createElement("pre"); text.textContent = JSON.stringify(e.data); document.body.append(text); });
+</script><iframe src="page.html" style="width:WIDTHpx;height:2000px;border:0"></iframe></body>"""
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+@pytest.mark.parametrize("which", ["hardware", "compare"])
+def test_no_element_is_wider_than_a_phone(which: str, tmp_path: Path) -> None:
+    """The page stands in a frame of a phone's width: a window of a browser cannot be that narrow everywhere."""
+    text = page(made("hardware", "trot", hardware)) if which == "hardware" else compared_page()
+    (tmp_path / "page.html").write_text(text.replace("</body>", f"{MEASURE}</body>"))
+    frame = tmp_path / "frame.html"
+    frame.write_text(FRAME.replace("WIDTH", str(PHONE)))
+    with tempfile.TemporaryDirectory() as profile:
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
+        where = [f"--user-data-dir={profile}", "--virtual-time-budget=5000", "--dump-dom", frame.as_uri()]
+        done = subprocess.run(["chromium", *flags, *where], capture_output=True, text=True, timeout=60)
+    found = re.search(r"<pre>(.*?)</pre>", done.stdout, re.DOTALL)
+    assert found, done.stderr
+    seen = json.loads(found[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
+    assert seen["width"] == PHONE
+    assert seen["all"] > 100
+    assert seen["wide"] == []
+    assert seen["page"] <= PHONE
