@@ -112,6 +112,8 @@ NEEDS = {
         *("observation=clock", "reward=clock", "ppo=gpu", "command=widening", "actuator=delay"),
         "observation.gait_clock.rate=3.1",  # neither the file's nor the experiment's, which the rewards take over
     ],
+    "experiment/five_minutes": ["reward=clock"],
+    "experiment/robust": ["experiment=trot", "backend=cpu"],
     "experiment/paper_trot": ["reward=paper_trot", "command=widening", "actuator=delay", "ppo=gpu"],
     "experiment/reference_second": ["experiment=reference", "backend=cpu"],  # it changes what that one adds
 }
