@@ -50,7 +50,7 @@ class Verdict:
         claim: what was claimed.
         figure: the worst condition's figure with its 95 % interval.
         condition: that condition.
-        of: conditions that it was looked for in.
+        conditions: in how many it was looked for.
     """
 
     name: str

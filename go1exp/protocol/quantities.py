@@ -63,7 +63,7 @@ class Derived:
         meaning: in words.
         condition: what it is about.
         better: the direction that is better.
-        of: figure of some rows; NaN where it is not defined. Its interval is by the bootstrap over robots.
+        function: figure of some rows; NaN where it is not defined. Its interval is by the bootstrap over robots.
     """
 
     name: str
