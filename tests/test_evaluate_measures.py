@@ -174,7 +174,7 @@ def test_the_delay_of_the_margin_is_that_of_the_effect_and_takes_the_place_of_an
 def test_the_margin_is_the_largest_delay_before_the_first_fall(
     task: TaskConfig, monkeypatch: pytest.MonkeyPatch, first_falls: int, falls_from: int, margin: int | None, run: int
 ) -> None:
-    def fake(task: TaskConfig, policy: Any, config: EvalConfig, on_step: Any) -> dict[str, Any]:
+    def fake(task: TaskConfig, policy: Any, config: EvalConfig, on_step: Any, controller: Any) -> dict[str, Any]:
         delay = 1000.0 * task.effect[-1].parameters["delay"]
         return {"distinct_falls": {"count": int(delay > falls_from - 1), "n": 5}}
 

@@ -24,6 +24,7 @@ from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.schema import registry
 from go1exp.schema.registry import Expected
 from go1exp.train import checkpoint, run_folder, trainer
+from go1exp.train.group import Group
 from go1exp.train.metrics import CsvWriter
 from go1exp.train.ppo import AdaptivePPO
 from tests.command import run as cli
@@ -164,8 +165,8 @@ def break_gradient(monkeypatch: pytest.MonkeyPatch, name: str, value: float, num
     """Make one element of a parameter's gradient ``value`` in backward pass ``number``."""
     build = trainer.build
 
-    def broken(config: TrainConfig) -> AdaptivePPO:
-        ppo, passes = build(config), [0]
+    def broken(config: TrainConfig, group: Group) -> AdaptivePPO:
+        ppo, passes = build(config, group), [0]
 
         def damage(gradient: Tensor) -> Tensor:
             passes[0] += 1

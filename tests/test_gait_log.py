@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from go1exp.mdp.types import Snapshot
 from go1exp.testing.snapshots import random_snapshot
 from go1exp.train import checkpoint
 from go1exp.train.checkpoint import DamagedCheckpoint
+from go1exp.train.group import Group
 
 DT, SUBSTEPS = 0.02, 10
 TROT, PRONK, HOP = (0.0, 0.5, 0.5, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.11, 0.71, 0.05)
@@ -97,7 +99,7 @@ def test_a_checkpoint_of_before_is_refused_in_a_line(
     state = core.state_dict()
     del state["gait_log"]
     monkeypatch.setattr(checkpoint, "_core", lambda ppo: core)
-    learner: Any = None
+    learner: Any = SimpleNamespace(group=Group())
     with pytest.raises(DamagedCheckpoint, match="of another version of go1exp: it has no 'gait_log'"):
         checkpoint.restore(learner, {"env": state})
 

@@ -22,7 +22,7 @@ from go1exp.cli import engine as engine_choice
 from go1exp.cli import other_robot
 from go1exp.cli.runs import shipped_policies
 from go1exp.compose import compose
-from go1exp.config import TaskConfig
+from go1exp.config import TaskConfig, parse_parts
 from go1exp.env.core import Go1Core
 from go1exp.env.engine import make_backend
 from go1exp.evaluate import engine as evaluate_engine
@@ -38,7 +38,7 @@ from go1exp.train import preflight
 INSTALLED = importlib.util.find_spec("sapien") is not None
 needs_physx = pytest.mark.skipif(not INSTALLED, reason="sapien is not installed: pip install 'go1exp[physx]'")
 
-PHYSX: Any = engine_choice.split(compose("eval", ["engine=physx", "engine.threads=1"]))[0]
+PHYSX: Any = parse_parts(compose("eval", ["engine=physx", "engine.threads=1"]), ("engine",))[0]["engine"]
 CPU = CpuBackend("cpu", threads=1)
 ROUGH = ("terrain=rough", "terrain.rows=3", "terrain.cols=3")
 DT = 0.002

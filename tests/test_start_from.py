@@ -120,7 +120,7 @@ def test_from_the_command_line(
         (
             "nowhere",
             "start_from = 'nowhere': no run folder (it has no config.yaml) and no shipped policy "
-            "(there are: paper, trot)",
+            "(there are: paper, robust, trot)",
         ),
         (str(first), "ppo.hidden is [512, 256, 128] here"),
     ):

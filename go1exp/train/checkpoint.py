@@ -110,9 +110,8 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
         DamagedCheckpoint: if it lacks a part that this version's environment has; the learner is as it was.
     """
     core = _core(ppo)
-    robots = ppo.group.part({name: state[name] for name in ROBOTS}, core.num_envs)
     try:
-        core.load_state_dict(robots["env"])
+        core.load_state_dict(ppo.group.part(state["env"], core.num_envs))
     except KeyError as missing:
         raise DamagedCheckpoint(
             f"a checkpoint of another version of go1exp: it has no {missing}; go on with that version, or begin a new "
@@ -126,8 +125,8 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     # SB3 makes these two when learning starts, unless the first is there already.
     ppo.ep_info_buffer = deque(state["episodes"], maxlen=ppo._stats_window_size)
     ppo.ep_success_buffer = deque(maxlen=ppo._stats_window_size)
-    ppo._last_obs = robots["last_obs"].numpy()
-    ppo._last_episode_starts = robots["last_episode_starts"].numpy()
+    last = ppo.group.part([state["last_obs"], state["last_episode_starts"]], core.num_envs)
+    ppo._last_obs, ppo._last_episode_starts = (each.numpy() for each in last)
     rng = state["rng"]
     torch.set_rng_state(rng["torch"])
     if rng["cuda"] is not None and torch.cuda.is_available():
