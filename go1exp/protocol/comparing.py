@@ -39,7 +39,8 @@ class Difference:
         other: of the other subject.
         difference: other less first, with its interval; n is the pairs.
         word: whether the other is better.
-        needed: pairs (robots, where a figure is of all) that would tell such a difference; None if it is told, or none was seen.
+        needed: pairs (robots, where a figure is of all) that would tell such a difference; None if it is told, or none
+            was seen.
     """
 
     subject: str
