@@ -121,7 +121,7 @@ class Kicks(Protocol):
         from go1exp.protocol.plan import Plan
 
         t = stage.times(self.duration_s)
-        side = np.where(np.arange(self.robots) % 2, np.pi, 0.0) + np.radians(self.direction_deg)
+        side = self._sides()
         count = len(self.impulses)
         sizes = np.tile(np.array(self.impulses), (self.robots, 1))
         kicks = Impulses(self.starts(), sizes, np.repeat(side[:, None], count, 1), self.push_s, self.point)
@@ -188,6 +188,10 @@ class Kicks(Protocol):
         kicks = [round(float(s), 3) for s in self.starts()[n]]
         return {**kept, "kicks": kicks, "nominal": float(motion.height[rest, n].mean()), "dt": motion.dt}
 
+    def _sides(self) -> NDArray[np.float64]:
+        """(N,) direction of the force on each robot, from its heading counter-clockwise, rad."""
+        return np.where(np.arange(self.robots) % 2, np.pi, 0.0) + np.radians(self.direction_deg)
+
     def _after(self, motion: Motion, k: int) -> dict[str, Any]:
         """Return height, and velocity to the pushed side, around one kick, of the robots that are up before it."""
         starts, dt = self.starts()[:, k], motion.dt
@@ -197,13 +201,14 @@ class Kicks(Protocol):
         keep = motion.alive[np.round(starts / dt).astype(int) - 1, robots[0]]
         rows = np.minimum(rows, len(motion.t) - 1)
         alive = motion.alive[rows, robots][:, keep]
-        sign = np.where(np.arange(self.robots) % 2, -1.0, 1.0)
+        side = self._sides()
+        along = motion.velocity[..., 0] * np.cos(side) + motion.velocity[..., 1] * np.sin(side)
         curves: dict[str, Any] = {
             "impulse": float(self.impulses[k]),
             "t": (steps * dt).round(4).tolist(),
             "n": int(keep.sum()),
         }
-        for name, values in (("height", motion.height), ("speed", motion.velocity[..., 1] * sign)):
+        for name, values in (("height", motion.height), ("speed", along)):
             each = np.where(alive, values[rows, robots][:, keep], np.nan)
             up_steps = np.isfinite(each).any(1)
             bands = np.full((3, len(steps)), np.nan)
