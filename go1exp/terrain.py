@@ -141,6 +141,12 @@ class Terrain:
     config: TerrainConfig
 
     @property
+    def difficulty_per_level(self) -> FloatArray:
+        """Difficulty that one level adds to a tile, (cols,): 0 for flat columns."""
+        levels = max(self.config.rows - 1, 1) if self.config.kind != "flat" else 1
+        return np.array([kind != "flat" for kind in self.tile_types]) / levels
+
+    @property
     def extent(self) -> tuple[float, float, float, float]:
         """World (x_min, x_max, y_min, y_max) of the samples, m."""
         ny, nx = self.heights.shape

@@ -884,3 +884,25 @@ def test_a_healthy_step_is_no_fault(make_core: Make) -> None:
     core.reset()
     for action in actions(4, 60, 3.0):
         core.check(core.step(action))
+
+
+def test_commands_are_slower_on_harder_tiles_and_not_on_flat_ones(make_core: Make) -> None:
+    """The same draws as without, times the share that the tile's difficulty leaves."""
+    ground = (
+        *("terrain=rough", "terrain.cols=2", "terrain.rows=5", "curriculum=none", "terrain.boxes_proportion=0.5"),
+        *("terrain.flat_proportion=0.5", "terrain.bumps_proportion=0", "terrain.ramps_proportion=0"),
+    )
+    usual, slowed = (
+        make_core(*ground, *share, "command=widening", "command.start=0.5", num_envs=40)
+        for share in ((), ("+command.hard_share=0.4",))
+    )
+    for core in (usual, slowed):
+        core.reset()
+    assert usual.terrain.tile_types == ("boxes", "flat")
+    assert set(usual.level.tolist()) == set(range(5))
+    difficulty = torch.where(usual.tile_column == 0, usual.level / 4, 0.0)
+    assert_close(slowed.command.value, usual.command.value * (1.0 - 0.6 * difficulty).unsqueeze(1))
+    slowed.level.zero_()  # a tile that got easier
+    for core in (usual, slowed):
+        core.command.advance(0.02, torch.ones(40, dtype=torch.bool))
+    assert_close(slowed.command.value, usual.command.value)

@@ -23,7 +23,7 @@ from go1exp.config import TaskConfig
 from go1exp.protocol import comparing
 from go1exp.protocol.base import Chosen, chosen
 from go1exp.protocol.disturbances import Impulses
-from go1exp.protocol.drivers import PolicyDriver
+from go1exp.protocol.drivers import ControllerDriver, Driver, PolicyDriver
 from go1exp.protocol.kinds.corners import step_answer
 from go1exp.protocol.kinds.push_map import largest_survived
 from go1exp.protocol.plan import Plan
@@ -204,7 +204,7 @@ def test_a_better_subject_is_called_better_and_a_worse_one_worse(
 # ---------------------------------------------------------------------- the stage
 
 
-def stage(driver: PolicyDriver, **changes: Any) -> Stage:
+def stage(driver: Driver, **changes: Any) -> Stage:
     return Stage(driver, Setting(**{"noise": True, "randomize": True, "trunk_velocity": "exact", "seed": 1, **changes}))
 
 
@@ -370,3 +370,27 @@ def test_paper_is_all_of_the_papers() -> None:
     assert list(terrain.ladders) == ["slope_up", "slope_down", "gravel"]
     assert not grid
     assert chosen(compose("eval", [])["protocol"]) == ([], True)
+
+
+def test_the_mpc_is_put_back_to_an_instant(make_task: Callable[..., TaskConfig]) -> None:
+    """It walks on as it did, bit for bit: a push map need not be walked again for every kick."""
+    pytest.importorskip("daqp")
+    import yaml
+
+    from go1exp import data_root
+    from go1exp.controller.mpc import Mpc
+    from go1exp.controller.settings import MpcSettings, parse_controller
+
+    file = data_root() / "conf/controller/mpc.yaml"
+    settings = parse_controller(yaml.safe_load(file.read_text()) | {"stand": 0.0})
+    assert isinstance(settings, MpcSettings)
+    driver = ControllerDriver("mpc", make_task("backend.threads=1", "rand=table1"), lambda: Mpc(settings))
+    nothing, command = np.zeros((2, 1)), np.broadcast_to([0.5, 0.0, 0.0], (40, 2, 3))
+    session = stage(driver).session(Plan(command, impulses=Impulses(nothing, nothing, nothing, 0.05)))
+    session.run(20)
+    state = session.save()
+    assert state is not None
+    first = session.run(20)
+    session.load(state, 20)
+    assert np.array_equal(session.run(20).velocity, first.velocity)
+    assert stage(driver, trunk_velocity="estimated").session(Plan(command)).save() is None

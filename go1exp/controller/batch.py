@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.controller.types import Command, Controller, Drive, Sensed
+from go1exp.controller.types import Command, Controller, Drive, Savable, Sensed
 from go1exp.env.core import Go1Core
 from go1exp.estimation.many import Filters
 from go1exp.record.tape import sample
@@ -79,6 +80,30 @@ class Driven:
             self.controllers[i].reset()
             if self._estimates:
                 self._filters.restart(int(i))
+
+    def save(self) -> Any | None:
+        """Return a copy of what all remember, or None where a controller or the filter cannot be put back."""
+        each = [one.save() for one in self.controllers if isinstance(one, Savable)]
+        if self._estimates or len(each) < len(self.controllers):
+            return None
+        tensors = [tensor.clone() for tensor in self._tensors()]
+        return each, tensors, self._steps, self._feeds, copy.deepcopy(self._rng)
+
+    def load(self, state: Any) -> None:
+        """Put back what ``save`` returned, after the environment was put back."""
+        each, tensors, self._steps, self._feeds, rng = state
+        self._rng = copy.deepcopy(rng)
+        for one, of_controller in zip(self.controllers, each, strict=True):
+            assert isinstance(one, Savable)
+            one.load(of_controller)
+        for tensor, value in zip(self._tensors(), tensors, strict=True):
+            tensor.copy_(value)
+        if self._has_gains:
+            self._plant.set_gains(self._kp, self._kd)
+
+    def _tensors(self) -> tuple[Tensor, ...]:
+        """What is in force, and the last readings, which the engine writes in its next step only."""
+        return self._target, self._forward, self._kp, self._kd, self._core.backend.sensordata
 
     def _step(self) -> None:
         """Let the controllers act where their time has come, and advance the physics."""

@@ -6,7 +6,9 @@ Control" (IROS 2018).
 
 from __future__ import annotations
 
+import copy
 import math
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +36,9 @@ STANDING = Drive(
     robot.NOMINAL_STANCE, np.full(robot.NUM_JOINTS, 60.0), np.full(robot.NUM_JOINTS, 2.0), np.zeros(robot.NUM_JOINTS)
 )
 """The nominal stance, before the first step: 60 N m/rad and 2 N m s/rad hold the trunk to some millimetres (chosen)."""
+
+BUILT = ("settings", "period", "_kin", "_plan", "_every")
+"""What no step changes, or each one works out anew from the readings."""
 
 
 class Mpc:
@@ -71,6 +76,14 @@ class Mpc:
         self._command: Command = (0.0, 0.0, 0.0)
         self._place, self._lag, self._heading = np.zeros(3), np.zeros(2), 0.0
         self._forces = np.zeros((robot.NUM_LEGS, 3))
+
+    def save(self) -> Any:
+        """Return a copy of everything that it remembers."""
+        return copy.deepcopy({name: value for name, value in vars(self).items() if name not in BUILT})
+
+    def load(self, state: Any) -> None:
+        """Put back what ``save`` returned."""
+        vars(self).update(copy.deepcopy(state))
 
     def step(self, command: Command, sensed: Sensed) -> Drive:
         """Return what the drives are told until the next call."""

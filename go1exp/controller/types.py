@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -63,3 +63,14 @@ class Controller(Protocol):
 
     def step(self, command: Command, sensed: Sensed) -> Drive:
         """Return what the drives are told until the next call."""
+
+
+@runtime_checkable
+class Savable(Protocol):
+    """A controller that can be put back to an instant; one that cannot is played from its start again."""
+
+    def save(self) -> Any:
+        """Return a copy of everything that it remembers."""
+
+    def load(self, state: Any) -> None:
+        """Put back what ``save`` returned."""

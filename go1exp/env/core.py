@@ -8,6 +8,8 @@ makes environment i of a batch compute exactly what it would compute alone.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from math import inf
 from typing import Any
 
 import torch
@@ -23,6 +25,7 @@ from go1exp.env.restarts import Restarts
 from go1exp.env.terms import StepTerms
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.clearance import lift
+from go1exp.mdp.commands import UniformVelocity
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight, HeightScan
 from go1exp.mdp.kinematics import KinematicState
@@ -109,11 +112,7 @@ class Go1Core:
 
     def _build_ground(self, first_env: int) -> None:
         """Prepare height lookup, tiles and the place of each environment on them."""
-        t = self.terrain
-
-        def to_device(array: Any) -> Tensor:
-            return torch.as_tensor(array, dtype=torch.float32, device=self.device)
-
+        t, to_device = self.terrain, partial(torch.as_tensor, dtype=torch.float32, device=self.device)
         self._ground = GroundHeight(to_device(t.heights), t.x0, t.y0, t.resolution)
         self._origins = to_device(t.tile_origins)
         rows, cols = t.tile_origins.shape[:2]
@@ -121,8 +120,9 @@ class Go1Core:
         self.tile_column = env % cols
         self.level = torch.zeros_like(env)
         self._max_level = rows - 1
+        self._grade = to_device(t.difficulty_per_level)[self.tile_column]
         self._bounded = t.config.kind != "flat"
-        extent = to_device(t.extent)
+        extent = to_device(t.extent if self._bounded else (-inf, inf, -inf, inf))
         self._map = extent[[0, 2]] + MAP_MARGIN, extent[[1, 3]] - MAP_MARGIN
         rules = [t() for t in self.task.curriculum]
         start = getattr(rules[0], "start_level_max", self._max_level) if rules else self._max_level
@@ -130,10 +130,12 @@ class Go1Core:
 
     def _build_terms(self, drives: EnvRandom, critic: bool) -> None:
         """Turn the configured terms into callables, and make per-environment the model fields that will vary."""
-        task, sim = self.task, self.task.sim
-        setup = drive_setup(task.robot, sim.physics_dt, self.backend, drives)
+        task = self.task
+        setup = drive_setup(task.robot, task.sim.physics_dt, self.backend, drives)
         self.plant = Plant(self.backend, setup, task.actuator, task.effect)
         self.command = task.command(self.random.stream("command"))
+        if isinstance(self.command, UniformVelocity):
+            self.command.ground = self.level, self._grade
         self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}
         self._curriculum = [t() for t in task.curriculum]
         self.terms = StepTerms(task, self.num_envs, self.device, critic)
@@ -276,8 +278,6 @@ class Go1Core:
 
     def _off_map(self) -> Tensor:
         """(N,) bool: at the edge of a height field, beyond which there is no ground."""
-        if not self._bounded:
-            return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         xy, (low, high) = self._state.base_pos_w[:, :2], self._map
         return ((xy < low) | (xy > high)).any(-1)
 

@@ -20,6 +20,9 @@ class UniformVelocity(Memory):
 
     memory: tuple[str, ...] = ("value", "time_left")
 
+    ground: tuple[Tensor, Tensor] | None = None
+    """Level of each robot's tile (N,), which changes, and the difficulty that a level adds there (N,); None is flat."""
+
     def __init__(
         self,
         stream: Stream,
@@ -30,6 +33,7 @@ class UniformVelocity(Memory):
         hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
         zero_fraction: Fraction = 0.0,
+        hard_share: Fraction = 1.0,
     ) -> None:
         """Keep the ranges (m/s, m/s, rad/s, s).
 
@@ -42,12 +46,14 @@ class UniformVelocity(Memory):
             standing_fraction: share of the commands that are exactly zero.
             zero_fraction: probability that an axis of another command is zero, each axis by itself: without it a
                 robot is hardly ever told to do one thing alone.
+            hard_share: share of the ranges on the hardest tiles of a height field, from 1 on flat ones; linear in
+                difficulty. Nobody runs over boxes of 20 cm (go2_rl_gym: commands by terrain).
         """
         device = stream.key.device
         ranges = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z, hold_time], device=device)
         self._low, self._high = ranges.unbind(1)
         self._standing_fraction, self._zero_fraction = standing_fraction, zero_fraction
-        self._stream = stream
+        self._hard_share, self._stream = hard_share, stream
         self.value = torch.zeros(len(stream.key), 3, device=device)
         self.time_left = torch.zeros(len(stream.key), device=device)
 
@@ -59,12 +65,19 @@ class UniformVelocity(Memory):
         asked = self._stream.uniform(1) >= self._standing_fraction
         if self._zero_fraction:
             asked = asked & (self._stream.uniform(3) >= self._zero_fraction)
-        self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * asked * self.share(), self.value))
+        self.value.copy_(torch.where(due.unsqueeze(1), draw[:, :3] * asked * self._in_force(), self.value))
         self.time_left.copy_(torch.where(due, draw[:, 3], self.time_left))
 
     def share(self) -> Tensor | float:
         """Share of the ranges that velocities are drawn from."""
         return 1.0
+
+    def _in_force(self) -> Tensor | float:
+        """That share on the ground of each robot."""
+        if self.ground is None or self._hard_share == 1.0:
+            return self.share()
+        level, grade = self.ground
+        return self.share() * (1.0 - (1.0 - self._hard_share) * level * grade).unsqueeze(1)
 
 
 @command("widening_velocity")
@@ -88,6 +101,7 @@ class WideningVelocity(UniformVelocity):
         hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
         zero_fraction: Fraction = 0.0,
+        hard_share: Fraction = 1.0,
     ) -> None:
         """Keep the ranges; velocities are drawn from the share ``start`` of them first, from all after ``over`` s."""
         super().__init__(
@@ -98,6 +112,7 @@ class WideningVelocity(UniformVelocity):
             hold_time=hold_time,
             standing_fraction=standing_fraction,
             zero_fraction=zero_fraction,
+            hard_share=hard_share,
         )
         self._start, self._over = start, over
         self.age = torch.zeros(len(stream.key), device=stream.key.device)

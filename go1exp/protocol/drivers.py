@@ -191,15 +191,7 @@ class ControllerDriver:
 
     def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> Pilot:
         """Take the robots of an environment."""
-        return _ControllerPilot(core, self.make, noise=core.noise, seed=seed, trunk_velocity=trunk_velocity)
-
-
-class _ControllerPilot(Driven):
-    def save(self) -> Any | None:
-        return None  # a controller is put back by playing its past again
-
-    def load(self, state: Any) -> None:
-        raise NotImplementedError
+        return Driven(core, self.make, noise=core.noise, seed=seed, trunk_velocity=trunk_velocity)
 
 
 Progress = Callable[[int, int], None]
