@@ -157,6 +157,13 @@ def test_results_lie_in_the_run_folder_unless_the_user_says(run: Path) -> None:
     assert (run / "protocols" / "corners.html").is_file()
 
 
+def test_results_that_will_be_replaced_are_named(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evaluated(tmp_path, f"run={run}")
+    assert "note:" not in capsys.readouterr().out
+    evaluated(tmp_path, f"run={run}")
+    assert f"note: {tmp_path} holds corners.json of an earlier call" in capsys.readouterr().out
+
+
 def test_the_help_says_what_the_keys_of_a_protocol_are(capsys: pytest.CaptureFixture[str]) -> None:
     show("eval", "go1exp eval", ["protocol", "protocol=kicks"])
     shown = capsys.readouterr().out

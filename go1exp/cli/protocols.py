@@ -91,6 +91,13 @@ def playable(protocols: Sequence[Chosen], driver: Driver) -> list[Chosen]:
     return list(protocols)
 
 
+def note_replaced(folder: Path, files: Sequence[str]) -> None:
+    """Say which results of an earlier call the new ones will replace."""
+    present = [name for name in files if (folder / name).exists()]
+    if present:
+        print(f"note: {folder} holds {', '.join(present)} of an earlier call; new ones replace them (or: folder=NAME)")
+
+
 def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[str, Any], rates: Rates) -> None:
     """Play protocols one after the other, write what came of each, and print the verdicts."""
     from go1exp.cli.subjects import driver
@@ -100,6 +107,7 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
     drives = driver(subject, other)
     refuse(protocols, drives)
     protocols = playable(protocols, drives)
+    note_replaced(folder, [f"{c.key}.json" for c in protocols])
     for k, c in enumerate(protocols):
         show = spinner(1, f"{c.key} ({k + 1} of {len(protocols)})")
         result = played(c, drives, rates, {"robot": other_robot.described(other)}, show)
