@@ -190,7 +190,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "train:device": lambda walk: ["cuda"],
     "train:logger.wandb": lambda walk: [{"project": "p", "mode": "offline", "group": None, "entity": None}],
     "train:resume": lambda walk: [str(walk.trained("resumed"))],
-    "train:start_from": lambda walk: ["paper"],
+    "train:start_from": lambda walk: ["hop"],
     "train:actuator.file": lambda walk: [str(walk.net(1))],
     "train:actuator.period": lambda walk: ["resample"],
     "train:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],

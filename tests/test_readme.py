@@ -52,8 +52,8 @@ BUDGETS: dict[str, tuple[str, ...]] = {
 
 LEFT_OUT = {
     "go1exp deploy runs/NAME/bundle.zip command=keyboard": "keys need a terminal: tests/test_deploy.py",
-    "go1exp eval policy=robust protocol=paper": "takes eight minutes: tests/test_protocols.py plays each one",
-    "go1exp compare robust mpc trot@physx protocol=kicks": "needs an extra: tests/test_protocol_commands.py",
+    "go1exp eval policy=paper protocol=paper": "takes eight minutes: tests/test_protocols.py plays each one",
+    "go1exp compare paper mpc trot@physx protocol=kicks": "needs an extra: tests/test_protocol_commands.py",
     "go1exp gap logs=recordings model=go2 out=gap": "needs recordings of a Go2: tests/test_gap_machines.py",
 }
 """Commands that are not run, and why."""

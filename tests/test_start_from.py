@@ -106,21 +106,21 @@ def test_from_the_command_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     big = [o for o in SMALL if "hidden" not in o]
-    assert APP.run([*big, "start_from=paper", "hydra.run.dir=tuned"]) == 0
+    assert APP.run([*big, "start_from=hop", "hydra.run.dir=tuned"]) == 0
     assert json.loads((tmp_path / "tuned/start.json").read_text())["num_timesteps"] > 1e8
     assert "starting from" in capsys.readouterr().out
-    assert parse_train(run_folder.read_config(tmp_path / "tuned")).process.start_from == "paper"
+    assert parse_train(run_folder.read_config(tmp_path / "tuned")).process.start_from == "hop"
 
-    run = tmp_path / "paper"  # a run folder goes before a shipped policy of its name
+    run = tmp_path / "hop"  # a run folder goes before a shipped policy of its name
     train_here(run, "ppo.hidden=[512,256,128]")
-    assert APP.run([*big, "start_from=paper", "hydra.run.dir=of_the_folder"]) == 0
+    assert APP.run([*big, "start_from=hop", "hydra.run.dir=of_the_folder"]) == 0
     assert json.loads((tmp_path / "of_the_folder/start.json").read_text())["num_timesteps"] == 16
 
     for wrong, said in (
         (
             "nowhere",
             "start_from = 'nowhere': no run folder (it has no config.yaml) and no shipped policy "
-            "(there are: paper, robust, trot)",
+            "(there are: hop, paper, trot)",
         ),
         (str(first), "ppo.hidden is [512, 256, 128] here"),
     ):

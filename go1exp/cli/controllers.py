@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from go1exp.config import TaskConfig
     from go1exp.controller.types import Controller
 
-CONDITIONS = "paper"
+CONDITIONS = "hop"
 """Shipped policy whose robot, ground and noise another controller walks under where no run is named."""
 
 
