@@ -20,10 +20,10 @@ from torch import Tensor
 import go1exp.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.compose import compose
 from go1exp.config import TaskConfig
+from go1exp.evaluate.drivers import ControllerDriver, Driver, PolicyDriver
 from go1exp.protocol import comparing
 from go1exp.protocol.base import Chosen, chosen
 from go1exp.protocol.disturbances import Impulses
-from go1exp.protocol.drivers import ControllerDriver, Driver, PolicyDriver
 from go1exp.protocol.kinds.corners import step_answer
 from go1exp.protocol.kinds.push_map import largest_survived
 from go1exp.protocol.plan import Plan

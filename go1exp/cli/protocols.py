@@ -12,8 +12,8 @@ from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.subjects import Named
+    from go1exp.evaluate.drivers import Driver
     from go1exp.protocol.base import Chosen
-    from go1exp.protocol.drivers import Driver
     from go1exp.protocol.playing import Rates
     from go1exp.protocol.result import Result
 

@@ -16,7 +16,7 @@ from go1exp.schema.registry import ConfigError
 if TYPE_CHECKING:
     from go1exp.config import TaskConfig
     from go1exp.controller.settings import MpcSettings
-    from go1exp.protocol.drivers import Driver
+    from go1exp.evaluate.drivers import Driver
     from go1exp.schema.backends import BackendConfig
 
 
@@ -152,7 +152,8 @@ def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = 
         ConfigError: if a run's configuration is not one that this version knows.
         go1exp.deploy.archive.BundleError: if a bundle is damaged or was changed.
     """
-    from go1exp.protocol.drivers import BundleDriver, PolicyDriver
+    from go1exp.evaluate.drivers import PolicyDriver
+    from go1exp.protocol.bundles import BundleDriver
 
     if subject.bundle is not None:
         from go1exp.config import parse_train
@@ -172,7 +173,7 @@ def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = 
 
 
 def _controlled(subject: Named, controller: MpcSettings, other: dict[str, Any], robot_of: TaskConfig | None) -> Driver:
-    from go1exp.protocol.drivers import ControllerDriver
+    from go1exp.evaluate.drivers import ControllerDriver
 
     assert subject.run is not None
     task = _robot(controllers.task_of(subject.run), other, robot_of)

@@ -1,8 +1,13 @@
-"""Columns of the terms in an observation."""
+"""What a policy observes: columns of the terms, and which velocity of the trunk."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 from go1exp.config import TaskConfig
+
+TrunkVelocity = Literal["exact", "estimated"]
+"""Velocity of the trunk that is observed: the true one, or what the filter makes of the sensors."""
 
 
 def columns(task: TaskConfig, term: str) -> slice | None:

@@ -6,19 +6,17 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
 from go1exp.config import TaskConfig, time_rules
-from go1exp.controller.batch import Driven
 from go1exp.controller.types import Controller
-from go1exp.deploy.past import PastActions
 from go1exp.env.core import Go1Core
+from go1exp.evaluate.drivers import ControllerDriver, Driver, PolicyDriver
 from go1exp.evaluate.engine import require_agreement
-from go1exp.evaluate.estimated import EstimatedVelocity
 from go1exp.evaluate.measured import described, interval
-from go1exp.evaluate.observed import columns
+from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.evaluate.policy import Policy
 from go1exp.evaluate.recorder import Recorder
 from go1exp.mdp.commands import FixedVelocity
@@ -63,7 +61,7 @@ class EvalConfig:
     policy_dt: float | None
     seed: int
     physics_dt: float | None = None
-    trunk_velocity: Literal["exact", "estimated"] = "exact"
+    trunk_velocity: TrunkVelocity = "exact"
     engine: BackendConfig | None = None
 
     @property
@@ -123,14 +121,12 @@ def evaluate(
         Expected: if that is not near enough.
     """
     count = len(config.commands) * config.episodes
-    imu = config.trunk_velocity == "estimated" or controller is not None
+    driver = _driver(task, policy, controller)
+    imu = config.trunk_velocity == "estimated" or driver.senses
     judged = evaluation_task(task, config)
     checks = require_agreement(judged)
     core = Go1Core(judged, count, config.seed, noise=config.noise, imu=imu)
-    act = _driven(core, controller, config) if controller else _seeing(core, policy, config)
-    # A policy that runs faster than it was trained sees its action of one training period ago.
-    past = PastActions[torch.Tensor](task.sim.policy_dt, core.task.sim.policy_dt)
-    past_columns = columns(core.task, "previous_action") if past.cycles > 1 else None
+    act = driver.begin(core, config.trunk_velocity, config.seed)
     assert isinstance(core.command, FixedVelocity)
     # Robot i has command i // episodes: the robots of one command are neighbours.
     commands = torch.tensor(config.commands, dtype=torch.float32)
@@ -146,9 +142,6 @@ def evaluate(
         result = core.step(act(observation))
         core.check(result)
         observation = result.observation
-        if past_columns is not None:
-            observation = observation.clone()
-            observation[:, past_columns] = past.after(core.action.clone())
         tally.add_step(result.terminated, result.truncated, dt)
         if step >= settle:
             tally.add_velocity(_planar_velocity(core), core.command.value)
@@ -165,18 +158,11 @@ def evaluate(
     return report
 
 
-def _driven(core: Go1Core, make: Callable[[], Controller], config: EvalConfig) -> Policy:
-    """Let controllers drive the robots; return what they want to be called like, a policy."""
-    return Driven(core, make, noise=config.noise, seed=config.seed, trunk_velocity=config.trunk_velocity)
-
-
-def _seeing(core: Go1Core, policy: Policy | None, config: EvalConfig) -> Policy:
-    """Return the policy, which sees an estimated velocity if it is to."""
+def _driver(task: TaskConfig, policy: Policy | None, controller: Callable[[], Controller] | None) -> Driver:
+    if controller is not None:
+        return ControllerDriver("", task, controller)
     assert policy is not None  # or there would be a controller
-    if config.trunk_velocity == "exact":
-        return policy
-    see = EstimatedVelocity(core, config.noise, config.seed).put
-    return lambda observation: policy(see(observation))
+    return PolicyDriver("", task, policy)
 
 
 def _planar_velocity(core: Go1Core) -> torch.Tensor:

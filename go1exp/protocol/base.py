@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.protocol.claims import Claim
 from go1exp.protocol.quantities import FINGERPRINT, LIFE, Column, Derived, Row
-from go1exp.protocol.signals import TrunkVelocity
 from go1exp.schema.registry import ConfigError, Term, as_json, bind_list, explain, find, members, unknown_name
 from go1exp.schema.settings import settings
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.protocol.signals import TrunkVelocity
+from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.terrain import TerrainConfig
 
 if TYPE_CHECKING:

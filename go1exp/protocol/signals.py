@@ -14,9 +14,6 @@ from go1exp.schema.settings import settings
 Velocity = tuple[float, float, float]
 """x and y in m/s, yaw rate in rad/s, body frame."""
 
-TrunkVelocity = Literal["exact", "estimated"]
-"""What a policy sees of the trunk's velocity."""
-
 
 @settings
 class Constant:

@@ -17,14 +17,14 @@ from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.delay_margin import EFFECT as DELAY
 from go1exp.evaluate.delay_margin import delayed
+from go1exp.evaluate.drivers import Driver, Progress
 from go1exp.evaluate.engine import require_agreement
+from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.evaluate.recorder import Recorder
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.protocol.disturbances import Impulses, Kicker, heading
-from go1exp.protocol.drivers import Driver, Progress
 from go1exp.protocol.plan import Array, Motion, Plan
-from go1exp.protocol.signals import TrunkVelocity
 from go1exp.schema.backends import BackendConfig
 from go1exp.schema.registry import Entry, Term, members
 

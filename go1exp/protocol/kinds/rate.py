@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
-from go1exp.protocol.signals import Signal, TrunkVelocity
+from go1exp.protocol.signals import Signal
 from go1exp.schema.registry import NonNegative, Positive, protocol
 from go1exp.schema.settings import settings
 
