@@ -100,6 +100,7 @@ class InProcess:
         self.port = self._server.port
         self.report: dict[str, Any] = {}
         self.truth: dict[str, np.ndarray] = {}
+        self.obeyed: np.ndarray | None = None
 
     def __enter__(self) -> InProcess:
         return self
@@ -108,6 +109,7 @@ class InProcess:
         self.world.closed = True
         empty = Deadlines(TICK, 1).timing()
         self.report = asdict(self._server.counts) | {"timing": asdict(empty)}
+        self.obeyed = self._server.obeyed.rows()
         rows = self._server.truth.rows()
         if not np.isnan(rows).any():
             self.truth = dict(zip(("clock", *TRUTH), rows.T, strict=True))
@@ -119,7 +121,7 @@ def lockstep(spoil: Spoil = lambda state: state) -> Iterator[World]:
     """Let ``go1exp.deploy.job.run_job`` run in simulated time; ``spoil`` changes what sensors say, None is silence."""
     world = World(spoil)
 
-    def clock(spin: float, meanwhile: Any) -> Any:
+    def clock(spin: float, meanwhile: Any, between: Any) -> Any:
         world.spins.append(spin)
         return SimpleNamespace(now=lambda: world.now, sleep_until=world.pass_until)
 

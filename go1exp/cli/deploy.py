@@ -13,20 +13,33 @@ from go1exp.controller.settings import MpcSettings
 from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
+    from go1exp.cli.settings import DeploySettings
     from go1exp.deploy.controller import Mover
+
+MISSING = "???"
+"""What OmegaConf has for a setting that must be given."""
 
 
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.settings import DeploySettings, parse
     from go1exp.schema.settings import subset
 
+    if container.get("check") is True and container.get("bundle") == MISSING:
+        container = {**container, "bundle": None}
     other = {name: container[name] for name in CHOICES if container.get(name) is not None}
     settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in CHOICES})
     controller = controllers.chosen(settings.controller)
-    if settings.robot == "go1" and other:
+    if settings.check:
+        return _check(settings)
+    if settings.bundle is None:
+        raise ConfigError(["bundle = null: only check=true needs none; give it as in go1exp deploy runs/NAME/bundle.zip"])
+    real = settings.robot != "sim"
+    if real and other:
         raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
-
-    if settings.robot == "go1" and controller:
+    for name in ("address", "feet"):
+        if not real and getattr(settings, name) is not None:
+            raise ConfigError([f"{name} = {getattr(settings, name)}: is for robot=go1 and robot=go1_sdk"])
+    if real and controller:
         raise ConfigError(
             ["controller=mpc: is for robot=sim; it has never moved a real robot, nor has a person tried it"]
         )
@@ -47,7 +60,8 @@ def _task(container: dict[str, Any]) -> int:
     wish = Wish(settings.command, settings.sinusoid.amplitude, settings.sinusoid.period)
     plan = subset(Plan, settings, wish=wish, rate=rate)
     sim = dataclasses.asdict(settings.sim)
-    job = Job(settings.bundle, settings.robot, plan, settings.out, sim, other, settings.truth, _mover(controller))
+    about = {"truth": settings.truth, "address": settings.address, "feet": settings.feet}
+    job = Job(settings.bundle, settings.robot, plan, settings.out, sim, other, mover=_mover(controller), **about)
     try:
         return run_job(job, lambda line: print(line, flush=True))
     except RefusedError as error:
@@ -55,6 +69,18 @@ def _task(container: dict[str, Any]) -> int:
     finally:
         if not existed:
             remove_empty(Path(settings.out))
+
+
+def _check(settings: DeploySettings) -> int:
+    """Look at the robot."""
+    from go1exp import robot
+    from go1exp.deploy.job import CheckJob, run_check
+
+    if settings.robot != "go1":
+        raise ConfigError([f"check = true: is for robot=go1, not robot={settings.robot}"])
+    feet = Path(settings.feet or Path(settings.out) / "feet.json")
+    job = CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, feet, settings.address)
+    return run_check(job, lambda line: print(line, flush=True))
 
 
 def _mover(controller: MpcSettings | None) -> Mover | None:

@@ -253,8 +253,12 @@ class DeploySettings(Stages):
 
     Attributes:
         controller: what moves the robot: policy, that of the bundle, or mpc (robot=sim only).
-        bundle: file that go1exp export wrote.
-        robot: sim, a simulated robot in another process, or go1, the real one.
+        bundle: file that go1exp export wrote; check=true needs none.
+        robot: sim, a simulated robot in another process, go1, the real one, or go1_sdk, the same by the vendor's SDK.
+        address: HOST:PORT of robot=go1 and go1_sdk; null takes 192.168.123.10:8007.
+        check: with robot=go1, only look at the robot and calibrate its foot sensors; no torque is ever asked for.
+        feet: calibration of robot=go1's foot sensors, which check=true writes; null takes contact from torques alone,
+            and lets check=true write feet.json in out.
         command: velocity as [x m/s, y m/s, yaw rad/s]; or FILE.csv, sinusoid, keyboard, gamepad.
         sinusoid: the sines of command=sinusoid.
         rate: rate of policy and commands, Hz; null takes that of training.
@@ -268,8 +272,11 @@ class DeploySettings(Stages):
     """
 
     controller: Any = None
-    bundle: Annotated[str, Field(min_length=1)]
-    robot: Literal["sim", "go1"]
+    bundle: Annotated[str, Field(min_length=1)] | None
+    robot: Literal["sim", "go1", "go1_sdk"]
+    address: str | None
+    check: bool
+    feet: str | None
     command: tuple[float, float, float] | str
     sinusoid: SinusoidSettings
     rate: Annotated[float, Field(ge=10, le=1000)] | None

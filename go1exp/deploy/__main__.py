@@ -31,7 +31,10 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
 
     parser = argparse.ArgumentParser("python -m go1exp.deploy", description="Run a bundle's policy on a robot.")
     parser.add_argument("bundle", help="file that go1exp export wrote")
-    parser.add_argument("--robot", default="sim", help="sim, go1, or the port where a simulated robot listens")
+    parser.add_argument("--robot", default="sim", help="sim, go1, go1_sdk, or the port where a simulated robot listens")
+    parser.add_argument("--address", help="HOST:PORT of go1 and go1_sdk; 192.168.123.10:8007 if left out")
+    parser.add_argument("--check", action="store_true", help="with go1: look at the robot; no torque is ever asked for")
+    parser.add_argument("--feet", help="calibration of go1's foot sensors, which --check writes (OUT/feet.json)")
     parser.add_argument("--rate", type=positive, help="Hz of policy and commands; that of training if left out")
     parser.add_argument("--seconds", type=positive, help="s under the policy; until it is stopped if left out")
     parser.add_argument(
@@ -65,6 +68,7 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     sim.add_argument("--delay", type=float, default=0.0, help="of datagrams, each way, s")
     sim.add_argument("--loss", type=float, default=0.0, help="share of datagrams that get lost, each way")
     sim.add_argument("--seed", type=int, default=0)
+    sim.add_argument("--protocol", choices=("go1", "exact"), default="go1", help="also with --robot PORT")
     sim.add_argument("--truth", action="store_true", help="also write the true motion into the recording")
     return parser.parse_args(given)
 
@@ -98,12 +102,31 @@ def _walk(options: argparse.Namespace) -> int:
             stale=options.stale,
             spin=options.spin,
         )
-        sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "loss", "seed")}
-        job = Job(options.bundle, options.robot, plan, options.out, sim, truth=options.truth)
+        sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "loss", "seed", "protocol")}
+        if options.check:
+            return _check(options)
+        about = {"truth": options.truth, "address": options.address, "feet": options.feet}
+        job = Job(options.bundle, options.robot, plan, options.out, sim, **about)
         return run_job(job, lambda line: print(line, flush=True))
     except (Expected, OSError, ValueError) as error:
         print(f"go1exp.deploy: {error}", file=sys.stderr)
         return FAILED
+
+
+def _check(options: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    import numpy as np
+
+    from go1exp.deploy.bundle import load
+    from go1exp.deploy.job import CheckJob, run_check
+
+    if options.robot != "go1":
+        raise ValueError(f"--check with --robot {options.robot}: is for --robot go1")
+    about = load(options.bundle).metadata
+    feet = Path(options.feet or Path(options.out) / "feet.json")
+    job = CheckJob(about.joints, np.array(about.joint_limits), feet, options.address)
+    return run_check(job, lambda line: print(line, flush=True))
 
 
 if __name__ == "__main__":

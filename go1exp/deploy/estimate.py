@@ -11,6 +11,7 @@ import numpy as np
 
 from go1exp.deploy.messages import LowState
 from go1exp.estimation import FilterConfig, Status, from_json, go1, make_filter, sample
+from go1exp.estimation.feet import FootCalibration
 
 FASTEST = 10.0
 """Speed above which an estimate has diverged, m/s: the top speed of a Go1's joints gives about 6 m/s."""
@@ -44,13 +45,18 @@ class KalmanEstimator:
         restarts: number of times that it initialised the speed again after a gap.
     """
 
-    def __init__(self, config: FilterConfig, fail: Fail) -> None:
+    def __init__(self, config: FilterConfig, fail: Fail, feet: FootCalibration | None = None) -> None:
         """Build the filter; ``fail`` is called when its estimate is no longer valid.
+
+        Args:
+            config: its settings.
+            fail: ``Safety.fail``.
+            feet: of sensors that count instead of saying newtons.
 
         Raises:
             go1exp.estimation.EstimatorError: if the compiled filter is missing.
         """
-        self._filter, self._fail = make_filter(config), fail
+        self._filter, self._fail, self._feet = make_filter(config), fail, feet
         self._velocity = np.full(3, np.nan)
         self._since: float | None = None
         self.refused = {Status.LATE.name: 0, Status.INVALID.name: 0}
@@ -72,7 +78,7 @@ class KalmanEstimator:
             state.joint_pos,
             state.joint_vel,
             state.joint_torque,
-            state.foot_force,
+            state.foot_force if self._feet is None else self._feet.forces(state.foot_force),
         )
         status = Status(self._filter.update(row))
         if status.name in self.refused:

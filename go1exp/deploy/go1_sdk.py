@@ -1,11 +1,12 @@
 """A link to the real Go1 through the vendor's SDK (``unitree_legged_sdk`` 3.8, its binding ``robot_interface``).
 
-It has been run against a stand-in with the binding's names only, never on hardware. Names, ports and rates are those of
-the SDK's own low-level example.
+It has been run against the simulated robot by the vendor's binary, never on hardware. Names, ports and rates are those
+of the SDK's own low-level example. ``robot=go1`` needs no binding.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import threading
 import time
@@ -15,27 +16,21 @@ from typing import Any
 
 import numpy as np
 
+from go1exp.deploy.go1_wire import JOINTS, LOW_LEVEL, PERIOD, ROBOT, ROBOT_PORT, SERVO
 from go1exp.deploy.launch import RobotError
 from go1exp.deploy.messages import LowCmd, LowState
 from go1exp.deploy.safety import DEFAULT_KD
 
-MODULE = "robot_interface"
-NOTICE = "note: robot=go1 has never been run on a robot; hang it up first, and keep a hand on its switch"
+MODULES = ("robot_interface", "unitree_legged_sdk.robot_interface")
+"""Names of the binding: as the SDK's build leaves it, and as the package unitree-legged-sdk has it."""
 
-LOW_LEVEL, LOCAL_PORT, ROBOT, ROBOT_PORT = 0xFF, 8080, "192.168.123.10", 8007
-SERVO = 0x0A
-"""Mode of a motor in which it follows gains and targets."""
+LOCAL_PORT = 8080
 
 POWER_LEVEL = 5
 """Level of the SDK's PowerProtect, of 1 to 10: 500 W, as in ``SafetyConfig.power``."""
 
-PERIOD = 0.002
-"""Period of the exchange with the robot, s."""
-
 SILENCE = 0.05
 """The drives are commanded to brake when the runtime has sent no command for this time, s."""
-
-JOINTS = 12
 
 
 class SdkLink:
@@ -44,14 +39,14 @@ class SdkLink:
     Only that thread calls the SDK. If the runtime stops sending commands, the drives brake.
     """
 
-    def __init__(self, sdk: Any = None) -> None:
+    def __init__(self, sdk: Any = None, address: tuple[str, int] = (ROBOT, ROBOT_PORT)) -> None:
         """Open the way; ``sdk`` stands for the module in tests.
 
         Raises:
             RobotError: if the binding is not there.
         """
         self._sdk = _module() if sdk is None else sdk
-        self._udp = self._sdk.UDP(LOW_LEVEL, LOCAL_PORT, ROBOT, ROBOT_PORT)
+        self._udp = self._sdk.UDP(LOW_LEVEL, LOCAL_PORT, *address)
         self._guard = self._sdk.Safety(self._sdk.LeggedType.Go1)
         self._command, self._state = self._sdk.LowCmd(), self._sdk.LowState()
         self._udp.InitCmdData(self._command)
@@ -79,6 +74,9 @@ class SdkLink:
     def send(self, command: LowCmd) -> None:
         """Hand over a command; it goes out within 2 ms, and again every 2 ms."""
         self._wanted = (command, time.perf_counter())
+
+    def repeat(self) -> None:
+        """Do nothing: the thread repeats the command."""
 
     def close(self) -> None:
         """End the exchange, after a last command to brake."""
@@ -147,11 +145,11 @@ def _read(state: Any, now: float) -> LowState:
 
 
 def _module() -> Any:
-    try:
-        return importlib.import_module(MODULE)
-    except ImportError as error:
-        raise RobotError(
-            f"robot=go1: no module {MODULE!r} ({error}). It is the Python binding of the vendor's unitree_legged_sdk "
-            "3.8 (branch for the Go1): build it on this computer and put its folder into PYTHONPATH. "
-            "This way to the robot has never been run on hardware; robot=sim needs nothing"
-        ) from None
+    for name in MODULES:
+        with contextlib.suppress(ImportError):
+            return importlib.import_module(name)
+    raise RobotError(
+        f"robot=go1_sdk: no module {MODULES[0]!r}. It is the Python binding of the vendor's unitree_legged_sdk 3.8 "
+        "(branch for the Go1): build it on this computer and put its folder into PYTHONPATH, or install "
+        "unitree-legged-sdk==3.8.20231105 with --no-deps (Python 3.11, x86-64). robot=go1 needs none of it"
+    )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,17 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy import bundle as bundles
+from go1exp.deploy.address import parsed_address
+from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.commands import KEYS, make, range_array
 from go1exp.deploy.controller import Mover
+from go1exp.deploy.estimate import settings as estimator_settings
+from go1exp.deploy.go1_check import Report, calibrate, check
 from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
-from go1exp.deploy.udp import UdpLink
+from go1exp.deploy.udp import HOST, SIMULATED_TICK_S, Go1Link, UdpLink
+from go1exp.estimation.feet import FootCalibration
 from go1exp.deploy.walk import STATUS, Outcome, Plan, account, interruptible, save, velocity_errors, walk
 
 Say = Callable[[str], None]
@@ -32,13 +38,15 @@ class Job:
 
     Attributes:
         bundle: the file.
-        robot: ``sim``, ``go1``, or the port of this machine at which a simulated robot already listens.
+        robot: ``sim``, ``go1``, ``go1_sdk``, or the port of this machine at which a simulated robot already listens.
         plan: how to walk.
         out: folder of the logs.
         sim: settings of the simulated robot (``go1exp.sim_robot.machine.SimConfig``).
         other: its ``actuator`` and ``effect``, if not those of training.
         truth: also write the simulated trunk's true motion into the recording.
         mover: walks in place of the bundle's policy.
+        address: HOST:PORT of ``go1`` and ``go1_sdk``; that of every Go1 if None.
+        feet: file of the foot sensors' calibration, for ``go1`` and ``go1_sdk``; contact from torques alone if None.
     """
 
     bundle: str
@@ -49,6 +57,11 @@ class Job:
     other: Mapping[str, Any] = field(default_factory=dict)
     truth: bool = False
     mover: Mover | None = None
+    address: str | None = None
+    feet: str | None = None
+
+
+NOTICE = "note: robot=go1 has never been run on a robot; hang it up first, and keep a hand on its switch"
 
 
 @dataclass
@@ -61,33 +74,88 @@ class _Robot:
 
 
 @contextmanager
-def _reached(job: Job, say: Say) -> Iterator[_Robot]:
+def _reached(job: Job, bundle: Bundle, say: Say) -> Iterator[_Robot]:
     """Open the link to the robot; close it at the end."""
-    if job.robot == "go1":
-        from go1exp.deploy.go1_sdk import NOTICE, SdkLink
-
-        link = SdkLink()
-        say(NOTICE)
-        try:
+    with contextlib.ExitStack() as stack:
+        if job.robot in ("go1", "go1_sdk"):
+            say(NOTICE)
+            link: Link = _real(job, bundle, say, stack)
             yield _Robot(link, simulated=False)
-        finally:
-            link.close()
-    elif job.robot == "sim":
-        say("starting the simulated robot")
-        with SimulatedRobot(job.bundle, job.sim, job.other) as process:
-            udp = UdpLink(process.port)
-            try:
-                yield _Robot(udp, True, process)
-            finally:
-                udp.close()
-    else:
-        if not (job.robot.isascii() and job.robot.isdigit() and 0 < int(job.robot) < 2**16):
-            raise RobotError(f"robot={job.robot}: must be sim, go1, or the port where a simulated robot listens")
-        udp = UdpLink(int(job.robot))
-        try:
-            yield _Robot(udp, simulated=True)
-        finally:
-            udp.close()
+        elif job.robot == "sim":
+            say("starting the simulated robot")
+            process = stack.enter_context(SimulatedRobot(job.bundle, job.sim, job.other))
+            yield _Robot(stack.enter_context(closing(simulated(job, process.port))), True, process)
+        else:
+            if not (job.robot.isascii() and job.robot.isdigit() and 0 < int(job.robot) < 2**16):
+                raise RobotError(
+                    f"robot={job.robot}: must be sim, go1, go1_sdk, or the port where a simulated robot listens"
+                )
+            yield _Robot(stack.enter_context(closing(simulated(job, int(job.robot)))), simulated=True)
+
+
+def simulated(job: Job, port: int) -> Link:
+    """Return a link to the simulated robot that listens at a port of this machine."""
+    if job.sim.get("protocol") == "exact":
+        return UdpLink(port)
+    return Go1Link(HOST, port, SIMULATED_TICK_S)
+
+
+def _real(job: Job, bundle: Bundle, say: Say, stack: contextlib.ExitStack) -> Link:
+    """Return a link to a real robot, which has passed its check.
+
+    Raises:
+        RobotError: if it has not.
+    """
+    if job.robot == "go1_sdk":
+        from go1exp.deploy.go1_sdk import SdkLink
+
+        return stack.enter_context(closing(SdkLink(address=parsed_address(job.address))))
+    link = stack.enter_context(closing(Go1Link(*parsed_address(job.address))))
+    about = bundle.metadata
+    report = check(link, about.joints, np.array(about.joint_limits), estimator_settings(about.estimator), say)
+    if report.problems:
+        raise RobotError("the robot does not pass its check, so no walk begins: " + "; ".join(report.problems))
+    return link
+
+
+@dataclass(frozen=True)
+class CheckJob:
+    """A robot to look at.
+
+    Attributes:
+        joints: names.
+        stops: (J, 2) hard stops, rad.
+        feet: file of the foot sensors' calibration, which is made or completed.
+        address: HOST:PORT; that of every Go1 if None.
+    """
+
+    joints: Sequence[str]
+    stops: np.ndarray
+    feet: Path
+    address: str | None = None
+
+
+def run_check(job: CheckJob, say: Say) -> int:
+    """Look at a robot, calibrate its feet's sensors, and return the exit status: 0 if a walk may begin.
+
+    Raises:
+        go1exp.errors.Expected: if the address or the calibration's file is wrong.
+        OSError: if the socket or the file cannot be opened.
+    """
+    host, port = parsed_address(job.address)
+    say(f"listening to {host}:{port}; nothing is sent that asks for a torque")
+    with closing(Go1Link(host, port)) as link:
+        report: Report = check(link, job.joints, job.stops, estimator_settings({}), say)
+    if report.lines:
+        calibrate(report, job.feet, say)
+    for problem in report.problems:
+        say(f"problem: {problem}")
+    say("check passed: a walk may begin" if not report.problems else "check not passed: no walk would begin")
+    return NOT_PASSED if report.problems else 0
+
+
+NOT_PASSED = 1
+"""Exit status of a check that finds a problem."""
 
 
 def run_job(job: Job, say: Say) -> int:
@@ -112,12 +180,13 @@ def run_job(job: Job, say: Say) -> int:
         say(f"note: the policy was trained at {1 / about.policy_dt:g} Hz and runs at {plan.rate:g} Hz")
     if plan.wish.command == "keyboard":
         say(KEYS)
+    feet = None if job.feet is None else FootCalibration.read(Path(job.feet))
     _writable(Path(job.out))
     outcome: Outcome | None = None
     try:
-        with interruptible(), _reached(job, say) as robot:
+        with interruptible(), _reached(job, bundle, say) as robot:
             contact = None if robot.simulated else "torque"
-            outcome = walk(bundle, robot.link, plan, contact=contact, on_second=say, mover=job.mover)
+            outcome = walk(bundle, robot.link, plan, contact=contact, feet=feet, on_second=say, mover=job.mover)
             traffic = getattr(robot.link, "traffic", None)
     except KeyboardInterrupt:
         if outcome is not None:
@@ -135,11 +204,12 @@ def run_job(job: Job, say: Say) -> int:
         kp=np.array(about.kp),
         kd=np.array(about.kd),
         simulated=robot.simulated,
-        newton=robot.simulated,
+        newton=robot.simulated and job.sim.get("feet") != "raw",
         episode=_free(Path(job.out), time.strftime("walk_%Y-%m-%d_%H-%M-%S")),
         notes="ends where the drives begin to brake" + (OTHER_MOVER if job.mover else ""),
     )
-    files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None)
+    obeyed = None if robot.process is None else robot.process.obeyed
+    files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None, obeyed)
     say(str(outcome.timing))
     for line in summary_lines(content):
         say(line)

@@ -127,16 +127,19 @@ class Log:
         row[16:19], row[19:22] = cycle.velocity, cycle.base_lin_vel
         self.phases.setdefault(cycle.phase, cycle.t)
 
-    def recording(self, about: About, truth: Mapping[str, np.ndarray] | None = None) -> Recording | None:
+    def recording(
+        self, about: About, truth: Mapping[str, np.ndarray] | None = None, obeyed: np.ndarray | None = None
+    ) -> Recording | None:
         """Return the walk from the first command in force to the first that brakes; None if there was none.
 
         Args:
             about: its origin.
             truth: columns of the format by name, with ``clock``, s; rows are joined where the clocks are the same.
+            obeyed: (T, 2 + J) what a simulated robot had in force: its clock, s, whether a command was, targets, rad.
         """
         from go1exp.recording import Recording
 
-        rows = self._in_force()
+        rows = self._in_force() if obeyed is None or self._numbered() else self._as_told(obeyed)
         if rows is None:
             return None
         kept, targets = rows
@@ -150,7 +153,8 @@ class Log:
         good &= np.isfinite(np.stack(list(channels.values()))).all(axis=0)
         if good.sum() < 2:
             return None
-        notes = [about.notes, "" if (self.states.part("in_force")[kept] >= 0).all() else UNKNOWN_DELAY]
+        told = obeyed is not None or (self.states.part("in_force")[kept] >= 0).all()
+        notes = [about.notes, "" if told else UNKNOWN_DELAY]
         notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
         meta = _meta(about, t[good], "; ".join(note for note in notes if note))
         channels = {"t": t, **channels}
@@ -175,6 +179,19 @@ class Log:
             feet = states.part("foot_force")[kept]
             channels |= {FOOT_FORCE + leg: feet[:, k] for k, leg in enumerate(about.metadata.legs)}
         return channels
+
+    def _numbered(self) -> bool:
+        """Return whether the robot told in its states which command was in force."""
+        return bool((self.states.part("in_force") >= 0).any())
+
+    def _as_told(self, obeyed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""
+        clock = self.states.part("clock")
+        if not len(obeyed) or not len(clock) or np.isnan(clock).any():
+            return None
+        nearest = np.clip(np.searchsorted(obeyed[:, 0], clock - 1e-6), 0, len(obeyed) - 1)
+        in_force = (np.abs(obeyed[nearest, 0] - clock) < 1e-6) & (obeyed[nearest, 1] > 0)
+        return (in_force, obeyed[nearest[in_force], 2:]) if in_force.any() else None
 
     def _in_force(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""

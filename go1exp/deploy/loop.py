@@ -30,6 +30,10 @@ class Clock(Protocol):
         """Return at ``when`` or a little later; at once if that has passed."""
 
 
+BETWEEN_S = 0.002
+"""Period at which a clock lets something be done between two cycles, s: that of the Go1's packets."""
+
+
 class MonotonicClock:
     """The system's monotonic clock.
 
@@ -37,10 +41,17 @@ class MonotonicClock:
         spin: time before each instant for which the core is kept busy instead of asleep, s; 0: not at all.
         meanwhile: called once at the beginning of that, for example a rehearsal of the work: after a sleep the caches
             are cold, and the first work takes two to three times as long.
+        between: called every ``BETWEEN_S`` while it sleeps, for example to send a command again; None: it sleeps
+            through.
     """
 
-    def __init__(self, spin: float = 0.0, meanwhile: Callable[[], None] = lambda: None) -> None:
-        self._spin, self._meanwhile = spin, meanwhile
+    def __init__(
+        self,
+        spin: float = 0.0,
+        meanwhile: Callable[[], None] = lambda: None,
+        between: Callable[[], None] | None = None,
+    ) -> None:
+        self._spin, self._meanwhile, self._between = spin, meanwhile, between
 
     def now(self) -> float:
         """Return the time, s."""
@@ -48,7 +59,11 @@ class MonotonicClock:
 
     def sleep_until(self, when: float) -> None:
         """Sleep, then poll the clock for the last ``spin`` s."""
-        left = when - time.perf_counter() - self._spin
+        wake = when - self._spin
+        while self._between is not None and wake - time.perf_counter() > BETWEEN_S:
+            time.sleep(BETWEEN_S)
+            self._between()
+        left = wake - time.perf_counter()
         if left > 0:
             time.sleep(left)
         if self._spin and time.perf_counter() < when:

@@ -68,5 +68,8 @@ class Link(Protocol):
     def send(self, command: LowCmd) -> None:
         """Send a command, without waiting."""
 
+    def repeat(self) -> None:
+        """Send what the robot must hear between two commands, if its protocol wants that; called every 2 ms."""
+
     def close(self) -> None:
         """Close the connection."""

@@ -24,6 +24,7 @@ from go1exp.deploy.estimate import KalmanEstimator, NoEstimator, settings
 from go1exp.deploy.log import About, Log, write_cycles
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.messages import Link
+from go1exp.estimation.feet import FootCalibration
 from go1exp.deploy.safety import RULES, Fault, Safety, SafetyConfig
 from go1exp.files import write_json
 
@@ -92,10 +93,17 @@ class Outcome:
         return 0 if self.fault is None else STATUS.get(self.fault.name, UNKNOWN_FAULT)
 
 
-def estimator_of(bundle: Bundle, safety: Safety, contact: str | None, always: bool = False) -> Estimator:
+def estimator_of(
+    bundle: Bundle,
+    safety: Safety,
+    contact: str | None,
+    feet: FootCalibration | None = None,
+    always: bool = False,
+) -> Estimator:
     """Return the estimator that a bundle's policy wants; with ``always`` one in any case.
 
-    ``contact`` is ``torque`` for a robot whose feet's sensors are not calibrated; None leaves the bundle's choice.
+    ``contact`` is ``torque`` for a robot whose feet's sensors speak no newtons; None leaves the bundle's choice. With
+    their calibration, ``feet``, both are used.
 
     Raises:
         go1exp.schema.registry.ConfigError: if the bundle's settings are not such.
@@ -105,8 +113,8 @@ def estimator_of(bundle: Bundle, safety: Safety, contact: str | None, always: bo
 
     if not always and all(port.name != "base_lin_vel_b" for port in bundle.policy.inputs):
         return NoEstimator()
-    changes: dict[str, Any] = TORQUE if contact == "torque" else {}
-    return KalmanEstimator(settings(bundle.metadata.estimator, **changes), safety.fail)
+    changes: dict[str, Any] = TORQUE if contact == "torque" and feet is None else {}
+    return KalmanEstimator(settings(bundle.metadata.estimator, **changes), safety.fail, feet)
 
 
 def walk(
@@ -115,6 +123,7 @@ def walk(
     plan: Plan,
     *,
     contact: str | None = None,
+    feet: FootCalibration | None = None,
     on_second: Callable[[str], None] = lambda line: None,
     mover: Mover | None = None,
 ) -> Outcome:
@@ -127,13 +136,13 @@ def walk(
     about = bundle.metadata
     limits = about.joints, np.array(about.joint_limits), np.array(about.torque_limit)
     safety = Safety(*limits, SafetyConfig(stale=plan.stale))
-    estimator = estimator_of(bundle, safety, contact, always=mover is not None)
+    estimator = estimator_of(bundle, safety, contact, feet, always=mover is not None)
     stop_requests: list[str] = []
     ranges = range_array(about.command_ranges)
     with contextlib.closing(make(plan.wish, ranges, safety.stop, stop_requests.append)) as commands:
         walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests, mover)
         with stopping(safety):
-            clock = MonotonicClock(plan.spin, walk.rehearse)
+            clock = MonotonicClock(plan.spin, walk.rehearse, link.repeat)
             timing = run(walk.cycle, walk.rate, None, clock, lambda timing: on_second(walk.status(timing)))
         return walk.outcome(timing)
 
@@ -290,9 +299,16 @@ def account(bundle: Bundle, plan: Plan, outcome: Outcome, extra: Mapping[str, An
 
 
 def save(
-    folder: Path, about: About, outcome: Outcome, content: dict[str, Any], truth: Mapping[str, np.ndarray] | None
+    folder: Path,
+    about: About,
+    outcome: Outcome,
+    content: dict[str, Any],
+    truth: Mapping[str, np.ndarray] | None,
+    obeyed: np.ndarray | None = None,
 ) -> list[Path]:
     """Write NAME.json, NAME.npz and, if the robot was commanded, NAME.parquet; return the files.
+
+    ``truth`` and ``obeyed`` are those of a simulated robot (``Log.recording``).
 
     Raises:
         OSError: if one cannot be written.
@@ -302,7 +318,7 @@ def save(
     files = [folder / f"{about.episode}.json", folder / f"{about.episode}.npz"]
     write_json(files[0], content, indent=1, allow_nan=False)  # first: nothing else is as small
     write_cycles(files[1], outcome.log)
-    recording = outcome.log.recording(about, truth)
+    recording = outcome.log.recording(about, truth, obeyed)
     if recording is not None:
         from go1exp import recording as format_
 

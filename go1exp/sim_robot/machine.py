@@ -117,6 +117,17 @@ class Robot:
             self._fed = torch.tensor(fed, dtype=self._plant.q.dtype).unsqueeze(0)
         self._set_gains(command.kp, command.kd)
 
+    def release(self) -> None:
+        """Do as a command says that asks for nothing: the joints are free, once a command has moved them."""
+        if np.isfinite(self._commanded):
+            nothing = np.zeros(robot.NUM_JOINTS)
+            self.obey(LowCmd(self._target[0].numpy().astype(float), nothing, nothing), self._in_force)
+
+    def in_force(self) -> np.ndarray:
+        """Return whether a command was in force in the last step, 1 or 0, and its targets, rad: (13,)."""
+        obeying = np.isfinite(self._commanded) and not self.braking
+        return np.concatenate([[obeying], self._target[0].numpy()])
+
     def step(self) -> None:
         """Advance by a tick; drives without a command for ``SILENCE`` brake."""
         if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE + 1e-9:

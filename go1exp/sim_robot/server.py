@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.deploy import wire
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.udp import HOST
+from go1exp.deploy.messages import LowCmd
 from go1exp.sim_robot.machine import TICK, Robot
+from go1exp.sim_robot.protocols import OLD, language
 from go1exp.sim_robot.settings import SimConfig
 
 MOST_AT_ONCE = 10
@@ -26,6 +27,14 @@ TRUTH = (
     *("base_ang_vel_x_b", "base_ang_vel_y_b", "base_ang_vel_z_b"),
 )
 """Columns of the truth, named as in a recording."""
+
+GONE_S = 1.0
+"""A speaker who has been silent for this time is gone: the next one is heard, s."""
+
+STRANGER = "another sender"
+
+OBEYED = ("obeying", *(f"q_target_{k}" for k in range(12)))
+"""Columns of what was in force: whether a command was, and its targets."""
 
 CHUNK = 5000
 ASK_EVERY = 20
@@ -59,10 +68,10 @@ class Network:
 
 
 class Truth:
-    """The trunk's true motion by the robot's clock, kept in blocks so that no array is ever copied to grow."""
+    """Rows of numbers by the robot's clock, kept in blocks so that no array is ever copied to grow."""
 
-    def __init__(self) -> None:
-        self._pieces = [np.zeros((CHUNK, 1 + len(TRUTH)))]
+    def __init__(self, width: int = len(TRUTH)) -> None:
+        self._pieces = [np.zeros((CHUNK, 1 + width))]
         self._rows = 0
 
     def add(self, clock: float, values: np.ndarray) -> None:
@@ -75,7 +84,7 @@ class Truth:
         self._rows += 1
 
     def rows(self) -> np.ndarray:
-        """Return everything: clock, and the columns of ``TRUTH``, (T, 14)."""
+        """Return everything: clock, and the columns, (T, 1 + width)."""
         return np.concatenate([*self._pieces[:-1], self._pieces[-1][: self._rows]])
 
 
@@ -85,8 +94,9 @@ class Counts:
 
     Attributes:
         commands: commands put into force.
-        old: commands that came after a newer one.
+        old: commands that came after a newer one (known with protocol=exact only).
         foreign: datagrams that were not a valid message, or came from another sender.
+        refused: these by their reason.
         states: states sent.
         lost: datagrams that the simulated network lost.
         slipped: time by which the robot's clock fell behind for good, s.
@@ -96,6 +106,7 @@ class Counts:
     commands: int = 0
     old: int = 0
     foreign: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
     states: int = 0
     lost: int = 0
     slipped: float = 0.0
@@ -106,32 +117,42 @@ class Counts:
 class Server:
     """A robot at a port of this machine.
 
+    It answers to the first who speaks to it in its protocol. Other senders are refused until that one has been silent
+    for ``GONE_S``.
+
     Attributes:
-        port: where it listens.
+        address: where it listens.
         counts: what has happened.
+        peer: who it listens to; None before anybody has spoken.
         truth: the trunk's true motion.
+        obeyed: what was in force, in the columns of ``OBEYED``.
     """
 
-    def __init__(self, robot: Robot, config: SimConfig, port: int = 0) -> None:
+    def __init__(self, robot: Robot, config: SimConfig, port: int = 0, host: str = HOST) -> None:
         """Listen at ``port``, or at any that is free if 0.
 
         Raises:
-            OSError: if the port is taken.
+            OSError: if the port is taken, or the host is not this machine's.
         """
-        self._robot = robot
+        self._robot, self._language = robot, language(config)
         rng = np.random.default_rng([config.seed, 1])
         self._uplink, self._downlink = (Network(config.delay, config.loss, rng) for _ in range(2))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
-            self._socket.bind((HOST, port))
+            self._socket.bind((host, port))
         except OSError:
             self._socket.close()
             raise
-        self.port: int = self._socket.getsockname()[1]
-        self._peer: tuple[str, int] | None = None
-        self._last = 0
-        self.counts, self.truth = Counts(), Truth()
+        self.address: tuple[str, int] = self._socket.getsockname()
+        self.peer: tuple[str, int] | None = None
+        self._heard = -math.inf
+        self.counts, self.truth, self.obeyed = Counts(), Truth(), Truth(len(OBEYED))
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return self.address[1]
 
     def serve(self, going: Callable[[], bool], seconds: float | None = None) -> Timing:
         """Run in real time while ``going``; return how the time was kept."""
@@ -155,7 +176,6 @@ class Server:
 
         timing = run(work, 1.0 / TICK, seconds, clock)
         self.counts.timing = asdict(timing)
-        self.counts.lost = self._uplink.lost + self._downlink.lost
         return timing
 
     def tick(self) -> None:
@@ -168,46 +188,51 @@ class Server:
         robot.step()
         state, true = robot.sense()
         self.truth.add(now, true)
-        if self._peer is not None:
-            self._downlink.put(now, wire.pack_state(state, self.counts.ticks))
-            for data in self._downlink.take(now):
-                self._send(data)
+        self.obeyed.add(now, robot.in_force())
+        data = self._language.written(state, round(now / TICK))
+        if self.peer is not None:
+            self._downlink.put(now, data)
+            for late in self._downlink.take(now):
+                self._send(late)
         self.counts.ticks += 1
+        self.counts.lost = self._uplink.lost + self._downlink.lost
 
     def _listen(self, now: float) -> None:
         while True:
             try:
-                data, sender = self._socket.recvfrom(wire.COMMAND_SIZE + 1)
+                data, sender = self._socket.recvfrom(self._language.size + 1)
             except BlockingIOError:
                 return
             except ConnectionRefusedError:
                 continue  # an earlier state was sent to a port that is closed
-            about = wire.head(data)
-            if about is None or about.kind == wire.STATE or self._peer not in (None, sender):
-                self.counts.foreign += 1
-                continue
-            self._peer = sender  # the first sender; others are ignored
-            if about.kind == wire.COMMAND:
+            if why := self._language.refusal(data):
+                self._refuse(why)
+            elif self.peer not in (None, sender) and now - self._heard < GONE_S:
+                self._refuse(STRANGER)
+            else:
+                self.peer, self._heard = sender, now
                 self._uplink.put(now, data)
 
+    def _refuse(self, why: str) -> None:
+        self.counts.foreign += 1
+        self.counts.refused[why] = self.counts.refused.get(why, 0) + 1
+
     def _obey(self, data: bytes) -> None:
-        about = wire.head(data)
-        assert about is not None  # checked when it was received
-        if wire.newer(about.number, self._last) <= 0:
+        heard = self._language.read(data)
+        if heard == OLD:
             self.counts.old += 1
-            return
-        command = wire.unpack_command(data, about)
-        if not all(np.isfinite(getattr(command, name)).all() for name, _ in wire.COMMAND_PARTS):
-            self.counts.foreign += 1
-            return
-        self._last = about.number
-        self.counts.commands += 1
-        self._robot.obey(command, about.number)
+        elif isinstance(heard, str):
+            self._refuse(heard)
+        elif heard.command is None:
+            self._robot.release()
+        else:
+            self.counts.commands += 1
+            self._robot.obey(heard.command, heard.number or self.counts.commands)
 
     def _send(self, data: bytes) -> None:
-        assert self._peer is not None
+        assert self.peer is not None
         try:
-            self._socket.sendto(data, self._peer)
+            self._socket.sendto(data, self.peer)
             self.counts.states += 1
         except (BlockingIOError, ConnectionRefusedError):
             pass

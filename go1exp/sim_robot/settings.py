@@ -19,6 +19,10 @@ class SimConfig:
         noise: noise of its sensors, as a multiple of the paper's Table II.
         delay: delay of datagrams, each way, s.
         loss: share of the datagrams that are lost, each way.
+        protocol: go1 for the robot's own packets, with their rounding; exact for double precision, with the number of
+            the command in force.
+        feet: what the foot sensors say with protocol=go1, newton, or raw counts with zeros and scales of their own, as
+            the robot's.
         seed: seed of noise, loss and random effects.
     """
 
@@ -28,4 +32,6 @@ class SimConfig:
     noise: NonNegative = 1.0
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     loss: Annotated[Fraction, Field(lt=1)] = 0.0
+    protocol: Literal["go1", "exact"] = "go1"
+    feet: Literal["newton", "raw"] = "newton"
     seed: Annotated[int, Field(ge=0)] = 0

@@ -1,0 +1,122 @@
+"""The feet's loads: counts of uncalibrated sensors to newtons, and the forces that balance the joints' torques."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from go1exp.errors import Expected
+from go1exp.estimation.config import FilterConfig
+from go1exp.estimation.legs import foot
+
+LEGS = 4
+SINGULAR = 1e-6
+"""Smallest determinant of a leg's Jacobian, m3/rad3: a straighter leg says nothing about the force along it."""
+
+LIGHT, STANDING = 10.0, 60.0
+"""Sum of the feet's vertical forces by torques below which they carry nothing, and above which a Go1 stands, N
+(chosen: a Go1 weighs 125 N, and its drives' friction looks like up to 2 N a foot)."""
+
+
+class CalibrationError(Expected):
+    """A calibration cannot be read or made; the message says why."""
+
+
+@dataclass(frozen=True)
+class FootCalibration:
+    """What four foot sensors say without load, and how much more for each newton.
+
+    Attributes:
+        zero: (4,) counts without load.
+        scale: (4,) counts per newton; None before the robot has stood.
+    """
+
+    zero: tuple[float, float, float, float]
+    scale: tuple[float, float, float, float] | None = None
+
+    def forces(self, counts: np.ndarray) -> np.ndarray:
+        """Return forces (4,), N, for counts (4,).
+
+        Raises:
+            CalibrationError: without scales.
+        """
+        if self.scale is None:
+            raise CalibrationError("the feet's calibration has no scales: check=true while the robot stands makes them")
+        return (np.asarray(counts, float) - self.zero) / self.scale
+
+    def write(self, path: Path) -> None:
+        """Write JSON."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def read(cls, path: Path) -> FootCalibration:
+        """Read what ``write`` wrote.
+
+        Raises:
+            CalibrationError: if it is no calibration; the message names file and key.
+        """
+        try:
+            content = json.loads(Path(path).read_text())
+            zero, scale = content["zero"], content["scale"]
+            numbers = [*zero, *(scale or [1.0] * LEGS)]
+            if len(zero) != LEGS or len(numbers) != 2 * LEGS or not np.isfinite(numbers).all():
+                raise ValueError("needs four finite numbers in zero, and in scale or null there")
+            if scale and min(scale) <= 0.0:
+                raise ValueError(f"scale = {scale}: must be greater than 0")
+            return cls(tuple(map(float, zero)), tuple(map(float, scale)) if scale else None)  # type: ignore[arg-type]
+        except (ValueError, KeyError, TypeError) as error:
+            raise CalibrationError(f"{path}: is no calibration of the feet: {error}") from None
+
+
+def forces_by_torque(config: FilterConfig, q: np.ndarray, torque: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the vertical forces (4,), N, by which the ground balances the joints' torques: tau + J' f = 0.
+
+    Args:
+        config: has the legs.
+        q: (12,) joint angles, rad.
+        torque: (12,) of the joints, N m.
+        up: (3,) the vertical in the trunk's frame.
+    """
+    forces = np.zeros(LEGS)
+    for leg, (chain, angles, tau) in enumerate(
+        zip(config.legs, q.reshape(LEGS, 3), torque.reshape(LEGS, 3), strict=True)
+    ):
+        jacobian = foot(chain, angles)[1]
+        if abs(np.linalg.det(jacobian)) > SINGULAR:
+            forces[leg] = -np.linalg.solve(jacobian.T, tau) @ up
+    return forces
+
+
+def calibrated(
+    counts: np.ndarray, by_torque: np.ndarray, before: FootCalibration | None = None
+) -> tuple[FootCalibration | None, str]:
+    """Return the calibration after a robot at rest was looked at, and what was learnt in words.
+
+    A robot whose feet carry nothing (lying, or hung) gives zeros, a standing one scales.
+
+    Args:
+        counts: (4,) mean counts of the sensors.
+        by_torque: (4,) mean vertical forces that balance the torques, N.
+        before: what is known already.
+    """
+    total = float(by_torque.sum())
+    if abs(total) < LIGHT:
+        scale = None if before is None else before.scale
+        return FootCalibration(tuple(map(float, counts)), scale), "zeros, from a robot that lies or hangs"  # type: ignore[arg-type]
+    if total < STANDING or by_torque.min() < 0.3 * total / LEGS:
+        return before, f"nothing: the feet carry {total:.0f} N by the torques, which is neither lying nor standing"
+    if before is None:
+        return None, "nothing: it stands, but the zeros are not known; check=true while it lies or hangs comes first"
+    scale = (counts - before.zero) / by_torque
+    if scale.min() <= 0.0:
+        return before, f"nothing: the counts of {legs_below(scale)} do not grow under load"
+    return FootCalibration(before.zero, tuple(map(float, scale))), "scales, from a robot that stands"  # type: ignore[arg-type]
+
+
+def legs_below(values: np.ndarray) -> str:
+    """Return the names of the legs whose values (4,) are not positive."""
+    return ", ".join(name for name, value in zip(("FR", "FL", "RR", "RL"), values, strict=True) if value <= 0.0)
