@@ -278,7 +278,8 @@ def test_a_network_delays_and_loses() -> None:
 
 
 def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) -> None:
-    server = Server(Robot(bundle_task(file, {}), sim_config({})), sim_config({}))
+    config = sim_config({"protocol": "exact"})
+    server = Server(Robot(bundle_task(file, {}), config), config)
     client, other = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     to = ("127.0.0.1", server.port)
     server.tick()
@@ -333,8 +334,10 @@ def play(
     usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "lie_down": 0.0, "brake": 0.1}
     usual["wish"] = Wish((0.4, 0.0, 0.0))
     output: list[str] = []
+    # Exact readings and numbered commands, to compare with; tests/test_go1_walk.py walks by the robot's own packets.
+    job = {**(job or {}), "sim": {"protocol": "exact", **(job or {}).get("sim", {})}}
     with lockstep(spoil) as world:
-        status = run_job(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), output.append)
+        status = run_job(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **job), output.append)
     (account,) = out.glob("*.json")
     kept = list(out.glob("*.parquet"))
     with np.load(next(out.glob("*.npz"))) as cycles:
@@ -607,7 +610,7 @@ def test_a_link_that_breaks_ends_the_walk_with_a_log(file: str) -> None:
             raise RobotError("the SDK failed")
         return [make_state(time.perf_counter(), clock=math.nan, in_force=-1)]
 
-    link = SimpleNamespace(receive=receive, send=sent.append, close=lambda: None)
+    link = SimpleNamespace(receive=receive, send=sent.append, repeat=lambda: None, close=lambda: None)
     outcome = walk.walk(load(file), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0))
     assert outcome.fault is not None
     assert (outcome.fault.name, outcome.fault.message) == ("runtime", "RobotError: the SDK failed")
@@ -932,8 +935,8 @@ def test_the_sdks_thread_runs_and_its_failure_is_told() -> None:
 
 
 def test_without_the_sdk_the_robot_is_refused(file: str, tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match=r"no module 'robot_interface'.*never been run on hardware"):
-        run_job(Job(file, "go1", Plan(), str(tmp_path)), print)
+    with pytest.raises(RobotError, match=r"no module 'robot_interface'.*robot=go1 needs none of it"):
+        run_job(Job(file, "go1_sdk", Plan(), str(tmp_path)), print)
 
 
 # ---------------------------------------------------------------------- processes
@@ -1055,7 +1058,7 @@ def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytes
     assert main([file, "--command", "fast", "--out", str(tmp_path)]) == 1
     assert capfd.readouterr().err.startswith("go1exp.deploy: command 'fast': must be three numbers")
     assert main([file, "--robot", "dog", "--out", str(tmp_path)]) == 1
-    assert "robot=dog: must be sim, go1, or the port" in capfd.readouterr().err
+    assert "robot=dog: must be sim, go1, go1_sdk, or the port" in capfd.readouterr().err
     with pytest.raises(SystemExit):
         main([file, "--rate", "-5"])
     assert "-5: must be greater than 0" in capfd.readouterr().err

@@ -1,0 +1,395 @@
+"""The Go1's packets: layout, rounding, checksum, refusals; bytes that the vendor's binary sent, and what it accepted."""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from go1exp.deploy import go1_wire as wire
+from go1exp.deploy.messages import LowCmd, LowState
+from go1exp.deploy.udp import Go1Link
+from go1exp.sim_robot.protocols import Go1, roll_pitch_yaw
+from go1exp.sim_robot.settings import SimConfig
+
+# Bytes of unitree-legged-sdk 3.8.20231105, received on a socket: InitCmdData, then twelve motors set to
+# q = linspace(-1, 1, 12), dq = 0, tau = 0.37 k - 2, Kp = 20 + 0.37 k, Kd = 0.5 + 0.07 k.
+BEGIN = "feefff00" + 18 * "00"
+STOPPED = "0ab9d2ff4e00007a46" + 18 * "00"
+END = 44 * "00" + "00000000"
+VENDOR_IDLE = bytes.fromhex(BEGIN + 20 * STOPPED + END + "e2f07f34")
+VENDOR_MOTORS = (
+    *("0a000080bf0000000000fe80020800", "0a5d7451bf000000005ffe8b020900", "0abae822bf00000000befe97020a00"),
+    *("0a2fbae8be000000001dffa3020b00", "0ae9a28bbe000000007bffaf020c00", "0a8c2ebabd00000000daffbb020d00"),
+    *("0a8c2eba3d000000003800c7020e00", "0ae9a28b3e000000009700d2020f00", "0a2fbae83e00000000f500de021000"),
+    *("0abae8223f000000005401ea021200", "0a5d74513f00000000b301f6021300", "0a0000803f00000000110202031400"),
+)
+VENDOR_COMMAND = bytes.fromhex(
+    BEGIN + "".join(motor + 24 * "0" for motor in VENDOR_MOTORS) + 8 * STOPPED + END + "432758d6"
+)
+
+Q = np.linspace(-1.0, 1.0, 12)
+
+
+def command(**changes: Any) -> LowCmd:
+    k = np.arange(12)
+    usual = {"joint_target": Q, "kp": 20 + 0.37 * k, "kd": 0.5 + 0.07 * k, "feedforward": 0.37 * k - 2.0}
+    return LowCmd(**{**usual, **changes})
+
+
+def state(**changes: Any) -> LowState:
+    usual: dict[str, Any] = {
+        "joint_pos": Q,
+        "joint_vel": 10.0 * Q,
+        "joint_torque": 30.0 * Q,
+        "imu_quat": np.array([0.5, 0.5, -0.5, 0.5]),
+        "imu_gyro": np.array([0.1, 0.2, 0.3]),
+        "imu_acc": np.array([1.0, 2.0, 9.8]),
+        "foot_force": np.array([100.0, -3.0, 200.0, 30000.0]),
+    }
+    return LowState(0.0, **{**usual, **changes})
+
+
+HEALTH = wire.Health(55, -1.234, (3.84,) * 10, tuple(range(30, 42)), 50, tuple(map(float, range(-6, 6))))
+GOOD = wire.pack_state(state(), 123456789, HEALTH, np.array([0.1, 0.2, 0.3]))
+
+
+def resealed(packet: bytes, place: int, content: bytes) -> bytes:
+    """The packet with other content and the checksum that belongs to it."""
+    changed = packet[:place] + content + packet[place + len(content) :]
+    return changed[:-4] + wire.checksum(changed).to_bytes(4, "little")
+
+
+def slow_checksum(packet: bytes) -> int:
+    """The checksum bit by bit, as the SDK's documentation has it."""
+    crc = 0xFFFFFFFF
+    for k in range((len(packet) - 4) // 4):
+        (word,) = struct.unpack_from("<I", packet, 4 * k)
+        for bit in range(31, -1, -1):
+            top = crc >> 31
+            crc = (crc << 1) & 0xFFFFFFFF
+            crc ^= 0x04C11DB7 * (top ^ (word >> bit & 1))
+    return crc
+
+
+# ---------------------------------------------------------------------- bytes
+
+
+def test_an_idle_command_is_the_vendors_byte_by_byte() -> None:
+    assert wire.IDLE == VENDOR_IDLE
+
+
+def test_a_command_is_the_vendors_byte_by_byte() -> None:
+    assert wire.pack_command(command()) == VENDOR_COMMAND
+
+
+def test_the_checksum_is_that_of_the_vendor_and_of_its_definition() -> None:
+    for packet in (VENDOR_IDLE, VENDOR_COMMAND, GOOD):
+        assert wire.checksum(packet) == slow_checksum(packet) == int.from_bytes(packet[-4:], "little")
+    assert [(len(packet) - 4) // 4 for packet in (VENDOR_IDLE, GOOD)] == [152, 200]
+
+
+def test_every_field_has_its_offset_unit_and_source() -> None:
+    assert (wire.COMMAND_TYPE.itemsize, wire.STATE_TYPE.itemsize) == (614, 807)
+    offsets = {name: wire.STATE_TYPE.fields[name][1] for name in wire.STATE_TYPE.names}  # type: ignore[index,union-attr]
+    told = {"imu": 22, "motor": 75, "battery": 715, "foot_force": 739, "foot_force_est": 747, "tick": 755}
+    assert {name: offsets[name] for name in told} == told
+    assert (offsets["remote"], offsets["reserve"], offsets["crc"]) == (759, 799, 803)
+    assert wire.dtype_of(wire.MOTOR_COMMAND).itemsize == 27
+    assert wire.dtype_of(wire.MOTOR_STATE).itemsize == 32
+    for fields in (wire.COMMAND, wire.STATE, wire.MOTOR_COMMAND, wire.MOTOR_STATE, wire.IMU, wire.BATTERY):
+        assert all(field.unit and field.source for field in fields)
+
+
+def test_a_state_written_by_hand_is_read_as_the_vendors_client_read_it() -> None:
+    """The client accepted this packet and gave these values."""
+    by_hand = bytearray(807)
+    by_hand[:3] = b"\xfe\xef\xff"
+    struct.pack_into("<13fb", by_hand, 22, 0.5, 0.5, -0.5, 0.5, 0.1, 0.2, 0.3, 1.0, 2.0, 9.8, 0.1, 0.2, 0.3, 50)
+    for k in range(12):
+        tau = int(30.0 * Q[k] * 256)
+        motor = (10, Q[k], 10.0 * Q[k], k - 6, tau, Q[k], 10.0 * Q[k], k - 6, 30 + k)
+        struct.pack_into("<Bffhhffhb", by_hand, 75 + 32 * k, *motor)
+    struct.pack_into("<BBBBiH4b10B", by_hand, 715, 0, 0, 0, 55, -1234, 0, 0, 0, 0, 0, *[120] * 10)
+    struct.pack_into("<4h", by_hand, 739, 100, -3, 200, 30000)
+    struct.pack_into("<I", by_hand, 755, 123456789)
+    by_hand[-4:] = slow_checksum(bytes(by_hand)).to_bytes(4, "little")
+    assert bytes(by_hand) == GOOD
+    assert wire.tick_of(GOOD) == 123456789
+    read = wire.unpack_state(GOOD, 7.0, 1.5)
+    assert (read.t, read.clock, read.in_force) == (7.0, 1.5, -1)
+    assert read.joint_torque[3] == -13.6328125  # -13.6363 cut towards zero
+    for name in ("joint_pos", "joint_vel", "imu_quat", "imu_gyro", "imu_acc", "foot_force"):
+        np.testing.assert_allclose(getattr(read, name), getattr(state(), name), rtol=1e-7, err_msg=name)
+    np.testing.assert_allclose(read.joint_torque, 30.0 * Q, atol=1 / 256)
+    assert wire.unpack_health(GOOD) == HEALTH
+
+
+# ---------------------------------------------------------------------- rounding
+
+
+@pytest.mark.parametrize(
+    ("name", "given_", "had"),
+    [
+        ("feedforward", -2.35, -2.34765625),
+        ("feedforward", 2.35, 2.34765625),
+        ("feedforward", -0.003, 0.0),
+        ("feedforward", 200.0, 127.99609375),
+        ("feedforward", -200.0, -128.0),
+        ("kp", 35.3, 35.28125),
+        ("kp", 3000.0, 2047.96875),
+        ("kp", -1.0, 0.0),
+        ("kd", 1.2, 1.1875),
+        ("kd", 0.5, 0.5),
+        ("kd", 0.3, 0.25),
+    ],
+)
+def test_gains_and_torques_are_cut_to_the_robots_steps_and_kept_in_its_range(
+    name: str, given_: float, had: float
+) -> None:
+    """Beyond the range the vendor's client wraps around, 200 N m to -56: ours stops at the largest."""
+    asked = wire.unpack_command(wire.pack_command(command(**{name: np.full(12, given_)})))
+    assert isinstance(asked, wire.MotorCommand)
+    assert set(getattr(asked, {"feedforward": "tau"}.get(name, name))) == {had}
+    assert not asked.idle
+
+
+finite = st.floats(-3.0, 3.0)
+
+
+@given(
+    st.lists(finite, min_size=12, max_size=12),
+    st.lists(st.floats(0, 100), min_size=12, max_size=12),
+    st.lists(st.floats(-40, 40), min_size=12, max_size=12),
+)
+def test_a_command_comes_through_within_its_steps(q: list[float], gains: list[float], torque: list[float]) -> None:
+    sent = LowCmd(np.array(q), np.array(gains), np.array(gains) / 10, feedforward=np.array(torque))
+    asked = wire.unpack_command(wire.pack_command(sent))
+    assert isinstance(asked, wire.MotorCommand)
+    np.testing.assert_allclose(asked.q, q, rtol=1e-7, atol=1e-30)
+    for got, wanted, step in ((asked.kp, gains, 1 / 32), (asked.kd, sent.kd, 1 / 16), (asked.tau, torque, 1 / 256)):
+        off = np.abs(np.array(wanted)) - np.abs(got)
+        assert (off >= 0).all()
+        assert (off < step).all()
+        assert (got * np.array(wanted) >= 0).all()
+    assert not asked.dq.any()
+
+
+def test_what_is_no_command_is_refused_before_it_is_sent() -> None:
+    with pytest.raises(ValueError, match=r"sizes \{'joint_target': 12, 'kp': 3, 'kd': 12, 'feedforward': 12\}"):
+        wire.pack_command(command(kp=np.zeros(3)))
+    for name in ("joint_target", "kp", "kd", "feedforward"):
+        for wrong in (math.nan, math.inf, 1e12):
+            values = np.zeros(12)
+            values[5] = wrong
+            with pytest.raises(ValueError, match="not finite"):
+                wire.pack_command(command(**{name: values}))
+
+
+def test_stop_values_switch_feedback_off() -> None:
+    asked = wire.unpack_command(VENDOR_IDLE)
+    assert isinstance(asked, wire.MotorCommand)
+    assert asked.idle
+    # Gains beside a stop value mean nothing.
+    packet = resealed(VENDOR_IDLE, 22, bytes.fromhex("0ab9d2ff4e00007a46" + "0000" + "8002" + "0800"))
+    asked = wire.unpack_command(packet)
+    assert isinstance(asked, wire.MotorCommand)
+    assert (asked.kp[0], asked.kd[0], asked.idle) == (0.0, 0.0, True)
+    braking = wire.unpack_command(resealed(VENDOR_COMMAND, 22, b"\0"))
+    assert isinstance(braking, wire.MotorCommand)
+    assert braking.damping.tolist() == [True] + [False] * 11
+
+
+# ---------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("packet", "why"),
+    [
+        (VENDOR_COMMAND[:-1], wire.Refusal.SIZE),
+        (VENDOR_COMMAND + b"\0", wire.Refusal.SIZE),
+        (b"", wire.Refusal.SIZE),
+        (GOOD, wire.Refusal.SIZE),
+        (b"\xfe\xee" + VENDOR_COMMAND[2:], wire.Refusal.HEAD),
+        (VENDOR_COMMAND[:2] + b"\xee" + VENDOR_COMMAND[3:], wire.Refusal.LEVEL),
+        (VENDOR_COMMAND[:-1] + b"\0", wire.Refusal.CHECKSUM),
+        (VENDOR_COMMAND[:300] + b"\1" + VENDOR_COMMAND[301:], wire.Refusal.CHECKSUM),
+        (resealed(VENDOR_COMMAND, 23, struct.pack("<f", math.nan)), wire.Refusal.CONTENT),
+        (resealed(VENDOR_COMMAND, 27, struct.pack("<f", math.inf)), wire.Refusal.CONTENT),
+        (resealed(VENDOR_COMMAND, 23, struct.pack("<f", 1e6)), wire.Refusal.CONTENT),
+        (resealed(VENDOR_COMMAND, 22, b"\7"), wire.Refusal.CONTENT),
+    ],
+)
+def test_a_packet_that_is_wrong_is_refused_by_name(packet: bytes, why: wire.Refusal) -> None:
+    assert wire.unpack_command(packet) is why
+
+
+def test_a_state_is_refused_likewise() -> None:
+    wrong = {GOOD[:-1]: "SIZE", VENDOR_COMMAND: "SIZE", b"x" + GOOD[1:]: "HEAD", GOOD[:100] + b"\7" + GOOD[101:]: "CHECKSUM"}
+    wrong[GOOD[:2] + b"\xee" + GOOD[3:]] = "LEVEL"
+    assert [wire.refusal(packet, 807) for packet in wrong] == [wire.Refusal[why] for why in wrong.values()]
+    assert wire.refusal(GOOD, 807) is None
+
+
+def mutations(packet: bytes) -> st.SearchStrategy[bytes]:
+    """The packet with bytes changed, cut, doubled, moved, or replaced; never the packet itself."""
+    place = st.integers(0, len(packet) - 1)
+    changed = st.lists(st.tuples(place, st.integers(1, 255)), min_size=1, max_size=8).map(
+        lambda edits: bytes(b ^ dict(edits).get(k, 0) for k, b in enumerate(packet))
+    )
+    cut = place.map(lambda k: packet[:k])
+    longer = st.binary(min_size=1, max_size=40).map(lambda more: packet + more)
+    moved = place.map(lambda k: packet[k:] + packet[:k])
+    return st.one_of(changed, cut, longer, moved, st.binary(max_size=900)).filter(lambda data: data != packet)
+
+
+MANY = settings(max_examples=10_000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@pytest.mark.slow("go1exp/deploy/go1_wire.py", "go1exp/sim_robot/protocols.py")
+@MANY
+@given(mutations(VENDOR_COMMAND))
+def test_of_ten_thousand_mutated_commands_none_is_obeyed(packet: bytes) -> None:
+    assert LISTENER.refusal(packet) is not None or covers_nothing(packet, VENDOR_COMMAND)
+
+
+LISTENER = Go1(SimConfig())
+
+
+def covers_nothing(packet: bytes, original: bytes) -> bool:
+    """Whether it differs only in the bytes that no checksum covers, the last two or three of ``reserve``."""
+    covered = (len(original) - 4) // 4 * 4
+    return packet[:covered] == original[:covered] and packet[-4:] == original[-4:] and len(packet) == len(original)
+
+
+@pytest.mark.slow("go1exp/deploy/go1_wire.py", "go1exp/deploy/udp.py")
+@MANY
+@given(mutations(GOOD))
+def test_of_ten_thousand_mutated_states_none_is_believed(packet: bytes) -> None:
+    assert wire.refusal(packet, wire.STATE_SIZE) is not None or covers_nothing(packet, GOOD)
+
+
+@settings(max_examples=300, deadline=None)
+@given(mutations(VENDOR_COMMAND), st.booleans())
+def test_a_mutated_command_raises_nothing_even_with_its_own_checksum(packet: bytes, seal: bool) -> None:
+    if seal and len(packet) == wire.COMMAND_SIZE:
+        packet = resealed(packet, 0, b"\xfe\xef\xff")
+    with np.errstate(all="raise"):
+        heard = LISTENER.read(packet)
+    if not isinstance(heard, str) and heard.command is not None:
+        told = heard.command
+        parts = (told.joint_target, told.kp, told.kd)
+        assert all(np.isfinite(part).all() for part in parts)
+        assert np.abs(told.joint_target).max() <= wire.FARTHEST
+
+
+@settings(max_examples=300, deadline=None)
+@given(mutations(GOOD))
+def test_a_mutated_state_raises_nothing_and_is_refused(packet: bytes) -> None:
+    assert wire.refusal(packet, wire.STATE_SIZE) is not None or covers_nothing(packet, GOOD)
+
+
+# ---------------------------------------------------------------------- the link
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[Go1Link, socket.socket, tuple[str, int]]]:
+    """A link and the socket of a robot to which it has spoken."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        other.settimeout(5.0)
+        link = Go1Link("127.0.0.1", other.getsockname()[1], 0.001)
+        assert link.receive() == []
+        data, address = other.recvfrom(1000)
+        assert data == wire.IDLE  # asks for nothing until there is a command
+        yield link, other, address
+        link.close()
+
+
+def sent(tick: int) -> bytes:
+    return wire.pack_state(state(), tick, HEALTH, np.zeros(3))
+
+
+def test_a_link_leaves_out_what_is_old_doubled_or_damaged_and_counts_it(
+    pair: tuple[Go1Link, socket.socket, tuple[str, int]],
+) -> None:
+    link, other, address = pair
+    for data in (GOOD[:-1], VENDOR_COMMAND, GOOD[:80] + b"\7" + GOOD[81:], b""):
+        other.sendto(data, address)
+    for tick in (10, 12, 12, 8, 18, 16, 10):
+        other.sendto(sent(tick), address)
+    assert [round(1e3 * one.clock) for one in link.receive()] == [10, 12, 18]
+    traffic = link.traffic
+    assert (traffic.received, traffic.late, traffic.lost, traffic.foreign) == (3, 4, 2, 4)
+    assert traffic.refused_because == {"wrong size": 3, "wrong checksum": 1}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(sent(20), address)
+    assert link.receive() == []  # the kernel lets nobody else through
+    assert link.traffic.foreign == 4
+
+
+def test_a_tick_wraps_around(pair: tuple[Go1Link, socket.socket, tuple[str, int]]) -> None:
+    link, other, address = pair
+    for tick in (2**32 - 2, 0, 2):
+        other.sendto(sent(tick), address)
+    clocks = [one.clock for one in link.receive()]
+    np.testing.assert_allclose(np.diff(clocks), 0.002, atol=1e-9)
+    assert link.traffic.late == 0
+
+
+def test_a_command_is_sent_again_between_two_cycles(pair: tuple[Go1Link, socket.socket, tuple[str, int]]) -> None:
+    link, other, _ = pair
+    link.send(command())
+    link.repeat()  # at once: it has just been sent
+    time.sleep(0.003)
+    link.repeat()
+    other.setblocking(False)
+    packets = [other.recv(1000) for _ in range(2)]
+    assert packets == [VENDOR_COMMAND, VENDOR_COMMAND]
+    with pytest.raises(BlockingIOError):
+        other.recv(1000)
+
+
+def test_without_the_ticks_unit_a_state_has_no_clock() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        link = Go1Link("127.0.0.1", other.getsockname()[1])
+        link.receive()
+        _, address = other.recvfrom(1000)
+        for tick in (2, 4, 3):
+            other.sendto(sent(tick), address)
+        assert [math.isnan(one.clock) for one in link.receive()] == [True, True]
+        assert (link.traffic.late, link.traffic.lost) == (1, 0)
+        link.close()
+
+
+# ---------------------------------------------------------------------- the simulated robot's side
+
+
+def test_a_damping_motor_and_a_wanted_speed_reach_the_drives() -> None:
+    packet = resealed(VENDOR_COMMAND, 22, b"\0")  # the first motor brakes by itself
+    packet = resealed(packet, 22 + 27 + 5, struct.pack("<f", 2.0))  # the second is to turn at 2 rad/s
+    heard = LISTENER.read(packet)
+    assert not isinstance(heard, str)
+    told = heard.command
+    assert told is not None
+    assert told.feedforward is not None
+    assert (told.kp[0], told.kd[0], told.feedforward[0], told.damping) == (0.0, 2.0, 0.0, False)
+    assert told.feedforward[1] == pytest.approx(-1.62890625 + 2.0 * 0.5625)
+    assert LISTENER.read(VENDOR_IDLE).command is None  # type: ignore[union-attr]
+
+
+def test_roll_pitch_and_yaw_are_those_of_scipy(rotations: int = 50) -> None:
+    from scipy.spatial.transform import Rotation
+
+    for turn in Rotation.random(rotations, rng=0):
+        yaw, pitch, roll = turn.as_euler("ZYX")
+        np.testing.assert_allclose(roll_pitch_yaw(turn.as_quat(scalar_first=True)), [roll, pitch, yaw], atol=1e-7)
