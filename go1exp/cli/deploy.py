@@ -11,13 +11,11 @@ from go1exp.cli.app import App
 from go1exp.cli.other_robot import CHOICES
 from go1exp.controller.settings import MpcSettings
 from go1exp.schema.registry import ConfigError
+from go1exp.schema.settings import MISSING
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import DeploySettings
     from go1exp.deploy.controller import Mover
-
-MISSING = "???"
-"""What OmegaConf has for a setting that must be given."""
 
 
 def _task(container: dict[str, Any]) -> int:

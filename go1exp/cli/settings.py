@@ -290,6 +290,21 @@ class DeploySettings(Stages):
 
 
 @settings
+class SimSettings(SimConfig):
+    """``conf/sim.yaml`` without the groups.
+
+    Attributes:
+        address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to the network, to anybody in it.
+        tile: row and column of the tile of terrain=rough on which it begins; rows grow harder.
+        seconds: how long it lives, s; null until Ctrl-C.
+    """
+
+    address: str = "127.0.0.1:8007"
+    tile: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (0, 0)
+    seconds: Positive | None = None
+
+
+@settings
 class FitActuatorSettings(FitSettings):
     """``conf/fit-actuator.yaml`` without the group.
 
@@ -386,6 +401,7 @@ SETTINGS: dict[str, type] = {
     "export": ExportSettings,
     "export_check": ExportCheckSettings,
     "deploy": DeploySettings,
+    "sim": SimSettings,
     "fit-actuator": FitActuatorSettings,
     "list": ListSettings,
     "bench": BenchSettings,

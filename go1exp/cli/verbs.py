@@ -11,13 +11,14 @@ VERBS = {
     "gap": "find where simulation and recordings disagree, name the missing effect, add it",
     "export": "pack a trained policy into one sealed file for the robot; check such a file",
     "deploy": "run a bundle's policy in real time on a robot, or on a simulated one in another process",
+    "sim": "the simulated robot alone, for any client that speaks the Go1's protocol",
     "fit-actuator": "learn an actuator net from recordings",
     "list": "list terms, groups and their choices, one line each",
     "bench": "measure speed as ratios in one run",
 }
 """Verb -> one line; the module has the verb's name (``list`` is ``listing``)."""
 
-MODULES = {"eval": "evaluate", "fit-actuator": "fit_actuator", "list": "listing"}
+MODULES = {"eval": "evaluate", "fit-actuator": "fit_actuator", "list": "listing", "sim": "simulate"}
 """Modules that cannot have their verb's name."""
 
 SUBVERBS = {"record": ("audit", "import"), "export": ("check",)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -17,10 +18,12 @@ from go1exp.effects.rules import has_gains
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
-from go1exp.schema.registry import ConfigError
+from go1exp.robot import RobotConfig
+from go1exp.schema.contact import ContactConfig
+from go1exp.schema.registry import ConfigError, Term
 from go1exp.sim_robot.settings import SimConfig
 from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import TerrainConfig, build_terrain
+from go1exp.terrain import Terrain, TerrainConfig, build_terrain
 
 TICK = 0.002
 """Period of the drives and of the states that the robot sends, s: the vendor's SDK has 500 Hz."""
@@ -41,6 +44,27 @@ SETTLE_S = 1.0
 """Simulated time in which the robot comes to rest before it takes commands, s."""
 
 
+@dataclass(frozen=True)
+class Body:
+    """A robot and the ground that it stands on, without any training.
+
+    Attributes:
+        robot: masses and limits.
+        actuator: its drives.
+        effect: what else acts.
+        contact: how its feet touch the ground.
+        terrain: the ground.
+        tile: row and column of the tile on which it begins.
+    """
+
+    robot: RobotConfig
+    actuator: Term
+    effect: tuple[Term, ...]
+    contact: ContactConfig
+    terrain: TerrainConfig = field(default_factory=TerrainConfig)
+    tile: tuple[int, int] = (0, 0)
+
+
 class Robot:
     """One Go1 with its sensors.
 
@@ -49,11 +73,13 @@ class Robot:
         braking: whether its drives only brake: no command for too long, or a damping command.
     """
 
-    def __init__(self, task: TaskConfig, config: SimConfig) -> None:
+    def __init__(self, task: TaskConfig | Body, config: SimConfig) -> None:
         """Put the task's robot, with its drives and effects, where ``config.start`` says, at rest.
 
+        The robot of a training stands on flat ground, a ``Body`` on its own.
+
         Raises:
-            ConfigError: if its drives have no gains, since commands set gains.
+            ConfigError: if its drives have no gains, since commands set gains; if there is no such tile.
         """
         if not has_gains(task.actuator):
             name = task.actuator.entry.name
@@ -62,9 +88,9 @@ class Robot:
             )
         self._config, self._rng = config, np.random.default_rng(config.seed)
         held = (1.0, 0.0, 0.0, 0.0) if config.start == "hung" else None
-        model, blocks = build_model(
-            task.robot, build_terrain(TerrainConfig()), TICK, contact=task.contact, imu=True, held=held
-        )
+        terrain = build_terrain(task.terrain if isinstance(task, Body) else TerrainConfig())
+        self._origin = _origin(terrain, task.tile if isinstance(task, Body) else (0, 0))
+        model, blocks = build_model(task.robot, terrain, TICK, contact=task.contact, imu=True, held=held)
         backend = MujocoCpu(model, blocks, 1, threads=1)
         random = EnvRandom(config.seed, 1, device=backend.qpos.device)
         self._plant = Plant(backend, drive_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
@@ -84,7 +110,8 @@ class Robot:
         qpos, qvel = torch.zeros_like(plant.backend.qpos), torch.zeros_like(plant.backend.qvel)
         qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(joints)
         if start != "hung":
-            qpos[:, 2] = LYING_HEIGHT if start == "lying" else robot.NOMINAL_HEIGHT
+            qpos[:, :3] = torch.as_tensor(self._origin)
+            qpos[:, 2] += LYING_HEIGHT if start == "lying" else robot.NOMINAL_HEIGHT
             qpos[:, 3] = 1.0
         everyone = torch.ones(1, dtype=torch.bool)
         plant.backend.reset(everyone, qpos, qvel)
@@ -119,13 +146,13 @@ class Robot:
 
     def release(self) -> None:
         """Do as a command says that asks for nothing: the joints are free, once a command has moved them."""
-        if np.isfinite(self._commanded):
+        if self.commanded:
             nothing = np.zeros(robot.NUM_JOINTS)
             self.obey(LowCmd(self._target[0].numpy().astype(float), nothing, nothing), self._in_force)
 
     def in_force(self) -> np.ndarray:
         """Return whether a command was in force in the last step, 1 or 0, and its targets, rad: (13,)."""
-        obeying = np.isfinite(self._commanded) and not self.braking
+        obeying = self.commanded and not self.braking
         return np.concatenate([[obeying], self._target[0].numpy()])
 
     def step(self) -> None:
@@ -164,6 +191,15 @@ class Robot:
         trunk = torch.cat([pose[:, :7], speed[:, :6]], dim=1)[0].numpy() if floats else np.full(13, np.nan)
         self._true = np.array(trunk)
 
+    @property
+    def commanded(self) -> bool:
+        """Whether any command has come that asked for something."""
+        return bool(np.isfinite(self._commanded))
+
+    def sense_truth(self) -> np.ndarray:
+        """Return the truth (13,) at the instant at which the last step began (``sense``)."""
+        return self._true
+
     def sense(self) -> tuple[LowState, np.ndarray]:
         """Return the sensors' readings of the instant at which the last step began, and the truth (13,) then.
 
@@ -185,6 +221,19 @@ class Robot:
             foot_force=readings["foot_force"],
         )
         return state, self._true
+
+
+def _origin(terrain: Terrain, tile: tuple[int, int]) -> np.ndarray:
+    """Return the centre of a tile on the ground, (3,), m.
+
+    Raises:
+        ConfigError: if there is no such tile.
+    """
+    rows, columns = terrain.tile_origins.shape[:2]
+    if tile[0] >= rows or tile[1] >= columns:
+        raise ConfigError([f"tile = {list(tile)}: the ground has {rows} rows and {columns} columns, counted from 0"])
+    origin: np.ndarray = terrain.tile_origins[tile]
+    return origin
 
 
 def noisy(true: Mapping[str, np.ndarray], share: float, rng: np.random.Generator) -> dict[str, np.ndarray]:

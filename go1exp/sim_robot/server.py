@@ -93,6 +93,7 @@ class Counts:
     """Counts at the robot's end: datagrams by what happened to them, and how real time was kept.
 
     Attributes:
+        heard: datagrams of the one who is listened to, those that ask for nothing included.
         commands: commands put into force.
         old: commands that came after a newer one (known with protocol=exact only).
         foreign: datagrams that were not a valid message, or came from another sender.
@@ -103,6 +104,7 @@ class Counts:
         ticks: simulated ticks of 2 ms.
     """
 
+    heard: int = 0
     commands: int = 0
     old: int = 0
     foreign: int = 0
@@ -121,6 +123,7 @@ class Server:
     for ``GONE_S``.
 
     Attributes:
+        robot: what is simulated.
         address: where it listens.
         counts: what has happened.
         peer: who it listens to; None before anybody has spoken.
@@ -134,7 +137,7 @@ class Server:
         Raises:
             OSError: if the port is taken, or the host is not this machine's.
         """
-        self._robot, self._language = robot, language(config)
+        self.robot, self._language = robot, language(config)
         rng = np.random.default_rng([config.seed, 1])
         self._uplink, self._downlink = (Network(config.delay, config.loss, rng) for _ in range(2))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -180,7 +183,7 @@ class Server:
 
     def tick(self) -> None:
         """Receive, obey the newest command, simulate one tick, and send the readings of its beginning."""
-        robot, now = self._robot, self._robot.clock
+        robot, now = self.robot, self.robot.clock
         self._listen(now)
         for data in self._uplink.take(now):
             self._obey(data)
@@ -211,6 +214,7 @@ class Server:
                 self._refuse(STRANGER)
             else:
                 self.peer, self._heard = sender, now
+                self.counts.heard += 1
                 self._uplink.put(now, data)
 
     def _refuse(self, why: str) -> None:
@@ -224,10 +228,10 @@ class Server:
         elif isinstance(heard, str):
             self._refuse(heard)
         elif heard.command is None:
-            self._robot.release()
+            self.robot.release()
         else:
             self.counts.commands += 1
-            self._robot.obey(heard.command, heard.number or self.counts.commands)
+            self.robot.obey(heard.command, heard.number or self.counts.commands)
 
     def _send(self, data: bytes) -> None:
         assert self.peer is not None

@@ -1,0 +1,51 @@
+"""``go1exp sim``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from go1exp.cli.app import App
+from go1exp.schema.registry import ConfigError
+from go1exp.schema.settings import subset
+
+BODY = ("robot", "actuator", "effect", "contact", "terrain")
+"""Groups of the configuration that describe the robot and its ground."""
+
+
+def _task(container: dict[str, Any]) -> int:
+    from go1exp import robot
+    from go1exp.cli.parts import parse_with_groups
+    from go1exp.cli.settings import SimSettings
+    from go1exp.deploy.address import parsed_address
+    from go1exp.effects.rules import drive_problems
+    from go1exp.sim_robot.settings import SimConfig
+
+    settings, parts = parse_with_groups(SimSettings, container, BODY)
+    if problems := drive_problems(parts["actuator"], parts["effect"], robot.JOINTS):
+        raise ConfigError(problems)
+    host, port = parsed_address(settings.address, HERE)
+
+    import torch
+
+    from go1exp.sim_robot.alone import serve
+    from go1exp.sim_robot.machine import Body, Robot
+    from go1exp.sim_robot.server import Server
+
+    torch.set_num_threads(1)
+    config = subset(SimConfig, settings)
+    server = Server(Robot(Body(**parts, tile=settings.tile), config), config, port, host)
+    host, port = server.address
+    print(f"a Go1 ({settings.start}) listens at {host}:{port}; Ctrl-C ends it", flush=True)
+    if host != HERE[0]:
+        print("note: anybody in the network can command it", flush=True)
+    try:
+        serve(server, lambda: True, lambda line: print(line, flush=True), settings.seconds)
+    finally:
+        server.close()
+    return 0
+
+
+HERE = ("127.0.0.1", 8007)
+"""Where it listens unless told otherwise: nobody else in the network can reach it."""
+
+APP = App("sim", _task)
