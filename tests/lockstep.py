@@ -46,10 +46,13 @@ class World:
         self.obeyed: dict[int, LowCmd] = {}
         self.targets: list[tuple[float, np.ndarray, bool]] = []
         self.spins: list[float] = []
+        self.between: Callable[[], None] = lambda: None
+        self.on_server: Callable[[World], None] = lambda world: None
         self.closed = False
 
     def pass_until(self, when: float) -> None:
         while self.now + TICK <= when + 1e-9:
+            self.between()
             if self.server is not None and not self.closed:
                 self.server.tick()
             self.now += TICK
@@ -97,6 +100,7 @@ class InProcess:
         robot.world, world.robot = world, robot
         self.world, self._server = world, Mutable(robot, config)
         world.server = self._server
+        world.on_server(world)
         self.port = self._server.port
         self.report: dict[str, Any] = {}
         self.truth: dict[str, np.ndarray] = {}
@@ -117,12 +121,19 @@ class InProcess:
 
 
 @contextmanager
-def lockstep(spoil: Spoil = lambda state: state) -> Iterator[World]:
-    """Let ``go1exp.deploy.job.run_job`` run in simulated time; ``spoil`` changes what sensors say, None is silence."""
+def lockstep(
+    spoil: Spoil = lambda state: state, on_server: Callable[[World], None] = lambda world: None
+) -> Iterator[World]:
+    """Let ``go1exp.deploy.job.run_job`` run in simulated time.
+
+    ``spoil`` changes what sensors say, None is silence; ``on_server`` is called when the robot is there.
+    """
     world = World(spoil)
+    world.on_server = on_server
 
     def clock(spin: float, meanwhile: Any, between: Any) -> Any:
         world.spins.append(spin)
+        world.between = between
         return SimpleNamespace(now=lambda: world.now, sleep_until=world.pass_until)
 
     host_time = SimpleNamespace(perf_counter=lambda: world.now, time=lambda: 0.0)

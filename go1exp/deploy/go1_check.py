@@ -90,7 +90,7 @@ class Heard:
 
 def listen(
     link: Go1Link,
-    seconds: float = SECONDS,
+    seconds: float,
     now: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Heard:
@@ -255,7 +255,7 @@ def check(
     bounds: Bounds | None = None,
 ) -> Report:
     """Listen for ``SECONDS``, say what was heard, tell the link its tick's unit, and return the findings."""
-    report = judged(listen(link), link, joints, stops, config, bounds or Bounds())
+    report = judged(listen(link, SECONDS), link, joints, stops, config, bounds or Bounds())
     for line in report.lines:
         say(line)
     link.tick_s = report.tick_s

@@ -146,7 +146,7 @@ def run_check(job: CheckJob, say: Say) -> int:
     say(f"listening to {host}:{port}; nothing is sent that asks for a torque")
     with closing(Go1Link(host, port)) as link:
         report: Report = check(link, job.joints, job.stops, estimator_settings({}), say)
-    if report.lines:
+    if not report.problems:
         calibrate(report, job.feet, say)
     for problem in report.problems:
         say(f"problem: {problem}")

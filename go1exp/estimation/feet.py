@@ -75,6 +75,8 @@ class FootCalibration:
 def forces_by_torque(config: FilterConfig, q: np.ndarray, torque: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return the vertical forces (4,), N, by which the ground balances the joints' torques: tau + J' f = 0.
 
+    Of a leg whose readings are not finite it is NaN.
+
     Args:
         config: has the legs.
         q: (12,) joint angles, rad.
@@ -85,6 +87,9 @@ def forces_by_torque(config: FilterConfig, q: np.ndarray, torque: np.ndarray, up
     for leg, (chain, angles, tau) in enumerate(
         zip(config.legs, q.reshape(LEGS, 3), torque.reshape(LEGS, 3), strict=True)
     ):
+        if not np.isfinite([*angles, *tau]).all():
+            forces[leg] = np.nan
+            continue
         jacobian = foot(chain, angles)[1]
         if abs(np.linalg.det(jacobian)) > SINGULAR:
             forces[leg] = -np.linalg.solve(jacobian.T, tau) @ up

@@ -1,0 +1,439 @@
+"""Walks over the Go1's own packets, at a time of their own: what goes wrong on the way, who else speaks, the check."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from go1exp import recording, robot
+from go1exp.compose import compose
+from go1exp.config import parse_train
+from go1exp.deploy import go1_check, job
+from go1exp.deploy import go1_wire as wire
+from go1exp.deploy.commands import Wish
+from go1exp.deploy.go1_check import Bounds, Heard, judged, listen
+from go1exp.deploy.job import CheckJob, Job, run_check, run_job
+from go1exp.deploy.launch import RobotError
+from go1exp.deploy.udp import Go1Link
+from go1exp.deploy.walk import Plan
+from go1exp.estimation import go1
+from go1exp.estimation.feet import CalibrationError, FootCalibration, calibrated, forces_by_torque
+from go1exp.export.build import build
+from go1exp.sim_robot.__main__ import bundle_task, sim_config
+from go1exp.sim_robot.alone import Account
+from go1exp.sim_robot.machine import SILENCE, TICK, Robot
+from go1exp.sim_robot.server import GONE_S, STRANGER, Network, Server
+from go1exp.train import run_folder, trainer
+from tests.lockstep import World, lockstep
+from tests.small_run import SMALL
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A bundle of two tiny iterations: its policy hardly moves, so that a robot stands."""
+    run = tmp_path_factory.mktemp("go1") / "run"
+    container = compose("train", (*SMALL, "actuator.kp=35", "actuator.kd=0.7"))
+    run_folder.write(run, container)
+    trainer.train(parse_train(container), container, run)
+    path = run / "walk.zip"
+    path.write_bytes(build(run, seconds=0.2))
+    return str(path)
+
+
+def play(
+    file: str, out: Path, meddle: Callable[[World], None] = lambda world: None, **sim: Any
+) -> SimpleNamespace:
+    """Walk for a second by the robot's packets; ``meddle`` is called when the simulated robot is there."""
+    plan = Plan(seconds=1.0, stand_up=0.2, lie_down=0.0, brake=0.1, wish=Wish((0.4, 0.0, 0.0)))
+    output: list[str] = []
+    with lockstep(on_server=meddle) as world:
+        status = run_job(Job(file, "sim", plan, str(out), sim=sim, truth=True), output.append)
+    account = json.loads(next(out.glob("*.json")).read_text())
+    return SimpleNamespace(
+        status=status,
+        output=output,
+        account=account,
+        recording=recording.read(next(out.glob("*.parquet"))),
+        world=world,
+    )
+
+
+def test_a_walk_over_the_robots_packets_has_its_rounding_and_what_was_in_force(file: str, tmp_path: Path) -> None:
+    done = play(file, tmp_path, noise=0.0)
+    assert done.status == 0
+    r = done.recording
+    assert len(r.t) == 600
+    np.testing.assert_allclose(np.diff(r.t), TICK, atol=1e-9)
+    had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
+    assert r.joint("q_target").tobytes() == np.array([had[round(t / TICK)] for t in r.t]).tobytes()
+    torque = r.joint("tau_est") * 256
+    np.testing.assert_allclose(torque, np.rint(torque), atol=1e-9)
+    # kd = 0.7 is 0.6875 on this wire
+    half = 0.5 * (r.joint("q_target")[1:] + r.joint("q_target")[:-1])
+    made = 35.0 * (half - r.joint("q")[1:]) - 0.6875 * r.joint("qd")[1:]
+    np.testing.assert_allclose(r.joint("tau_est")[1:], made, atol=1 / 256 + 1e-4)
+    assert r.block("base_pos_z_w").min() > 0.2
+    assert np.max(done.account["velocity"]["estimate_rmse"]) < 0.05
+    link, there = done.account["link"], done.account["simulated_robot"]
+    assert (link["lost"], link["late"], link["foreign"], there["foreign"]) == (0, 0, 0, 0)
+    assert done.world.robot.braking
+
+
+class Spoilt(Network):
+    """Loses one in a hundred, doubles, delays, damages and repeats old ones, each for one datagram in twenty."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(0.0, 0.01, np.random.default_rng(seed))
+        self._dice, self._old = np.random.default_rng(seed + 100), list[bytes]()
+        self.done = dict.fromkeys(("doubled", "delayed", "damaged", "replayed"), 0)
+
+    def put(self, now: float, data: bytes) -> None:
+        what = self._dice.choice(["", *self.done], p=[0.8, 0.05, 0.05, 0.05, 0.05])
+        if what:
+            self.done[what] += 1
+        self._old = [*self._old[-50:], data]
+        super().put(now + 0.006 * (what == "delayed"), data)
+        if what == "doubled":
+            super().put(now, data)
+        if what == "damaged":
+            place = int(self._dice.integers(3, 600))
+            super().put(now, data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :])
+        if what == "replayed":
+            super().put(now, self._old[0])
+
+
+def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(file: str, tmp_path: Path) -> None:
+    ways: list[Spoilt] = []
+
+    def spoil(world: World) -> None:
+        assert world.server is not None
+        ways[:] = Spoilt(1), Spoilt(2)
+        world.server._uplink, world.server._downlink = ways
+
+    done = play(file, tmp_path, spoil)
+    assert done.status == 0
+    assert done.output[-1] == "walked for 1.0 s, to the end"
+    up, down = (way.done for way in ways)
+    assert min(*up.values(), *down.values()) >= 10
+    link, there = done.account["link"], done.account["simulated_robot"]
+    assert link["refused_because"] == {"wrong checksum": down["damaged"]}
+    assert link["late"] >= down["doubled"] + down["replayed"]  # and what was overtaken
+    assert link["lost"] > 3
+    assert there["refused"] == {"wrong checksum": up["damaged"]}
+    r = done.recording
+    assert (np.diff(r.t) > 0).all()
+    assert r.block("base_pos_z_w").min() > 0.2
+
+
+def server(file: str, **sim: Any) -> Server:
+    config = sim_config({"noise": 0.0, **sim})
+    return Server(Robot(bundle_task(file, {}), config), config)
+
+
+@contextmanager
+def speakers(count: int) -> Iterator[list[socket.socket]]:
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    for one in sockets:
+        one.bind(("127.0.0.1", 0))
+        one.settimeout(5.0)
+    yield sockets
+    for one in sockets:
+        one.close()
+
+
+def stance_command(**changes: Any) -> bytes:
+    from go1exp.deploy.messages import LowCmd
+
+    usual = {"joint_target": robot.NOMINAL_STANCE.copy(), "kp": np.full(12, 20.0), "kd": np.full(12, 0.5)}
+    return wire.pack_command(LowCmd(**{**usual, **changes}))
+
+
+def test_a_robot_answers_the_first_who_speaks_and_refuses_and_counts_the_others(file: str) -> None:
+    made = server(file)
+    with speakers(2) as (first, second):
+        to = ("127.0.0.1", made.port)
+        for wrong in (b"", b"x" * 614, wire.IDLE[:-1], wire.IDLE[:-1] + b"\0"):
+            second.sendto(wrong, to)
+        made.tick()
+        assert made.peer is None
+        assert made.counts.refused == {"wrong size": 2, "wrong head": 1, "wrong checksum": 1}
+        first.sendto(wire.IDLE, to)
+        second.sendto(stance_command(joint_target=robot.NOMINAL_STANCE + 0.5), to)
+        made.tick()
+        assert made.peer == first.getsockname()
+        assert made.counts.refused[STRANGER] == 1
+        assert (made.counts.commands, made.robot.commanded) == (0, False)
+        packet = first.recv(1000)
+        assert wire.refusal(packet, wire.STATE_SIZE) is None
+        for _ in range(round(GONE_S / TICK) + 2):
+            made.tick()
+        second.sendto(stance_command(), to)
+        made.tick()
+        assert made.peer == second.getsockname()  # the first has been silent for a second
+        assert made.counts.commands == 1
+    made.close()
+
+
+def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(file: str) -> None:
+    made = server(file, start="standing")
+    with speakers(1) as (client,):
+        to = ("127.0.0.1", made.port)
+        for _ in range(200):
+            client.sendto(wire.IDLE, to)
+            made.tick()
+        assert made.robot.sense_truth()[2] > 0.25  # it stands, as by its maker's own controller
+        client.sendto(stance_command(), to)
+        made.tick()
+        for tick in range(round(SILENCE / TICK) + 3):
+            assert made.robot.braking == (tick * TICK > SILENCE + 1e-9), tick
+            made.tick()
+        client.sendto(wire.IDLE, to)  # asks for nothing, and now that is what the drives do
+        for _ in range(10):
+            made.tick()
+        np.testing.assert_allclose(made.robot.sense()[0].joint_torque, 0.0, atol=1e-9)
+    made.close()
+
+
+def test_raw_foot_sensors_have_a_zero_and_a_scale_each(file: str) -> None:
+    counts = {}
+    for start in ("hung", "standing"):
+        made = server(file, start=start, feet="raw", seed=3)
+        with speakers(1) as (client,):
+            client.sendto(wire.IDLE, ("127.0.0.1", made.port))
+            made.tick()
+            counts[start] = wire.unpack_state(client.recv(1000), 0.0, 0.0).foot_force
+        force = made.robot.sense()[0].foot_force
+        made.close()
+    assert ((counts["hung"] >= 100) & (counts["hung"] < 130)).all()
+    scale = (counts["standing"] - counts["hung"]) / force
+    assert ((scale > 0.45) & (scale < 1.55)).all()
+    assert np.ptp(scale) > 0.1
+
+
+def test_the_robot_alone_says_who_speaks_and_what_it_refuses(file: str) -> None:
+    made, lines = server(file), list[str]()
+    account = Account(made, lines.append, _at=0.0)
+    with speakers(2) as (first, second):
+        to = ("127.0.0.1", made.port)
+        account.look(1.1)
+        for k in range(100):
+            first.sendto(wire.IDLE, to)
+            if k in (50, 60):
+                second.sendto(wire.IDLE, to)
+            made.tick()
+        account.look(1.5)
+        second.sendto(wire.IDLE, to)
+        made.tick()
+        account.look(2.1)
+        account.look(3.2)
+        account.look(4.3)
+    made.close()
+    name = "{}:{}".format(*made.peer)  # type: ignore[misc]
+    assert lines[0] == "nobody speaks"
+    assert lines[1].startswith(f"{name} speaks; others are refused")
+    assert lines[2] == f"refused for the first time: {STRANGER}"
+    assert lines[3].startswith(f"{name}: 100 packets/s in, 101 out; holding its pose, trunk at 0.")
+    assert lines[3].endswith(f"refused 1 x {STRANGER}; 0 ms behind real time")
+    assert lines[4:] == ["nobody speaks"]
+
+
+# ---------------------------------------------------------------------- the check
+
+
+@contextmanager
+def living(made: Server) -> Iterator[list[bytes]]:
+    """Let a robot tick in another thread; yields every packet that it gets."""
+    heard: list[bytes] = []
+    read, ended = made._language.refusal, threading.Event()
+    made._language.refusal = lambda data: heard.append(data) or read(data)  # type: ignore[method-assign,func-returns-value]
+    thread = threading.Thread(target=made.serve, args=(lambda: not ended.is_set(),))
+    thread.start()
+    while not made.counts.ticks and thread.is_alive():
+        time.sleep(0.001)
+    try:
+        yield heard
+    finally:
+        ended.set()
+        thread.join(10.0)
+        made.close()
+
+
+LOOSE = Bounds(rate=20.0, gap=2.0)
+"""For a machine that is busy."""
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(go1_check, "SECONDS", 0.3)
+    usual = go1_check.check
+    monkeypatch.setattr(job, "check", lambda *given: usual(*given, LOOSE))
+
+
+@pytest.mark.usefixtures("patient")
+def test_a_check_asks_for_no_torque_and_calibrates_feet_from_lying_and_standing(file: str, tmp_path: Path) -> None:
+    feet, said = tmp_path / "feet.json", list[str]()
+    for start in ("standing", "lying", "standing"):
+        made = server(file, start=start, feet="raw", seed=3, noise=0.1)
+        with living(made) as heard:
+            look = CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, feet, f"127.0.0.1:{made.port}")
+            assert run_check(look, said.append) == 0, said[-4:]
+        assert len(heard) > 5
+        assert set(heard) == {wire.IDLE}
+        assert not made.robot.commanded
+    learnt = [line for line in said if line.startswith("calibration")]
+    assert ["zeros are not known" in learnt[0], "zeros, from" in learnt[1], "scales, from" in learnt[2]] == [True] * 3
+    known = FootCalibration.read(feet)
+    sensors = made._language._feet  # type: ignore[attr-defined]
+    np.testing.assert_allclose(known.zero, sensors.zero, atol=8.0)  # the calves of a lying robot rest on its feet
+    assert known.scale is not None
+    np.testing.assert_allclose(known.scale, sensors.scale, rtol=0.3)
+    np.testing.assert_allclose(known.forces(sensors.counts(np.full(4, 30.0))), 30.0, rtol=0.3)
+    assert any("battery: 80 %" in line for line in said)
+
+
+@pytest.mark.usefixtures("patient")
+def test_a_walk_begins_only_after_the_check_has_passed(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = Plan(seconds=0.2, stand_up=0.1, lie_down=0.0, brake=0.1, stale=5.0)
+    made = server(file, start="standing")
+    made._language._health = wire.Health(charge=7)  # type: ignore[attr-defined]
+    there = {"address": f"127.0.0.1:{made.port}"}
+    with living(made) as heard:
+        with pytest.raises(RobotError, match=r"does not pass its check.*battery: 7 %; at least 20 % are needed"):
+            run_job(Job(file, "go1", plan, str(tmp_path / "a"), **there), print)
+        assert set(heard) == {wire.IDLE}
+        made._language._health = wire.Health()  # type: ignore[attr-defined]
+        until = made.counts.ticks + round(GONE_S / TICK) + 5
+        while made.counts.ticks < until:
+            time.sleep(0.01)
+        assert run_job(Job(file, "go1", plan, str(tmp_path / "b"), **there), print) == 0
+        assert set(heard) != {wire.IDLE}
+    walked = recording.read(next((tmp_path / "b").glob("*.parquet")))
+    assert walked.meta.source == "measured"
+    assert not any(name.startswith("foot_force") for name in walked.channels)
+
+
+def test_nobody_there_is_said_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(go1_check, "SECONDS", 0.05)
+    said: list[str] = []
+    with speakers(1) as (silent,):
+        address = "{}:{}".format(*silent.getsockname())
+        assert run_check(CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", address), said.append) == 1
+    assert said[1].startswith("problem: no robot: 0 states in 0.1 s; nothing came")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(RobotError, match="address=here: must be HOST:PORT, such as 192.168.123.10:8007"):
+        run_check(CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", "here"), said.append)
+
+
+def heard_of(**changes: Any) -> Heard:
+    """What a good robot says for a second, with changes."""
+    from go1exp.deploy.messages import LowState
+
+    usual: dict[str, Any] = {
+        "joint_pos": robot.NOMINAL_STANCE,
+        "joint_vel": np.zeros(12),
+        "joint_torque": np.zeros(12),
+        "imu_quat": np.array([1.0, 0, 0, 0]),
+        "imu_gyro": np.zeros(3),
+        "imu_acc": np.array([0, 0, 9.81]),
+        "foot_force": np.full(4, 115.0),
+    }
+    health = changes.pop("health", wire.Health())
+    period = changes.pop("period", 0.002)
+    states = [LowState(period * k, **{**usual, **changes}) for k in range(500)]
+    return Heard(1.0, states, [(2 * k, 0.002 * k) for k in range(500)], health)
+
+
+def at(k: int, value: float, rest: np.ndarray) -> np.ndarray:
+    values = np.array(rest, float)
+    values[k] = value
+    return values
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({}, None),
+        ({"period": 0.005}, "packets: 200 a second; at least 400"),
+        ({"health": wire.Health(charge=19)}, "battery: 19 %; at least 20 %"),
+        ({"health": wire.Health(motor_temperature=(30,) * 5 + (66,) + (30,) * 6)}, "temperature: FL_calf has 66 °C"),
+        ({"joint_pos": at(3, 1.0, robot.NOMINAL_STANCE)}, "joints: FL_hip is at 1.000 rad; its range is -0.863"),
+        ({"joint_pos": at(3, np.nan, robot.NOMINAL_STANCE)}, "joints: FL_hip is at nan rad"),
+        ({"joint_vel": at(2, 1.5, np.zeros(12))}, "joints: FR_calf moves at 1.50 rad/s"),
+        ({"imu_quat": np.zeros(4)}, "attitude quaternion's length is 0.000"),
+        ({"imu_acc": np.array([0.0, 0.0, 5.0])}, "accelerometer says 5.00 m/s2"),
+        ({"imu_quat": np.array([np.cos(0.4), np.sin(0.4), 0, 0])}, "leans by 46 degrees"),
+    ],
+)
+def test_each_finding_of_the_check_keeps_a_walk_from_beginning(changes: dict[str, Any], problem: str | None) -> None:
+    link = Go1Link("127.0.0.1", 9)
+    report = judged(heard_of(**changes), link, robot.JOINTS, robot.JOINT_POS_LIMITS, go1(), Bounds())
+    link.close()
+    assert bool(report.problems) == (problem is not None), report.problems
+    assert problem is None or any(problem in line for line in report.problems)
+    assert report.tick_s == 0.001
+
+
+def test_the_ticks_unit_is_measured() -> None:
+    for unit, per_packet in ((0.001, 2), (0.000001, 2000), (0.002, 1)):
+        heard = Heard(ticks=[(per_packet * k + 2**32 - 50, 0.002 * k + 0.0001 * (k % 3)) for k in range(300)])
+        assert heard.tick_s == unit
+    assert np.isnan(Heard(ticks=[(7 * k, 0.002 * k) for k in range(300)]).tick_s)
+    assert np.isnan(Heard().tick_s)
+
+
+def test_a_calibration_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "feet.json"
+    for content in ("{", "{}", '{"zero": [1, 2, 3], "scale": null}', '{"zero": [1,2,3,4], "scale": [1,1,1,0]}'):
+        path.write_text(content)
+        with pytest.raises(CalibrationError, match=r"feet\.json: is no calibration"):
+            FootCalibration.read(path)
+    zeros = FootCalibration((1.0, 2.0, 3.0, 4.0))
+    zeros.write(path)
+    assert FootCalibration.read(path) == zeros
+    with pytest.raises(CalibrationError, match="has no scales"):
+        zeros.forces(np.zeros(4))
+
+
+def test_feet_are_not_calibrated_by_a_robot_that_neither_lies_nor_stands() -> None:
+    zeros = FootCalibration((100.0,) * 4)
+    for forces in ([10.0] * 4, [60.0, 60.0, 5.0, 5.0]):
+        after, learnt = calibrated(np.full(4, 130.0), np.array(forces), zeros)
+        assert after is zeros
+        assert learnt.startswith("nothing: ")
+    after, learnt = calibrated(np.array([90.0, 130, 130, 130]), np.full(4, 30.0), zeros)
+    assert (after, "the counts of FR do not grow" in learnt) == (zeros, True)
+    after, _ = calibrated(np.full(4, 130.0), np.full(4, 30.0), zeros)
+    assert after == FootCalibration((100.0,) * 4, (1.0,) * 4)
+
+
+def test_forces_that_balance_the_torques_are_those_under_the_feet(file: str) -> None:
+    made = server(file, start="standing")
+    for _ in range(100):
+        made.tick()
+    state = made.robot.sense()[0]
+    made.close()
+    forces = forces_by_torque(go1(), state.joint_pos, state.joint_torque, np.array([0.0, 0.0, 1.0]))
+    # The legs' own weight is not in the torques of a foot: 7.5 kg of the robot's 12.7 are legs.
+    np.testing.assert_allclose(forces, state.foot_force, rtol=0.25)
+
+
+def test_listening_lasts_as_long_as_asked() -> None:
+    with speakers(1) as (other,):
+        link = Go1Link(*other.getsockname())
+        clock = iter(np.arange(0.0, 10.0, 0.1))
+        heard = listen(link, 1.0, now=lambda: float(next(clock)), sleep=lambda s: None)
+        link.close()
+    assert heard.states == []
+    assert heard.seconds > 1.0
