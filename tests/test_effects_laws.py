@@ -22,6 +22,8 @@ from go1exp import robot
 from go1exp.actuator.envelope import envelope
 from go1exp.compose import compose
 from go1exp.config import MANY_TERMS, TaskConfig, parse_task
+from go1exp.deploy import go1_wire
+from go1exp.deploy.messages import LowCmd
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Effect
 from go1exp.env.plant import Plant, drive_setup
@@ -353,6 +355,23 @@ def test_scaled_gains_are_those_gains() -> None:
         found, expected = swing(stand({effect: {"scale": scale}}), DT, 0.2), swing(stand({}, kp=kp, kd=kd), DT, 0.2)
         assert torch.equal(found, expected)
         assert apart(found, swing(stand({}), DT, 0.2)) > 0.005
+
+
+@pytest.mark.parametrize("steps", [1.0, 3.0])
+def test_fixed_point_cuts_gains_and_torques_as_the_go1s_packets_do(
+    steps: float, drives: Callable[..., DriveSetup]
+) -> None:
+    setup = drives(1)
+    law = term("effect", "fixed_point", {"steps": steps})(setup)
+    gains, torque = setup.zeros() + 2.35, setup.zeros() - 2.35
+    kp, kd = law.on_gains(gains, gains)
+    cut = [float(values[0, 0]) for values in (kp, kd, law.on_feedforward(torque))]
+    # the same numbers through a packet, in units of the coarser steps
+    packet = LowCmd(np.zeros(12), *(np.full(12, 2.35 / steps),) * 2, feedforward=np.full(12, -2.35 / steps))
+    asked = go1_wire.unpack_command(go1_wire.pack_command(packet))
+    assert isinstance(asked, go1_wire.MotorCommand)
+    assert cut == pytest.approx([steps * values[0] for values in (asked.kp, asked.kd, asked.tau)], abs=1e-12)
+    assert cut[1] < 2.35 < 2.35 + cut[1] - cut[2]
 
 
 def test_strength_is_both_gains_and_viscous_friction_is_kd_while_no_drive_saturates() -> None:

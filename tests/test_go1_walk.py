@@ -78,7 +78,8 @@ def test_a_walk_over_the_robots_packets_has_its_rounding_and_what_was_in_force(f
     assert r.joint("q_target").tobytes() == np.array([had[round(t / TICK)] for t in r.t]).tobytes()
     torque = r.joint("tau_est") * 256
     np.testing.assert_allclose(torque, np.rint(torque), atol=1e-9)
-    # kd = 0.7 is 0.6875 on this wire
+    assert (r.meta.kp[0], r.meta.kd[0]) == (35.0, 0.6875)  # 0.7 is 0.6875 on this wire
+    assert "torques have steps of 1/256 N m" in r.meta.notes
     half = 0.5 * (r.joint("q_target")[1:] + r.joint("q_target")[:-1])
     made = 35.0 * (half - r.joint("q")[1:]) - 0.6875 * r.joint("qd")[1:]
     np.testing.assert_allclose(r.joint("tau_est")[1:], made, atol=1 / 256 + 1e-4)

@@ -236,6 +236,11 @@ def pack_command(command: LowCmd) -> bytes:
     return bytes(packet)
 
 
+def gains_on_wire(kp: np.ndarray, kd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gains (J,) that the robot's drives have when these are commanded: cut to whole steps."""
+    return np.trunc(np.asarray(kp) / KP_STEP) * KP_STEP, np.trunc(np.asarray(kd) / KD_STEP) * KD_STEP
+
+
 def _sizes(command: LowCmd) -> dict[str, int]:
     names = ("joint_target", "kp", "kd", "feedforward")
     return {name: np.size(getattr(command, name)) for name in names if getattr(command, name) is not None}

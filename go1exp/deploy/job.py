@@ -20,6 +20,7 @@ from go1exp.deploy.commands import KEYS, make, range_array
 from go1exp.deploy.controller import Mover
 from go1exp.deploy.estimate import settings as estimator_settings
 from go1exp.deploy.go1_check import Report, calibrate, check
+from go1exp.deploy.go1_wire import gains_on_wire
 from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
@@ -29,6 +30,7 @@ from go1exp.deploy.walk import STATUS, Outcome, Plan, account, interruptible, sa
 
 Say = Callable[[str], None]
 
+ON_WIRE = "; gains are those that the packets carried, torques have steps of 1/256 N m"
 OTHER_MOVER = "; not moved by a policy: gains change, and torques that are fed forward are not recorded"
 
 
@@ -199,14 +201,17 @@ def run_job(job: Job, say: Say) -> int:
         truth, extra["simulated_robot"] = robot.process.truth, robot.process.report
         extra["velocity"] = velocity_errors(outcome.log, truth)
     content = account(bundle, plan, outcome, extra)
+    on_wire = job.robot in ("go1", "go1_sdk") or job.sim.get("protocol", "go1") == "go1"
+    gains = np.array(about.kp), np.array(about.kd)
+    gains = gains_on_wire(*gains) if on_wire else gains
     where = About(
         metadata=about,
-        kp=np.array(about.kp),
-        kd=np.array(about.kd),
+        kp=gains[0],
+        kd=gains[1],
         simulated=robot.simulated,
         newton=robot.simulated and job.sim.get("feet") != "raw",
         episode=_free(Path(job.out), time.strftime("walk_%Y-%m-%d_%H-%M-%S")),
-        notes="ends where the drives begin to brake" + (OTHER_MOVER if job.mover else ""),
+        notes="ends where the drives begin to brake" + (ON_WIRE if on_wire else "") + (OTHER_MOVER if job.mover else ""),
     )
     obeyed = None if robot.process is None else robot.process.obeyed
     files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None, obeyed)
