@@ -131,7 +131,7 @@ def lockstep(
     world = World(spoil)
     world.on_server = on_server
 
-    def clock(spin: float, meanwhile: Any, between: Any) -> Any:
+    def clock(spin: float, meanwhile: Any, between: Any, prepare: Any) -> Any:
         world.spins.append(spin)
         world.between = between
         return SimpleNamespace(now=lambda: world.now, sleep_until=world.pass_until)

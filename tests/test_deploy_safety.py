@@ -271,6 +271,12 @@ class FakeLink:
     def send(self, command: LowCmd) -> None:
         self.sent.append(command)
 
+    def repeat(self) -> None:
+        pass
+
+    def rehearse(self, command: LowCmd) -> None:
+        pass
+
     def close(self) -> None:
         pass
 
@@ -388,6 +394,33 @@ def test_a_rehearsal_leaves_no_trace() -> None:
     assert len(rehearsed.link.sent) == len(plain.link.sent) == 30
     for one, other in zip(rehearsed.link.sent, plain.link.sent, strict=True):
         assert (one.joint_target == other.joint_target).all()
+
+
+def test_states_that_are_taken_before_their_cycle_count_once_and_in_order() -> None:
+    plain, early = controller(), controller()
+    states: list[list[float]] = []
+    early.it._on_cycle = lambda cycle: states.append([state.t for state in cycle.fresh])
+    for k in range(20):
+        plain.run_cycles(1, k)
+        early.link._script = lambda _, k=k: always(k)[:3]  # type: ignore[misc]
+        early.it.prepare()
+        early.link._script = lambda _, k=k: always(k)[3:]  # type: ignore[misc]
+        early.run_cycles(1, k)
+    assert states == [[state.t for state in always(k)] for k in range(20)]
+    assert early.it._estimator.count == plain.it._estimator.count == 100
+    for one, other in zip(early.link.sent, plain.link.sent, strict=True):
+        assert (one.joint_target == other.joint_target).all()
+
+
+def test_what_fails_before_a_cycle_is_a_fault_in_it() -> None:
+    made = controller(estimator=Velocity(fails_at=90, how="raise"))
+    for k in range(30):
+        if made.it.phase == "walking":
+            made.it.prepare()
+        made.run_cycles(1, k)
+    assert made.safety.fault is not None
+    assert (made.safety.fault.name, made.safety.fault.message) == ("runtime", "FloatingPointError: singular")
+    assert made.link.sent[-1].damping
 
 
 def test_the_reach_of_a_target_follows_the_gains() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -164,6 +164,8 @@ class Controller:
         self._past = PastActions[np.ndarray](about.policy_dt, about.policy_dt if rate is None else 1.0 / rate)
         self._target = self._nominal.copy()
         self._state: LowState | None = None
+        self._early: list[LowState] = []  # received before their cycle; of these so many are in the estimate
+        self._estimated, self._failed_early = 0, cast("Exception | None", None)
         self._origin, self._halting = self._nominal, False
         self._since = 0.0
         self._velocity, self._base = np.zeros(3), np.full(3, np.nan)
@@ -176,14 +178,15 @@ class Controller:
         If anything fails in it, the drives are commanded to brake; only the link and ``on_cycle`` can raise.
         """
         self._begin = now if self._begin is None else self._begin
-        fresh = self._link.receive()
+        fresh, estimated = [*self._early, *self._link.receive()], self._estimated
+        self._early, self._estimated = [], 0
         if fresh:
             self._state = fresh[-1]
         elif self._state is None and now - self._begin > self._stages.patience:
             self.safety.fail("no_state", f"the robot has not said anything for {self._stages.patience:g} s", now)
         self._observation = None
         try:
-            wanted = self._wanted(now, fresh)
+            wanted = self._wanted(now, fresh[estimated:])
         except Exception as error:  # without a new command the robot would go on with its last one
             self.safety.fail("runtime", f"{type(error).__name__}: {error}", now)
             wanted = None
@@ -209,22 +212,36 @@ class Controller:
         else:
             self.phase, self._since, self.finished = "damping", now, True
 
+    def prepare(self) -> None:
+        """Take the states that have come by now, so that the next cycle has less to do; what fails, fails there."""
+        try:
+            for state in self._link.receive():
+                self._early.append(state)
+                self._base = self._estimator.update(state)
+                self._estimated += 1
+        except Exception as error:
+            self._failed_early = error
+
     def rehearse(self) -> None:
         """Run the costly parts of a cycle so that caches are warm; nothing is kept and nothing is sent."""
         if self._state is not None and self.phase == "walking":
             self._policy(self._readings)
-            self.safety.rehearse(self._state, LowCmd(self._target, self._kp, self._kd))
+            command = LowCmd(self._target, self._kp, self._kd)
+            self.safety.rehearse(self._state, command)
+            self._link.rehearse(command)
 
     def walked(self, now: float) -> float:
         """Return the time since walking began, s; 0 unless the robot walks now."""
         return now - self._since if self.phase == "walking" else 0.0
 
-    def _wanted(self, now: float, fresh: Sequence[LowState]) -> LowCmd | None:
-        """Return the command of the present phase; None if it has none."""
+    def _wanted(self, now: float, unestimated: Sequence[LowState]) -> LowCmd | None:
+        """Return the command of the present phase; None if it has none. ``unestimated``: states to estimate from."""
         state = self._state
         if state is None or self.phase == "damping":
             return None
-        for each in fresh:
+        if self._failed_early is not None:
+            raise self._failed_early
+        for each in unestimated:
             self._base = self._estimator.update(each)
         if self.phase == "waiting":
             self.phase, self._since, self._origin = "standing_up", now, state.joint_pos.copy()

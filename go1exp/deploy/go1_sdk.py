@@ -78,6 +78,9 @@ class SdkLink:
     def repeat(self) -> None:
         """Do nothing: the thread repeats the command."""
 
+    def rehearse(self, command: LowCmd) -> None:
+        """Do nothing: the thread sends."""
+
     def close(self) -> None:
         """End the exchange, after a last command to brake."""
         self._going = False

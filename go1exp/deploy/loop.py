@@ -34,6 +34,10 @@ BETWEEN_S = 0.002
 """Period at which a clock lets something be done between two cycles, s: that of the Go1's packets."""
 
 
+MARGIN_S = 0.00015
+"""Time before an instant from which nothing more is prepared, s: one preparation takes less."""
+
+
 class MonotonicClock:
     """The system's monotonic clock.
 
@@ -41,6 +45,7 @@ class MonotonicClock:
         spin: time before each instant for which the core is kept busy instead of asleep, s; 0: not at all.
         meanwhile: called once at the beginning of that, for example a rehearsal of the work: after a sleep the caches
             are cold, and the first work takes two to three times as long.
+        prepare: called again and again after it, until ``MARGIN_S`` before the instant: work that need not wait for it.
         between: called every ``BETWEEN_S`` while it sleeps, for example to send a command again; None: it sleeps
             through.
     """
@@ -50,8 +55,9 @@ class MonotonicClock:
         spin: float = 0.0,
         meanwhile: Callable[[], None] = lambda: None,
         between: Callable[[], None] | None = None,
+        prepare: Callable[[], None] | None = None,
     ) -> None:
-        self._spin, self._meanwhile, self._between = spin, meanwhile, between
+        self._spin, self._meanwhile, self._between, self._prepare = spin, meanwhile, between, prepare
 
     def now(self) -> float:
         """Return the time, s."""
@@ -68,6 +74,8 @@ class MonotonicClock:
             time.sleep(left)
         if self._spin and time.perf_counter() < when:
             self._meanwhile()
+        while self._spin and self._prepare is not None and time.perf_counter() < when - MARGIN_S:
+            self._prepare()
         while self._spin and time.perf_counter() < when:
             pass
 

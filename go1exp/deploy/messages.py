@@ -71,5 +71,8 @@ class Link(Protocol):
     def repeat(self) -> None:
         """Send what the robot must hear between two commands, if its protocol wants that; called every 2 ms."""
 
+    def rehearse(self, command: LowCmd) -> None:
+        """Do what sending a command takes, without sending it, so that caches are warm."""
+
     def close(self) -> None:
         """Close the connection."""

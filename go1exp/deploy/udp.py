@@ -162,6 +162,10 @@ class UdpLink:
     def repeat(self) -> None:
         """Do nothing: this robot keeps a command for a while."""
 
+    def rehearse(self, command: LowCmd) -> None:
+        """Pack a command that is not sent."""
+        wire.pack_command(command, 0, 0.0)
+
     def close(self) -> None:
         """Close the socket."""
         self._datagrams.close()
@@ -244,6 +248,10 @@ class Go1Link:
         self._spoken = now
         self.traffic.repeated += 1
         self._datagrams.put(self._packet)
+
+    def rehearse(self, command: LowCmd) -> None:
+        """Pack a command that is not sent."""
+        go1_wire.pack_command(command)
 
     def close(self) -> None:
         """Close the socket."""

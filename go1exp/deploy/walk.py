@@ -142,7 +142,7 @@ def walk(
     with contextlib.closing(make(plan.wish, ranges, safety.stop, stop_requests.append)) as commands:
         walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests, mover)
         with stopping(safety):
-            clock = MonotonicClock(plan.spin, walk.rehearse, link.repeat)
+            clock = MonotonicClock(plan.spin, walk.rehearse, link.repeat, walk.prepare)
             timing = run(walk.cycle, walk.rate, None, clock, lambda timing: on_second(walk.status(timing)))
         return walk.outcome(timing)
 
@@ -220,6 +220,10 @@ class _Walk:
         """Make a cycle that sends nothing, so that the next one is quick."""
         with contextlib.suppress(Exception):  # what is wrong is the cycle's to find
             self._controller.rehearse()
+
+    def prepare(self) -> None:
+        """Take what has come already, while the robot moves."""
+        self._controller.prepare()
 
     def status(self, timing: Timing) -> str:
         """Return a line on phase, timing and estimated velocity."""
