@@ -260,6 +260,8 @@ def test_a_command_without_position_gain_is_not_divided_by() -> None:
 class FakeLink:
     """Gives the states of a script, one list each cycle, and keeps what is sent."""
 
+    sent_at = math.nan
+
     def __init__(self, script: Callable[[int], Sequence[LowState]]) -> None:
         self._script, self.cycle = script, -1
         self.sent: list[LowCmd] = []

@@ -20,9 +20,21 @@ import numpy as np
 
 from go1exp.config import parse_train
 from go1exp.deploy.bundle import Bundle, loads
+from go1exp.deploy.go1_wire import (
+    JOINTS,
+    STATE_SIZE,
+    Health,
+    pack_command,
+    pack_state,
+    refusal,
+    tick_of,
+    unpack_command,
+    unpack_state,
+)
 from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.loop import Timing
 from go1exp.deploy.loop import run as loop
+from go1exp.deploy.messages import LowCmd, LowState
 from go1exp.export.build import build
 from go1exp.train import run_folder, trainer
 
@@ -53,7 +65,7 @@ def run(
         bundle = loads(data, str(file))
         for k in range(rounds):
             idle = loop(lambda now: True, RATE, seconds)
-            results.append(_walk(file, seconds, place / str(k)) | {"policy_us": _policy(bundle)} | _jitter(idle))
+            results.append(_walk(file, seconds, place / str(k)) | {"policy_us": _policy(bundle), "packets_us": _packets()} | _jitter(idle))
             on_round(k + 1, rounds)
     return {name: float(np.median([one[name] for one in results])) for name in results[0]}
 
@@ -70,6 +82,27 @@ def _policy(bundle: Bundle) -> float:
     for _ in range(CALLS):
         start = time.perf_counter()
         bundle.policy(readings)
+        times.append(time.perf_counter() - start)
+    return 1e6 * float(np.median(times))
+
+
+def _packets() -> float:
+    """Return the time to pack, check and unpack a command and a state, both ends together, us: the median."""
+    rng = np.random.default_rng(0)
+    command = LowCmd(rng.normal(size=JOINTS), np.full(JOINTS, 20.0), np.full(JOINTS, 0.5))
+    quat = np.array([1.0, 0.0, 0.0, 0.0])
+    three = [rng.normal(size=JOINTS) for _ in range(3)]
+    state = LowState(0.0, *three, quat, np.zeros(3), np.zeros(3), np.full(4, 30.0))
+    health, rpy = Health(), np.zeros(3)
+    packet = pack_state(state, 2, health, rpy)
+    times = []
+    for _ in range(CALLS):
+        start = time.perf_counter()
+        unpack_command(pack_command(command))
+        pack_state(state, 2, health, rpy)
+        if refusal(packet, STATE_SIZE) is None:
+            tick_of(packet)
+            unpack_state(packet, 0.0, 0.0)
         times.append(time.perf_counter() - start)
     return 1e6 * float(np.median(times))
 
@@ -99,9 +132,14 @@ def _walk(file: Path, seconds: float, out: Path) -> dict[str, float]:
         raise RobotError(f"python -m go1exp.deploy: {done.stderr.strip() or done.stdout.strip().splitlines()[-1]}")
     account = json.loads(next(out.glob("*.json")).read_text())
     timing = account["timing"]
+    with np.load(next(out.glob("*.npz"))) as cycles:
+        took = 1e3 * (cycles["sent_at"] - cycles["t"])
+    p50, p99 = np.nanpercentile(took, [50, 99])
     return {
-        "command_p50_ms": 1e3 * timing["work_p50"],
-        "command_p99_ms": 1e3 * timing["work_p99"],
+        "command_p50_ms": float(p50),
+        "command_p99_ms": float(p99),
+        "cycle_p50_ms": 1e3 * timing["work_p50"],
+        "cycle_p99_ms": 1e3 * timing["work_p99"],
         "missed_400hz": 100.0 * timing["missed_share"],
         "period_p99_ms": 1e3 * timing["period_p99"],
         "start_s": account["first_command_after_s"],

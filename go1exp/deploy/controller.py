@@ -5,6 +5,7 @@ The controller does not know which robot the link leads to, where commands come 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
@@ -94,6 +95,7 @@ class Cycle:
         base_lin_vel: (3,) the estimate; NaN before the first.
         observation: (O,) input of the network; None unless walking.
         fresh: the states received since the last cycle, oldest first.
+        sent_at: when the command left, s of the runtime's clock; NaN if none did.
     """
 
     t: float
@@ -104,6 +106,7 @@ class Cycle:
     base_lin_vel: np.ndarray
     observation: np.ndarray | None
     fresh: Sequence[LowState] = ()
+    sent_at: float = math.nan
 
 
 class Controller:
@@ -198,7 +201,8 @@ class Controller:
             self._target = sent.joint_target
             self._link.send(sent)
         command = sent if heard else None
-        about = (self._velocity, self._base, self._observation, fresh)
+        sent_at = self._link.sent_at if heard else math.nan
+        about = (self._velocity, self._base, self._observation, fresh, sent_at)
         self._on_cycle(Cycle(now, self.phase, self._state, command, *about))
         return self.phase != "damping" or now - self._since < self._stages.brake
 

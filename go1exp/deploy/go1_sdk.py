@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import threading
 import time
 from collections import deque
@@ -37,7 +38,12 @@ class SdkLink:
     """Exchanges states and commands every 2 ms in a thread of its own, at any rate of the runtime.
 
     Only that thread calls the SDK. If the runtime stops sending commands, the drives brake.
+
+    Attributes:
+        sent_at: NaN: the thread sends.
     """
+
+    sent_at = math.nan
 
     def __init__(self, sdk: Any = None, address: tuple[str, int] = (ROBOT, ROBOT_PORT)) -> None:
         """Open the way; ``sdk`` stands for the module in tests.

@@ -11,6 +11,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -246,8 +247,7 @@ def _sizes(command: LowCmd) -> dict[str, int]:
     return {name: np.size(getattr(command, name)) for name in names if getattr(command, name) is not None}
 
 
-@dataclass(frozen=True)
-class MotorCommand:
+class MotorCommand(NamedTuple):
     """What a command asks of the twelve motors: torque = kp (q* - q) + kd (dq* - dq) + tau, each (12,).
 
     Attributes:
@@ -257,7 +257,6 @@ class MotorCommand:
         kp: N m/rad; zero where the packet has POSITION_STOP.
         kd: N m s/rad; zero where it has VELOCITY_STOP.
         damping: (12,) bool: the motor brakes by itself, whatever else is asked.
-        idle: nothing is asked of any motor.
     """
 
     q: np.ndarray
@@ -266,7 +265,11 @@ class MotorCommand:
     kp: np.ndarray
     kd: np.ndarray
     damping: np.ndarray
-    idle: bool
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is asked of any motor."""
+        return not (self.kp.any() or self.kd.any() or self.tau.any() or self.damping.any())
 
 
 FASTEST, FARTHEST, BEYOND = 1000.0, 100.0, 1e9
@@ -277,22 +280,28 @@ def unpack_command(packet: bytes) -> MotorCommand | Refusal:
     """Return what a packet asks for, or why it is refused."""
     if wrong := refusal(packet, COMMAND_SIZE):
         return wrong
-    numbers = _MOTORS.unpack_from(packet, _PLACE)
-    mode, q, dq, tau, kp, kd = (np.array(numbers[k::_EACH], float) for k in range(_EACH))
+    numbers = np.array(_MOTORS.unpack_from(packet, _PLACE), float).reshape(JOINTS, _EACH).T
+    mode, q, dq, tau, kp, kd = numbers
     free, loose = q == _FREE, dq == _LOOSE
-    q[free] = kp[free] = dq[loose] = kd[loose] = 0.0
+    if free.any() or loose.any():
+        q[free] = kp[free] = dq[loose] = kd[loose] = 0.0
     damping = mode == DAMPING
     # written so that a NaN is refused
-    if not (abs(q).max() <= FARTHEST and abs(dq).max() <= FASTEST and (damping | (mode == SERVO)).all()):
+    if not ((abs(numbers) <= _BOUNDS).all() and (damping | (mode == SERVO)).all()):
         return Refusal.CONTENT
-    idle = not (kp.any() or kd.any() or tau.any() or damping.any())
-    return MotorCommand(q, dq, tau * TORQUE_STEP, kp * KP_STEP, kd * KD_STEP, damping, idle)
+    numbers *= _UNITS
+    return MotorCommand(q, dq, tau, kp, kd, damping)
 
 
+_BOUNDS = np.array([[255.0], [FARTHEST], [FASTEST], [32768.0], [65535.0], [65535.0]])
+_UNITS = np.array([[1.0], [1.0], [1.0], [TORQUE_STEP], [KP_STEP], [KD_STEP]])
 _FREE, _LOOSE = float(np.float32(POSITION_STOP)), float(np.float32(VELOCITY_STOP))
 
 
 # ---------------------------------------------------------------------- states
+
+NUMBERS = 2**32
+"""The tick wraps around here."""
 
 
 @dataclass(frozen=True)
@@ -316,9 +325,20 @@ class Health:
     acceleration: tuple[float, ...] = (0.0,) * JOINTS
 
 
-def _whole(values: np.ndarray, step: float) -> np.ndarray:
-    """Return values as whole numbers of ``step`` that 16 bits hold; the cast to an integer cuts towards zero."""
-    return np.minimum(np.maximum(values * (1.0 / step), -32768), 32767)
+_STATE_MOTORS = struct.Struct("<" + "BffhhffhbII" * JOINTS)
+_STATE_IMU = struct.Struct("<13fb")
+_STATE_BATTERY = struct.Struct("<BBBBiHbbbb10B")
+_STATE_REST = struct.Struct("<4h8xI")
+_PLACES = {name: STATE_TYPE.fields[name][1] for name in ("imu", "motor", "battery", "foot_force")}  # type: ignore[index]
+_BLANK_STATE = sealed(_blank(STATE_TYPE))
+
+
+_STATE_STEPS = np.repeat([1.0 / TORQUE_STEP, 1.0 / ACCELERATION_STEP, 1.0], [JOINTS, JOINTS, LEGS])
+
+
+@lru_cache(maxsize=8)
+def _cells(voltage: tuple[float, ...]) -> tuple[int, ...]:
+    return tuple(round(1000.0 * volts / 32.0) for volts in voltage)
 
 
 def pack_state(state: LowState, tick: int, health: Health, rpy: np.ndarray) -> bytes:
@@ -330,20 +350,23 @@ def pack_state(state: LowState, tick: int, health: Health, rpy: np.ndarray) -> b
         health: everything else.
         rpy: (3,) roll, pitch and yaw, rad.
     """
-    packet = _blank(STATE_TYPE)
-    imu, motors, battery = packet["imu"], packet["motor"][0, :JOINTS], packet["battery"]
-    imu["quat"], imu["gyro"], imu["acc"] = state.imu_quat, state.imu_gyro, state.imu_acc
-    imu["rpy"], imu["temperature"] = rpy, health.imu_temperature
-    motors["mode"], motors["q"], motors["dq"] = SERVO, state.joint_pos, state.joint_vel
-    motors["q_raw"], motors["dq_raw"] = state.joint_pos, state.joint_vel
-    motors["tau"] = _whole(state.joint_torque, TORQUE_STEP)
-    motors["ddq"] = motors["ddq_raw"] = _whole(np.array(health.acceleration), ACCELERATION_STEP)
-    motors["temperature"] = health.motor_temperature
-    battery["charge"], battery["current"] = health.charge, round(1000.0 * health.current)
-    battery["cell_voltage"] = [round(1000.0 * volts / 32.0) for volts in health.cell_voltage]
-    packet["foot_force"] = _whole(state.foot_force, 1.0)
-    packet["tick"] = tick % 2**32
-    return sealed(packet)
+    packet = bytearray(_BLANK_STATE)
+    imu = np.concatenate([state.imu_quat, state.imu_gyro, state.imu_acc, rpy]).tolist()
+    _STATE_IMU.pack_into(packet, _PLACES["imu"], *imu, health.imu_temperature)
+    fixed = np.concatenate([state.joint_torque, health.acceleration, state.foot_force]) * _STATE_STEPS
+    whole = np.minimum(np.maximum(fixed, -32768), 32767).astype(np.int32).tolist()  # cuts towards zero
+    numbers: list[float] = [SERVO, 0.0, 0.0, 0, 0, 0.0, 0.0, 0, 0, 0, 0] * JOINTS
+    numbers[1::11] = numbers[5::11] = state.joint_pos.tolist()
+    numbers[2::11] = numbers[6::11] = state.joint_vel.tolist()
+    numbers[3::11] = numbers[7::11] = whole[JOINTS : 2 * JOINTS]
+    numbers[4::11], numbers[8::11] = whole[:JOINTS], health.motor_temperature
+    _STATE_MOTORS.pack_into(packet, _PLACES["motor"], *numbers)
+    cells = _cells(health.cell_voltage)
+    battery = (0, 0, 0, health.charge, round(1000.0 * health.current), 0, 0, 0, 0, 0, *cells)
+    _STATE_BATTERY.pack_into(packet, _PLACES["battery"], *battery)
+    _STATE_REST.pack_into(packet, _PLACES["foot_force"], *whole[2 * JOINTS :], tick % NUMBERS)
+    packet[-4:] = checksum(packet).to_bytes(4, "little")
+    return bytes(packet)
 
 
 def tick_of(packet: bytes) -> int:
@@ -388,8 +411,6 @@ def unpack_health(packet: bytes) -> Health:
         acceleration=tuple(map(float, motors["ddq"] * ACCELERATION_STEP)),
     )
 
-
-NUMBERS = 2**32
 
 
 def newer(tick: int, than: int) -> int:

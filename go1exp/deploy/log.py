@@ -26,8 +26,12 @@ STATE = (
     *(("t", 1), ("clock", 1), ("in_force", 1), ("q", 12), ("qd", 12), ("tau_est", 12)),
     *(("imu_quat", 4), ("imu_gyro", 3), ("imu_acc", 3), ("foot_force", 4)),
 )
-CYCLE = (("t", 1), ("phase", 1), ("number", 1), ("damping", 1), ("q_target", 12), ("command", 3), ("estimate", 3))
-"""Parts of a row: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0."""
+CYCLE = (
+    *(("t", 1), ("phase", 1), ("number", 1), ("damping", 1), ("q_target", 12), ("command", 3), ("estimate", 3)),
+    ("sent_at", 1),
+)
+"""Parts of a row: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0;
+``sent_at`` when it left."""
 
 
 class Ring:
@@ -124,7 +128,7 @@ class Log:
             self._sent += 1
             self.first_command = cycle.t if self.first_command is None else self.first_command
             row[2], row[3], row[4:16] = self._sent, cycle.command.damping, cycle.command.joint_target
-        row[16:19], row[19:22] = cycle.velocity, cycle.base_lin_vel
+        row[16:19], row[19:22], row[22] = cycle.velocity, cycle.base_lin_vel, cycle.sent_at
         self.phases.setdefault(cycle.phase, cycle.t)
 
     def recording(

@@ -60,7 +60,13 @@ class LowCmd:
 
 
 class Link(Protocol):
-    """The connection to a robot, real or simulated."""
+    """The connection to a robot, real or simulated.
+
+    Attributes:
+        sent_at: when the last command left, s on the runtime's clock; NaN before, or if the link does not know.
+    """
+
+    sent_at: float
 
     def receive(self) -> Sequence[LowState]:
         """Return the states that have arrived since the last call, oldest first, without waiting."""

@@ -108,6 +108,7 @@ class UdpLink:
 
     Attributes:
         traffic: counts of its datagrams.
+        sent_at: when the last command left, s; NaN before.
     """
 
     def __init__(self, port: int, host: str = HOST) -> None:
@@ -119,6 +120,7 @@ class UdpLink:
         self._datagrams = Datagrams(port, host, wire.STATE_SIZE)
         self._last: int | None = None
         self._greeted = -float("inf")
+        self.sent_at = math.nan
         self.traffic = self._datagrams.traffic
 
     def receive(self) -> Sequence[LowState]:
@@ -158,6 +160,7 @@ class UdpLink:
         """Send a command, without waiting."""
         self.traffic.sent += 1
         self._datagrams.put(wire.pack_command(command, self.traffic.sent, time.perf_counter()))
+        self.sent_at = time.perf_counter()
 
     def repeat(self) -> None:
         """Do nothing: this robot keeps a command for a while."""
@@ -180,6 +183,7 @@ class Go1Link:
     Attributes:
         traffic: counts of its datagrams.
         tick_s: unit of the robot's tick, s; NaN if not known: then states have no clock and lost ones are not counted.
+        sent_at: when the last command left, s; NaN before.
         newest: the last state's packet that was accepted; empty before the first.
     """
 
@@ -193,7 +197,7 @@ class Go1Link:
         self.traffic, self.tick_s, self.newest = self._datagrams.traffic, tick_s, b""
         self._last: int | None = None
         self._clock, self._packet = 0.0, go1_wire.IDLE
-        self._spoken = -math.inf
+        self._spoken, self.sent_at = -math.inf, math.nan
 
     def receive(self) -> Sequence[LowState]:
         """Return the states that have arrived since the last call, oldest first, without waiting."""
@@ -236,9 +240,9 @@ class Go1Link:
             ValueError: if it has a part of another size, or one that is not finite.
         """
         self._packet = go1_wire.pack_command(command)
-        self._spoken = time.perf_counter()
         self.traffic.sent += 1
         self._datagrams.put(self._packet)
+        self._spoken = self.sent_at = time.perf_counter()
 
     def repeat(self) -> None:
         """Send the last command again if a period has passed since; before the first, what asks for nothing."""
