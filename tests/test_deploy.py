@@ -612,8 +612,12 @@ def test_a_link_that_breaks_ends_the_walk_with_a_log(file: str) -> None:
 
     def nothing(*_: object) -> None: ...
 
-    link = SimpleNamespace(sent_at=math.nan, receive=receive, send=sent.append, repeat=nothing, rehearse=nothing, close=nothing)
-    outcome = walk.walk(load(file), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0, spin=0.0))
+    link = SimpleNamespace(
+        sent_at=math.nan, receive=receive, send=sent.append, repeat=nothing, rehearse=nothing, close=nothing
+    )
+    outcome = walk.walk(
+        load(file), cast(Link, link), Plan(rate=500.0, stale=BUSY, stand_up=0.004, seconds=5.0, spin=0.0)
+    )
     assert outcome.fault is not None
     assert (outcome.fault.name, outcome.fault.message) == ("runtime", "RobotError: the SDK failed")
     assert outcome.status == STATUS["runtime"]

@@ -404,9 +404,9 @@ def test_states_that_are_taken_before_their_cycle_count_once_and_in_order() -> N
     early.it._on_cycle = lambda cycle: states.append([state.t for state in cycle.fresh])
     for k in range(20):
         plain.run_cycles(1, k)
-        early.link._script = lambda _, k=k: always(k)[:3]  # type: ignore[misc]
+        early.link._script = lambda _, k=k: always(k)[:3]
         early.it.prepare()
-        early.link._script = lambda _, k=k: always(k)[3:]  # type: ignore[misc]
+        early.link._script = lambda _, k=k: always(k)[3:]
         early.run_cycles(1, k)
     assert states == [[state.t for state in always(k)] for k in range(20)]
     assert early.it._estimator.count == plain.it._estimator.count == 100

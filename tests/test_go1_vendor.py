@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from go1exp import recording, robot
+from go1exp.cli.runs import shipped_policies
 from go1exp.deploy import go1_sdk
 from go1exp.deploy import go1_wire as wire
 from go1exp.deploy.commands import Wish
@@ -25,7 +26,6 @@ from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.messages import LowCmd, LowState
 from go1exp.deploy.walk import Plan
 from go1exp.export.build import build
-from go1exp.cli.runs import shipped_policies
 
 try:
     SDK: Any = go1_sdk._module()
@@ -116,7 +116,9 @@ def test_it_reads_every_state_as_our_runtime_does(client: SimpleNamespace) -> No
         quat = rng.normal(size=4)
         state = LowState(
             0.0,
-            *(scale * rng.normal(size=12) for scale in (1.0, 10.0, 15.0)),
+            rng.normal(size=12),
+            10.0 * rng.normal(size=12),
+            15.0 * rng.normal(size=12),
             quat / np.linalg.norm(quat),
             rng.normal(size=3),
             9.81 * rng.normal(size=3),
@@ -140,7 +142,9 @@ def test_it_reads_every_state_as_our_runtime_does(client: SimpleNamespace) -> No
 
 
 def test_it_too_refuses_a_wrong_checksum(client: SimpleNamespace) -> None:
-    state = LowState(0.0, *[np.zeros(12)] * 3, np.array([1.0, 0, 0, 0]), np.zeros(3), np.zeros(3), np.zeros(4))
+    state = LowState(
+        0.0, np.zeros(12), np.zeros(12), np.zeros(12), np.array([1.0, 0, 0, 0]), np.zeros(3), np.zeros(3), np.zeros(4)
+    )
     good = wire.pack_state(state, 10, wire.Health(), np.zeros(3))
     client.exchange(good)
     assert client.told.tick == 10
@@ -163,4 +167,3 @@ def test_its_position_limit_is_the_range_to_which_our_targets_are_limited(client
         guard.PositionLimit(client.asked)
         limited = [client.asked.motorCmd[k].q for k in range(12)]
         np.testing.assert_allclose(limited, sdk_range(robot.JOINTS)[:, side], atol=1e-5)
-

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +28,7 @@ from go1exp.deploy.launch import RobotError
 from go1exp.deploy.udp import Go1Link
 from go1exp.deploy.walk import Plan
 from go1exp.estimation import go1
-from go1exp.estimation.feet import CalibrationError, FootCalibration, calibrated, forces_by_torque
+from go1exp.estimation.feet import CalibrationError, FootCalibration, calibrated, forces_by_torque, kinematics
 from go1exp.export.build import build
 from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.alone import Account
@@ -50,9 +51,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def play(
-    file: str, out: Path, meddle: Callable[[World], None] = lambda world: None, **sim: Any
-) -> SimpleNamespace:
+def play(file: str, out: Path, meddle: Callable[[World], None] = lambda world: None, **sim: Any) -> SimpleNamespace:
     """Walk for a second by the robot's packets; ``meddle`` is called when the simulated robot is there."""
     plan = Plan(seconds=1.0, stand_up=0.2, lie_down=0.0, brake=0.1, wish=Wish((0.4, 0.0, 0.0)))
     output: list[str] = []
@@ -276,8 +275,7 @@ LOOSE = Bounds(rate=20.0, gap=2.0)
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(go1_check, "SECONDS", 0.3)
-    usual = go1_check.check
-    monkeypatch.setattr(job, "check", lambda *given: usual(*given, LOOSE))
+    monkeypatch.setattr(job, "check", partial(go1_check.check, bounds=LOOSE))
 
 
 @pytest.mark.usefixtures("patient")
@@ -309,16 +307,16 @@ def test_a_walk_begins_only_after_the_check_has_passed(
     plan = Plan(seconds=0.2, stand_up=0.1, lie_down=0.0, brake=0.1, stale=5.0)
     made = server(file, start="standing")
     made._language._health = wire.Health(charge=7)  # type: ignore[attr-defined]
-    there = {"address": f"127.0.0.1:{made.port}"}
+    there = f"127.0.0.1:{made.port}"
     with living(made) as heard:
         with pytest.raises(RobotError, match=r"does not pass its check.*battery: 7 %; at least 20 % are needed"):
-            run_job(Job(file, "go1", plan, str(tmp_path / "a"), **there), print)
+            run_job(Job(file, "go1", plan, str(tmp_path / "a"), address=there), print)
         assert set(heard) == {wire.IDLE}
         made._language._health = wire.Health()  # type: ignore[attr-defined]
         until = made.counts.ticks + round(GONE_S / TICK) + 5
         while made.counts.ticks < until:
             time.sleep(0.01)
-        assert run_job(Job(file, "go1", plan, str(tmp_path / "b"), **there), print) == 0
+        assert run_job(Job(file, "go1", plan, str(tmp_path / "b"), address=there), print) == 0
         assert set(heard) != {wire.IDLE}
     walked = recording.read(next((tmp_path / "b").glob("*.parquet")))
     assert walked.meta.source == "measured"
@@ -333,7 +331,7 @@ def test_nobody_there_is_said_in_a_line(tmp_path: Path, monkeypatch: pytest.Monk
         assert run_check(CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", address), said.append) == 1
     assert said[1].startswith("problem: no robot: 0 states in 0.1 s; nothing came")
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(RobotError, match="address=here: must be HOST:PORT, such as 192.168.123.10:8007"):
+    with pytest.raises(RobotError, match=r"address=here: must be HOST:PORT, such as 192\.168\.123\.10:8007"):
         run_check(CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", "here"), said.append)
 
 
@@ -425,7 +423,7 @@ def test_forces_that_balance_the_torques_are_those_under_the_feet(file: str) -> 
         made.tick()
     state = made.robot.sense()[0]
     made.close()
-    forces = forces_by_torque(go1(), state.joint_pos, state.joint_torque, np.array([0.0, 0.0, 1.0]))
+    forces = forces_by_torque(state.joint_pos, state.joint_torque, np.array([0.0, 0.0, 1.0]), kinematics(go1()))
     # The legs' own weight is not in the torques of a foot: 7.5 kg of the robot's 12.7 are legs.
     np.testing.assert_allclose(forces, state.foot_force, rtol=0.25)
 

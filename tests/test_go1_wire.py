@@ -1,4 +1,4 @@
-"""The Go1's packets: layout, rounding, checksum, refusals; bytes that the vendor's binary sent, and what it accepted."""
+"""The Go1's packets: layout, rounding, checksum, refusals; bytes that the vendor's binary sent and accepted."""
 
 from __future__ import annotations
 
@@ -233,7 +233,12 @@ def test_a_packet_that_is_wrong_is_refused_by_name(packet: bytes, why: wire.Refu
 
 
 def test_a_state_is_refused_likewise() -> None:
-    wrong = {GOOD[:-1]: "SIZE", VENDOR_COMMAND: "SIZE", b"x" + GOOD[1:]: "HEAD", GOOD[:100] + b"\7" + GOOD[101:]: "CHECKSUM"}
+    wrong = {
+        GOOD[:-1]: "SIZE",
+        VENDOR_COMMAND: "SIZE",
+        b"x" + GOOD[1:]: "HEAD",
+        GOOD[:100] + b"\7" + GOOD[101:]: "CHECKSUM",
+    }
     wrong[GOOD[:2] + b"\xee" + GOOD[3:]] = "LEVEL"
     assert [wire.refusal(packet, 807) for packet in wrong] == [wire.Refusal[why] for why in wrong.values()]
     assert wire.refusal(GOOD, 807) is None
@@ -387,9 +392,9 @@ def test_a_damping_motor_and_a_wanted_speed_reach_the_drives() -> None:
     assert LISTENER.read(VENDOR_IDLE).command is None  # type: ignore[union-attr]
 
 
-def test_roll_pitch_and_yaw_are_those_of_scipy(rotations: int = 50) -> None:
+def test_roll_pitch_and_yaw_are_those_of_scipy() -> None:
     from scipy.spatial.transform import Rotation
 
-    for turn in Rotation.random(rotations, rng=0):
+    for turn in Rotation.random(50, rng=0):
         yaw, pitch, roll = turn.as_euler("ZYX")
         np.testing.assert_allclose(roll_pitch_yaw(turn.as_quat(scalar_first=True)), [roll, pitch, yaw], atol=1e-7)

@@ -65,7 +65,11 @@ def run(
         bundle = loads(data, str(file))
         for k in range(rounds):
             idle = loop(lambda now: True, RATE, seconds)
-            results.append(_walk(file, seconds, place / str(k)) | {"policy_us": _policy(bundle), "packets_us": _packets()} | _jitter(idle))
+            results.append(
+                _walk(file, seconds, place / str(k))
+                | {"policy_us": _policy(bundle), "packets_us": _packets()}
+                | _jitter(idle)
+            )
             on_round(k + 1, rounds)
     return {name: float(np.median([one[name] for one in results])) for name in results[0]}
 
@@ -91,8 +95,8 @@ def _packets() -> float:
     rng = np.random.default_rng(0)
     command = LowCmd(rng.normal(size=JOINTS), np.full(JOINTS, 20.0), np.full(JOINTS, 0.5))
     quat = np.array([1.0, 0.0, 0.0, 0.0])
-    three = [rng.normal(size=JOINTS) for _ in range(3)]
-    state = LowState(0.0, *three, quat, np.zeros(3), np.zeros(3), np.full(4, 30.0))
+    q, qd, torque = (rng.normal(size=JOINTS) for _ in range(3))
+    state = LowState(0.0, q, qd, torque, quat, np.zeros(3), np.zeros(3), np.full(4, 30.0))
     health, rpy = Health(), np.zeros(3)
     packet = pack_state(state, 2, health, rpy)
     times = []

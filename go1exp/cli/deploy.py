@@ -29,18 +29,8 @@ def _task(container: dict[str, Any]) -> int:
     controller = controllers.chosen(settings.controller)
     if settings.check:
         return _check(settings)
-    if settings.bundle is None:
-        raise ConfigError(["bundle = null: only check=true needs none; give it as in go1exp deploy runs/NAME/bundle.zip"])
-    real = settings.robot != "sim"
-    if real and other:
-        raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
-    for name in ("address", "feet"):
-        if not real and getattr(settings, name) is not None:
-            raise ConfigError([f"{name} = {getattr(settings, name)}: is for robot=go1 and robot=go1_sdk"])
-    if real and controller:
-        raise ConfigError(
-            ["controller=mpc: is for robot=sim; it has never moved a real robot, nor has a person tried it"]
-        )
+    _refuse_misfits(settings, other, controller is not None)
+    assert settings.bundle is not None  # or it would have been refused
     rate = settings.rate
     if controller:
         rate = 1.0 / controller.period
@@ -58,8 +48,18 @@ def _task(container: dict[str, Any]) -> int:
     wish = Wish(settings.command, settings.sinusoid.amplitude, settings.sinusoid.period)
     plan = subset(Plan, settings, wish=wish, rate=rate)
     sim = dataclasses.asdict(settings.sim)
-    about = {"truth": settings.truth, "address": settings.address, "feet": settings.feet}
-    job = Job(settings.bundle, settings.robot, plan, settings.out, sim, other, mover=_mover(controller), **about)
+    job = Job(
+        settings.bundle,
+        settings.robot,
+        plan,
+        settings.out,
+        sim,
+        other,
+        truth=settings.truth,
+        mover=_mover(controller),
+        address=settings.address,
+        feet=settings.feet,
+    )
     try:
         return run_job(job, lambda line: print(line, flush=True))
     except RefusedError as error:
@@ -67,6 +67,24 @@ def _task(container: dict[str, Any]) -> int:
     finally:
         if not existed:
             remove_empty(Path(settings.out))
+
+
+def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled: bool) -> None:
+    """Raise ConfigError if settings do not go together; ``other``: choices of the simulated robot's groups."""
+    if settings.bundle is None:
+        raise ConfigError(
+            ["bundle = null: only check=true needs none; give it as in go1exp deploy runs/NAME/bundle.zip"]
+        )
+    real = settings.robot != "sim"
+    if real and other:
+        raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
+    for name in ("address", "feet"):
+        if not real and getattr(settings, name) is not None:
+            raise ConfigError([f"{name} = {getattr(settings, name)}: is for robot=go1 and robot=go1_sdk"])
+    if real and controlled:
+        raise ConfigError(
+            ["controller=mpc: is for robot=sim; it has never moved a real robot, nor has a person tried it"]
+        )
 
 
 def _check(settings: DeploySettings) -> int:

@@ -105,8 +105,8 @@ def _walk(options: argparse.Namespace) -> int:
         sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "loss", "seed", "protocol")}
         if options.check:
             return _check(options)
-        about = {"truth": options.truth, "address": options.address, "feet": options.feet}
-        job = Job(options.bundle, options.robot, plan, options.out, sim, **about)
+        where = options.bundle, options.robot, plan, options.out, sim
+        job = Job(*where, truth=options.truth, address=options.address, feet=options.feet)
         return run_job(job, lambda line: print(line, flush=True))
     except (Expected, OSError, ValueError) as error:
         print(f"go1exp.deploy: {error}", file=sys.stderr)

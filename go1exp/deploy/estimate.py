@@ -11,7 +11,7 @@ import numpy as np
 
 from go1exp.deploy.messages import LowState
 from go1exp.estimation import FilterConfig, Status, from_json, go1, make_filter, sample
-from go1exp.estimation.feet import FootCalibration
+from go1exp.estimation.feet import FootCalibration, LoadByBoth
 
 FASTEST = 10.0
 """Speed above which an estimate has diverged, m/s: the top speed of a Go1's joints gives about 6 m/s."""
@@ -21,6 +21,9 @@ BLIND_S = 0.1
 
 TORQUE = {"contact_source": "torque", "contact_low": 10.0, "contact_high": 40.0}
 """Contact from the joints' torques, for a robot whose foot sensors are not calibrated (``docs/estimation.md``)."""
+
+BOTH: dict[str, Any] = {"contact_source": "force", "contact_low": 10.0, "contact_high": 30.0}
+"""Contact from torques and calibrated foot sensors together (``docs/estimation.md``)."""
 
 Fail = Callable[[str, str, float], None]
 """``Safety.fail``: name of the fault, message, the runtime's clock."""
@@ -56,7 +59,8 @@ class KalmanEstimator:
         Raises:
             go1exp.estimation.EstimatorError: if the compiled filter is missing.
         """
-        self._filter, self._fail, self._feet = make_filter(config), fail, feet
+        self._filter, self._fail = make_filter(config), fail
+        self._both = None if feet is None else LoadByBoth(config, feet)
         self._velocity = np.full(3, np.nan)
         self._since: float | None = None
         self.refused = {Status.LATE.name: 0, Status.INVALID.name: 0}
@@ -78,7 +82,7 @@ class KalmanEstimator:
             state.joint_pos,
             state.joint_vel,
             state.joint_torque,
-            state.foot_force if self._feet is None else self._feet.forces(state.foot_force),
+            self._loads(state),
         )
         status = Status(self._filter.update(row))
         if status.name in self.refused:
@@ -97,6 +101,12 @@ class KalmanEstimator:
             self._fail("estimator", f"the filter has diverged: it says {speed:g} m/s", state.t)
         self._velocity = velocity
         return velocity
+
+    def _loads(self, state: LowState) -> np.ndarray:
+        """Return what the filter takes for the forces under the feet (4,), N."""
+        if self._both is None:
+            return state.foot_force
+        return self._both.loads(state.foot_force, state.joint_pos, state.joint_torque, state.imu_quat)
 
 
 class NoEstimator:

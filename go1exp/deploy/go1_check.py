@@ -18,7 +18,7 @@ from go1exp.deploy.messages import LowState
 from go1exp.deploy.safety import SafetyConfig, lean
 from go1exp.deploy.udp import Go1Link
 from go1exp.estimation import FilterConfig
-from go1exp.estimation.feet import FootCalibration, calibrated, forces_by_torque
+from go1exp.estimation.feet import FootCalibration, calibrated, forces_by_torque, kinematics, vertical
 
 SECONDS = 2.0
 """How long to listen, s."""
@@ -149,21 +149,17 @@ def judged(
         more, wrong = judge(heard, joints, stops, bounds)
         lines += more
         problems += wrong
-    up = _up(heard.mean("imu_quat"))
+    up = vertical(heard.mean("imu_quat"))
     counts, force = (
         heard.mean("foot_force"),
-        forces_by_torque(config, heard.mean("joint_pos"), heard.mean("joint_torque"), up),
+        forces_by_torque(heard.mean("joint_pos"), heard.mean("joint_torque"), up, kinematics(config)),
     )
     spread = np.std([state.foot_force for state in heard.states], axis=0)
-    lines.append("feet FR FL RR RL: counts " + " ".join(f"{c:.0f}±{s:.1f}" for c, s in zip(counts, spread, strict=True)))
+    lines.append(
+        "feet FR FL RR RL: counts " + " ".join(f"{c:.0f}±{s:.1f}" for c, s in zip(counts, spread, strict=True))
+    )
     lines.append("  vertical force by the torques " + " ".join(f"{value:.0f}" for value in force) + " N")
     return Report(tuple(lines), tuple(problems), heard.tick_s, counts, force)
-
-
-def _up(quat: np.ndarray) -> np.ndarray:
-    """Return the vertical in the trunk's frame, of an attitude w-x-y-z."""
-    w, x, y, z = quat / max(float(np.linalg.norm(quat)), 1e-9)
-    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
 
 
 def _packets(heard: Heard, link: Go1Link) -> list[str]:
@@ -226,9 +222,9 @@ def _joints(heard: Heard, joints: Sequence[str], stops: np.ndarray, bounds: Boun
             for j in range(k, min(k + 3, len(joints)))
         )
         lines.append("  " + "  ".join(parts))
-    for k in np.flatnonzero(~(beyond <= SafetyConfig.beyond_stop)):
+    for k in map(int, np.flatnonzero(~(beyond <= SafetyConfig.beyond_stop))):
         problems.append(f"joints: {joints[k]} is at {q[k]:.3f} rad; its range is {stops[k, 0]} to {stops[k, 1]}")
-    for k in np.flatnonzero(~(qd <= bounds.speed)):
+    for k in map(int, np.flatnonzero(~(qd <= bounds.speed))):
         problems.append(f"joints: {joints[k]} moves at {qd[k]:.2f} rad/s; the robot must be at rest")
     return lines, problems
 
@@ -242,7 +238,9 @@ def _trunk(heard: Heard, joints: Sequence[str], stops: np.ndarray, bounds: Bound
     if not abs(acc - 9.81) <= bounds.gravity:
         problems.append(f"IMU: the accelerometer says {acc:.2f} m/s2 at rest instead of 9.81")
     if not angle <= bounds.lean:
-        problems.append(f"IMU: the trunk leans by {math.degrees(angle):.0f} degrees; {math.degrees(bounds.lean):.0f} at most")
+        problems.append(
+            f"IMU: the trunk leans by {math.degrees(angle):.0f} degrees; {math.degrees(bounds.lean):.0f} at most"
+        )
     return [f"IMU: gravity {acc:.2f} m/s2, leans by {math.degrees(angle):.1f} degrees"], problems
 
 

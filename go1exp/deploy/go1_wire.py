@@ -412,7 +412,6 @@ def unpack_health(packet: bytes) -> Health:
     )
 
 
-
 def newer(tick: int, than: int) -> int:
     """Return by how much a tick is ahead of another; negative if it is older. Wrap-around is handled."""
     return (tick - than + NUMBERS // 2) % NUMBERS - NUMBERS // 2

@@ -25,8 +25,8 @@ from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
 from go1exp.deploy.udp import HOST, SIMULATED_TICK_S, Go1Link, UdpLink
-from go1exp.estimation.feet import FootCalibration
 from go1exp.deploy.walk import STATUS, Outcome, Plan, account, interruptible, save, velocity_errors, walk
+from go1exp.estimation.feet import FootCalibration
 
 Say = Callable[[str], None]
 
@@ -201,18 +201,7 @@ def run_job(job: Job, say: Say) -> int:
         truth, extra["simulated_robot"] = robot.process.truth, robot.process.report
         extra["velocity"] = velocity_errors(outcome.log, truth)
     content = account(bundle, plan, outcome, extra)
-    on_wire = job.robot in ("go1", "go1_sdk") or job.sim.get("protocol", "go1") == "go1"
-    gains = np.array(about.kp), np.array(about.kd)
-    gains = gains_on_wire(*gains) if on_wire else gains
-    where = About(
-        metadata=about,
-        kp=gains[0],
-        kd=gains[1],
-        simulated=robot.simulated,
-        newton=robot.simulated and job.sim.get("feet") != "raw",
-        episode=_free(Path(job.out), time.strftime("walk_%Y-%m-%d_%H-%M-%S")),
-        notes="ends where the drives begin to brake" + (ON_WIRE if on_wire else "") + (OTHER_MOVER if job.mover else ""),
-    )
+    where = _about(job, bundle, robot.simulated)
     obeyed = None if robot.process is None else robot.process.obeyed
     files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None, obeyed)
     say(str(outcome.timing))
@@ -222,6 +211,25 @@ def run_job(job: Job, say: Say) -> int:
     end = f"until {outcome.asked}" if outcome.asked else "to the end"
     say(f"fault: {outcome.fault}" if outcome.fault else f"walked for {outcome.walked:.1f} s, {end}")
     return outcome.status
+
+
+def _about(job: Job, bundle: Bundle, simulated: bool) -> About:
+    """Return the origin of a walk's log."""
+    about = bundle.metadata
+    on_wire = job.robot in ("go1", "go1_sdk") or job.sim.get("protocol", "go1") == "go1"
+    gains = np.array(about.kp), np.array(about.kd)
+    gains = gains_on_wire(*gains) if on_wire else gains
+    return About(
+        metadata=about,
+        kp=gains[0],
+        kd=gains[1],
+        simulated=simulated,
+        newton=simulated and job.sim.get("feet") != "raw",
+        episode=_free(Path(job.out), time.strftime("walk_%Y-%m-%d_%H-%M-%S")),
+        notes="ends where the drives begin to brake"
+        + (ON_WIRE if on_wire else "")
+        + (OTHER_MOVER if job.mover else ""),
+    )
 
 
 def summary_lines(content: Mapping[str, Any]) -> list[str]:

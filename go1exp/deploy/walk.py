@@ -20,12 +20,12 @@ from go1exp import signals
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.commands import Limited, Wish, make, range_array
 from go1exp.deploy.controller import Controller, Cycle, Estimator, Mover, Stages
-from go1exp.deploy.estimate import KalmanEstimator, NoEstimator, settings
+from go1exp.deploy.estimate import BOTH, TORQUE, KalmanEstimator, NoEstimator, settings
 from go1exp.deploy.log import About, Log, write_cycles
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.messages import Link
-from go1exp.estimation.feet import FootCalibration
 from go1exp.deploy.safety import RULES, Fault, Safety, SafetyConfig
+from go1exp.estimation.feet import FootCalibration
 from go1exp.files import write_json
 
 FAULTS = (*RULES, "no_state", "estimator", "command", "runtime")
@@ -109,12 +109,14 @@ def estimator_of(
         go1exp.schema.registry.ConfigError: if the bundle's settings are not such.
         go1exp.estimation.EstimatorError: if the compiled filter is missing.
     """
-    from go1exp.deploy.estimate import TORQUE
-
     if not always and all(port.name != "base_lin_vel_b" for port in bundle.policy.inputs):
         return NoEstimator()
-    changes: dict[str, Any] = TORQUE if contact == "torque" and feet is None else {}
-    return KalmanEstimator(settings(bundle.metadata.estimator, **changes), safety.fail, feet)
+    changes: dict[str, Any] = {}
+    if contact == "torque":
+        changes = TORQUE if feet is None else BOTH
+    return KalmanEstimator(
+        settings(bundle.metadata.estimator, **changes), safety.fail, feet if changes is BOTH else None
+    )
 
 
 def walk(

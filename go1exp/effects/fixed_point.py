@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 class FixedPoint(Effect):
     """Commanded gains and feed-forward torques are cut towards zero to whole steps: ``steps`` times those of a Go1.
 
-    A Go1's packets carry kp in steps of 1/32 N m/rad, kd of 1/16 N m s/rad, torque of 1/256 N m (``deploy/go1_wire.py``,
-    read off the vendor's client), so that kd = 0.3 becomes 0.25 and kd = 0.5 stays. Targets are floats and stay as they
-    are. The packets' range is a Go1's and is never reached by one. Looks like ``kd_scale`` and ``kp_scale``, since it
-    changes nothing but gains; only recordings at two gains can tell them apart.
+    A Go1's packets carry kp in steps of 1/32 N m/rad, kd of 1/16 N m s/rad, torque of 1/256 N m
+    (``deploy/go1_wire.py``, read off the vendor's client), so that kd = 0.3 becomes 0.25 and kd = 0.5 stays. Targets
+    are floats and stay as they are. The packets' range is never reached by a Go1. It changes nothing but gains and
+    torques that are fed forward, so recordings at one gain cannot tell it from ``kp_scale``, ``kd_scale``, ``viscous``.
     """
 
     title = "fixed-point numbers in the commands"

@@ -82,6 +82,17 @@ def make_filter(config: FilterConfig) -> _kalman.Filter:
     return compiled_filter
 
 
+def compiled_legs(config: FilterConfig) -> list[_kalman.Leg]:
+    """Return the compiled legs; ``foot(q)`` of one gives what ``go1exp.estimation.legs.foot`` does.
+
+    Raises:
+        EstimatorError: if the extension is missing.
+    """
+    legs = _plain(compiled(), "legs", config.legs)
+    assert isinstance(legs, list)
+    return legs
+
+
 def _plain(module: ModuleType, name: str, value: object) -> object:
     """Convert a setting to the type that the extension takes."""
     if name == "legs":

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from go1exp.errors import Expected
-from go1exp.estimation.config import FilterConfig
-from go1exp.estimation.legs import foot
+from go1exp.estimation import FilterConfig, compiled_legs
 
 LEGS = 4
 SINGULAR = 1e-6
@@ -72,28 +72,71 @@ class FootCalibration:
             raise CalibrationError(f"{path}: is no calibration of the feet: {error}") from None
 
 
-def forces_by_torque(config: FilterConfig, q: np.ndarray, torque: np.ndarray, up: np.ndarray) -> np.ndarray:
+class LoadByBoth:
+    """The feet's loads from calibrated sensors and from the joints' torques together: their mean.
+
+    The torques have the inertia of the swinging leg in them, the sensors an error of their calibration; each alone
+    finds contact in a foot that swings, or loses a loaded one, at other times than the other.
+    """
+
+    def __init__(self, config: FilterConfig, calibration: FootCalibration) -> None:
+        """Take the legs and the calibration.
+
+        Raises:
+            CalibrationError: if the calibration has no scales.
+        """
+        calibration.forces(np.zeros(LEGS))  # raises
+        self._legs, self._calibration = kinematics(config), calibration
+
+    def mixed(self, counts: np.ndarray, by_torque: np.ndarray) -> np.ndarray:
+        """Return loads (4,), N, from counts (4,) and the forces (4,), N, that balance the torques."""
+        load: np.ndarray = 0.5 * (self._calibration.forces(counts) + by_torque)
+        return load
+
+    def loads(self, counts: np.ndarray, q: np.ndarray, torque: np.ndarray, quat: np.ndarray) -> np.ndarray:
+        """Return loads (4,), N, from counts (4,), angles (12,) rad, torques (12,) N m and the attitude w-x-y-z."""
+        return self.mixed(counts, forces_by_torque(q, torque, vertical(quat), self._legs))
+
+
+def vertical(quat: np.ndarray) -> np.ndarray:
+    """Return the vertical (3,) in the trunk's frame, of an attitude w-x-y-z."""
+    w, x, y, z = quat / max(float(np.linalg.norm(quat)), 1e-9)
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+def forces_by_torque(
+    q: np.ndarray, torque: np.ndarray, up: np.ndarray, legs: Sequence[Callable[[np.ndarray], Kinematics]]
+) -> np.ndarray:
     """Return the vertical forces (4,), N, by which the ground balances the joints' torques: tau + J' f = 0.
 
-    Of a leg whose readings are not finite it is NaN.
+    Of a leg whose readings are not finite it is NaN, of a straight leg 0.
 
     Args:
-        config: has the legs.
         q: (12,) joint angles, rad.
         torque: (12,) of the joints, N m.
         up: (3,) the vertical in the trunk's frame.
+        legs: for each leg the function that returns position, Jacobian and turning of its foot (``kinematics``).
     """
-    forces = np.zeros(LEGS)
-    for leg, (chain, angles, tau) in enumerate(
-        zip(config.legs, q.reshape(LEGS, 3), torque.reshape(LEGS, 3), strict=True)
-    ):
-        if not np.isfinite([*angles, *tau]).all():
-            forces[leg] = np.nan
-            continue
-        jacobian = foot(chain, angles)[1]
-        if abs(np.linalg.det(jacobian)) > SINGULAR:
-            forces[leg] = -np.linalg.solve(jacobian.T, tau) @ up
-    return forces
+    jacobians = np.array([leg(angles)[1] for leg, angles in zip(legs, q.reshape(LEGS, 3), strict=True)])
+    straight = ~(abs(np.linalg.det(jacobians)) > SINGULAR)
+    if straight.any():
+        jacobians[straight] = np.eye(3)
+    forces = -np.linalg.solve(jacobians.transpose(0, 2, 1), torque.reshape(LEGS, 3, 1))[..., 0] @ up
+    if straight.any():
+        forces[straight] = np.where(np.isfinite(q.reshape(LEGS, 3)).all(axis=1), 0.0, np.nan)[straight]
+    return np.asarray(forces)
+
+
+Kinematics = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def kinematics(config: FilterConfig) -> list[Callable[[np.ndarray], Kinematics]]:
+    """Return the compiled kinematics of each leg.
+
+    Raises:
+        go1exp.estimation.EstimatorError: if the compiled filter is missing.
+    """
+    return [leg.foot for leg in compiled_legs(config)]
 
 
 def calibrated(

@@ -13,7 +13,6 @@ import numpy as np
 
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.udp import HOST
-from go1exp.deploy.messages import LowCmd
 from go1exp.sim_robot.machine import TICK, Robot
 from go1exp.sim_robot.protocols import OLD, language
 from go1exp.sim_robot.settings import SimConfig
