@@ -15,10 +15,11 @@ import io
 import itertools
 import json
 import re
+import socket
 import sys
 import types
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager, redirect_stdout
+from contextlib import closing, contextmanager, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -36,9 +37,12 @@ from go1exp.cli import settings
 from go1exp.cli.app import App
 from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.record import RIG
+from go1exp.cli.simulate import BODY
 from go1exp.compose import compose_unresolved
 from go1exp.config import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
+from go1exp.deploy import go1_wire
 from go1exp.deploy.bundle import loads
+from go1exp.deploy.messages import LowCmd
 from go1exp.deploy.walk import STATUS
 from go1exp.env.core import Go1Core
 from go1exp.export import graph
@@ -49,6 +53,7 @@ from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.schema import registry
 from go1exp.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
 from go1exp.schema.registry import ConfigError, Expected, Range
+from go1exp.sim_robot.settings import SimSettings
 from go1exp.train import run_folder, start, trainer
 from tests.lockstep import lockstep
 
@@ -75,7 +80,8 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
-    "deploy.yaml:hydra": "Hydra's own settings",
+    **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("deploy", "sim")},
+    **{f"deploy.yaml:{key}": "of robot=go1: tests/test_go1_walk.py" for key in ("address", "check", "feet")},
     **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},
     **{f"eval.yaml:{key}": "not of the grid: tests/test_protocol_commands.py" for key in ("bundle", "folder")},
     **{
@@ -179,6 +185,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "export": {"seconds": 0.1},
     "export_check": {},
     "deploy": {"seconds": 0.04, "stand_up": 0.06, "lie_down": 0.04, "brake": 0.06, "patience": 0.1, "keep": 0.2},
+    "sim": {"noise": 1.0},
     "list": {},
     "bench": {"num_envs": 4, "rounds": 1, "seconds": 0.1, "threads": 1},
 }
@@ -229,6 +236,10 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "deploy:bundle": lambda walk: [str(walk.exported("other", "seed=5"))],
     "deploy:rate": lambda walk: [100.0],
     "deploy:lie_down": lambda walk: [0.0],
+    "sim:address": lambda walk: ["127.0.0.1:18007"],
+    "sim:tile": lambda walk: [[1, 1]],
+    "sim:seconds": lambda walk: [1.0],
+    "sim:effect": lambda walk: [{"coulomb": {"bound": 0.4}}],
     "list:group": lambda walk: ["reward"],
     "bench:overrides": lambda walk: [["sim.physics_dt=0.004"]],
 }
@@ -414,6 +425,7 @@ SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
     "export": (settings.ExportSettings, ()),
     "export_check": (settings.ExportCheckSettings, ()),
     "deploy": (settings.DeploySettings, CHOICES),
+    "sim": (SimSettings, BODY),
     "list": (settings.ListSettings, ()),
     "bench": (settings.BenchSettings, ()),
 }
@@ -612,6 +624,8 @@ class Walk:
         if leaf.program == "deploy":
             swings = ["command=sinusoid"] if leaf.key.startswith("sinusoid.") else []
             return [f"bundle={self.exported('run')}", *swings]
+        if leaf.program == "sim":
+            return ["terrain=rough"] if leaf.key == "tile" else []
         if leaf.program == "gap":
             return [f"logs={self.recorded('held', HELD)}"]
         return []
@@ -1014,6 +1028,32 @@ def deploy_trace(container: dict[str, Any], walk: Walk) -> Trace:
                 yield from recorded({name: content})
 
 
+def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
+    """What a client that moves a leg hears, and where the robot truly is, tick by tick."""
+    from go1exp.cli.simulate import APP
+    from go1exp.sim_robot import alone
+
+    seen: list[Any] = []
+
+    def lived(server: Any, going: Any, say: Any, seconds: float | None) -> None:
+        seen.append([server.address, seconds])
+        far = go1_wire.pack_command(LowCmd(np.tile([0.1, 1.2, -1.8], 4), np.full(12, 20.0), np.full(12, 0.5)))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            client.setblocking(False)
+            for k in range(60):
+                client.sendto(go1_wire.IDLE if k < 5 else far, server.address)
+                server.tick()
+                with suppress(BlockingIOError):
+                    while True:
+                        seen.append([k, client.recv(2000)])
+        seen.append(server.truth.rows())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(alone, "serve", lived)
+        outcome(APP, container, walk)
+    yield from (("lived", part) for part in seen)
+
+
 def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
     from go1exp.cli.listing import APP
 
@@ -1063,6 +1103,7 @@ TRACES: dict[str, Callable[[dict[str, Any], Walk], Trace]] = {
     "export": export_trace,
     "export_check": check_trace,
     "deploy": deploy_trace,
+    "sim": sim_trace,
     "list": list_trace,
     "bench": bench_trace,
 }
@@ -1097,6 +1138,7 @@ SLOW = {
     "export": ("conf/export.yaml", "go1exp/export/", *VERB),
     "export_check": ("conf/export_check.yaml", "go1exp/export/", *VERB),
     "deploy": ("conf/deploy.yaml", "go1exp/deploy/", "go1exp/sim_robot/", *VERB),
+    "sim": ("conf/sim.yaml", "go1exp/sim_robot/", *VERB),
     "fit-actuator": ("conf/fit-actuator.yaml", "go1exp/fit/", *VERB),
     "eval": ("conf/eval.yaml", "go1exp/evaluate/", *VERB),
     "play": ("conf/play.yaml", "go1exp/evaluate/", *VERB),
@@ -1213,7 +1255,9 @@ def test_the_tables_hold_no_keys_that_are_gone() -> None:
 @pytest.mark.parametrize(
     "program",
     [
-        pytest.param(p, marks=[pytest.mark.slow(*SLOW[p])] if p in ("gap", "export", "export_check", "deploy") else [])
+        pytest.param(
+            p, marks=[pytest.mark.slow(*SLOW[p])] if p in ("gap", "export", "export_check", "deploy", "sim") else []
+        )
         for p in TRACES
     ],
 )

@@ -15,7 +15,7 @@ from go1exp.record.plan import Wishes
 from go1exp.schema import settings as schema
 from go1exp.schema.registry import NonNegative, Positive
 from go1exp.schema.settings import settings
-from go1exp.sim_robot.settings import SimConfig
+from go1exp.sim_robot.settings import SimConfig, SimSettings
 
 T = TypeVar("T")
 
@@ -287,21 +287,6 @@ class DeploySettings(Stages):
     sim: SimConfig
     truth: bool
     out: str
-
-
-@settings
-class SimSettings(SimConfig):
-    """``conf/sim.yaml`` without the groups.
-
-    Attributes:
-        address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to the network, to anybody in it.
-        tile: row and column of the tile of terrain=rough on which it begins; rows grow harder.
-        seconds: how long it lives, s; null until Ctrl-C.
-    """
-
-    address: str = "127.0.0.1:8007"
-    tile: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (0, 0)
-    seconds: Positive | None = None
 
 
 @settings

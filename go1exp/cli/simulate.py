@@ -15,10 +15,9 @@ BODY = ("robot", "actuator", "effect", "contact", "terrain")
 def _task(container: dict[str, Any]) -> int:
     from go1exp import robot
     from go1exp.cli.parts import parse_with_groups
-    from go1exp.cli.settings import SimSettings
     from go1exp.deploy.address import parsed_address
     from go1exp.effects.rules import drive_problems
-    from go1exp.sim_robot.settings import SimConfig
+    from go1exp.sim_robot.settings import SimConfig, SimSettings
 
     settings, parts = parse_with_groups(SimSettings, container, BODY)
     if problems := drive_problems(parts["actuator"], parts["effect"], robot.JOINTS):

@@ -146,14 +146,12 @@ def judged(
         return Report((), (f"no robot: {heard_so_far}{refused}",))
     lines, problems = [*_packets(heard, link)], [*_packet_problems(heard, link, bounds)]
     for judge in (_battery, _joints, _trunk):
-        more, wrong = judge(heard, joints, stops, bounds)
-        lines += more
+        findings, wrong = judge(heard, joints, stops, bounds)
+        lines += findings
         problems += wrong
     up = vertical(heard.mean("imu_quat"))
-    counts, force = (
-        heard.mean("foot_force"),
-        forces_by_torque(heard.mean("joint_pos"), heard.mean("joint_torque"), up, kinematics(config)),
-    )
+    counts = heard.mean("foot_force")
+    force = forces_by_torque(heard.mean("joint_pos"), heard.mean("joint_torque"), up, kinematics(config))
     spread = np.std([state.foot_force for state in heard.states], axis=0)
     lines.append(
         "feet FR FL RR RL: counts " + " ".join(f"{c:.0f}±{s:.1f}" for c, s in zip(counts, spread, strict=True))

@@ -1,8 +1,7 @@
 """The Go1's low-level UDP protocol: commands of 614 bytes, states of 807, as the vendor's SDK 3.8.6 sends and expects.
 
-Little-endian, packed. Layout, scales, rounding and checksum were read off the vendor's compiled client
-(``unitree-legged-sdk`` 3.8.20231105) by exchanging packets with it; nothing here was tried on a robot.
-A packet of another size, head, level or checksum is refused (``refusal``). No function here knows a socket.
+Fields, scales and units are in ``go1_fields``. Nothing here was tried on a robot. A packet of another size, head,
+level or checksum is refused (``refusal``). No function here knows a socket.
 """
 
 from __future__ import annotations
@@ -16,124 +15,33 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from go1exp.deploy.go1_fields import ACCELERATION_STEP as ACCELERATION_STEP
+from go1exp.deploy.go1_fields import BATTERY as BATTERY
+from go1exp.deploy.go1_fields import COMMAND as COMMAND
+from go1exp.deploy.go1_fields import COMMAND_SIZE as COMMAND_SIZE
+from go1exp.deploy.go1_fields import COMMAND_TYPE as COMMAND_TYPE
+from go1exp.deploy.go1_fields import DAMPING as DAMPING
+from go1exp.deploy.go1_fields import HEAD as HEAD
+from go1exp.deploy.go1_fields import IMU as IMU
+from go1exp.deploy.go1_fields import JOINTS as JOINTS
+from go1exp.deploy.go1_fields import KD_STEP as KD_STEP
+from go1exp.deploy.go1_fields import KP_STEP as KP_STEP
+from go1exp.deploy.go1_fields import LEGS as LEGS
+from go1exp.deploy.go1_fields import LOW_LEVEL as LOW_LEVEL
+from go1exp.deploy.go1_fields import MOTOR_COMMAND as MOTOR_COMMAND
+from go1exp.deploy.go1_fields import MOTOR_STATE as MOTOR_STATE
+from go1exp.deploy.go1_fields import PERIOD as PERIOD
+from go1exp.deploy.go1_fields import POSITION_STOP as POSITION_STOP
+from go1exp.deploy.go1_fields import ROBOT as ROBOT
+from go1exp.deploy.go1_fields import ROBOT_PORT as ROBOT_PORT
+from go1exp.deploy.go1_fields import SERVO as SERVO
+from go1exp.deploy.go1_fields import STATE as STATE
+from go1exp.deploy.go1_fields import STATE_SIZE as STATE_SIZE
+from go1exp.deploy.go1_fields import STATE_TYPE as STATE_TYPE
+from go1exp.deploy.go1_fields import TORQUE_STEP as TORQUE_STEP
+from go1exp.deploy.go1_fields import VELOCITY_STOP as VELOCITY_STOP
+from go1exp.deploy.go1_fields import dtype_of as dtype_of
 from go1exp.deploy.messages import LowCmd, LowState
-
-COMMAND_SIZE, STATE_SIZE = 614, 807
-HEAD, LOW_LEVEL = b"\xfe\xef", 0xFF
-ROBOT, ROBOT_PORT = "192.168.123.10", 8007
-"""Address of the robot's motor board for low-level commands (the SDK's examples)."""
-
-JOINTS, MOTORS, LEGS = 12, 20, 4
-PERIOD = 0.002
-"""Period at which the vendor's client sends, and at which the robot answers, s."""
-
-SERVO, DAMPING = 0x0A, 0x00
-"""Modes of a motor: it follows gains and targets; it brakes by itself."""
-
-POSITION_STOP, VELOCITY_STOP = 2.146e9, 16000.0
-"""Values of q and dq that switch off a motor's position and speed feedback (``comm.h``: PosStopF, VelStopF)."""
-
-TORQUE_STEP, KP_STEP, KD_STEP, ACCELERATION_STEP = 1.0 / 256.0, 1.0 / 32.0, 1.0 / 16.0, 1.0
-"""Steps of the fixed-point numbers: N m, N m/rad, N m s/rad, rad/s2. All are cut towards zero."""
-
-TORQUE_RANGE = (-32768 * TORQUE_STEP, 32767 * TORQUE_STEP)
-KP_MOST, KD_MOST = 65535 * KP_STEP, 65535 * KD_STEP
-
-
-class Field(NamedTuple):
-    """One field of a packet: NumPy's type, its unit (of the number times ``step``), and where that is known from."""
-
-    name: str
-    kind: str
-    unit: str
-    source: str
-    step: float = 1.0
-
-
-SDK = "comm.h of SDK 3.8.6"
-TRIED = "exchanged with the vendor's client"
-GUESS = "free-dog-sdk; not verified"
-
-_BEGIN = (
-    Field("head", "S2", "FE EF", TRIED),
-    Field("level", "u1", "0xFF: low level", TRIED),
-    Field("frame_reserve", "u1", "-", SDK),
-    Field("serial", "(2,)<u4", "-; the vendor's client sends 0", TRIED),
-    Field("version", "(2,)<u4", "-; the vendor's client sends 0", TRIED),
-    Field("bandwidth", "<u2", "-; the vendor's client sends 0", TRIED),
-)
-MOTOR_COMMAND = (
-    Field("mode", "u1", "SERVO or DAMPING", SDK),
-    Field("q", "<f4", "rad; POSITION_STOP: no position feedback", TRIED),
-    Field("dq", "<f4", "rad/s; VELOCITY_STOP: no speed feedback", TRIED),
-    Field("tau", "<i2", "N m", TRIED, TORQUE_STEP),
-    Field("kp", "<u2", "N m/rad", TRIED, KP_STEP),
-    Field("kd", "<u2", "N m s/rad", TRIED, KD_STEP),
-    Field("reserve", "(3,)<u4", "-", SDK),
-)
-MOTOR_STATE = (
-    Field("mode", "u1", "SERVO, DAMPING or 0x08: too hot", SDK),
-    Field("q", "<f4", "rad", TRIED),
-    Field("dq", "<f4", "rad/s", TRIED),
-    Field("ddq", "<i2", "rad/s2", TRIED, ACCELERATION_STEP),
-    Field("tau", "<i2", "N m, estimated by the drive", TRIED, TORQUE_STEP),
-    Field("q_raw", "<f4", "rad", TRIED),
-    Field("dq_raw", "<f4", "rad/s", TRIED),
-    Field("ddq_raw", "<i2", "rad/s2", TRIED, ACCELERATION_STEP),
-    Field("temperature", "i1", "degrees Celsius", TRIED),
-    Field("reserve", "(2,)<u4", "-", SDK),
-)
-IMU = (
-    Field("quat", "(4,)<f4", "w-x-y-z, trunk to world", TRIED),
-    Field("gyro", "(3,)<f4", "rad/s, trunk frame", TRIED),
-    Field("acc", "(3,)<f4", "m/s2, specific force, trunk frame", TRIED),
-    Field("rpy", "(3,)<f4", "rad: roll, pitch, yaw", TRIED),
-    Field("temperature", "i1", "degrees Celsius", TRIED),
-)
-BATTERY = (
-    Field("version", "(2,)u1", "high, low", TRIED),
-    Field("status", "u1", "-", SDK),
-    Field("charge", "u1", "percent", TRIED),
-    Field("current", "<i4", "mA", SDK),
-    Field("cycles", "<u2", "charging cycles", SDK),
-    Field("cell_temperature", "(2,)i1", "degrees Celsius", SDK),
-    Field("board_temperature", "(2,)i1", "degrees Celsius", SDK),
-    Field("cell_voltage", "(10,)u1", "mV", GUESS, 32.0),
-)
-_END = (Field("remote", "(40,)u1", "the handheld controller's bytes", SDK), Field("reserve", "<u4", "-", SDK))
-_CRC = (Field("crc", "<u4", "checksum of the words before it", TRIED),)
-
-
-def dtype_of(fields: tuple[Field, ...], **parts: tuple[np.dtype[Any], tuple[int, ...]]) -> np.dtype[Any]:
-    """Return the packed type of ``fields``, in which ``parts`` gives the type and shape of nested ones."""
-    return np.dtype([(f.name, *parts[f.name]) if f.name in parts else (f.name, f.kind) for f in fields])
-
-
-COMMAND = (
-    *_BEGIN,
-    Field("motor", "V27", "MOTOR_COMMAND, 20 of them: FR FL RR RL x hip thigh calf, then 8 that a Go1 lacks", TRIED),
-    Field("battery_off", "(4,)u1", "0xA5 in the first byte switches the battery off; the rest is reserve", SDK),
-    *_END,
-    *_CRC,
-)
-STATE = (
-    *_BEGIN,
-    Field("imu", "V53", "IMU", TRIED),
-    Field("motor", "V32", "MOTOR_STATE, 20 of them in the order of the command's", TRIED),
-    Field("battery", "V24", "BATTERY", TRIED),
-    Field("foot_force", "(4,)<i2", "raw counts, FR FL RR RL; each sensor has its own zero and scale", TRIED),
-    Field("foot_force_est", "(4,)<i2", "typically zero", SDK),
-    Field("tick", "<u4", "time; ms by 3.8.6's comment, us by an earlier one's", SDK),
-    *_END,
-    *_CRC,
-)
-COMMAND_TYPE = dtype_of(COMMAND, motor=(dtype_of(MOTOR_COMMAND), (MOTORS,)))
-STATE_TYPE = dtype_of(
-    STATE,
-    imu=(dtype_of(IMU), ()),
-    motor=(dtype_of(MOTOR_STATE), (MOTORS,)),
-    battery=(dtype_of(BATTERY), ()),
-)
 
 # ---------------------------------------------------------------------- checksum and refusals
 
@@ -311,7 +219,7 @@ class Health:
     Attributes:
         charge: of the battery, percent.
         current: of the battery, A.
-        cell_voltage: (10,) V (scale not verified).
+        cell_voltage: (10,) V.
         motor_temperature: (12,) degrees Celsius.
         imu_temperature: degrees Celsius.
         acceleration: (12,) of the joints, rad/s2.

@@ -157,8 +157,8 @@ class Log:
         good &= np.isfinite(np.stack(list(channels.values()))).all(axis=0)
         if good.sum() < 2:
             return None
-        told = obeyed is not None or (self.states.part("in_force")[kept] >= 0).all()
-        notes = [about.notes, "" if told else UNKNOWN_DELAY]
+        known = obeyed is not None or (self.states.part("in_force")[kept] >= 0).all()
+        notes = [about.notes, "" if known else UNKNOWN_DELAY]
         notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
         meta = _meta(about, t[good], "; ".join(note for note in notes if note))
         channels = {"t": t, **channels}

@@ -7,7 +7,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from go1exp.schema.registry import STRICT, Fraction, NonNegative
+from go1exp.schema.registry import STRICT, Fraction, NonNegative, Positive
+from go1exp.schema.settings import settings
 
 
 @dataclass(frozen=True)
@@ -35,3 +36,18 @@ class SimConfig:
     protocol: Literal["go1", "exact"] = "go1"
     feet: Literal["newton", "raw"] = "newton"
     seed: Annotated[int, Field(ge=0)] = 0
+
+
+@settings
+class SimSettings(SimConfig):
+    """``conf/sim.yaml`` without the groups.
+
+    Attributes:
+        address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to the network, to anybody in it.
+        tile: row and column of the tile of terrain=rough on which it begins; rows grow harder.
+        seconds: how long it lives, s; null until Ctrl-C.
+    """
+
+    address: str = "127.0.0.1:8007"
+    tile: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (0, 0)
+    seconds: Positive | None = None
