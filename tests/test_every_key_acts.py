@@ -1046,7 +1046,7 @@ def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
                 with suppress(BlockingIOError):
                     while True:
                         seen.append([k, client.recv(2000)])
-        seen.append(server.truth.rows())
+        seen.insert(1, server.truth.rows())
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(alone, "serve", lived)

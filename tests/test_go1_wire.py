@@ -165,6 +165,7 @@ def test_gains_and_torques_are_cut_to_the_robots_steps_and_kept_in_its_range(
 finite = st.floats(-3.0, 3.0)
 
 
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(finite, min_size=12, max_size=12),
     st.lists(st.floats(0, 100), min_size=12, max_size=12),
@@ -282,7 +283,7 @@ def test_of_ten_thousand_mutated_states_none_is_believed(packet: bytes) -> None:
     assert wire.refusal(packet, wire.STATE_SIZE) is not None or covers_nothing(packet, GOOD)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(mutations(VENDOR_COMMAND), st.booleans())
 def test_a_mutated_command_raises_nothing_even_with_its_own_checksum(packet: bytes, seal: bool) -> None:
     if seal and len(packet) == wire.COMMAND_SIZE:
@@ -296,7 +297,7 @@ def test_a_mutated_command_raises_nothing_even_with_its_own_checksum(packet: byt
         assert np.abs(told.joint_target).max() <= wire.FARTHEST
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(mutations(GOOD))
 def test_a_mutated_state_raises_nothing_and_is_refused(packet: bytes) -> None:
     assert wire.refusal(packet, wire.STATE_SIZE) is not None or covers_nothing(packet, GOOD)

@@ -118,12 +118,13 @@ def forces_by_torque(
         legs: for each leg the function that returns position, Jacobian and turning of its foot (``kinematics``).
     """
     jacobians = np.array([leg(angles)[1] for leg, angles in zip(legs, q.reshape(LEGS, 3), strict=True)])
-    straight = ~(abs(np.linalg.det(jacobians)) > SINGULAR)
-    if straight.any():
-        jacobians[straight] = np.eye(3)
+    unread = ~(np.isfinite(jacobians).all(axis=(1, 2)) & np.isfinite(torque.reshape(LEGS, 3)).all(axis=1))
+    jacobians[unread] = np.eye(3)
+    straight = abs(np.linalg.det(jacobians)) <= SINGULAR
+    jacobians[straight] = np.eye(3)
     forces = -np.linalg.solve(jacobians.transpose(0, 2, 1), torque.reshape(LEGS, 3, 1))[..., 0] @ up
-    if straight.any():
-        forces[straight] = np.where(np.isfinite(q.reshape(LEGS, 3)).all(axis=1), 0.0, np.nan)[straight]
+    forces[straight] = 0.0
+    forces[unread] = np.nan
     return np.asarray(forces)
 
 
