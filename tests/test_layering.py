@@ -53,6 +53,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "recording.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "importers/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     "audit/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
+    "statistics/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", "go1exp.schema", "go1exp.measures", *UP),
     "measures/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     "excitations/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
     # what the robot's computer runs
