@@ -22,7 +22,21 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
 
 FOREIGN = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra")
-OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "export", "sim_robot", "bench", "protocol", "cli")
+OWN = (
+    "physics",
+    "env",
+    "train",
+    "evaluate",
+    "record",
+    "fit",
+    "gap",
+    "export",
+    "sim_robot",
+    "bench",
+    "protocol",
+    "report",
+    "cli",
+)
 
 
 def up(*but: str) -> tuple[str, ...]:
@@ -122,6 +136,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "sim_robot/settings.py": (*FOREIGN, "torch", "go1exp.config", *up("sim_robot")),
     "evaluate/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
+    "report/": (*FOREIGN, "torch", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     "protocol/": ("mujoco", "hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
 }
 """File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""

@@ -31,7 +31,7 @@ class Association:
         name: of the quantity.
         spearman: rank correlation; NaN for quantities that are not numbers.
         p: of it, or of the differences between the values of a quantity that is no number; two-sided, by permutation.
-        importance: loss of explained variance if the quantity is shuffled, of the whole variance; 0 or less is none.
+        importance: share of the figure's variance that it explains; 0 or less is none.
         n: values.
     """
 
@@ -120,9 +120,10 @@ def associations(quantities: Mapping[str, ArrayLike], figure: ArrayLike, seed: i
 def permutation_importance(
     columns: Mapping[str, NDArray[Any]], y: NDArray[np.float64], seed: int = 0
 ) -> dict[str, float]:
-    """Return, by quantity, how much less of y's rank variance is predicted when it is shuffled; NaN with few rows.
+    """Return, by quantity, the share of y's rank variance that it explains; NaN with few rows.
 
-    Each row is predicted from the other folds (Breiman 2001, with a linear model in place of a forest).
+    Each row is predicted from the other folds; shuffling a quantity raises the mean square error by twice the share
+    that is its own (Breiman 2001, with a linear model in place of a forest).
     """
     from scipy import stats
 
@@ -153,7 +154,7 @@ def permutation_importance(
             shuffled = design.copy()
             shuffled[:, columns_of] = block[rng.permutation(n)]
             losses.append(error(shuffled))
-        importance[name] = float(np.mean(losses)) - usual
+        importance[name] = 0.5 * (float(np.mean(losses)) - usual)
     return importance
 
 

@@ -146,9 +146,10 @@ def share_bootstrap(
 ) -> Interval:
     """Return the share of falls with the percentile interval over runs drawn with replacement: too narrow for few."""
     fell, robots = np.asarray(counts, dtype=np.float64), np.asarray(totals, dtype=np.float64)
+    fell, robots = fell[robots > 0], robots[robots > 0]
     n = len(robots)
-    if n < 2 or not robots.sum():
-        share = float(fell.sum() / robots.sum()) if robots.sum() else np.nan
+    if n < 2:
+        share = float(fell.sum() / robots.sum()) if n else np.nan
         return Interval(share, np.nan, np.nan, n)
     drawn = np.random.default_rng(seed).integers(n, size=(draws, n))
     shares = fell[drawn].sum(1) / robots[drawn].sum(1)
