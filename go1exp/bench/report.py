@@ -47,7 +47,9 @@ def run(container: dict[str, Any], on_round: Callable[[int, int], None]) -> dict
         if status:
             raise RuntimeError(f"go1exp report ended with status {os.waitstatus_to_exitcode(status)}")
         size = (study / "report" / "report.html").stat().st_size
-    return {"report_s": seconds, "report_mb": usage.ru_maxrss / 1024.0, "report_page_mb": size / 1e6}
+    busy = usage.ru_utime + usage.ru_stime
+    figures = {"report_s": seconds, "report_cpu_s": busy, "report_mb": usage.ru_maxrss / 1024.0}
+    return {**figures, "report_page_mb": size / 1e6}
 
 
 def make_run(folder: Path, container: dict[str, Any], number: int, rows: int) -> None:
