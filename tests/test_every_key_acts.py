@@ -62,6 +62,11 @@ Trace = Generator[tuple[str, Any], None, None]
 Two traces are run in turns: while one waits, it has changed nothing that the other could see.
 """
 
+REPORT = (
+    *("folders", "baseline", "curves", "figures", "correction", "paired", "unfinished", "eval", "evaluation", "points"),
+    *("wandb", "project", "folder", "plugins", "hydra"),
+)
+
 COMPARE = ("subjects", "same_robot", "seed", "physics_dt", "folder", "plugins", "hydra")
 
 EXEMPT = {
@@ -76,6 +81,8 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     "deploy.yaml:hydra": "Hydra's own settings",
+    **{f"report.yaml:{key}": "tests/test_report.py shows what it does" for key in REPORT},
+    **{f"train.yaml:{key}": "tests/test_beside.py shows what it does" for key in ("eval", "video", "stop")},
     **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},
     **{f"eval.yaml:{key}": "not of the grid: tests/test_protocol_commands.py" for key in ("bundle", "folder")},
     **{

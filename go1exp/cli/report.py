@@ -68,11 +68,11 @@ def lines(made: Report) -> list[str]:
     text_lines += [f"not counted: {a.label}: {a.state} ({a.cause})" for a in made.study.absent]
     text_lines += [f"note: {note}" for note in made.study.notes]
     for outcome in made.outcomes:
-        told = [v for v in outcome.verdicts if v.word != "not told apart"]
+        clear = [v for v in outcome.verdicts if v.word != "not told apart"]
         if outcome.verdicts:
             words = ", ".join(f"{n} {word}" for word, n in counts(outcome.verdicts).items())
             text_lines.append(f"{outcome.judged.name}: {words}")
-        for v in told:
+        for v in clear:
             d = v.difference.estimate
             change = interval_text(d.estimate, d.low, d.high)
             text_lines.append(

@@ -43,13 +43,14 @@ def _wandb() -> Any:
 
 
 def _unless(variable: str, value: Any) -> Any:
-    """Return a setting, or None where the environment has it: wandb then reads it there."""
-    return None if os.environ.get(variable) else value
+    """Return a setting, or what the environment has in its place; wandb itself reads that only once in a process."""
+    given = os.environ.get(variable)
+    return (given.split(",") if variable == "WANDB_TAGS" else given) if given else value
 
 
 def mode(config: WandbConfig) -> str:
     """Return offline, online, disabled or shared: that of the environment, or the configured one."""
-    return os.environ.get("WANDB_MODE") or config.mode
+    return str(_unless("WANDB_MODE", config.mode))
 
 
 class WandbWriter(KVWriter):
@@ -62,7 +63,7 @@ class WandbWriter(KVWriter):
         wandb = _wandb()
         identity = run / IDENTITY
         if not identity.exists():
-            write_text(identity, os.environ.get("WANDB_RUN_ID") or uuid.uuid4().hex[:8])
+            write_text(identity, _unless("WANDB_RUN_ID", uuid.uuid4().hex[:8]))
         self._folder, self._config, self._step = run, config, 0
         place = run.resolve()
         in_sweep = next((p for p in place.parents if (p / INDEX).is_file()), None)
@@ -157,7 +158,7 @@ def log_tables(
         project=_unless("WANDB_PROJECT", project),
         name=_unless("WANDB_NAME", f"report of {folder.resolve().parent.name}"),
         job_type="report",
-        mode=os.environ.get("WANDB_MODE") or how,
+        mode=_unless("WANDB_MODE", how),
         dir=_unless("WANDB_DIR", str(folder)),
         settings=wandb.Settings(x_disable_stats=True, silent=True),
     )
