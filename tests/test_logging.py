@@ -309,8 +309,8 @@ def test_an_offline_run_holds_name_group_tags_notes_config_films_evaluations_and
     run = tmp_path / "sweep" / "gait-0_seed-1"
     (run / "checkpoints").mkdir(parents=True)
     (run.parent / "sweep.json").write_text("{}")
-    for file in ("checkpoints/000002.pt", "best.pt", "best.json", "config.yaml", "bundle.zip", "film.mp4"):
-        (run / file).write_bytes(file.encode())
+    for name in ("checkpoints/000002.pt", "best.pt", "best.json", "config.yaml", "bundle.zip", "film.mp4"):
+        (run / name).write_bytes(name.encode())
     (run / "evals.csv").write_text("iteration,steps,score\n1,64,0.5\n2,128,0.25\n")
     monkeypatch.setattr(wandb_writer, "_bundle", lambda folder: folder / "bundle.zip")
     config = replace(OFFLINE, group=None, tags=("trot", "ablation"), notes="why", artifacts=True)
@@ -329,11 +329,11 @@ def test_an_offline_run_holds_name_group_tags_notes_config_films_evaluations_and
     assert set(about.tags) == {"trot", "ablation"}
     logged = {u.key: json.loads(u.value_json) for u in about.config.update}
     assert (logged["seed"], logged["reward"]) == (7, {"gait": {"weight": 10.0}})
-    names = {key for row in rows for key in row}
-    assert "eval/score" in names
+    columns = {key for row in rows for key in row}
+    assert "eval/score" in columns
     films = [row for row in rows if any(key.startswith("film") and "steps" not in key for key in row)]
     assert films
-    assert any(key.startswith("evaluations") for key in names)
+    assert any(key.startswith("evaluations") for key in columns)
     kept = {item.path for record in of_kind(file, "files") for item in record.files}
     assert any(path.startswith("media/videos/film") for path in kept)
     assert any(path.startswith("media/table/evaluations") for path in kept)

@@ -315,7 +315,7 @@ def test_a_run_without_evaluation_and_one_evaluated_otherwise_are_named(tmp_path
     notes = made(tmp_path).study.notes
     assert "grid: other left out, evaluated with other settings (seed) than most" in notes
     assert "old: eval.json without eval.parquet, of an older version; eval=true makes both" in notes
-    assert any(n.startswith("grid: no evaluation of 3 runs (bare, old, other)") for n in notes)
+    assert any(n.startswith("grid: no evaluation of 2 runs (bare, old)") for n in notes)
 
 
 def test_damaged_rows_are_named_and_the_others_stay(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from go1exp import __version__
 from go1exp.evaluate.drivers import Driver, Progress
+from go1exp.protocol.base import Chosen
 from go1exp.protocol.claims import judged
 from go1exp.protocol.quantities import Derived, Row, about, distinct, plain, resampled, summary
 from go1exp.protocol.result import Result

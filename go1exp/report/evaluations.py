@@ -80,7 +80,7 @@ def evaluations(study: Study) -> list[Judged]:
         study.notes.append(f"{_listed(old)}: eval.json without eval.parquet, of an older version; eval=true makes both")
     made = [_judged(name, study) for name in [GRID, *sorted(set(known) - {GRID})] if name in known]
     for judged in made:
-        lacking = [run.label for run in study.runs if run.folder not in judged.runs]
+        lacking = [run.label for run in study.runs if judged.name not in names(run)]
         if lacking:
             study.notes.append(f"{judged.name}: no evaluation of {_listed(lacking)}" + _advice(judged.name))
     if not made:

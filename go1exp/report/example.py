@@ -1,4 +1,4 @@
-"""A study that nobody has trained: run folders as training and evaluation leave them, to measure and try reports with."""
+"""A study that nobody has trained: run folders as training and evaluation leave them, to measure reports with."""
 
 from __future__ import annotations
 

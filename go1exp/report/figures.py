@@ -139,7 +139,7 @@ def compared(
     correction: Literal["holm", "none"],
     paired: bool,
 ) -> list[Verdict]:
-    """Return each group against the baseline, figure by figure.
+    """Return each group against the baseline, figure by figure; nothing of groups without this evaluation.
 
     Args:
         judged: an evaluation.
@@ -157,7 +157,10 @@ def compared(
     if problems:
         raise ConfigError(problems)
     columns = [known[name] for name in (wanted or judged.main) if name in known]
-    subjects = [(g, c) for c in columns for g in made if g is not baseline]
+    evaluated = [g for g in made if any(run.folder in judged.runs for run in g.runs)]
+    if baseline not in evaluated:
+        return []
+    subjects = [(g, c) for c in columns for g in evaluated if g is not baseline]
     samples = [_samples(judged, group, baseline, column, paired) for group, column in subjects]
     differences = [compare.difference(a, b, paired) for a, b in samples]
     p_values = [d.p for d in differences]
