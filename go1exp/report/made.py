@@ -75,9 +75,7 @@ def report(study: Study, settings: ReportSettings, plain: dict[str, Any]) -> Rep
         given = (settings.figures, settings.correction, settings.paired)
         verdicts = compared(judged, made, first, *given) if len(made) > 1 else []
         if not any(run.folder in judged.runs for run in first.runs):
-            study.notes.append(
-                f"{judged.name}: the baseline ({first.name}) has none, so that nothing is compared with it"
-            )
+            study.notes.append(f"{judged.name}: the baseline has none, so that nothing is compared with it")
         each = by_condition(judged, made)
         outcomes.append(Outcome(judged, table(judged, made), each, verdicts, sensitivities(judged, made)))
     return Report(study, made, first, drawn, outcomes, plain)
