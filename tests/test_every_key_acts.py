@@ -49,7 +49,7 @@ from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.schema import registry
 from go1exp.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
 from go1exp.schema.registry import ConfigError, Expected, Range
-from go1exp.train import run_folder, start, trainer
+from go1exp.train import run_folder, start, trainer, wandb_writer
 from tests.lockstep import lockstep
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
@@ -196,6 +196,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "train:torch_threads": lambda walk: [2],
     "train:device": lambda walk: ["cuda"],
     "train:logger.wandb": lambda walk: [{"project": "p", "mode": "offline", "group": None, "entity": None}],
+    "train:logger.wandb.tags": lambda walk: [["trot"]],
     "train:resume": lambda walk: [str(walk.trained("resumed"))],
     "train:start_from": lambda walk: ["hop"],
     "train:actuator.file": lambda walk: [str(walk.net(1))],
@@ -778,6 +779,7 @@ def stand_ins() -> Iterator[tuple[list[str], list[Any]]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stable_baselines3.common.base_class.get_device", get_device)
         patch.setitem(sys.modules, "wandb", wandb_stub(told))
+        patch.setattr(wandb_writer, "_bundle", lambda run: None)  # tests/test_logging.py has what packs it
         torch.set_num_threads(1)
         try:
             yield asked, told
@@ -790,10 +792,15 @@ def wandb_stub(told: list[Any]) -> types.ModuleType:
 
     def init(**arguments: Any) -> Any:
         told.append({k: v for k, v in arguments.items() if k not in ("config", "id", "dir", "settings")})
-        return types.SimpleNamespace(log=lambda values, step: told.append(sorted(values)), finish=lambda: None)
+        run = {"id": "stub", "log_artifact": lambda artifact: told.append(artifact.files), "finish": lambda: None}
+        return types.SimpleNamespace(log=lambda values, step: told.append(sorted(values)), **run)
+
+    def artifact(name: str, type: str) -> Any:
+        files: list[str] = []
+        return types.SimpleNamespace(files=files, add_file=lambda path, name: files.append(name))
 
     module = types.ModuleType("wandb")
-    module.init, module.Settings = init, dict  # type: ignore[attr-defined]
+    module.init, module.Settings, module.Artifact = init, dict, artifact  # type: ignore[attr-defined]
     return module
 
 
