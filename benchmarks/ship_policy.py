@@ -131,7 +131,8 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def write(report: dict[str, Any], file: Path) -> None:
-    """Write a report and print it."""
+    """Write a report without its rows, and print it."""
+    report.pop("rows")
     file.write_text(json.dumps(report, indent=1) + "\n")
     print(table.text(report), flush=True)
 

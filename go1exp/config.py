@@ -23,6 +23,7 @@ from go1exp.mdp import mirror
 from go1exp.robot import RobotConfig
 from go1exp.schema import plugins
 from go1exp.schema.backends import BACKENDS, BackendConfig, CpuBackend
+from go1exp.schema.beside import BESIDE, EvalDuring, StopRule, VideoDuring
 from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.schema.learner import CheckpointConfig as CheckpointConfig
 from go1exp.schema.learner import LoggerConfig as LoggerConfig
@@ -147,6 +148,9 @@ class TrainConfig:
     logger: LoggerConfig
     checkpoint: CheckpointConfig
     process: ProcessConfig
+    eval: EvalDuring = BESIDE["eval"]
+    video: VideoDuring = BESIDE["video"]
+    stop: StopRule = BESIDE["stop"]
 
 
 class RewardSlots(BaseModel):
@@ -203,13 +207,16 @@ SECTIONS: dict[str, type] = {
     "ppo": PPOConfig,
     "logger": LoggerConfig,
     "checkpoint": CheckpointConfig,
+    "eval": EvalDuring,
+    "video": VideoDuring,
+    "stop": StopRule,
 }
 """Sections of the configuration that are one dataclass each (of the backend, one for each engine)."""
 
 ENGINES = ("backend", "engine")
 """Groups of which a configuration uses one engine: the one that trains, and the one that judges."""
 
-OF_OLDER_RUNS: dict[str, Any] = {"contact": MUJOCO_CONTACT, "critic": ()}
+OF_OLDER_RUNS: dict[str, Any] = {"contact": MUJOCO_CONTACT, "critic": (), **BESIDE}
 """Parts that runs of older versions do not name, and what they were."""
 
 ONE_TERM = ("actuator", "command")
@@ -361,7 +368,7 @@ def parse_train(container: Mapping[str, Any]) -> TrainConfig:
     """Load the plugins of a training configuration and validate it; raise ConfigError with every problem."""
     plugins.use(container.get(plugins.KEY))
     task_names = tuple(f.name for f in fields(TaskConfig))
-    others = ("ppo", "logger", "checkpoint")
+    others = ("ppo", "logger", "checkpoint", *BESIDE)
     top = tuple(f.name for f in fields(ProcessConfig))
     known = (*task_names, *others, *top)
     problems = [

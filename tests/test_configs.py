@@ -113,7 +113,7 @@ def ablated(name: str, base: Mapping[str, Any]) -> dict[str, Any]:
         gone = {"no_push": "event.", "no_rand": "rand."}[name]
         return {k: v for k, v in base.items() if not k.startswith(gone)}
     if name == "no_noise":
-        return {k: 0.0 if k.endswith(".noise") else v for k, v in base.items()}
+        return {k: 0.0 if k.endswith(".noise") and k != "eval.noise" else v for k, v in base.items()}
     if name.startswith("no_rand_"):
         term = name.removeprefix("no_rand_")
         return {**base, **{f"rand.{term}.{k}": v for k, v in NEUTRAL[term].items()}}

@@ -54,7 +54,7 @@ from go1exp.schema import registry
 from go1exp.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
 from go1exp.schema.registry import ConfigError, Expected, Range
 from go1exp.sim_robot.settings import SimSettings
-from go1exp.train import run_folder, start, trainer
+from go1exp.train import run_folder, start, trainer, wandb_writer
 from tests.lockstep import lockstep
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
@@ -66,6 +66,11 @@ Trace = Generator[tuple[str, Any], None, None]
 
 Two traces are run in turns: while one waits, it has changed nothing that the other could see.
 """
+
+REPORT = (
+    *("folders", "baseline", "curves", "figures", "correction", "paired", "unfinished", "eval", "evaluation", "points"),
+    *("wandb", "project", "folder", "plugins", "hydra"),
+)
 
 COMPARE = ("subjects", "same_robot", "seed", "physics_dt", "folder", "plugins", "hydra")
 
@@ -82,6 +87,9 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("deploy", "sim")},
     **{f"deploy.yaml:{key}": "of robot=go1: tests/test_go1_walk.py" for key in ("address", "check", "feet")},
+    "logger/wandb.yaml:logger.wandb.tags": "tests/test_logging.py reads them back",
+    **{f"report.yaml:{key}": "tests/test_report.py shows what it does" for key in REPORT},
+    **{f"train.yaml:{key}": "tests/test_beside.py shows what it does" for key in ("eval", "video", "stop")},
     **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},
     **{f"eval.yaml:{key}": "not of the grid: tests/test_protocol_commands.py" for key in ("bundle", "folder")},
     **{
@@ -785,6 +793,7 @@ def stand_ins() -> Iterator[tuple[list[str], list[Any]]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stable_baselines3.common.base_class.get_device", get_device)
         patch.setitem(sys.modules, "wandb", wandb_stub(told))
+        patch.setattr(wandb_writer, "_bundle", lambda run: None)  # tests/test_logging.py has what packs it
         torch.set_num_threads(1)
         try:
             yield asked, told
@@ -797,10 +806,15 @@ def wandb_stub(told: list[Any]) -> types.ModuleType:
 
     def init(**arguments: Any) -> Any:
         told.append({k: v for k, v in arguments.items() if k not in ("config", "id", "dir", "settings")})
-        return types.SimpleNamespace(log=lambda values, step: told.append(sorted(values)), finish=lambda: None)
+        run = {"id": "stub", "log_artifact": lambda artifact: told.append(artifact.files), "finish": lambda: None}
+        return types.SimpleNamespace(log=lambda values, step: told.append(sorted(values)), **run)
+
+    def artifact(name: str, type: str) -> Any:
+        files: list[str] = []
+        return types.SimpleNamespace(files=files, add_file=lambda path, name: files.append(name))
 
     module = types.ModuleType("wandb")
-    module.init, module.Settings = init, dict  # type: ignore[attr-defined]
+    module.init, module.Settings, module.Artifact = init, dict, artifact  # type: ignore[attr-defined]
     return module
 
 

@@ -10,6 +10,7 @@ import sys
 import time
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from stable_baselines3.common import logger as sb3_logger
 from go1exp.compose import compose
 from go1exp.config import LoggerConfig, WandbConfig, parse_train
 from go1exp.schema.registry import Expected
-from go1exp.train import metrics, run_folder, trainer
+from go1exp.train import metrics, run_folder, trainer, wandb_writer
 from go1exp.train.metrics import CsvWriter, make_logger
 
 ROUGH_NUMBERS = (1 / 3, -1e-17, 12345678.9, 0.1 + 0.2, float("nan"), 6.02e23)
@@ -254,8 +255,8 @@ def no_account(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing of the machine's own Weights & Biases settings is read or written."""
     for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
         monkeypatch.setenv(name, str(tmp_path / "wandb_home"))
-    for name in ("WANDB_MODE", "WANDB_DIR", "WANDB_PROJECT", "WANDB_RUN_ID", "WANDB_DISABLED"):
-        monkeypatch.delenv(name, raising=False)
+    for name in ("MODE", "DIR", "PROJECT", "RUN_ID", "DISABLED", "NAME", "RUN_GROUP", "TAGS", "NOTES", "ENTITY"):
+        monkeypatch.delenv(f"WANDB_{name}", raising=False)
 
 
 def log_to_wandb(run: Path, iterations: range) -> str:
@@ -291,6 +292,119 @@ def test_an_offline_wandb_run_holds_the_metrics_and_is_continued_under_its_id(tm
     assert [h["_step"] for h in history(second)] == [256, 320]
     (again,) = [r.run for r in wandb_records(second) if r.WhichOneof("record_type") == "run"][:1]
     assert again.run_id == identity
+
+
+def of_kind(file: Path, kind: str) -> list[Any]:
+    return [getattr(r, kind) for r in wandb_records(file) if r.WhichOneof("record_type") == kind]
+
+
+def wait_for_the_end(file: Path) -> None:
+    history(file)
+
+
+def test_an_offline_run_holds_name_group_tags_notes_config_films_evaluations_and_artifacts(
+    tmp_path: Path, no_account: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What ``wandb sync`` sends later."""
+    run = tmp_path / "sweep" / "gait-0_seed-1"
+    (run / "checkpoints").mkdir(parents=True)
+    (run.parent / "sweep.json").write_text("{}")
+    for name in ("checkpoints/000002.pt", "best.pt", "best.json", "config.yaml", "bundle.zip", "film.mp4"):
+        (run / name).write_bytes(name.encode())
+    (run / "evals.csv").write_text("iteration,steps,score\n1,64,0.5\n2,128,0.25\n")
+    monkeypatch.setattr(wandb_writer, "_bundle", lambda folder: folder / "bundle.zip")
+    config = replace(OFFLINE, group=None, tags=("trot", "ablation"), notes="why", artifacts=True)
+    settings = {"seed": 7, "reward": {"gait": {"weight": 10.0}}}
+    logger = make_logger(LoggerConfig(csv=False, tensorboard=False, wandb=config), run, 0, settings)
+    logger.record("iteration", 1)
+    logger.dump(step=64)
+    metrics.log_film(logger, 64, run / "film.mp4")
+    logger.record("eval/score", 0.25)
+    metrics.dump_beside(logger, 128)
+    logger.close()
+    (file,) = run.rglob("*.wandb")
+    rows = history(file)
+    about = of_kind(file, "run")[0]
+    assert (about.display_name, about.run_group, about.notes) == ("gait-0_seed-1", "sweep", "why")
+    assert set(about.tags) == {"trot", "ablation"}
+    logged = {u.key: json.loads(u.value_json) for u in about.config.update}
+    assert (logged["seed"], logged["reward"]) == (7, {"gait": {"weight": 10.0}})
+    columns = {key for row in rows for key in row}
+    assert "eval/score" in columns
+    films = [row for row in rows if any(key.startswith("film") and "steps" not in key for key in row)]
+    assert films
+    assert any(key.startswith("evaluations") for key in columns)
+    kept = {item.path for record in of_kind(file, "files") for item in record.files}
+    assert any(path.startswith("media/videos/film") for path in kept)
+    assert any(path.startswith("media/table/evaluations") for path in kept)
+    artifacts = {a.type: [e.path for e in a.manifest.contents] for a in of_kind_of_requests(file)}
+    assert set(artifacts) >= {"model", "bundle"}
+    assert set(artifacts["model"]) == {"000002.pt", "best.pt", "best.json", "config.yaml"}
+    assert artifacts["bundle"] == ["bundle.zip"]
+
+
+def of_kind_of_requests(file: Path) -> list[Any]:
+    """Artifacts, which stand in records of their own or in requests."""
+    direct = of_kind(file, "artifact")
+    requests = [r for r in of_kind(file, "request") if r.WhichOneof("request_type") == "log_artifact"]
+    return [*direct, *(r.log_artifact.artifact for r in requests)]
+
+
+def test_variables_of_the_environment_go_before_the_settings(
+    tmp_path: Path, no_account: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = {"PROJECT": "theirs", "RUN_GROUP": "g", "NAME": "n", "TAGS": "a,b", "NOTES": "why", "RUN_ID": "abcd1234"}
+    for name, value in chosen.items():
+        monkeypatch.setenv(f"WANDB_{name}", value)
+    monkeypatch.setenv("WANDB_DIR", str(tmp_path / "elsewhere"))
+    (tmp_path / "elsewhere").mkdir()
+    assert log_to_wandb(tmp_path, range(1, 2)) == "abcd1234"
+    (file,) = (tmp_path / "elsewhere").rglob("*.wandb")
+    wait_for_the_end(file)
+    about = of_kind(file, "run")[0]
+    assert (about.run_id, about.project, about.run_group) == ("abcd1234", "theirs", "g")
+    assert (about.display_name, about.notes, set(about.tags)) == ("n", "why", {"a", "b"})
+    monkeypatch.setenv("WANDB_MODE", "online")
+    assert wandb_writer.mode(OFFLINE) == "online"
+
+
+def test_the_tables_of_a_report_are_logged(tmp_path: Path, no_account: None) -> None:
+    (tmp_path / "report.html").write_text("<p>report</p>")
+    tables = {
+        "grid_comparison": [{"group": "a", "p": 0.5, "runs_needed": ""}, {"group": "b", "p": 0.1, "runs_needed": 7}]
+    }
+    metrics.log_tables(tables, tmp_path / "report.html", "go1exp-tests", "offline", tmp_path)
+    (file,) = tmp_path.rglob("*.wandb")
+    wait_for_the_end(file)
+    assert of_kind(file, "run")[0].job_type == "report"
+    (table,) = tmp_path.rglob("grid_comparison*.table.json")
+    content = json.loads(table.read_text())
+    assert content["columns"] == ["group", "p", "runs_needed"]
+    assert content["data"] == [["a", 0.5, None], ["b", 0.1, 7.0]]
+
+
+def test_without_a_bundle_there_is_a_line_that_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert wandb_writer._bundle(tmp_path / "none") is None
+    assert "no bundle for Weights & Biases: go1exp export: run" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_tensorboard_has_the_configuration_as_hyperparameters(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from tensorboard.plugins.hparams import plugin_data_pb2
+
+    settings = {"seed": 7, "reward": {"gait": {"weight": 10.0}}, "resume": None, "devices": [1, 2]}
+    config = LoggerConfig(csv=False, tensorboard=True, wandb=None)
+    make_logger(config, tmp_path, 0, settings).close()
+    make_logger(config, tmp_path, 1, settings, steps=64).close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    content = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    found = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info.hparams
+    assert found["reward.gait.weight"].number_value == 10.0
+    assert found["seed"].number_value == 7
+    assert found["devices"].string_value == "[1, 2]"
+    assert "resume" not in found
 
 
 def test_without_wandb_the_message_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from go1exp.measures.statistics import (
+from go1exp.protocol.claims import Claim, judged, verdict
+from go1exp.protocol.comparing import word
+from go1exp.protocol.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
+from go1exp.statistics.intervals import (
     Interval,
     bootstrap_interval,
     logistic_fit,
@@ -17,9 +20,6 @@ from go1exp.measures.statistics import (
     pairs_needed,
     rate_interval,
 )
-from go1exp.protocol.claims import Claim, judged, verdict
-from go1exp.protocol.comparing import word
-from go1exp.protocol.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
 
 MOST = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here")
 LEAST = Claim(quantity="error", at_least=1.0, tolerance=0.2, source="here")

@@ -43,6 +43,7 @@ BUDGETS: dict[str, tuple[str, ...]] = {
     "fit-actuator": ("hidden=[6,5,4]", "epochs=2", "epoch_rows=400", "plots=false"),
     "gap replay": ("search.threads=1", "out=replay"),
     "gap": SEARCH,
+    "report": ("points=20",),
     "list": (),
     "export check": (),
     "export": ("seconds=0.1",),

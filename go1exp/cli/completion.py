@@ -41,7 +41,7 @@ WORDS = {
     "robot": ("sim", "go1"),
     "trunk_velocity": ("exact", "estimated"),
     "viewer": ("auto", "clip", "live"),
-    "suite": ("env", "train", "actuator", "deploy", "mpc", "gpu"),
+    "suite": ("env", "train", "actuator", "deploy", "mpc", "report", "gpu"),
     "what": ("all", "terms", "groups"),
     "stage": ("all", *STAGES),
     "support": ("auto", "hung", "ground"),
@@ -50,6 +50,8 @@ WORDS = {
     "device": ("auto", "cpu", "cuda"),
     "start": ("standing", "lying", "hung"),
     "judge": ("max_t", "gain", "bic"),
+    "correction": ("holm", "none"),
+    "wandb": ("offline", "online"),
     "schedule": ("adaptive", "fixed", "linear"),
 }
 """Last word of a key that takes one of a few words -> these."""

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
-from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError, Term, bind_list
 
 if TYPE_CHECKING:
@@ -102,7 +101,7 @@ def _of_grid(settings: Any, controller: MpcSettings | None) -> tuple[Path | None
 
 def _grid(settings: Any, measures: list[Term], judged: _Judged, subject: tuple[Path | None, Path | None, Path]) -> None:
     """Play the grid of constant commands."""
-    from go1exp.evaluate import bars, table
+    from go1exp.evaluate import bars, files, table
     from go1exp.evaluate.delay_margin import delay_margin
     from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
@@ -128,8 +127,7 @@ def _grid(settings: Any, measures: list[Term], judged: _Judged, subject: tuple[P
         falls = report["distinct_falls"]
         report["delay_margin"] = delay_margin(task, policy, config, falls, spinner(1, "with a delay"), make)
     report["bars"] = [dataclasses.asdict(verdict) for verdict in bars.judged(report)]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(out, report)
+    files.write(report, out)
     print(table.text(report))
     print(f"\nwritten to {out}")
 

@@ -9,9 +9,9 @@ from typing import Any
 
 PATH_KEYS = {
     *("run", "resume", "start_from", "policy", "checkpoint", "logs", "recordings", "files", "file", "path", "bundle"),
-    *("out", "dir", "mjcf"),
+    *("out", "dir", "mjcf", "baseline"),
 }
-"""Last words of the keys whose value is a file, a folder or a name."""
+"""Last words of the keys whose value is a file, a folder or a name, which may hold =."""
 
 _MEANT_FOR_HYDRA = re.compile(r"""$|null$|['"\[{]|.*\$\{|\w+\(.*\)$""")
 """A value with quotes of its own, a list, an interpolation, a function such as ``glob(*)``."""

@@ -12,6 +12,7 @@ from go1exp.fit.settings import FitSettings
 from go1exp.gap.result import GapSettings
 from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
+from go1exp.report.settings import ReportSettings
 from go1exp.schema import settings as schema
 from go1exp.schema.registry import NonNegative, Positive
 from go1exp.schema.settings import settings
@@ -343,8 +344,8 @@ class BenchSettings:
     """``conf/bench.yaml``.
 
     Attributes:
-        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime), mpc (controller)
-            or gpu (Warp).
+        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime), mpc,
+            report (go1exp report) or gpu (Warp).
         num_envs: environments of the batch.
         rounds: alternating measurements of each subject, of which the median counts.
         seconds: length of a measurement, s.
@@ -353,7 +354,7 @@ class BenchSettings:
         out: JSON file for the figures; null writes none.
     """
 
-    suite: Literal["env", "train", "actuator", "deploy", "mpc", "gpu"]
+    suite: Literal["env", "train", "actuator", "deploy", "mpc", "report", "gpu"]
     num_envs: Count
     rounds: Count
     seconds: Positive
@@ -365,6 +366,7 @@ class BenchSettings:
 EXAMPLES = {
     "run": "run=runs/NAME",
     "subjects": "go1exp compare trot paper protocol=kicks",
+    "folders": "go1exp report runs/sweep_NAME",
     "files": "go1exp record audit recordings/NAME.parquet",
     "file": "go1exp export check runs/NAME/bundle.zip",
     "source": "go1exp record import go2_in_air PATH",
@@ -378,6 +380,7 @@ EXAMPLES = {
 SETTINGS: dict[str, type] = {
     "eval": EvalSettings,
     "compare": CompareSettings,
+    "report": ReportSettings,
     "play": PlaySettings,
     "record": RecordSettings,
     "record_audit": AuditSettings,

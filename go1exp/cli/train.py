@@ -25,9 +25,12 @@ if TYPE_CHECKING:
     from go1exp.config import TrainConfig
     from go1exp.train.start import Weights
 
-RESUMABLE = ("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "devices", "backend")
-"""Settings that a resumed run may change: none of them changes what was computed so far (the last four may change
-what comes after in the last bits, and another engine rounds differently). ``backend`` and all that is in it."""
+RESUMABLE = (
+    *("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "devices", "backend"),
+    *("eval", "video", "stop"),
+)
+"""Settings that a resumed run may change: none of them changes what was computed so far (threads, devices and backend
+may change what comes after in the last bits, and another engine rounds differently). Sections, and all in them."""
 
 
 def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
@@ -42,7 +45,7 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
             continue
         if key == "backend":
             config.backend = OmegaConf.load(f"{config_folder()}/backend/{value}.yaml")
-        elif key in RESUMABLE or key.startswith("backend."):
+        elif key in RESUMABLE or key.partition(".")[0] in RESUMABLE:
             config.merge_with_dotlist([f"{key}={value}"])
         else:
             refused.append(f"{override}: a resumed run keeps its configuration; only {', '.join(RESUMABLE)} may change")
@@ -158,10 +161,14 @@ def _first_weights(job: TrainJob) -> Weights | None:
 
 
 def _is_finished(job: TrainJob) -> bool:
-    """Whether the folder holds all iterations already; says so."""
-    from go1exp.train import checkpoint, run_state
+    """Whether the folder holds all iterations already, or was ended by the same rule; says so."""
+    from go1exp.train import checkpoint, early_stop, run_state
 
     wanted = job.config.ppo.iterations
+    if reason := early_stop.ended(job.run, job.config.stop):
+        run_state.write(job.run, "done")
+        print(f"{job.run}: {reason}; now: {command('eval', settings={'run': job.run})}")
+        return True
     if checkpoint.iterations_done(job.run) < wanted or checkpoint.load_latest(job.run)[0]["iteration"] < wanted:
         return False
     run_state.write(job.run, "done")

@@ -6,6 +6,7 @@ VERBS = {
     "train": "train a policy from configuration",
     "eval": "run a trained policy through a grid of commands: errors, falls, a table and JSON",
     "compare": "compare policies on the same protocol and robots: paired differences, a page and JSON",
+    "report": "training runs together: learning curves, intervals over seeds, verdicts against a baseline",
     "play": "watch a trained policy: a clip without a display, a live viewer with one",
     "record": "drive the simulated robot and log it; audit recordings, import others",
     "gap": "find where simulation and recordings disagree, name the missing effect, add it",
@@ -32,10 +33,11 @@ POSITIONAL: dict[str, tuple[str, ...]] = {
     "deploy": ("bundle",),
     "list": ("group",),
     "compare": ("subjects",),
+    "report": ("folders",),
 }
 """Settings that may be given by position alone; those of ``LISTS`` take all that are left."""
 
-LISTS = ("files", "subjects")
+LISTS = ("files", "subjects", "folders")
 
 VALUED = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-dir", "-cd", "--config-name", "-cn")
 """Options of Hydra whose value is the word after them."""

@@ -22,6 +22,7 @@ from go1exp.env.evidence import Evidence, accuse
 from go1exp.env.gait_log import GaitLog
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.env.restarts import Restarts
+from go1exp.env.task_log import TaskLog
 from go1exp.env.terms import StepTerms
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.clearance import lift
@@ -82,8 +83,7 @@ class Go1Core:
         self.backend = make_backend(task.backend, model, sensors, num_envs)
         self.device = self.backend.qpos.device
         self.random = EnvRandom(seed, num_envs, first_env, self.device, units=self.backend.units)
-        self._held = held
-        self._state = KinematicState.view(self.backend.qpos, self.backend.qvel, held)
+        self._held, self._state = held, KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
         drives = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
         self._build_terms(drives, critic)
@@ -99,9 +99,10 @@ class Go1Core:
         self._last_qpos, self._last_qvel = torch.zeros_like(self.backend.qpos), torch.zeros_like(self.backend.qvel)
         self.reward_sums = self.terms.sums
         self.feet = Feet(num_envs, task.sim.physics_dt, self.device)
-        self.gait_log = GaitLog(num_envs, task.sim.policy_dt, self.device)
-        self._touched = torch.zeros_like(self._link_contacts)
-        self._calf_touched = torch.zeros_like(self._foot_contact[..., 0])
+        self.gait_log = GaitLog(num_envs, time.policy_dt, self.device)
+        self.task_log = TaskLog(time.policy_dt, self.device)
+        contacts = (self._link_contacts, self._foot_contact[..., 0])
+        self._touched, self._calf_touched = map(torch.zeros_like, contacts)
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
         self._started = False
         self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
@@ -117,11 +118,9 @@ class Go1Core:
         self._origins = to_device(t.tile_origins)
         rows, cols = t.tile_origins.shape[:2]
         env = torch.arange(first_env, first_env + self.num_envs, device=self.device)
-        self.tile_column = env % cols
-        self.level = torch.zeros_like(env)
-        self._max_level = rows - 1
+        self.tile_column, self.level = env % cols, torch.zeros_like(env)
+        self._max_level, self._bounded = rows - 1, t.config.kind != "flat"
         self._grade = to_device(t.difficulty_per_level)[self.tile_column]
-        self._bounded = t.config.kind != "flat"
         extent = to_device(t.extent if self._bounded else (-inf, inf, -inf, inf))
         self._map = extent[[0, 2]] + MAP_MARGIN, extent[[1, 3]] - MAP_MARGIN
         rules = [t() for t in self.task.curriculum]
@@ -200,16 +199,14 @@ class Go1Core:
         if self._held is None:
             lift(fresh, self._ground if self._bounded else None)
         self.backend.reset(mask, qpos, qvel)
-        self.feet.reset(mask)
-        self.gait_log.reset(mask)
-        self.terms.reset(mask)
+        for part in (self.feet, self.gait_log, self.terms):
+            part.reset(mask)
         for tensor in (self.action, self.previous_action, self.joint_acc):
             tensor.masked_fill_(rows, 0.0)  # and not a product: zero times NaN is NaN
         self.target.copy_(torch.where(rows, self._nominal, self.target))
         self.plant.reset(mask, self.target.to(self.backend.qpos.dtype))
-        self.steps.masked_fill_(mask, 0)
-        self._first_step.masked_fill_(mask, 0)
-        self.episode_return.masked_fill_(mask, 0.0)
+        for tensor in (self.steps, self._first_step, self.episode_return):
+            tensor.masked_fill_(mask, 0)
 
     # ------------------------------------------------------------------ step
 
@@ -236,8 +233,9 @@ class Go1Core:
         truncated = ((self.steps >= self.task.sim.episode_steps) | cut) & ~terminated
         reward = self.terms.reward(s)
         self.episode_return += reward
-        final_observation = self._observe(s, advance=True)
         episode_return, episode_length = self.episode_return.clone(), self.steps - self._first_step
+        self.task_log.add(s, (terminated, truncated & ~cut, truncated & cut), (episode_return, episode_length))
+        final_observation = self._observe(s, advance=True)
         self._last_qpos.copy_(self.backend.qpos)
         self._last_qvel.copy_(self.backend.qvel)
         if self._deferred:
@@ -373,7 +371,7 @@ class Go1Core:
         metrics = {f"reward/{t.key}": rate for t, rate in zip(self.terms.rewards, rates, strict=True)}
         if self._bounded:
             metrics["curriculum/terrain_level"] = float(self.level.float().mean())
-        return metrics | self.gait_log.drain() | self.backend.drain_metrics()
+        return metrics | self.gait_log.drain() | self.task_log.drain() | self.backend.drain_metrics()
 
     _BUFFERS = (
         *("action", "previous_action", "target", "joint_acc", "spawn"),
@@ -383,8 +381,8 @@ class Go1Core:
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own."""
         events = {f"event.{name}": part for name, part in self.events.items()}
-        named = {"backend": self.backend, "random": self.random, "plant": self.plant, "command": self.command}
-        return {**named, "feet": self.feet, "gait_log": self.gait_log, **events, **self.terms.parts()}
+        names = ("backend", "random", "plant", "command", "feet", "gait_log", "task_log")
+        return {**{name: getattr(self, name) for name in names}, **events, **self.terms.parts()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything needed to continue bit for bit."""
@@ -396,5 +394,6 @@ class Go1Core:
         for name in self._BUFFERS:
             getattr(self, name).copy_(state["core"][name])
         for name, part in self._parts().items():
-            part.load_state_dict(state[name])
+            if name in state or name != "task_log":  # which older checkpoints do not have, and which begins empty
+                part.load_state_dict(state[name])
         self._started = state["started"]

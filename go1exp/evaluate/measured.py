@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from go1exp.measures import measured, per_foot
-from go1exp.measures.statistics import Interval, mean_interval, phase_interval, share_interval
 from go1exp.measures.trace import Trace
 from go1exp.schema.registry import Term
+from go1exp.statistics.intervals import Interval, mean_interval, phase_interval, share_interval
 
 DIGITS = 6
 """Significant digits of a figure."""

@@ -19,7 +19,9 @@ from go1exp.evaluate.measured import described, interval
 from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.evaluate.policy import Policy
 from go1exp.evaluate.recorder import Recorder
+from go1exp.evaluate.rows import drawn, rows_of
 from go1exp.mdp.commands import FixedVelocity
+from go1exp.measures import measured
 from go1exp.schema.backends import BackendConfig
 from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.terrain import TerrainConfig
@@ -115,6 +117,7 @@ def evaluate(
     ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
     ``controller`` makes what moves one robot in place of the policy, by its own sensors.
     ``measures`` (``go1exp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
+    ``rows`` has one entry for each robot (``rows.py``), for a file of its own.
     ``agreement`` says how near another engine than MuJoCo came to it before anything else was done.
 
     Raises:
@@ -132,6 +135,7 @@ def evaluate(
     commands = torch.tensor(config.commands, dtype=torch.float32)
     core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
     observation = core.reset()
+    draws = drawn(core)  # robots that fall are drawn anew
     dt = core.task.sim.policy_dt
     steps, settle = round(config.duration_s / dt), round(config.settle_s / dt)
     tally = _Tally(count)
@@ -155,6 +159,10 @@ def evaluate(
         for k, row in enumerate(report["commands"]):
             row["measures"] = described(measures, recorder.trace(tally.distinct(k, config).numpy()))
         report["units"] = {t.key: t.entry.traits["unit"] for t in measures}
+    of_robots = measured(recorder.trace(slice(None)), list(measures)) if recorder else {}
+    report["rows"] = rows_of(
+        commands=core.command.value.double().numpy(), draws=draws, measures=of_robots, **tally.each(config)
+    )
     return report
 
 
@@ -208,6 +216,16 @@ class _Tally:
             "episodes": len(self.fell),
             "distinct_falls": self._falls(torch.cat([self.distinct(k, config) for k in range(len(config.commands))])),
             "settings": {k: v for k, v in dataclasses.asdict(config).items() if k != "commands"},
+        }
+
+    def each(self, config: EvalConfig) -> dict[str, Any]:
+        """Return what each robot came to, as ``rows_of`` takes it."""
+        mean = self.square_sum / self.samples.double().unsqueeze(1)  # NaN without a sample
+        return {
+            "episodes": config.episodes,
+            "errors": mean.sqrt().numpy(),
+            "fell": self.fell.numpy(),
+            "moving_s": self.survived.double().numpy(),
         }
 
     def distinct(self, k: int, config: EvalConfig) -> torch.Tensor:

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from go1exp.measures.statistics import Interval
 from go1exp.schema.registry import NonNegative
 from go1exp.schema.settings import settings
+from go1exp.statistics.intervals import Interval
 
 Word = Literal["reached", "close", "not reached", "not told"]
 

@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.measures.statistics import (
+from go1exp.protocol.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
+from go1exp.protocol.result import Result
+from go1exp.statistics.compare import Word as Word
+from go1exp.statistics.compare import word as word
+from go1exp.statistics.intervals import (
     Interval,
     bootstrap_interval,
     paired_mean_interval,
     paired_share_interval,
     pairs_needed,
 )
-from go1exp.protocol.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
-from go1exp.protocol.result import Result
-
-Word = Literal["better", "worse", "not told apart"]
 
 DRAWS = 1000
 """Bootstrap samples of a difference."""
@@ -52,15 +52,6 @@ class Difference:
     difference: Interval
     word: Word
     needed: int | None
-
-
-def word(difference: Interval, better: Literal["lower", "higher"]) -> Word:
-    """Return the word for a difference (other less first) whose interval is clear of zero or not."""
-    if not (math.isfinite(difference.low) and math.isfinite(difference.high)):
-        return "not told apart"
-    if difference.low > 0.0 or difference.high < 0.0:
-        return "better" if (difference.low > 0.0) == (better == "higher") else "worse"
-    return "not told apart"
 
 
 def compared(first: Result, other: Result) -> list[Difference]:

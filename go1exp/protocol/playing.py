@@ -10,13 +10,13 @@ from typing import Any
 
 from go1exp import __version__
 from go1exp.evaluate.drivers import Driver, Progress
-from go1exp.measures.statistics import Interval, bootstrap_interval
 from go1exp.protocol.base import Chosen
 from go1exp.protocol.claims import judged
 from go1exp.protocol.quantities import Derived, Row, about, distinct, plain, resampled, summary
 from go1exp.protocol.result import Result
 from go1exp.protocol.stage import Setting, Stage
 from go1exp.schema.backends import BackendConfig
+from go1exp.statistics.intervals import Interval, bootstrap_interval
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp.measures import per_foot
-from go1exp.measures.statistics import Interval, mean_interval, phase_interval, rate_interval, share_interval
 from go1exp.schema.registry import Term
+from go1exp.statistics.intervals import Interval, mean_interval, phase_interval, rate_interval, share_interval
 
 Row = dict[str, Any]
 Condition = tuple[Any, ...]

@@ -78,8 +78,12 @@ class WandbConfig:
     Attributes:
         project: name of the project.
         mode: offline, or online, which needs an account.
-        group: name under which runs are shown together, or null.
+        group: name under which runs are shown together; null takes that of the sweep, if there is one.
         entity: team or user, or null for the account's default.
+        name: of the run; null takes the run folder's.
+        tags: of the run, to find it by.
+        notes: a sentence on what it is for.
+        artifacts: log newest and best checkpoint, and the bundle of go1exp export, when training ends.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -88,6 +92,10 @@ class WandbConfig:
     mode: Literal["offline", "online"]
     group: str | None
     entity: str | None
+    name: str | None = None
+    tags: tuple[str, ...] = ()
+    notes: str | None = None
+    artifacts: bool = False
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import csv
 import io
 import math
-import uuid
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import HParam, KVWriter, Logger, TensorBoardOutputFormat
 
-from go1exp.config import LoggerConfig, WandbConfig
+from go1exp.config import LoggerConfig
 from go1exp.files import write_text
-from go1exp.schema.registry import ConfigError, Expected
+from go1exp.train.wandb_writer import WandbWriter
+from go1exp.train.wandb_writer import check_account as check_account
+from go1exp.train.wandb_writer import log_tables as log_tables
 
 CLOCK = "time/"
 """Prefix of metrics that depend on the machine's clock; they have a file of their own."""
@@ -77,38 +78,6 @@ def _number(text: str) -> float:
         return math.nan
 
 
-class WandbWriter(KVWriter):
-    """Sends metrics to a Weights & Biases run; a resumed run continues under the same id."""
-
-    def __init__(self, run: Path, config: WandbConfig, settings: dict[str, Any]) -> None:
-        try:
-            import wandb
-        except ImportError as error:
-            raise Expected("logger=wandb needs the package wandb: pip install wandb, or use logger=local") from error
-        identity = run / "wandb_id"
-        if not identity.exists():
-            write_text(identity, uuid.uuid4().hex[:8])
-        self._run = wandb.init(
-            project=config.project,
-            entity=config.entity,
-            group=config.group,
-            mode=config.mode,
-            id=identity.read_text(),
-            resume="allow",
-            dir=str(run),
-            config=settings,
-            settings=wandb.Settings(x_disable_stats=True, silent=True),
-        )
-
-    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """Log a row at ``step`` environment steps."""
-        self._run.log(dict(key_values), step=step)
-
-    def close(self) -> None:
-        """Finish the run."""
-        self._run.finish()
-
-
 class TensorBoardWriter(TensorBoardOutputFormat):
     """SB3's, which also hides the rows of a run that went on from an older checkpoint: they come once more."""
 
@@ -121,29 +90,37 @@ class TensorBoardWriter(TensorBoardOutputFormat):
             self.writer._get_file_writer().add_event(Event(session_log=restarted), steps + 1)
 
 
-def check_account(config: LoggerConfig) -> None:
-    """Refuse to log online to Weights & Biases without a key: it would ask, or fail, when all is built.
+def _hparams(settings: dict[str, Any]) -> HParam:
+    """Return a configuration as TensorBoard's hyperparameters: numbers, words and switches by their paths."""
+    flat: dict[str, bool | float | str] = {}
 
-    Raises:
-        ConfigError: if neither the environment nor a netrc file holds one.
-    """
-    if config.wandb is None or config.wandb.mode != "online":
-        return
-    try:
-        import wandb
+    def take(value: Any, path: str) -> None:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                take(inner, f"{path}.{key}" if path else str(key))
+        elif isinstance(value, bool | int | float | str):
+            flat[path] = value
+        elif value is not None:
+            flat[path] = str(value)
 
-        known = wandb.login(prompt=False, verify=False)
-    except ImportError:
-        return  # the writer says what to install
-    except Exception as error:  # a key of a wrong form
-        raise ConfigError([f"logger.wandb.mode = 'online': {' '.join(str(error).split())}"]) from None
-    if not known:
-        raise ConfigError(
-            [
-                "logger.wandb.mode = 'online': there is no API key; set WANDB_API_KEY, or run wandb login, or use "
-                "logger.wandb.mode=offline"
-            ]
-        )
+    take(settings, "")
+    return HParam(flat, dict.fromkeys(("rollout/return", "rollout/length", "task/fall_share", "eval/score"), 0.0))
+
+
+def log_film(logger: Logger, steps: int, file: Path) -> None:
+    """Give a film of the policy after ``steps`` environment steps to the writers that take films."""
+    for writer in logger.output_formats:
+        if isinstance(writer, WandbWriter):
+            writer.film(steps, file)
+
+
+def dump_beside(logger: Logger, steps: int) -> None:
+    """Write what was recorded to all writers but the CSV files, which have one row for each iteration."""
+    for writer in logger.output_formats:
+        if not isinstance(writer, CsvWriter):
+            writer.write(dict(logger.name_to_value), dict(logger.name_to_excluded), steps)
+    logger.name_to_value.clear()
+    logger.name_to_excluded.clear()
 
 
 def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[str, Any], steps: int = 0) -> Logger:
@@ -160,6 +137,8 @@ def make_logger(config: LoggerConfig, run: Path, iteration: int, settings: dict[
     if config.tensorboard:
         try:
             writers.append(TensorBoardWriter(run / "tensorboard", steps))
+            if settings and not steps:
+                writers[-1].write({"hparams": _hparams(settings)}, {"hparams": ()}, 0)
         except AssertionError:
             print("tensorboard is not installed: metrics go to the other writers only")
     if config.csv:

@@ -1,6 +1,7 @@
 """The run folder: what was run, with what, and where its results are.
 
-``config.yaml`` (resolved), ``meta.json`` (git commit, versions, machine, hashes of assets), ``metrics.csv``,
+``config.yaml`` (resolved), ``meta.json`` (git commit, versions, machine, hashes of assets), ``git.diff`` (what was not
+committed), ``metrics.csv``,
 ``timing.csv``, ``checkpoints/``, ``actuator.npz`` (a copy of the actuator net, if there is one), ``plugins/`` (copies
 of the user's files with terms). Whatever comes later reads the run's own configuration, never today's ``conf/``.
 """
@@ -26,7 +27,10 @@ from go1exp.train import kept_plugins
 NET = "actuator.npz"
 """A run's own copy of its actuator net."""
 
-PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco-core", "numpy", "hydra-core")
+DIFF, LONGEST_DIFF = "git.diff", 5_000_000
+"""What was not committed when the run began, and how many letters of it are kept."""
+
+PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco-core", "numpy", "hydra-core", "mujoco-warp", "warp-lang")
 
 
 def write(run: Path, container: dict[str, Any]) -> None:
@@ -38,6 +42,8 @@ def write(run: Path, container: dict[str, Any]) -> None:
     try:
         run.mkdir(parents=True, exist_ok=True)
         meta = {**_meta(container), "plugins": kept_plugins.keep(run, container)}
+        if meta["git_dirty"]:
+            write_text(run / DIFF, (_git("diff", "HEAD") or "")[:LONGEST_DIFF] + "\n")
         write_text(run / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(container)))
         write_json(run / "meta.json", meta)
         for settings in _with_files(container.get("actuator")):
@@ -99,8 +105,9 @@ def _meta(container: dict[str, Any]) -> dict[str, Any]:
         "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "seed": container.get("seed"),
         "packages": {name: version(name) for name in PACKAGES},
+        "installed": {d.name: d.version for d in sorted(importlib.metadata.distributions(), key=lambda d: d.name)},
         "python": platform.python_version(),
-        "machine": {"processor": _processor(), "cores": os.cpu_count()},
+        "machine": {"processor": _processor(), "cores": os.cpu_count(), **_gpus()},
         "assets_sha256": {str(p.relative_to(data_root())): hashlib.sha256(p.read_bytes()).hexdigest() for p in assets},
     }
 
@@ -113,6 +120,18 @@ def _git(*arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
+
+
+def _gpus() -> dict[str, Any]:
+    """Return NVIDIA's driver and the GPUs, as the driver tells them; nothing where there is none."""
+    place = Path("/proc/driver/nvidia")
+    try:
+        driver = (place / "version").read_text().splitlines()[0].strip()
+        named = [file.read_text() for file in sorted(place.glob("gpus/*/information"))]
+    except (OSError, IndexError):
+        return {}
+    models = [line.split(":", 1)[1].strip() for text in named for line in text.splitlines() if line.startswith("Model")]
+    return {"driver": driver, "gpus": models}
 
 
 def _processor() -> str:

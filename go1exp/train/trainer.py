@@ -23,13 +23,19 @@ from go1exp.env.sb3_env import Go1VecEnv
 from go1exp.files import opened, write_json
 from go1exp.schema.registry import Expected
 from go1exp.train import checkpoint, kept_plugins, members, metrics, preflight, start
+from go1exp.train.beside import Beside
 from go1exp.train.device import DevicePPO
+from go1exp.train.early_stop import EarlyStop
 from go1exp.train.group import Group
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
 
 LAST_PRESS = 3
 """The Ctrl-C that ends training without a checkpoint of the iteration under way."""
+
+
+class EndedEarly(Exception):
+    """The rule of ``stop`` has ended a training, which is complete."""
 
 
 class Stopped(Expected):
@@ -85,16 +91,34 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: star
         ppo = _begun(config, run, first, group)
         logger = metrics.make_logger(config.logger, run, ppo.iteration, container, ppo.num_timesteps)
         size = config.ppo.num_envs * config.ppo.steps
+        beside = Beside(config, run, ppo.iteration, lambda steps, file: metrics.log_film(logger, steps, file))
+        stop = EarlyStop(config.stop, run, ppo.iteration)
         with Progress(ppo.iteration, config.ppo.iterations, size) as progress, _signals() as asked_to_stop:
-            ppo.after_iteration = _Closing(config, run, logger, progress, asked_to_stop)
+            ppo.after_iteration = _Closing(config, run, logger, progress, asked_to_stop, beside, stop)
+            complete = False
             try:
                 _learn(ppo, config, logger)
+                complete = True
             except NumericalFault as fault:
                 _keep(fault, run)
                 raise
             finally:
-                logger.close()
+                _close(ppo, logger, beside, complete)
     return ppo
+
+
+def _close(ppo: AdaptivePPO, logger: Logger, beside: Beside, complete: bool) -> None:
+    """End what goes on beside the training, wait for it if that is complete, and close the logs."""
+    late = beside.finish(wait=complete)
+    for problem in beside.problems:
+        print(problem)
+    if beside.skipped:
+        print(f"{beside.skipped} evaluations or films were left out: the process beside the training is slower")
+    if late:
+        for key, value in late.items():
+            logger.record(key, value)
+        metrics.dump_beside(logger, ppo.num_timesteps)
+    logger.close()
 
 
 def train_as_member(container: dict[str, Any], run: Path, group: Group) -> None:
@@ -117,7 +141,10 @@ def _learn(ppo: AdaptivePPO, config: TrainConfig, logger: Logger) -> None:
     ppo.set_logger(logger)
     left = config.ppo.iterations * config.ppo.num_envs * config.ppo.steps - ppo.num_timesteps
     if left > 0:
-        ppo.learn(left, reset_num_timesteps=ppo.iteration == 0)
+        try:
+            ppo.learn(left, reset_num_timesteps=ppo.iteration == 0)
+        except EndedEarly as ended:
+            print(f"ended early: {ended}")
 
 
 def _begun(config: TrainConfig, run: Path, first: start.Weights | None, group: Group) -> AdaptivePPO:
@@ -145,9 +172,11 @@ class _Closing:
         logger: Logger,
         progress: Progress | None,
         asked_to_stop: Callable[[], bool],
+        beside: Beside | None = None,
+        stop: EarlyStop | None = None,
     ) -> None:
         self.config, self.run, self.logger, self.progress = config, run, logger, progress
-        self.asked_to_stop = asked_to_stop
+        self.asked_to_stop, self.beside, self.stop = asked_to_stop, beside, stop
         self._clock = time.monotonic()
 
     def __call__(self, ppo: AdaptivePPO) -> None:
@@ -160,13 +189,23 @@ class _Closing:
         self._clock = now
         for key, value in ppo.group.metrics(env.core.drain_metrics(steps)).items():
             self.logger.record(key, value)
+        for key, value in (self.beside.collect() if self.beside else {}).items():
+            self.logger.record(key, value)
+        logged = dict(self.logger.name_to_value)
         if self.progress:
-            self.progress.update(ppo.iteration, dict(self.logger.name_to_value))
+            self.progress.update(ppo.iteration, logged)
         self.logger.dump(step=ppo.num_timesteps)
         last = ppo.iteration >= self.config.ppo.iterations
+        reason = ppo.group.agreed(self.stop.reason(ppo.iteration, logged) if self.stop and not last else "")
         stopping = ppo.group.agreed(self.asked_to_stop())
-        if last or stopping or ppo.iteration % self.config.checkpoint.every == 0:
+        if last or stopping or reason or ppo.iteration % self.config.checkpoint.every == 0:
             checkpoint.save(ppo, self.run, self.config.checkpoint.keep)
+        if self.beside:
+            self.beside.offer(ppo, last=last or bool(reason))
+        if reason:
+            if self.stop:
+                self.stop.note(ppo.iteration, reason)
+            raise EndedEarly(reason)
         if stopping:
             raise Stopped(f"stopped after iteration {ppo.iteration}", finished=last)
 

@@ -11,8 +11,8 @@ from markupsafe import Markup
 
 import go1exp.gap.report.words as words
 from go1exp.effects.tolerances import Tolerances
-from go1exp.gap.report.svg import PAGE_INCHES, draw
 from go1exp.gap.result import GapResult, NamedEffect, Overlay
+from go1exp.svg import PAGE_INCHES, draw
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -137,7 +137,7 @@ def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _falls(rows: Sequence[Row]) -> Figure:
-    from go1exp.measures.statistics import share_interval
+    from go1exp.statistics.intervals import share_interval
 
     figure, axes = paint.panels(1, height=1.9)
     delays = sorted({row["delay_ms"] for row in rows})

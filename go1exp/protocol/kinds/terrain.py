@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from go1exp.measures.statistics import Logistic, logistic_fit
 from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.protocol.ground import UNITS, GroundName, Lanes, goal
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
 from go1exp.schema.registry import NonNegative, Positive, PositiveRange, protocol
 from go1exp.schema.settings import settings
+from go1exp.statistics.intervals import Logistic, logistic_fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

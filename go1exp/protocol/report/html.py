@@ -11,12 +11,12 @@ from typing import Any
 import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from go1exp.gap.report.svg import draw
 from go1exp.protocol.base import Drawing, Protocol
 from go1exp.protocol.claims import ORDER
 from go1exp.protocol.report.tables import claims_table, figure_tables, meanings
 from go1exp.protocol.report.words import falls
 from go1exp.protocol.result import Result
+from go1exp.svg import draw
 
 INTERVALS = (
     "Figures: mean over robots with Student's 95 % interval; shares with Wilson's; falls per moving robot-minute with"

@@ -1,0 +1,85 @@
+"""``go1exp report``."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from go1exp.cli.app import App, spinner
+from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.report.made import Report
+    from go1exp.report.runs import Study
+    from go1exp.report.settings import ReportSettings
+
+
+def _task(container: dict[str, Any]) -> None:
+    from go1exp.cli.settings import ReportSettings, parse
+
+    settings = parse(ReportSettings, container)
+    folder = Path(settings.folder or Path(settings.folders[0]) / "report")
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError([f"folder = {str(folder)!r}: is a file"])
+
+    from go1exp.report.runs import study
+
+    runs = study(settings.folders, settings.unfinished)
+    if settings.eval:
+        _evaluate(runs, settings)
+    import go1exp.protocol.kinds  # noqa: F401  (registers them)
+    from go1exp.report.made import report
+    from go1exp.report.writing import write
+
+    made = report(runs, settings, dataclasses.asdict(settings))
+    files = write(made, folder)
+    print("\n".join(lines(made)))
+    print(f"written to {files[0]}; {files[1].name} and {len(files) - 2} CSV files beside it")
+    if settings.wandb:
+        from go1exp.report.tables import plain_rows
+        from go1exp.train.metrics import log_tables
+
+        log_tables(plain_rows(made), files[0], settings.project, settings.wandb, folder)
+
+
+def _evaluate(runs: Study, settings: ReportSettings) -> None:
+    """Evaluate what is missing, and say what is being done."""
+    import go1exp.measures  # noqa: F401  (registers them)
+    from go1exp.report.evaluating import evaluate_missing, missing
+
+    def on_run(number: int, count: int, label: str) -> Callable[[int, int], None]:
+        print(f"evaluating {number}/{count}: {label}", file=sys.stderr, flush=True)
+        return spinner(1, f"evaluating {number}/{count}")
+
+    runs.notes += evaluate_missing(missing(runs.runs), settings.evaluation, on_run)
+
+
+def lines(made: Report) -> list[str]:
+    """Return what a terminal shows: groups, what does not count, remarks, verdicts."""
+    from go1exp.protocol.report.words import interval_text, number
+    from go1exp.report.tables import counts
+
+    runs = sum(len(g.runs) for g in made.groups)
+    text_lines = [f"{runs} runs in {len(made.groups)} groups; baseline: {made.baseline.name}"]
+    text_lines += [f"  {len(g.runs):3} runs  {g.name}" for g in made.groups]
+    text_lines += [f"not counted: {a.label}: {a.state} ({a.cause})" for a in made.study.absent]
+    text_lines += [f"note: {note}" for note in made.study.notes]
+    for outcome in made.outcomes:
+        clear = [v for v in outcome.verdicts if v.word != "not told apart"]
+        if outcome.verdicts:
+            words = ", ".join(f"{n} {word}" for word, n in counts(outcome.verdicts).items())
+            text_lines.append(f"{outcome.judged.name}: {words}")
+        for v in clear:
+            d = v.difference.estimate
+            change = interval_text(d.estimate, d.low, d.high)
+            text_lines.append(
+                f"  {v.word:7} {v.group}: {v.column.name} {number(v.first)} -> {number(v.other)}, difference {change},"
+                f" p {number(v.adjusted_p)}, n {d.n}"
+            )
+    return text_lines
+
+
+APP = App("report", _task)

@@ -1,0 +1,117 @@
+"""``python -m go1exp.evaluate.beside RUN``: evaluates and films policies of a training that goes on beside it.
+
+Jobs are lines of JSON on standard input, results are lines of JSON on standard output; see ``go1exp/train/beside.py``,
+which starts it. It ends with its input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from go1exp.evaluate.policy import load_run
+from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
+from go1exp.schema.backends import CpuBackend
+
+FALLEN = 1.0
+"""Error that a robot on the ground counts with, at least, m/s."""
+
+NICE = 19
+"""Lowest priority: what is left over by the training."""
+
+
+def score(rows: Sequence[dict[str, Any]], duration_s: float) -> float:
+    """Return the root mean square horizontal error, m/s, in which time on the ground counts as the whole command.
+
+    A robot that has fallen is off by its command, and by 1 m/s at least, for the rest of the episode: falls and errors
+    in one number, lower is better.
+    """
+    squares = []
+    for row in rows:
+        share = min(row["moving_s"] / duration_s, 1.0)
+        lost = max(math.hypot(row["x"], row["y"]), FALLEN)
+        squares.append(share * (row["error_xy"] or 0.0) ** 2 + (1.0 - share) * lost**2)
+    return math.sqrt(sum(squares) / len(squares))
+
+
+def evaluated(run: Path, policy_file: Path, settings: dict[str, Any]) -> dict[str, float]:
+    """Return the figures of a policy file of a run: score, errors, share of falls."""
+    config, policy, _ = load_run(run, policy_file)
+    commands = grid(settings["x"], settings["y"], settings["yaw"], False)
+    names = ("episodes", "duration_s", "settle_s", "noise", "randomize", "seed")
+    wanted = EvalConfig(
+        commands=commands,
+        push=False,
+        train_ground=False,
+        policy_dt=None,
+        engine=CpuBackend(name="cpu", threads=1),
+        **{name: settings[name] for name in names},
+    )
+    rows = evaluate(config.task, policy, wanted)["rows"]
+
+    def mean(name: str) -> float:
+        known = [row[name] for row in rows if row[name] is not None]
+        return sum(known) / len(known) if known else math.nan
+
+    figures = {name: mean(name) for name in ("error_xy", "error_yaw")}
+    return {"score": score(rows, wanted.duration_s), **figures, "fall_share": mean("fell")}
+
+
+def film(run: Path, policy_file: Path, settings: dict[str, Any], out: Path) -> None:
+    """Film a policy file of a run on the nominal robot on flat ground; write an MP4 file."""
+    from go1exp.env.core import Go1Core
+    from go1exp.evaluate import video
+
+    config, policy, _ = load_run(run, policy_file)
+    shown = EvalConfig(
+        commands=(tuple(settings["velocity"]),),
+        episodes=1,
+        duration_s=settings["seconds"],
+        settle_s=0.0,
+        policy_dt=None,
+        noise=False,
+        randomize=False,
+        push=False,
+        train_ground=False,
+        seed=1,
+        engine=CpuBackend(name="cpu", threads=1),
+    )
+    core = Go1Core(evaluation_task(config.task, shown), 1, 1, noise=False)
+    core.command.value[:] = core.command.value.new_tensor(settings["velocity"])
+    out.parent.mkdir(exist_ok=True)
+    video.write_mp4(out, list(video.record(core, policy, settings["seconds"], fps=25)), 25)
+
+
+def answered(run: Path, job: dict[str, Any]) -> dict[str, Any]:
+    """Do a job; return its result, or what went wrong."""
+    result = {name: job[name] for name in ("kind", "iteration", "steps", "policy")}
+    try:
+        if job["kind"] == "evaluate":
+            return {**result, "figures": evaluated(run, Path(job["policy"]), job["settings"])}
+        film(run, Path(job["policy"]), job["settings"], Path(job["out"]))
+        return {**result, "out": job["out"]}
+    except Exception as error:  # a failure here shall not end the training
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        return {**result, "problem": f"{job['kind']} beside the training failed: {text[:200]}"}
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Answer jobs until the input ends."""
+    with contextlib.suppress(OSError):
+        os.nice(NICE)
+    torch.set_num_threads(1)
+    answers, sys.stdout = sys.stdout, sys.stderr  # what libraries print is no answer
+    for line in sys.stdin:
+        print(json.dumps(answered(Path(arguments[0]), json.loads(line))), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,197 @@
+"""What evaluations of runs came to: rows of the grid of commands, and of protocols, as their folders hold them."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from go1exp import robot
+from go1exp.evaluate.files import FILE, rows_file
+from go1exp.evaluate.rows import COLUMNS, KEYS
+from go1exp.measures import every_measure
+from go1exp.protocol.quantities import FELL, MOVING, ROBOT, Column, columns_of
+from go1exp.report.runs import Run, Study
+
+GRID = "grid"
+PROTOCOLS = "protocols"
+"""Folder of other protocols in a run folder."""
+
+MAIN = ("error_xy", "error_yaw", FELL.name)
+"""Figures of the grid that are compared, unless others are asked for: few, as each takes its share of the level."""
+
+UNJUDGED = (MOVING.name,)
+"""Figures of rows that say how long they are, and nothing of a policy."""
+
+Rows = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """The rows of one run.
+
+    Attributes:
+        table: columns (n,) by name.
+        settings: of the evaluation, plain data: only equal ones are compared.
+    """
+
+    table: dict[str, NDArray[Any]]
+    settings: dict[str, Any]
+
+
+@dataclass
+class Judged:
+    """One protocol, or the grid, of all runs that were evaluated alike.
+
+    Attributes:
+        name: grid, or the protocol's.
+        keys: columns that say the condition of a row.
+        columns: figures.
+        main: names of those that are compared.
+        runs: rows by run folder.
+        settings: what all of these were evaluated with.
+    """
+
+    name: str
+    keys: tuple[str, ...]
+    columns: tuple[Column, ...]
+    main: tuple[str, ...]
+    runs: dict[Path, Evaluated] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def names(run: Run) -> list[str]:
+    """Return the evaluations that a run's folder holds."""
+    of_protocols = sorted(p.stem for p in (run.folder / PROTOCOLS).glob("*.json") if rows_file(p).is_file())
+    return [GRID, *of_protocols] if rows_file(run.folder / FILE).is_file() else of_protocols
+
+
+def evaluations(study: Study) -> list[Judged]:
+    """Return every evaluation that runs of a study have; what is left out is noted in the study."""
+    known = Counter(name for run in study.runs for name in names(run))
+    old = [run.label for run in study.runs if (run.folder / FILE).is_file() and GRID not in names(run)]
+    if old:
+        study.notes.append(f"{_listed(old)}: eval.json without eval.parquet, of an older version; eval=true makes both")
+    made = [_judged(name, study) for name in [GRID, *sorted(set(known) - {GRID})] if name in known]
+    for judged in made:
+        lacking = [run.label for run in study.runs if judged.name not in names(run)]
+        if lacking:
+            study.notes.append(f"{judged.name}: no evaluation of {_listed(lacking)}" + _advice(judged.name))
+    if not made:
+        study.notes.append(f"no run has an evaluation; eval=true makes them ({len(study.runs)} runs)")
+    return [judged for judged in made if judged.runs]
+
+
+def _advice(name: str) -> str:
+    return "; eval=true makes it" if name == GRID else f"; go1exp eval run=... protocol={name} makes it"
+
+
+def _listed(labels: Sequence[str]) -> str:
+    return (
+        labels[0] if len(labels) == 1 else f"{len(labels)} runs ({', '.join(labels[:3])}{', ...' * (len(labels) > 3)})"
+    )
+
+
+def _judged(name: str, study: Study) -> Judged:
+    """Read one evaluation of all runs and keep those with the settings that most have."""
+    entries: dict[Path, Evaluated] = {}
+    abouts: dict[Path, dict[str, Any]] = {}
+    for run in study.runs:
+        if name not in names(run):
+            continue
+        file = run.folder / FILE if name == GRID else run.folder / PROTOCOLS / f"{name}.json"
+        try:
+            abouts[run.folder] = about = json.loads(file.read_text())
+            entries[run.folder] = Evaluated(_table(rows_file(file)), _settings(name, about))
+        except (OSError, ValueError, KeyError) as error:
+            study.notes.append(f"{file}: cannot be read ({type(error).__name__}: {' '.join(str(error).split())[:100]})")
+    if not entries:
+        return Judged(name, (), (), ())
+    signs = {folder: json.dumps(e.settings, sort_keys=True) for folder, e in entries.items()}
+    usual = Counter(signs.values()).most_common(1)[0][0]
+    others = [run.label for run in study.runs if run.folder in signs and signs[run.folder] != usual]
+    if others:
+        differ = _differing(json.loads(usual), next(entries[f].settings for f, sign in signs.items() if sign != usual))
+        study.notes.append(f"{name}: {_listed(others)} left out, evaluated with other settings ({differ}) than most")
+    kept = {folder: e for folder, e in entries.items() if signs[folder] == usual}
+    first = next(iter(kept))
+    return _described(name, abouts[first], kept, kept[first].settings)
+
+
+def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    return ", ".join(k for k in {**one, **other} if one.get(k) != other.get(k))
+
+
+def _settings(name: str, about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what decides whether two evaluations may be compared."""
+    if name == GRID:
+        commands = [entry["command"] for entry in about["commands"]]
+        return {**about["settings"], "robot": about.get("robot", {}), "commands": commands}
+    kept = ("kind", "settings", "rates", "robot")
+    return {key: about[key] for key in kept if key in about}
+
+
+def _table(file: Path) -> dict[str, NDArray[Any]]:
+    """Return the columns of a file of rows; numbers as float64 with NaN where there is none."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(file)
+    except pa.ArrowInvalid as error:
+        raise ValueError(str(error)) from None
+    columns = {}
+    for name in table.column_names:
+        values = table[name].to_pylist()
+        textual = any(isinstance(v, str | list) for v in values)
+        columns[name] = (
+            np.array([json.dumps(v) if isinstance(v, list) else str(v) for v in values])
+            if textual
+            else np.array([np.nan if v is None else float(v) for v in values])
+        )
+    return columns
+
+
+def _described(name: str, about: Mapping[str, Any], runs: dict[Path, Evaluated], settings: dict[str, Any]) -> Judged:
+    """Return an evaluation with its columns, and its rows without repeats."""
+    if name == GRID:
+        random = any(settings.get(key) for key in ("noise", "randomize", "push", "train_ground"))
+        columns = (*COLUMNS, *columns_of(every_measure(), robot.LEGS))
+        distinct = {f: e if random else _first_robots(e) for f, e in runs.items()}
+        return Judged(name, KEYS, _present(columns, runs), MAIN, distinct, settings)
+    from go1exp.protocol.base import chosen
+
+    given = {"term": about["kind"], **about["settings"]}
+    protocol = chosen({name: given})[0][0].protocol
+    columns = _present(protocol.columns(), runs)
+    known = {c.name for c in columns if c.better}
+    main = [c.quantity for c in protocol.claims.values() if c.quantity in known]
+    return Judged(name, protocol.keys, columns, tuple(dict.fromkeys([*main, FELL.name])), runs, settings)
+
+
+def _present(columns: Sequence[Column], runs: Mapping[Path, Evaluated]) -> tuple[Column, ...]:
+    """Return the figures that rows have, without those that say nothing of a policy."""
+    return tuple(
+        c
+        for c in columns
+        if c.how != "phase" and c.name not in UNJUDGED and any(c.name in e.table for e in runs.values())
+    )
+
+
+def _first_robots(evaluated: Evaluated) -> Evaluated:
+    """Return one row of each command: without anything random all robots do the same."""
+    first = evaluated.table[ROBOT] == 0.0
+    return Evaluated({name: values[first] for name, values in evaluated.table.items()}, evaluated.settings)
+
+
+def draws(evaluated: Evaluated) -> dict[str, NDArray[np.float64]]:
+    """Return what was drawn for the robot of each row, (n,) by name."""
+    from go1exp.evaluate.rows import DRAW
+
+    return {name.removeprefix(DRAW): v for name, v in evaluated.table.items() if name.startswith(DRAW)}

@@ -1,0 +1,191 @@
+"""Figures of groups with intervals over runs, and each group against the baseline."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from go1exp.protocol.quantities import Column
+from go1exp.report.evaluations import Judged
+from go1exp.report.groups import Group
+from go1exp.schema.registry import ConfigError, unknown_name
+from go1exp.statistics import compare
+from go1exp.statistics.compare import Word
+from go1exp.statistics.intervals import Interval
+from go1exp.statistics.runs import clustered_share, iqm_interval, pooled_share, share_bootstrap
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of one group.
+
+    Attributes:
+        group: its name.
+        column: the figure.
+        runs: with its interval over runs; n is that of the runs.
+        robots: of a share, Wilson's interval over all robots of these runs; else None.
+        bootstrap: of a share, the percentile interval over runs; else None.
+        values: of each run, NaN where it has none.
+        condition: what it is about; empty for all conditions together.
+    """
+
+    group: str
+    column: Column
+    runs: Interval
+    robots: Interval | None
+    bootstrap: Interval | None
+    values: Floats
+    condition: tuple[tuple[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One figure of one group against the baseline.
+
+    Attributes:
+        group: its name.
+        column: the figure.
+        first: interquartile mean of the baseline.
+        other: of the group.
+        difference: with its p and effect sizes.
+        adjusted_p: after Holm's correction; the p itself without one.
+        word: better, worse or not told apart.
+        needed: runs in each group that would tell a difference like the one seen; None if it is told, or none was seen.
+        hopeless: whether even a clear difference could not have been told with so few runs among so many comparisons.
+    """
+
+    group: str
+    column: Column
+    first: float
+    other: float
+    difference: compare.Difference
+    adjusted_p: float
+    word: Word
+    needed: int | None
+    hopeless: bool
+
+
+def means(judged: Judged, group: Group, column: Column, rows: dict[Path, NDArray[np.bool_]] | None = None) -> Floats:
+    """Return the mean over rows of each run of a group (runs,), NaN of a run without a value."""
+    each = []
+    for run in group.runs:
+        known = _values(judged, run.folder, column, rows)
+        each.append(float(known.mean()) if len(known) else math.nan)
+    return np.array(each)
+
+
+def _values(judged: Judged, folder: Path, column: Column, rows: dict[Path, NDArray[np.bool_]] | None) -> Floats:
+    evaluated = judged.runs.get(folder)
+    if evaluated is None or column.name not in evaluated.table:
+        return np.empty(0)
+    values = evaluated.table[column.name]
+    if rows is not None:
+        values = values[rows[folder]]
+    return values[np.isfinite(values)]
+
+
+def figure(
+    judged: Judged,
+    group: Group,
+    column: Column,
+    rows: dict[Path, NDArray[np.bool_]] | None = None,
+    condition: tuple[tuple[str, Any], ...] = (),
+) -> Figure:
+    """Return a figure of a group; ``rows`` are those that count, of each run."""
+    values = means(judged, group, column, rows)
+    if column.how != "share":
+        return Figure(group.name, column, iqm_interval(values), None, None, values, condition)
+    of_runs = [_values(judged, run.folder, column, rows) for run in group.runs]
+    counts, totals = [int(v.sum()) for v in of_runs], [len(v) for v in of_runs]
+    over_runs, robots = clustered_share(counts, totals), pooled_share(counts, totals)
+    return Figure(group.name, column, over_runs, robots, share_bootstrap(counts, totals), values, condition)
+
+
+def table(judged: Judged, made: Sequence[Group]) -> list[Figure]:
+    """Return every figure of every group, over all conditions."""
+    return [figure(judged, group, column) for column in judged.columns for group in made]
+
+
+def by_condition(judged: Judged, made: Sequence[Group]) -> list[Figure]:
+    """Return the figures that have a better direction, of every group in every condition."""
+    columns = [c for c in judged.columns if c.better]
+    first = next(iter(judged.runs.values())).table
+    keys = [key for key in judged.keys if key in first]
+    conditions = list(dict.fromkeys(zip(*(first[key].tolist() for key in keys), strict=True)))
+    entries = []
+    for condition in conditions:
+        rows = {
+            folder: np.all([e.table[k] == v for k, v in zip(keys, condition, strict=True)], axis=0)
+            for folder, e in judged.runs.items()
+        }
+        named = tuple(zip(keys, condition, strict=True))
+        entries += [figure(judged, group, column, rows, named) for column in columns for group in made]
+    return entries
+
+
+def compared(
+    judged: Judged,
+    made: Sequence[Group],
+    baseline: Group,
+    wanted: Sequence[str] | None,
+    correction: Literal["holm", "none"],
+    paired: bool,
+) -> list[Verdict]:
+    """Return each group against the baseline, figure by figure; nothing of groups without this evaluation.
+
+    Args:
+        judged: an evaluation.
+        made: all groups.
+        baseline: one of them.
+        wanted: names of figures; None takes the evaluation's main ones.
+        correction: over all figures of all groups here, or none.
+        paired: pair runs by their seed.
+
+    Raises:
+        ConfigError: if a figure is asked for that rows do not have, or that has no better direction.
+    """
+    known = {c.name: c for c in judged.columns if c.better}
+    problems = [unknown_name("figures", name, known, "figure") for name in wanted or () if name not in known]
+    if problems:
+        raise ConfigError(problems)
+    columns = [known[name] for name in (wanted or judged.main) if name in known]
+    evaluated = [g for g in made if any(run.folder in judged.runs for run in g.runs)]
+    if baseline not in evaluated:
+        return []
+    subjects = [(g, c) for c in columns for g in evaluated if g is not baseline]
+    samples = [_samples(judged, group, baseline, column, paired) for group, column in subjects]
+    differences = [compare.difference(a, b, paired) for a, b in samples]
+    p_values = [d.p for d in differences]
+    adjusted = compare.holm(p_values) if correction == "holm" else p_values
+    family = sum(math.isfinite(p) for p in p_values) if correction == "holm" else 1
+    entries = []
+    for (group, column), (a, b), d, p in zip(subjects, samples, differences, adjusted, strict=True):
+        assert column.better is not None
+        said_word = compare.worded(d.estimate.estimate, p, column.better)
+        needed = None
+        if said_word == "not told apart":
+            level = compare.ALPHA / max(family, 1)
+            needed = compare.runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=level)
+        first, other = (float(iqm_interval(v).estimate) for v in (b, a))
+        hopeless = not d.least_p * family <= compare.ALPHA
+        entries.append(Verdict(group.name, column, first, other, d, p, said_word, needed, hopeless))
+    return entries
+
+
+def _samples(judged: Judged, group: Group, baseline: Group, column: Column, paired: bool) -> tuple[Floats, Floats]:
+    """Return one value per run of both, of seeds that both have if they are to be pairs."""
+    a, b = means(judged, group, column), means(judged, baseline, column)
+    if not paired:
+        return a[np.isfinite(a)], b[np.isfinite(b)]
+    theirs = {run.seed: value for run, value in zip(baseline.runs, b, strict=True)}
+    both = [(value, theirs[run.seed]) for run, value in zip(group.runs, a, strict=True) if run.seed in theirs]
+    pairs = np.array(both, dtype=np.float64).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]

@@ -1,0 +1,81 @@
+"""A whole report as data, from folders to verdicts; the page, the files and the terminal show parts of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from go1exp.report import curves as learning
+from go1exp.report.curves import Curve
+from go1exp.report.evaluations import Judged, evaluations
+from go1exp.report.figures import Figure, Verdict, by_condition, compared, table
+from go1exp.report.groups import Group, baseline, groups
+from go1exp.report.runs import Study
+from go1exp.report.sensitivity import Sensitivity, sensitivities
+from go1exp.report.settings import ReportSettings
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one evaluation of all runs.
+
+    Attributes:
+        judged: the evaluation.
+        figures: of all conditions together.
+        by_condition: of each condition.
+        verdicts: against the baseline; none of one group alone.
+        sensitivities: what goes with the main figures.
+    """
+
+    judged: Judged
+    figures: list[Figure]
+    by_condition: list[Figure]
+    verdicts: list[Verdict]
+    sensitivities: list[Sensitivity]
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that a report shows.
+
+    Attributes:
+        study: runs, and those that do not count.
+        groups: of them.
+        baseline: one of the groups.
+        curves: of metrics.
+        outcomes: of evaluations.
+        settings: as asked for, plain data.
+    """
+
+    study: Study
+    groups: list[Group]
+    baseline: Group
+    curves: list[Curve]
+    outcomes: list[Outcome]
+    settings: dict[str, Any]
+
+
+def report(study: Study, settings: ReportSettings, plain: dict[str, Any]) -> Report:
+    """Make the report of a study.
+
+    Raises:
+        ConfigError: if the baseline or a figure that is asked for is not there.
+    """
+    made = groups(study)
+    first = baseline(made, settings.baseline)
+    metrics: dict[Path, learning.Metrics] = {}
+    for run in (run for group in made for run in group.runs):
+        metrics[run.folder], remark = learning.read(run.folder, settings.curves)
+        study.notes += [remark] if remark else []
+    drawn, notes = learning.curves(made, metrics, settings.curves, settings.points)
+    study.notes += notes
+    outcomes = []
+    for judged in evaluations(study):
+        given = (settings.figures, settings.correction, settings.paired)
+        verdicts = compared(judged, made, first, *given) if len(made) > 1 else []
+        if not any(run.folder in judged.runs for run in first.runs):
+            study.notes.append(f"{judged.name}: the baseline has none, so that nothing is compared with it")
+        each = by_condition(judged, made)
+        outcomes.append(Outcome(judged, table(judged, made), each, verdicts, sensitivities(judged, made)))
+    return Report(study, made, first, drawn, outcomes, plain)

@@ -1,0 +1,169 @@
+"""Which quantities go with a figure: rank correlation with its test, and the importance of each beside the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+RESAMPLES = 9_999
+"""Permutations of a test; where there are fewer, all of them."""
+
+FOLDS = 5
+"""Parts of the data, each of which is predicted from the others."""
+
+SHUFFLES = 20
+"""Times that a quantity is shuffled."""
+
+LARGE = 500
+"""More values than these are tested by Student's approximation, which then agrees with the permutations."""
+
+
+@dataclass(frozen=True)
+class Association:
+    """How one quantity goes with a figure.
+
+    Attributes:
+        name: of the quantity.
+        spearman: rank correlation; NaN for quantities that are not numbers.
+        p: of it, or of the differences between the values of a quantity that is no number; two-sided, by permutation.
+        importance: share of the figure's variance that it explains; 0 or less is none.
+        n: values.
+    """
+
+    name: str
+    spearman: float
+    p: float
+    importance: float
+    n: int
+
+
+def spearman(x: ArrayLike, y: ArrayLike, seed: int = 0) -> tuple[float, float]:
+    """Return the rank correlation of x (n,) with y (n,), and its two-sided p by permutation; NaN where undefined."""
+    from scipy import stats
+
+    a, b = stats.rankdata(x), stats.rankdata(y)
+    if len(a) < 3 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return math.nan, math.nan
+    if len(a) > LARGE:
+        done = stats.spearmanr(a, b)
+        return float(done.statistic), float(done.pvalue)
+    centred = (b - b.mean()) / (len(b) * b.std())
+
+    def statistic(drawn: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
+        scaled = (drawn - drawn.mean(axis=axis, keepdims=True)) / a.std()
+        return np.asarray((scaled * centred).sum(axis=axis))
+
+    test = stats.permutation_test(
+        (a,), statistic, permutation_type="pairings", vectorized=True, n_resamples=RESAMPLES, rng=seed
+    )
+    return float(test.statistic), float(test.pvalue)
+
+
+def explained_by_names(names: ArrayLike, y: ArrayLike, seed: int = 0) -> float:
+    """Return the p that y (n,) has nothing to do with names (n,): the variance between names, by permutation."""
+    from scipy import stats
+
+    values = stats.rankdata(y)
+    labels, which = np.unique(np.asarray(names, dtype=str), return_inverse=True)
+    if len(labels) < 2 or len(labels) == len(values) or np.ptp(values) == 0.0:
+        return math.nan
+    counts = np.bincount(which)
+    member = np.eye(len(labels))[which]  # (n, names)
+
+    def between(drawn: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
+        means = np.moveaxis(drawn, axis, -1) @ member / counts
+        return np.asarray((counts * means**2).sum(-1))
+
+    test = stats.permutation_test(
+        (values,),
+        between,
+        permutation_type="pairings",
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        rng=seed,
+        alternative="greater",
+    )
+    return float(test.pvalue)
+
+
+def associations(quantities: Mapping[str, ArrayLike], figure: ArrayLike, seed: int = 0) -> list[Association]:
+    """Return how each of several quantities (n,) goes with a figure (n,), the most important first.
+
+    Rows in which anything is not finite are left out, and quantities that do not vary. The importance is that of a
+    linear model of ranks (names: one column each), by cross-validation: what it cannot see are effects that are not
+    monotone, and those of two quantities together.
+    """
+    y = np.asarray(figure, dtype=np.float64)
+    kept = np.isfinite(y)
+    columns: dict[str, NDArray[Any]] = {name: np.asarray(values) for name, values in quantities.items()}
+    for values in columns.values():
+        if values.dtype.kind in "fiub":
+            kept &= np.isfinite(values.astype(np.float64))
+    y = y[kept]
+    columns = {name: values[kept] for name, values in columns.items() if len(np.unique(values[kept])) > 1}
+    importance = permutation_importance(columns, y, seed)
+    entries = []
+    for name, values in columns.items():
+        if values.dtype.kind in "fiub":
+            rho, p = spearman(values.astype(np.float64), y, seed)
+        else:
+            rho, p = math.nan, explained_by_names(values, y, seed)
+        entries.append(Association(name, rho, p, importance[name], len(y)))
+    return sorted(entries, key=lambda e: -e.importance if math.isfinite(e.importance) else math.inf)
+
+
+def permutation_importance(
+    columns: Mapping[str, NDArray[Any]], y: NDArray[np.float64], seed: int = 0
+) -> dict[str, float]:
+    """Return, by quantity, the share of y's rank variance that it explains; NaN with few rows.
+
+    Each row is predicted from the other folds; shuffling a quantity raises the mean square error by twice the share
+    that is its own (Breiman 2001, with a linear model in place of a forest).
+    """
+    from scipy import stats
+
+    n = len(y)
+    blocks = {name: _features(values) for name, values in columns.items()}
+    width = sum(block.shape[1] for block in blocks.values())
+    if n < max(2 * FOLDS, 2 * (width + 1)) or np.ptp(y) == 0.0:
+        return dict.fromkeys(columns, math.nan)
+    ranks = stats.rankdata(y)
+    target = (ranks - ranks.mean()) / ranks.std()
+    rng = np.random.default_rng(seed)
+    fold = rng.permutation(np.arange(n) % FOLDS)
+    design = np.column_stack([np.ones(n), *blocks.values()])
+    weights = [np.linalg.lstsq(design[fold != k], target[fold != k], rcond=None)[0] for k in range(FOLDS)]
+
+    def error(matrix: NDArray[np.float64]) -> float:
+        predicted = np.empty(n)
+        for k in range(FOLDS):
+            predicted[fold == k] = matrix[fold == k] @ weights[k]
+        return float(((target - predicted) ** 2).mean())
+
+    usual, first, importance = error(design), 1, {}
+    for name, block in blocks.items():
+        columns_of = slice(first, first + block.shape[1])
+        first += block.shape[1]
+        losses = []
+        for _ in range(SHUFFLES):
+            shuffled = design.copy()
+            shuffled[:, columns_of] = block[rng.permutation(n)]
+            losses.append(error(shuffled))
+        importance[name] = 0.5 * (float(np.mean(losses)) - usual)
+    return importance
+
+
+def _features(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the columns of a quantity: its ranks, or one for each name but the first."""
+    from scipy import stats
+
+    if values.dtype.kind in "fiub":
+        ranks = stats.rankdata(values)
+        return np.asarray((ranks - ranks.mean()) / ranks.std())[:, None]
+    labels, which = np.unique(values.astype(str), return_inverse=True)
+    return np.asarray(np.eye(len(labels))[which][:, 1:])

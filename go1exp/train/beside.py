@@ -1,0 +1,186 @@
+"""Evaluates and films policies while training goes on: another process, on the CPU engine, of the lowest priority.
+
+The process is ``python -m go1exp.evaluate.beside RUN``; jobs and results are lines of JSON. Training never waits for
+it but at its end. What it finds goes to ``evals.csv``, to the loggers, and the best policy to ``best.pt``.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import math
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from go1exp.config import TrainConfig
+from go1exp.files import opened, write_bytes, write_json, write_text
+from go1exp.train.checkpoint import FORMAT, SUFFIX
+from go1exp.train.ppo import AdaptivePPO
+
+FOLDER, ROWS, BEST, FILMS = "evals", "evals.csv", "best.pt", "videos"
+"""In the run folder: policies that wait to be evaluated, what came of them, the best one, films."""
+
+WAITING = 3
+"""Jobs that may wait; a policy that would be the next one is not evaluated."""
+
+PATIENCE = 600.0
+"""Longest time to wait for results at the end of a training, s."""
+
+MODULE = "go1exp.evaluate.beside"
+
+
+class Beside:
+    """The other process, begun with the first job; with ``eval.every`` and ``video.every`` 0 there never is one.
+
+    Args:
+        config: of the training.
+        run: its folder.
+        iteration: that training continues from: rows of later ones are dropped.
+        on_film: called with the iteration's steps and the file of each film.
+    """
+
+    def __init__(
+        self, config: TrainConfig, run: Path, iteration: int, on_film: Callable[[int, Path], None] | None = None
+    ) -> None:
+        self._config, self._run, self._on_film = config, run, on_film
+        self._process: subprocess.Popen[str] | None = None
+        self._results: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        self._waiting, self.skipped, self.problems = 0, 0, list[str]()
+        self._rows = [row for row in _rows(run / ROWS) if row["iteration"] <= iteration]
+        if self._rows or (run / ROWS).is_file():
+            self._write_rows()
+
+    def offer(self, ppo: AdaptivePPO, last: bool) -> None:
+        """Have the policy evaluated and filmed if it is its turn, or the ``last``; returns at once."""
+        turns = {"evaluate": self._config.eval.every, "film": self._config.video.every}
+        for kind, every in turns.items():
+            if every and (last or ppo.iteration % every == 0):
+                if self._waiting >= WAITING and not last:
+                    self.skipped += 1
+                    continue
+                self._send(kind, ppo)
+
+    def _send(self, kind: str, ppo: AdaptivePPO) -> None:
+        file = self._run / FOLDER / f"{ppo.iteration:06d}{SUFFIX}"
+        if not file.is_file():
+            file.parent.mkdir(exist_ok=True)
+            state = {"format": FORMAT, "iteration": ppo.iteration, "num_timesteps": ppo.num_timesteps}
+            with opened(file) as written:
+                torch.save({**state, "policy": ppo.policy.state_dict()}, written)
+        section = self._config.eval if kind == "evaluate" else self._config.video
+        job: dict[str, Any] = {"kind": kind, "policy": str(file), "settings": dataclasses.asdict(section)}
+        job |= {"iteration": ppo.iteration, "steps": ppo.num_timesteps}
+        if kind == "film":
+            job["out"] = str(self._run / FILMS / f"{ppo.iteration:06d}.mp4")
+        try:
+            process = self._process or self._begin()
+            assert process.stdin is not None
+            process.stdin.write(json.dumps(job) + "\n")
+            process.stdin.flush()
+            self._waiting += 1
+        except OSError as error:
+            self.problems.append(f"evaluation beside the training has ended ({error.strerror})")
+
+    def _begin(self) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", MODULE, str(self._run)]
+        threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        # A session of its own: Ctrl-C is for the training, which then ends this process.
+        environment = {**os.environ, **threads, "CUDA_VISIBLE_DEVICES": ""}
+        self._process = subprocess.Popen(command, text=True, start_new_session=True, env=environment, **pipes)
+        self._listener = threading.Thread(target=self._listen, args=(self._process,), daemon=True)
+        self._listener.start()
+        return self._process
+
+    def _listen(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        with process.stdout:
+            for line in process.stdout:
+                if line.endswith("\n"):  # or it was killed while it wrote
+                    self._results.put(json.loads(line))
+        self._results.put(None)
+
+    def collect(self) -> dict[str, float]:
+        """Return the figures of the newest evaluation that has come since the last call; does not wait."""
+        figures: dict[str, float] = {}
+        while True:
+            try:
+                result = self._results.get_nowait()
+            except queue.Empty:
+                return figures
+            figures = self._take(result) or figures
+
+    def finish(self, wait: bool) -> dict[str, float]:
+        """End the process, after the jobs that wait if ``wait``; return the figures that came."""
+        figures: dict[str, float] = {}
+        if self._process is None:
+            return figures
+        assert self._process.stdin is not None
+        if wait and self._waiting:
+            print(f"waiting for {self._waiting} evaluations and films beside the training", flush=True)
+        try:
+            self._process.stdin.close()
+            while wait and self._waiting:
+                result = self._results.get(timeout=PATIENCE)
+                figures = self._take(result) or figures
+                if result is None:
+                    break
+        except (OSError, queue.Empty):
+            self.problems.append(f"{self._waiting} evaluations and films did not come")
+        self._process.kill()
+        self._process.wait()
+        self._listener.join()
+        return figures
+
+    def _take(self, result: dict[str, Any] | None) -> dict[str, float]:
+        """Keep a result; return the figures of an evaluation."""
+        if result is None:
+            if self._waiting:
+                self.problems.append("the process of evaluations and films has ended early")
+                self._waiting = 0
+            return {}
+        self._waiting -= 1
+        if problem := result.get("problem"):
+            if problem not in self.problems:
+                self.problems.append(problem)
+            return {}
+        if result["kind"] == "film":
+            if self._on_film:
+                self._on_film(result["steps"], Path(result["out"]))
+            return {}
+        row = {"iteration": result["iteration"], "steps": result["steps"], **result["figures"]}
+        better = all(not row["score"] >= old["score"] for old in self._rows) and math.isfinite(row["score"])
+        self._rows.append(row)
+        self._write_rows()
+        file = Path(result["policy"])
+        if better:
+            write_bytes(self._run / BEST, file.read_bytes())
+            write_json(self._run / "best.json", row)
+        return {f"eval/{key}": float(value) for key, value in row.items() if key != "steps"}
+
+    def _write_rows(self) -> None:
+        text = io.StringIO(newline="")
+        if self._rows:
+            writer = csv.DictWriter(text, list(self._rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(self._rows)
+        write_text(self._run / ROWS, text.getvalue())
+
+
+def _rows(file: Path) -> list[dict[str, float]]:
+    """Return the rows of earlier evaluations, those that are whole."""
+    if not file.is_file():
+        return []
+    with file.open(newline="") as text:
+        rows = [row for row in csv.DictReader(text) if None not in row.values()]
+    return [{k: int(v) if k in ("iteration", "steps") else float(v) for k, v in row.items()} for row in rows]

@@ -1,0 +1,188 @@
+"""What goes on beside a training: evaluation with the best policy kept, films, and rules that end it early."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from go1exp.cli.train import _refuse_other
+from go1exp.compose import compose
+from go1exp.config import parse_train
+from go1exp.evaluate.beside import answered, score
+from go1exp.schema.beside import StopRule
+from go1exp.schema.registry import ConfigError
+from go1exp.train import checkpoint, early_stop, run_folder, trainer
+from go1exp.train.beside import Beside
+from go1exp.train.early_stop import EarlyStop
+from tests.small_run import SMALL
+
+BRIEF = ("eval.x=[0.5]", "eval.y=[]", "eval.yaw=[]", "eval.episodes=2", "eval.duration_s=0.4", "eval.settle_s=0.2")
+
+
+def train(run: Path, *overrides: str) -> trainer.AdaptivePPO:
+    container = compose("train", [*SMALL, *overrides])
+    run_folder.write(run, container)
+    return trainer.train(parse_train(container), container, run)
+
+
+def rows(file: Path) -> list[dict[str, float]]:
+    return [{k: float(v) for k, v in r.items()} for r in csv.DictReader(file.read_text().splitlines())]
+
+
+# ---------------------------------------------------------------------- evaluation and films
+
+
+def test_a_job_gives_the_figures_of_its_policy(tmp_path: Path) -> None:
+    train(tmp_path, "checkpoint.every=1")
+    settings = dataclasses.asdict(parse_train(compose("train", [*SMALL, *BRIEF])).eval)
+    job = {"kind": "evaluate", "iteration": 1, "steps": 16, "policy": str(tmp_path / "checkpoints/000001.pt")}
+    result = answered(tmp_path, {**job, "settings": settings})
+    assert set(result["figures"]) == {"score", "error_xy", "error_yaw", "fall_share"}
+    assert 0.0 < result["figures"]["error_xy"] <= result["figures"]["score"] < 2.0
+    lost = answered(tmp_path, {**job, "policy": "none.pt", "settings": settings})
+    assert lost["problem"].startswith("evaluate beside the training failed: FileNotFoundError")
+
+
+def test_the_best_policy_is_that_of_the_lowest_score(tmp_path: Path) -> None:
+    beside = Beside(parse_train(compose("train", [*SMALL, "eval.every=1"])), tmp_path, 0)
+    for iteration, value in ((1, 0.5), (2, 0.3), (3, 0.4)):
+        file = tmp_path / f"{iteration}.pt"
+        file.write_bytes(bytes([iteration]))
+        result = {"kind": "evaluate", "iteration": iteration, "steps": 16 * iteration, "policy": str(file)}
+        figures = beside._take({**result, "figures": {"score": value, "fall_share": 0.0}})
+        assert figures == {"eval/iteration": iteration, "eval/score": value, "eval/fall_share": 0.0}
+    assert (tmp_path / "best.pt").read_bytes() == bytes([2])
+    assert json.loads((tmp_path / "best.json").read_text())["iteration"] == 2
+    assert [r["score"] for r in rows(tmp_path / "evals.csv")] == [0.5, 0.3, 0.4]
+
+
+@pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
+def test_policies_are_evaluated_beside_and_the_best_is_kept(tmp_path: Path) -> None:
+    plain = train(tmp_path / "plain", "ppo.iterations=4")
+    beside = train(tmp_path / "run", "ppo.iterations=4", "eval.every=2", *BRIEF)
+    table = rows(tmp_path / "run/evals.csv")
+    assert [(r["iteration"], r["steps"]) for r in table] == [(2, 32), (4, 64)]
+    best = min(table, key=lambda r: r["score"])
+    assert json.loads((tmp_path / "run/best.json").read_text()) == best
+    kept = checkpoint.read(tmp_path / "run/best.pt")
+    assert kept["iteration"] == best["iteration"]
+    for name, value in plain.policy.state_dict().items():  # training knows nothing of it
+        assert torch.equal(value, beside.policy.state_dict()[name])
+    assert (tmp_path / "plain/metrics.csv").read_text() == (tmp_path / "run/metrics.csv").read_text()
+    from go1exp.evaluate.policy import load_run
+
+    assert load_run(tmp_path / "run", tmp_path / "run/best.pt")[2]["iteration"] == best["iteration"]
+
+
+def test_a_run_that_goes_on_drops_evaluations_of_later_iterations(tmp_path: Path) -> None:
+    config = parse_train(compose("train", [*SMALL, "eval.every=1"]))
+    head = "iteration,steps,score,error_xy,error_yaw,fall_share\n"
+    (tmp_path / "evals.csv").write_text(f"{head}1,16,0.5,0.5,0.5,0.0\n2,32,0.4,0.4,0.5,0.0\n3,48,0.3")
+    Beside(config, tmp_path, 1)
+    assert [r["iteration"] for r in rows(tmp_path / "evals.csv")] == [1]
+
+
+@pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
+def test_a_failure_beside_is_one_line_and_training_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    beside = Beside(parse_train(compose("train", [*SMALL, "eval.every=1"])), tmp_path, 0)
+    policy = SimpleNamespace(state_dict=dict)
+    beside.offer(SimpleNamespace(iteration=1, num_timesteps=16, policy=policy), last=False)  # type: ignore[arg-type]
+    assert beside.finish(wait=True) == {}
+    (problem,) = beside.problems
+    assert problem.startswith("evaluate beside the training failed: FileNotFoundError")
+    assert "not a run folder" in problem
+
+
+def test_nothing_is_started_where_nothing_is_asked_for(tmp_path: Path) -> None:
+    beside = Beside(parse_train(compose("train", [*SMALL])), tmp_path, 0)
+    beside.offer(SimpleNamespace(iteration=1, num_timesteps=16), last=True)  # type: ignore[arg-type]
+    assert beside.finish(wait=True) == {}
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
+def test_films_are_made_beside(tmp_path: Path) -> None:
+    train(tmp_path / "run", "ppo.iterations=2", "video.every=2", "video.seconds=0.4")
+    film = tmp_path / "run/videos/000002.mp4"
+    if film.is_file():  # a machine without any graphics has none, and says so
+        assert film.stat().st_size > 1000
+
+
+def test_time_on_the_ground_counts_as_the_whole_command() -> None:
+    def row(x: float, moving: float, error: float) -> dict[str, Any]:
+        return {"x": x, "y": 0.0, "moving_s": moving, "error_xy": error}
+
+    assert score([row(1.5, 8.0, 0.2)], 8.0) == pytest.approx(0.2)
+    assert score([row(1.5, 4.0, 0.0)], 8.0) == pytest.approx(1.5 / math.sqrt(2))
+    assert score([row(0.0, 0.0, 0.0)], 8.0) == pytest.approx(1.0)
+
+
+# ---------------------------------------------------------------------- early stop
+
+
+def test_a_training_ends_when_a_figure_is_good_enough_and_is_complete(tmp_path: Path) -> None:
+    ppo = train(tmp_path, "ppo.iterations=6", "stop.figure=steps_total", "stop.at=1.0")
+    assert ppo.iteration == 6  # no such metric: no rule
+    rule = ("ppo.iterations=6", "stop.figure=train/learning_rate", "stop.better=lower", "stop.at=1.0")
+    ppo = train(tmp_path / "early", *rule)
+    assert ppo.iteration == 1
+    assert [p.name for p in checkpoint.checkpoints(tmp_path / "early")] == ["000001.pt"]
+    config = parse_train(compose("train", [*SMALL, *rule]))
+    reason = early_stop.ended(tmp_path / "early", config.stop)
+    assert reason.startswith("stopped early after iteration 1: train/learning_rate = ")
+    assert early_stop.ended(tmp_path / "early", StopRule()) == ""
+
+
+def test_patience_counts_from_the_best_and_goes_on_after_a_pause(tmp_path: Path) -> None:
+    rule = StopRule(figure="r", patience=3, least=0.5)
+    values = [1.0, 2.0, 2.4, 2.3, 2.2, 9.0]
+    stop = EarlyStop(rule, tmp_path, 0)
+    reasons = [stop.reason(k, {"r": v}) for k, v in enumerate(values, 1)]
+    assert [bool(r) for r in reasons] == [False, False, False, False, True, False]
+    assert reasons[4] == "r is no better than 2 since iteration 2"
+    table = "\n".join(["iteration,steps,r", *(f"{k},{k},{v}" for k, v in enumerate(values, 1)), ""])
+    (tmp_path / "metrics.csv").write_text(table)
+    resumed = EarlyStop(rule, tmp_path, 4)
+    assert resumed.reason(5, {"r": 2.2}) == reasons[4]
+
+
+def test_a_rule_needs_a_figure_and_a_limit() -> None:
+    with pytest.raises(ConfigError, match="figure = None: at and patience need one"):
+        parse_train(compose("train", ["stop.at=1.0"]))
+    with pytest.raises(ConfigError, match="needs at or patience"):
+        parse_train(compose("train", ["stop.figure=rollout/return"]))
+
+
+def test_runs_of_older_versions_have_none_of_it_and_may_get_it(tmp_path: Path) -> None:
+    old = compose("train", [*SMALL])
+    for key in ("eval", "video", "stop"):
+        del old[key]
+    assert parse_train(old).eval.every == 0
+    run_folder.write(tmp_path, old)
+    _refuse_other(tmp_path, compose("train", [*SMALL, "eval.every=5"]))
+
+
+# ---------------------------------------------------------------------- what a run folder says
+
+
+def test_the_run_folder_has_all_versions_and_what_was_not_committed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def git(*arguments: str) -> str:
+        return {"rev-parse": "abc", "status": " M file", "diff": "-old\n+new"}[arguments[0]]
+
+    monkeypatch.setattr(run_folder, "_git", git)
+    run_folder.write(tmp_path, compose("train", [*SMALL]))
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    assert meta["installed"]["torch"] == meta["packages"]["torch"]
+    assert {"mujoco-warp", "warp-lang"} <= set(meta["packages"])
+    assert len(meta["installed"]) > 20
+    assert (tmp_path / "git.diff").read_text() == "-old\n+new\n"

@@ -1,0 +1,456 @@
+"""``go1exp report``: groups, curves, verdicts and pages of studies whose truth is known; bad input in one line each."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+import go1exp.protocol.kinds  # noqa: F401  (registers them)
+from go1exp.cli.report import _task
+from go1exp.compose import compose
+from go1exp.evaluate.files import write as write_evaluation
+from go1exp.evaluate.rows import rows_of
+from go1exp.report import curves
+from go1exp.report.groups import baseline, groups
+from go1exp.report.made import Report, report
+from go1exp.report.runs import study
+from go1exp.report.settings import ReportSettings
+from go1exp.report.tables import tables
+from go1exp.report.writing import page, write
+from go1exp.schema.registry import ConfigError
+from go1exp.schema.settings import parse
+
+CONFIG: dict[str, Any] = {
+    "seed": 0,
+    "reward": {"gait": {"weight": 10.0}, "foot_slip": {"weight": -0.05}},
+    "ppo": {"num_envs": 4, "iterations": 40},
+    "logger": {"csv": True},
+}
+
+COMMANDS = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+ROBOTS = 8
+
+
+def metrics(folder: Path, rows: int, level: float, steps: int = 1000, rate: float = 500.0) -> None:
+    """Write metrics that rise to ``level`` in a straight line, and the time that they took."""
+    lines = [f"{k},{k * steps},{level * k / rows!r}" for k in range(1, rows + 1)]
+    (folder / "metrics.csv").write_text("\n".join(["iteration,steps,rollout/return", *lines, ""]))
+    lines = [f"{k},{k * steps},{rate!r}" for k in range(1, rows + 1)]
+    (folder / "timing.csv").write_text("\n".join(["iteration,steps,time/steps_per_s", *lines, ""]))
+
+
+def evaluation(folder: Path, level: float, falls: float, seed: int = 1, generator: int = 0) -> None:
+    """Write an evaluation whose errors grow as friction falls; robots fall with that probability."""
+    rng = np.random.default_rng([generator, int(level * 1e6) % 2**31])
+    commands = np.repeat(np.array(COMMANDS), ROBOTS, axis=0)
+    friction = np.random.default_rng(seed).uniform(0.4, 1.1, len(commands))
+    errors = level * np.exp(-friction)[:, None] * np.ones(3) + 0.002 * rng.normal(size=(len(commands), 3))
+    fell = rng.random(len(commands)) < falls
+    draws = {"friction": friction, "mass": np.random.default_rng(seed + 1).uniform(11.0, 14.0, len(commands))}
+    rows = rows_of(commands, ROBOTS, errors, fell, np.full(len(commands), 8.0), draws, {})
+    settings = {"episodes": ROBOTS, "noise": True, "randomize": True, "seed": seed}
+    about = {"settings": settings, "robot": {}, "commands": [{"command": c} for c in COMMANDS]}
+    write_evaluation({**about, "rows": rows}, folder / "eval.json")
+
+
+def run(folder: Path, seed: int, weight: float = 10.0, rows: int = 20, **changes: Any) -> Path:
+    """Write a finished run; ``changes``: state, level (of errors), falls, evaluated."""
+    folder.mkdir(parents=True)
+    config = {**CONFIG, "seed": seed, "reward": {**CONFIG["reward"], "gait": {"weight": weight}}}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    state, cause = changes.get("state", "done"), changes.get("cause", "")
+    (folder / "state.json").write_text(json.dumps({"state": state, "cause": cause}))
+    metrics(folder, rows, 10.0 + weight + 0.1 * seed)
+    if changes.get("evaluated", True):
+        level = changes.get("level", 0.3) + 0.01 * np.random.default_rng([seed, int(weight)]).normal()
+        evaluation(folder, level, changes.get("falls", 0.1), generator=seed)
+    return folder
+
+
+def settings(*folders: Path, **changes: Any) -> ReportSettings:
+    container = compose("report", [f"folders=[{','.join(map(str, folders))}]"])
+    return parse(ReportSettings, {**container, **changes})
+
+
+def made(*folders: Path, **changes: Any) -> Report:
+    wanted = settings(*folders, **changes)
+    return report(study(wanted.folders, wanted.unfinished), wanted, {"folders": [str(f) for f in folders]})
+
+
+@pytest.fixture(scope="module")
+def two_groups(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two groups of six runs: without the gait reward errors are larger, and falls as many."""
+    folder = tmp_path_factory.mktemp("study") / "sweep"
+    for seed in range(6):
+        run(folder / f"with{seed}", seed, 10.0)
+        run(folder / f"without{seed}", seed, 0.0, level=0.5)
+    return folder
+
+
+def table(file: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(file.read_text().splitlines()))
+
+
+# ---------------------------------------------------------------------- groups
+
+
+def test_groups_are_configurations_without_the_seed_named_by_what_differs(two_groups: Path) -> None:
+    got = made(two_groups)
+    assert [g.name for g in got.groups] == ["reward.gait.weight=0.0", "reward.gait.weight=10.0"]
+    assert [[r.seed for r in g.runs] for g in got.groups] == [list(range(6))] * 2
+    assert got.groups[0].settings == {"reward.gait.weight": 0.0}
+    assert "returns are of different rewards" in got.study.notes
+
+
+def test_a_term_that_a_group_lacks_is_named_once(tmp_path: Path) -> None:
+    run(tmp_path / "a", 0)
+    run(tmp_path / "b", 0)
+    config = yaml.safe_load((tmp_path / "b/config.yaml").read_text())
+    del config["reward"]["gait"]
+    (tmp_path / "b/config.yaml").write_text(yaml.safe_dump(config))
+    assert {g.name for g in made(tmp_path).groups} == {"reward.gait.weight=10.0", "no reward.gait"}
+
+
+def test_the_baseline_is_named_by_name_part_or_settings(two_groups: Path) -> None:
+    those = groups(study([str(two_groups)], False))
+    for wanted in ("reward.gait.weight=0.0", "weight=0.0", "reward.gait.weight=0.0, reward.gait.weight=0.0"):
+        assert baseline(those, wanted).settings == {"reward.gait.weight": 0.0}
+    with pytest.raises(ConfigError, match=r"2 groups of 'reward.gait.weight=0.0', 'reward.gait.weight=10.0'"):
+        baseline(those, "gait")
+    with pytest.raises(ConfigError, match="no group of"):
+        baseline(those, "feet")
+
+
+def test_a_sweep_names_jobs_lists_those_that_wait_and_says_why_others_failed(tmp_path: Path) -> None:
+    run(tmp_path / "one", 0)
+    run(tmp_path / "two", 1, state="failed", cause="No space left on device: metrics.csv", evaluated=False)
+    jobs = [
+        {
+            "number": k,
+            "name": f"seed={k}",
+            "overrides": [f"seed={k}"],
+            "state": state,
+            "run_folder": folder,
+            "cause": "",
+        }
+        for k, (folder, state) in enumerate((("one", "done"), ("two", "failed"), ("three", "waiting")))
+    ]
+    (tmp_path / "sweep.json").write_text(json.dumps({"jobs": jobs}))
+    got = study([str(tmp_path)], False)
+    assert [(r.label, r.job) for r in got.runs] == [("one", "seed=0")]
+    assert {(a.label, a.state, a.cause) for a in got.absent} == {
+        ("two", "failed", "No space left on device: metrics.csv"),
+        ("seed=2", "waiting", "has no run folder yet"),
+    }
+    assert [r.label for r in study([str(tmp_path)], True).runs] == ["one", "two"]
+
+
+# ---------------------------------------------------------------------- curves
+
+
+def test_a_curve_ends_where_the_first_run_of_its_group_does(tmp_path: Path) -> None:
+    run(tmp_path / "long", 0, rows=40)
+    run(tmp_path / "short", 1, rows=20)
+    got = made(tmp_path)
+    steps, hours = ([c for c in got.curves if c.axis == axis] for axis in ("steps", "hours"))
+    assert (steps[0].x[0], steps[0].x[-1]) == pytest.approx((0.001, 0.020))
+    assert steps[0].last == pytest.approx([20.0 * 20 / 40, 20.1])
+    assert steps[0].middle[-1] == pytest.approx((10.0 + 20.1) / 2)
+    assert hours[0].x[-1] == pytest.approx(20 * 1000 / 500 / 3600)
+
+
+def test_half_written_and_repeated_rows_are_left_out_and_said(tmp_path: Path) -> None:
+    folder = run(tmp_path / "a", 0)
+    file = folder / "metrics.csv"
+    whole, _ = curves.read(folder, ["rollout/return"])
+    file.write_text(file.read_text() + "21,21000,7")
+    cut, remark = curves.read(folder, ["rollout/return"])
+    assert remark == f"{file}: has rows that are not whole; they are left out"
+    assert cut.columns["rollout/return"].tolist() == whole.columns["rollout/return"].tolist()
+    file.write_text(file.read_text() + "\n20,20000,9.0\n22,22000\n23,23000,8.0\n")
+    again, remark = curves.read(folder, ["rollout/return"])
+    assert again.columns["iteration"].tolist() == [*range(1, 22), 23]
+    assert "not whole" in remark
+    file.write_text("")
+    assert curves.read(folder, ["rollout/return"])[1] == f"{file}: holds no whole row"
+
+
+def test_a_metric_that_runs_lack_is_said(two_groups: Path) -> None:
+    got = made(two_groups, curves=("rollout/return", "train/kl"))
+    assert {c.metric for c in got.curves} == {"rollout/return"}
+    (note,) = [n for n in got.study.notes if "train/kl" in n]
+    assert re.match(
+        r"train/kl: is not in the metrics of with\w+ and 11 more runs; it has iteration, steps,",
+        note.replace("without", "with"),
+    )
+
+
+# ---------------------------------------------------------------------- evaluations
+
+
+def test_a_worse_group_is_told_and_one_alike_is_not(two_groups: Path) -> None:
+    got = made(two_groups, baseline="weight=10.0")
+    (outcome,) = got.outcomes
+    words = {v.column.name: v.word for v in outcome.verdicts}
+    assert words == {"error_xy": "worse", "error_yaw": "worse", "fell": "not told apart"}
+    told = next(v for v in outcome.verdicts if v.column.name == "error_yaw")
+    assert told.difference.p == pytest.approx(2 / math.comb(12, 6))
+    assert told.adjusted_p == pytest.approx(3 * 2 / math.comb(12, 6))
+    assert told.difference.estimate.low > 0.0
+    assert told.difference.improvement == 1.0
+    assert told.needed is None
+    assert not told.hopeless
+
+
+def test_figures_are_means_of_runs_and_shares_have_three_intervals(two_groups: Path) -> None:
+    (outcome,) = made(two_groups).outcomes
+    fell = next(f for f in outcome.figures if f.column.name == "fell" and f.group.endswith("=10.0"))
+    assert fell.robots is not None
+    assert fell.bootstrap is not None
+    assert (fell.runs.n, fell.robots.n, len(fell.values)) == (6, 6 * 24, 6)
+    assert fell.runs.estimate == pytest.approx(fell.values.mean()) == pytest.approx(fell.robots.estimate)
+    error = next(f for f in outcome.figures if f.column.name == "error_yaw" and f.group.endswith("=10.0"))
+    first = table_of_run(two_groups / "with0")
+    assert error.values[0] == pytest.approx(np.mean(first["error_yaw"]))
+    of_one = [f for f in outcome.by_condition if f.column.name == "error_yaw" and f.group == error.group]
+    assert [dict(f.condition) for f in of_one] == [dict(zip(["x", "y", "yaw"], c, strict=True)) for c in COMMANDS]
+    assert np.mean([f.values[0] for f in of_one]) == pytest.approx(error.values[0])
+
+
+def table_of_run(folder: Path) -> dict[str, list[float]]:
+    import pyarrow.parquet as pq
+
+    columns: dict[str, list[float]] = pq.read_table(folder / "eval.parquet").to_pydict()
+    return columns
+
+
+def test_what_was_drawn_and_what_was_swept_go_with_the_error(two_groups: Path) -> None:
+    (outcome,) = made(two_groups).outcomes
+    by_name = {(e.association.name, e.column.name): e for e in outcome.sensitivities}
+    friction = by_name["friction", "error_yaw"]
+    assert friction.association.spearman < -0.9
+    assert friction.association.n == len(COMMANDS) * ROBOTS  # the same robots for all runs: one observation each
+    assert friction.adjusted_p < 0.01
+    assert by_name["mass", "error_yaw"].adjusted_p > 0.05
+    swept = by_name["reward.gait.weight", "error_yaw"]
+    assert (swept.source, swept.association.n) == ("setting", 12)
+    assert swept.adjusted_p < 0.01
+
+
+def test_few_runs_are_said_to_be_unable_to_tell(tmp_path: Path) -> None:
+    for seed in range(3):
+        run(tmp_path / f"a{seed}", seed)
+        run(tmp_path / f"b{seed}", seed, 0.0, level=3.0)
+    got = made(tmp_path)
+    assert all(v.hopeless and v.word == "not told apart" for v in got.outcomes[0].verdicts)
+    assert "5 runs in each group could tell" in tables(got)[0]["note"]
+    plain = made(tmp_path, correction="none", paired=True)
+    assert all(v.difference.least_p == 2 / 8 for v in plain.outcomes[0].verdicts)
+
+
+def test_pairs_are_runs_of_one_seed(two_groups: Path) -> None:
+    (outcome,) = made(two_groups, paired=True, correction="none").outcomes
+    verdict = next(v for v in outcome.verdicts if v.column.name == "error_yaw")
+    assert verdict.difference.p == pytest.approx(2 / 2**6)
+
+
+def test_a_protocols_rows_are_compared_by_its_claims(tmp_path: Path) -> None:
+    from go1exp.protocol.result import write_rows
+
+    protocol = compose("eval", ["protocol=kicks"])["protocol"]["kicks"]
+    for seed in range(6):
+        for group, level in ((10.0, 1.0), (0.0, 2.0)):
+            folder = run(tmp_path / f"g{group:.0f}s{seed}", seed, group, evaluated=False) / "protocols"
+            folder.mkdir()
+            rng = np.random.default_rng([seed, int(group)])
+            rows = [
+                {"impulse": impulse, "robot": n, "fell": False, "left_map": False, "moving_s": 4.0, "fingerprint": n}
+                | {"recovered": True, "recovery_s": level + 0.1 * rng.random()}
+                for impulse in protocol["impulses"]
+                for n in range(4)
+            ]
+            write_rows(folder / "kicks.parquet", rows, {})
+            about = {"kind": "kicks", "settings": protocol, "rates": {"seed": 1}, "robot": {}}
+            (folder / "kicks.json").write_text(json.dumps(about))
+    (outcome,) = made(tmp_path, figures=("recovery_s",), baseline="weight=0.0").outcomes
+    assert outcome.judged.name == "kicks"
+    assert [(v.column.name, v.word) for v in outcome.verdicts] == [("recovery_s", "better")]
+
+
+# ---------------------------------------------------------------------- bad input
+
+
+def test_folders_without_runs_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for folder, words in (
+        (tmp_path / "none", "there is no such folder"),
+        (tmp_path / "empty", "there is no run in it"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            study([str(folder)], False)
+    run(tmp_path / "late", 0, state="failed", cause="was killed")
+    with pytest.raises(ConfigError, match=r"none of the 1 runs in them counts: late: failed \(was killed\)"):
+        study([str(tmp_path / "late")], False)
+
+
+def test_a_run_without_evaluation_and_one_evaluated_otherwise_are_named(tmp_path: Path) -> None:
+    for seed in range(3):
+        run(tmp_path / f"a{seed}", seed)
+    run(tmp_path / "bare", 3, evaluated=False)
+    evaluation(run(tmp_path / "other", 4, evaluated=False), 0.3, 0.1, seed=2)
+    old = run(tmp_path / "old", 5, evaluated=False)
+    (old / "eval.json").write_text("{}")
+    notes = made(tmp_path).study.notes
+    assert "grid: other left out, evaluated with other settings (seed) than most" in notes
+    assert "old: eval.json without eval.parquet, of an older version; eval=true makes both" in notes
+    assert any(n.startswith("grid: no evaluation of 2 runs (bare, old)") for n in notes)
+
+
+def test_damaged_rows_are_named_and_the_others_stay(tmp_path: Path) -> None:
+    for seed in range(2):
+        run(tmp_path / f"a{seed}", seed)
+    (tmp_path / "a1/eval.parquet").write_bytes(b"half")
+    got = made(tmp_path)
+    assert any("a1/eval.json: cannot be read" in n for n in got.study.notes)
+    assert list(got.outcomes[0].judged.runs) == [(tmp_path / "a0").resolve()]
+
+
+def test_two_sweeps_of_one_name_keep_their_runs_apart_and_count_each_seed_once(tmp_path: Path) -> None:
+    for place in ("monday", "tuesday"):
+        for seed in range(2):
+            run(tmp_path / place / "sweep" / f"s{seed}", seed + (place == "tuesday"))
+    got = made(tmp_path / "monday/sweep", tmp_path / "tuesday/sweep")
+    assert [r.label for r in got.groups[0].runs] == ["monday/sweep/s0", "monday/sweep/s1", "tuesday/sweep/s1"]
+    (twice,) = got.study.absent
+    assert twice.label == "tuesday/sweep/s0"
+    assert "has the settings and the seed 1 of monday/sweep/s1; each seed counts once" in twice.cause
+    again = made(tmp_path / "monday", tmp_path / "monday/sweep")
+    assert len(again.groups[0].runs) == 2
+
+
+def test_a_figure_that_is_not_there_is_refused_with_the_nearest(two_groups: Path) -> None:
+    with pytest.raises(ConfigError, match=r"figures.*error_yow.*did you mean 'error_yaw'"):
+        made(two_groups, figures=("error_yow",))
+
+
+def test_runs_of_other_tasks_are_said(tmp_path: Path) -> None:
+    run(tmp_path / "a", 0)
+    run(tmp_path / "b", 0)
+    config = yaml.safe_load((tmp_path / "b/config.yaml").read_text())
+    (tmp_path / "b/config.yaml").write_text(yaml.safe_dump({**config, "command": {"term": "fixed_velocity"}}))
+    (note,) = [n for n in made(tmp_path).study.notes if "tasks" in n]
+    assert note == "training commands differ, so that returns and lengths are of different tasks"
+
+
+# ---------------------------------------------------------------------- files
+
+
+def test_the_command_writes_page_json_and_tables(
+    two_groups: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    container = compose("report", [f"folders=[{two_groups}]", f"folder={tmp_path}", "baseline='weight=10.0'"])
+    _task(container)
+    out = capsys.readouterr().out
+    assert "12 runs in 2 groups; baseline: reward.gait.weight=10.0" in out
+    assert re.search(r"worse +reward.gait.weight=0.0: error_yaw", out)
+    comparison = table(tmp_path / "grid_comparison.csv")
+    assert [r["verdict"] for r in comparison] == ["worse", "worse", "not told apart"]
+    assert {p.name for p in tmp_path.iterdir()} == {
+        *("report.html", "report.json", "runs.csv", "curves.csv", "grid_figures.csv", "grid_runs.csv"),
+        *("grid_comparison.csv", "grid_sensitivity.csv"),
+    }
+    assert len(table(tmp_path / "runs.csv")) == 12
+    assert len(table(tmp_path / "curves.csv")) == 2 * 2 * 200
+    content = json.loads((tmp_path / "report.json").read_text())
+    assert content["baseline"] == "reward.gait.weight=10.0"
+    assert len(content["grid_comparison"]) == 3
+
+
+def test_the_page_needs_nothing_beside_it(two_groups: Path) -> None:
+    text = page(made(two_groups))
+    assert not re.search(r'(?:src|href)="(?!#)', text)
+    assert "@import" not in text
+    for words in ("grid: against the baseline", "grid: figures", "grid: sensitivity", "rollout/return", "Groups"):
+        assert words in text
+
+
+def test_eval_true_evaluates_what_is_missing_with_the_runs_own_policy(tmp_path: Path) -> None:
+    from go1exp.config import parse_train
+    from go1exp.train import run_folder, run_state, trainer
+    from tests.small_run import SMALL
+
+    container = compose("train", [*SMALL, "ppo.iterations=1"])
+    run_folder.write(tmp_path / "r", container)
+    trainer.train(parse_train(container), container, tmp_path / "r")
+    run_state.write(tmp_path / "r", "done")
+    brief = {"x": [0.5], "y": [], "yaw": [], "episodes": 3, "duration_s": 0.2, "settle_s": 0.1}
+    changes = [f"evaluation.{key}={value}" for key, value in brief.items()]
+    _task(compose("report", [f"folders=[{tmp_path / 'r'}]", f"folder={tmp_path}/out", "eval=true", *changes]))
+    rows = table_of_run(tmp_path / "r")
+    assert (rows["x"], rows["robot"]) == ([0.0] * 3 + [0.5] * 3, [0, 1, 2] * 2)
+    assert {"draw.foot_friction_mean", "draw.center_of_mass_x", "draw.link_mass_range", "trot_error"} <= set(rows)
+    assert len(set(rows["draw.foot_friction_mean"])) == 6
+    assert all(0.4 <= v <= 1.1 for v in rows["draw.foot_friction_mean"])
+    assert len(table(tmp_path / "out/grid_runs.csv")) == 1
+
+
+# ---------------------------------------------------------------------- in a browser
+
+MEASURE = """
+<script>addEventListener("load", () => {
+  const all = [...document.querySelectorAll("body, body *:not(svg *), svg text")];
+  const wide = all.filter(e => { const r = e.getBoundingClientRect();
+    return r.right > innerWidth + 0.5 || r.left < -0.5 || !e.closest("svg") && e.scrollWidth > e.clientWidth + 1; });
+  const say = e => e.tagName + " " + e.textContent.trim().slice(0, 40);
+  parent.postMessage({width: innerWidth, all: all.length, drawings: document.querySelectorAll("figure svg").length,
+    verdicts: document.querySelectorAll("td .word").length, wide: wide.map(say)}, "*");
+});</script>
+"""
+
+FRAME = """<!DOCTYPE html><body><script>addEventListener("message", e => {
+  const text = document.createElement("pre"); text.textContent = JSON.stringify(e.data); document.body.append(text); });
+</script><iframe src="page.html" style="width:390px;height:2000px;border:0"></iframe></body>"""
+
+
+@pytest.fixture(scope="module")
+def in_a_browser(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
+    def measure(text: str) -> dict[str, Any]:
+        folder = tmp_path_factory.mktemp("page")
+        (folder / "page.html").write_text(text.replace("</body>", f"{MEASURE}</body>"))
+        (folder / "frame.html").write_text(FRAME)
+        with tempfile.TemporaryDirectory() as profile:
+            flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
+            where = [f"--user-data-dir={profile}", "--virtual-time-budget=5000", "--dump-dom"]
+            command = ["chromium", *flags, *where, (folder / "frame.html").as_uri()]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        found = re.search(r"<pre>(.*?)</pre>", done.stdout, re.DOTALL)
+        assert found, done.stderr
+        content = found[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")
+        measured: dict[str, Any] = json.loads(content)
+        return measured
+
+    return measure
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_a_browser_shows_the_page_and_a_phone_all_of_it(
+    two_groups: Path, in_a_browser: Callable[[str], dict[str, Any]], tmp_path: Path
+) -> None:
+    got = made(two_groups)
+    shown = in_a_browser(write(got, tmp_path)[0].read_text())
+    assert shown["width"] == 390
+    assert shown["drawings"] == 1 + 3 + 3  # one metric, three figures, and what goes with each
+    assert shown["verdicts"] == 3
+    assert shown["wide"] == []
