@@ -71,7 +71,10 @@ class VerbSource(FileConfigSource):
 
     def _place(self, config_path: str) -> str | None:
         """Return where a configuration lies below the folder; None if the verb does not see it."""
-        first, slash, rest = config_path.strip("/").partition("/")
+        path = config_path.strip("/")
+        for group in (g for g in FOLDERS if "/" in g and (path == g or path.startswith(f"{g}/"))):
+            return None if FOLDERS[group] in self._hidden else FOLDERS[group] + path.removeprefix(group)
+        first, slash, rest = path.partition("/")
         if first in self._hidden or first in FOLDERS.values() or FOLDERS.get(first) in self._hidden:
             return None
         return folder_of(first, Path(self.path)).name + slash + rest if first else ""
