@@ -355,7 +355,42 @@ class BenchSettings:
     out: str | None
 
 
+@settings
+class TuneSettings:
+    """``conf/tune.yaml``.
+
+    Attributes:
+        space: what to draw from, such as ["ppo.gamma=interval(0.97,0.995)"]; also tag(log,interval(..)), range(..),
+            choice(..).
+        overrides: settings of every trial, such as ["experiment=five_minutes"].
+        trials: trainings of the whole search, those of earlier commands and of other machines counted.
+        workers: trainings at once on this machine, its cores shared out.
+        metric: column of metrics.csv that says how good a training is.
+        direction: whether more of it is better.
+        average: newest iterations that the metric is averaged over.
+        warmup: iterations before a training may be ended early.
+        prune: end a training whose metric is below the median of the others at the same iteration.
+        storage: where trials are kept, as Optuna names databases; null is a SQLite file in out.
+        seed: of the draws.
+        out: folder of the search: a run folder for each trial, and an index as sweeps have.
+    """
+
+    space: tuple[str, ...]
+    overrides: tuple[str, ...]
+    trials: Count
+    workers: Count
+    metric: Annotated[str, Field(min_length=1)]
+    direction: Literal["maximize", "minimize"]
+    average: Count
+    warmup: Annotated[int, Field(ge=0)]
+    prune: bool
+    storage: str | None
+    seed: Annotated[int, Field(ge=0)]
+    out: Annotated[str, Field(min_length=1)]
+
+
 EXAMPLES = {
+    "space": """'space=["ppo.gamma=interval(0.97,0.995)"]'""",
     "run": "run=runs/NAME",
     "subjects": "go1exp compare trot paper protocol=kicks",
     "files": "go1exp record audit recordings/NAME.parquet",
@@ -382,6 +417,7 @@ SETTINGS: dict[str, type] = {
     "fit-actuator": FitActuatorSettings,
     "list": ListSettings,
     "bench": BenchSettings,
+    "tune": TuneSettings,
 }
 """Verbs besides ``train``, whose sections are in ``go1exp.config``, and the class of each one's settings."""
 

@@ -91,7 +91,7 @@ class TrainJob:
     resumed: bool
 
 
-def _resolved(container: dict[str, Any], overrides: list[str], run: Path) -> TrainJob:
+def resolved(container: dict[str, Any], overrides: list[str], run: Path) -> TrainJob:
     """Return the training that a composed configuration stands for; touches no file.
 
     Args:
@@ -111,7 +111,7 @@ def _resolved(container: dict[str, Any], overrides: list[str], run: Path) -> Tra
     return TrainJob(run, config, container, resumed=False)
 
 
-def _check(job: TrainJob) -> None:
+def check(job: TrainJob) -> None:
     """Refuse what cannot be trained on this machine, before anything is written."""
     from go1exp.train import preflight
 
@@ -124,8 +124,8 @@ def _task(container: dict[str, Any]) -> int | None:
     try:
         if container.get("sweep"):
             sweep.leave_to_go_on(container, overrides)
-        job = _resolved(container, overrides, folder)
-        _check(job)
+        job = resolved(container, overrides, folder)
+        check(job)
     except BaseException:
         discard(folder)
         raise
@@ -137,7 +137,7 @@ def _task(container: dict[str, Any]) -> int | None:
 def _go_on(run: Path, overrides: list[str]) -> int | None:
     """Do what a job of a sweep does in its run folder; return the exit status."""
     job = _planned(run, overrides)
-    _check(job)
+    check(job)
     return _run(job)
 
 
@@ -154,7 +154,7 @@ def _planned(run: Path, overrides: list[str]) -> TrainJob:
     return TrainJob(run, parse_train(kept_plugins.with_copies(run, container)), container, resumed=True)
 
 
-def _plan(job: TrainJob) -> None:
+def plan(job: TrainJob) -> None:
     """Write the run folder of a job that has not begun; one that has begun stays as it is."""
     from go1exp.schema import plugins
     from go1exp.train import run_folder, run_state
@@ -237,7 +237,7 @@ class _Train(App):
     def run(self, arguments: Sequence[str]) -> int:
         """Run with command-line arguments; return the exit status."""
         folders = given_folders(arguments)[1:]
-        with sweep.watched(sweep.Rules(self, folders, _resolved, _check, _plan, _planned, _go_on)):
+        with sweep.watched(sweep.Rules(self, folders, resolved, check, plan, _planned, _go_on)):
             return super().run(arguments)
 
 

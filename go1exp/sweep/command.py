@@ -84,6 +84,11 @@ class Running:
                     os.write(log, line)
         return Ended(self.process.wait(), last)
 
+    def outlast(self) -> None:
+        """Wait until it has ended, also inside a signal's handler: ``Popen.wait`` holds a lock meanwhile."""
+        with contextlib.suppress(ChildProcessError):
+            os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)
+
     def stop(self, number: int = signal.SIGTERM) -> None:
         """Ask it to end with a checkpoint (SIGTERM), or end it (SIGKILL)."""
         with contextlib.suppress(ProcessLookupError):
@@ -109,5 +114,5 @@ def run(command: Command) -> Ended:
         return running.wait()
     except BaseException:
         running.stop()
-        running.process.wait()
+        running.outlast()
         raise

@@ -112,6 +112,8 @@ def _now(job: Job, folder: Path, heard: str) -> Job:
     if known.state == "running":
         return replace(job, state="running", cause="")
     if known.state == "stopped":
+        if job.state == "done":  # a search ended it early
+            return job
         return replace(job, state="waiting", cause="stopped; goes on from its checkpoint")
     heard = heard or (job.cause if job.state == "failed" else "")
     return replace(job, state="failed", cause=heard) if heard else replace(job, state="waiting", cause="")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ from go1exp.sweep.launchers import RaySettings, Task, Watch
 
 LOOK_S = 2.0
 """Time between two looks at the run folders, s."""
+
+STOP_S = 120.0
+"""Time for the checkpoints of jobs that are stopped, s."""
 
 QUIET = {"RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0", "RAY_USAGE_STATS_ENABLED": "0"}
 """Variables for a private Ray: tell nobody that it was used, and leave CUDA_VISIBLE_DEVICES as it is for CPU jobs."""
@@ -50,7 +54,12 @@ class Ray:
                 num_gpus=self.settings.gpus,
                 max_retries=self.settings.retries,
             )(command.run)
-            _follow(ray, {run.remote(task.command): task for task in tasks}, watch)
+            references = {run.remote(task.command): task for task in tasks}
+            try:
+                _follow(ray, references, watch)
+            except KeyboardInterrupt:
+                _stop(ray, list(references))
+                raise
         finally:
             ray.shutdown()  # of a private one, the processes; of another, our connection: its tasks of ours end
 
@@ -103,6 +112,14 @@ def _follow(ray: Any, tasks: dict[Any, Task], watch: Watch) -> None:
         for reference in ended:
             watch.ended(tasks[reference], _result(ray, reference))
         watch.changed()
+
+
+def _stop(ray: Any, references: list[Any]) -> None:
+    """Have the tasks end with a checkpoint, and wait for that."""
+    print("\nstopping the jobs after the iteration under way, with a checkpoint", file=sys.stderr, flush=True)
+    for reference in references:
+        ray.cancel(reference)  # a KeyboardInterrupt in the worker, which ends the training and waits for it
+    ray.wait(references, num_returns=len(references), timeout=STOP_S)
 
 
 def _result(ray: Any, reference: Any) -> Ended:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -35,6 +36,9 @@ them."""
 ANSWER_S = 20.0
 """Time for Slurm's commands, s."""
 
+USUAL = ("", "None", "Resources", "Priority", "JobArrayTaskLimit", "BeginTime", "Cleaning")
+"""Why jobs wait, where it is nothing to tell of."""
+
 LOST_LOOKS = 30
 """Looks at the queue without an answer after which the controller counts as gone: its jobs go on without us."""
 
@@ -57,9 +61,10 @@ class SlurmJob:
         """Have the training save a checkpoint and end; return what runs when the job starts again."""
         from submitit.helpers import DelayedSubmission
 
+        signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # Slurm sends it again, and would interrupt what follows
         if self._running is not None:
             self._running.stop()
-            self._running.process.wait()
+            self._running.outlast()
         return DelayedSubmission(SlurmJob(self.command))
 
 
@@ -134,7 +139,7 @@ class Slurm:
 
     def _follow(self, place: Path, tasks: dict[str, Task], watch: Watch) -> None:
         """Look at the queue until none of the jobs is in it."""
-        left, lost = dict(tasks), 0
+        left, lost, told = dict(tasks), 0, set(USUAL)
         while left:
             try:
                 queued, lost = _queued(left), 0
@@ -142,10 +147,14 @@ class Slurm:
                 lost += 1
                 if lost >= LOST_LOOKS:
                     raise
-                queued = set(left)
+                queued = dict.fromkeys(left, "")
             for job in [job for job in left if job not in queued]:
                 watch.ended(left.pop(job), _result(place, job))
             watch.changed()
+            for reason in sorted(set(queued.values()) - told):
+                waiting = sum(why == reason for why in queued.values())
+                print(f"slurm: {waiting} jobs wait: {reason} (scontrol show job says more)", flush=True)
+                told.add(reason)
             if left:
                 time.sleep(self.settings.poll_s)
 
@@ -166,16 +175,15 @@ def _asked(*words: str) -> str:
     return done.stdout
 
 
-def _queued(ids: Iterable[str]) -> set[str]:
-    """Return which of the jobs are in the queue: waiting, running, or about to start again."""
+def _queued(ids: Iterable[str]) -> dict[str, str]:
+    """Return which of the jobs are in the queue (waiting, running, about to start again), each with why it waits."""
     wanted = set(ids)
     if not wanted:
-        return set()
+        return {}
     # All of the user's jobs: asking for one that is forgotten already is an error.
-    lines = _asked("squeue", "-h", "-r", "--me", "-t", "all", "-o", "%i %T").splitlines()
-    ended = ("COMPLETED", "FAILED", "CANCELLED", "TIMEOUT", "NODE_FAIL", "OUT_OF_MEMORY", "BOOT_FAIL", "DEADLINE")
-    states = dict(line.split(maxsplit=1) for line in lines if " " in line)
-    return {job for job, state in states.items() if job in wanted and state not in ended}
+    lines = _asked("squeue", "-h", "-r", "--me", "-o", "%i|%T|%r").splitlines()
+    rows = [line.split("|", 2) for line in lines if line.count("|") >= 2]
+    return {job: why if state == "PENDING" else "" for job, state, why in rows if job in wanted}
 
 
 def _noted(place: Path) -> dict[str, str]:
