@@ -203,9 +203,13 @@ def _checked(
         show(number + 1, len(listed))
     _refuse(problems, names)
     runs.check()
+    seen: list[dict[str, Any]] = []
     for number, job in enumerate([] if runs.remote else jobs):
-        with _noting(rules.app, problems, number):
-            rules.check(job)
+        about = {key: value for key, value in job.container.items() if key != "seed"}
+        if about not in seen:  # a seed changes nothing that this machine could lack
+            seen.append(about)
+            with _noting(rules.app, problems, number):
+                rules.check(job)
     _refuse(problems, names)
     return jobs
 

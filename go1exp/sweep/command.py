@@ -14,6 +14,9 @@ from dataclasses import dataclass, field
 
 UNSAID = "ended without a word"
 
+LONGEST = 4096
+"""Bytes of the end of an output that are kept for its last line."""
+
 PARENT = "{parent}"
 """Word of a command that becomes the id of the process that starts it."""
 
@@ -71,23 +74,29 @@ class Running:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             start_new_session=True,
+            bufsize=0,
         )
+        self._end = b""
 
     def wait(self) -> Ended:
         """Copy what it prints to the log until it ends; a log that cannot be written ends nothing."""
-        last = ""
-        assert self.process.stdout is not None
-        with self.process.stdout as output, _log(self._command.log) as log:
-            for line in output:
-                last = line.decode(errors="replace").strip() or last
-                with contextlib.suppress(OSError):
-                    os.write(log, line)
-        return Ended(self.process.wait(), last)
+        self._copy()
+        return Ended(self.process.wait(), self._end.decode(errors="replace").strip().rpartition("\n")[2].strip())
 
     def outlast(self) -> None:
         """Wait until it has ended, also inside a signal's handler: ``Popen.wait`` holds a lock meanwhile."""
+        self._copy()
         with contextlib.suppress(ChildProcessError):
             os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)
+
+    def _copy(self) -> None:
+        """Copy its output to its end. Without buffers, so that a signal's handler can go on where it interrupted."""
+        assert self.process.stdout is not None
+        with _log(self._command.log) as log, contextlib.suppress(OSError):
+            while part := os.read(self.process.stdout.fileno(), 65536):
+                self._end = (self._end + part)[-LONGEST:]
+                with contextlib.suppress(OSError):
+                    os.write(log, part)
 
     def stop(self, number: int = signal.SIGTERM) -> None:
         """Ask it to end with a checkpoint (SIGTERM), or end it (SIGKILL)."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,8 +26,9 @@ LOOK_S = 2.0
 STOP_S = 120.0
 """Time for the checkpoints of jobs that are stopped, s."""
 
-QUIET = {"RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0", "RAY_USAGE_STATS_ENABLED": "0"}
-"""Variables for a private Ray: tell nobody that it was used, and leave CUDA_VISIBLE_DEVICES as it is for CPU jobs."""
+QUIET = {"RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_BACKEND_LOG_LEVEL": "fatal", "RAY_USAGE_STATS_ENABLED": "0"}
+"""Variables for Ray: one line from us instead of many, tell nobody that it was used, and leave CUDA_VISIBLE_DEVICES as
+it is for CPU jobs."""
 
 
 class Ray:
@@ -72,6 +74,7 @@ class Ray:
         if ray.is_initialized():
             return
         address = self.settings.address
+        _refuse_silence(address)
         try:
             if address is None:
                 ray.init(address="local", include_dashboard=False, log_to_driver=False, logging_level="ERROR")
@@ -98,6 +101,24 @@ class Ray:
                     f"Ray's cluster has as many; the largest have {most['CPU']:g} cores, {most['GPU']:g} GPUs"
                 ]
             )
+
+
+def _refuse_silence(address: str | None) -> None:
+    """Refuse an address at which nobody listens: Ray itself would try for minutes.
+
+    Raises:
+        Expected: naming it.
+    """
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if not colon or not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=5.0).close()
+    except OSError as error:
+        why = error.strerror or error
+        raise Expected(
+            f"ray: no cluster at {address!r} ({why}); hydra.launcher.address=null starts one here"
+        ) from None
 
 
 def _follow(ray: Any, tasks: dict[Any, Task], watch: Watch) -> None:
