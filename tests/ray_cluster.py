@@ -27,7 +27,13 @@ def main(folder: Path, command: list[str]) -> int:
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     os.environ |= {"RAY_AUTH_MODE": "disabled", "RAY_BACKEND_LOG_LEVEL": "fatal"}
     address = f"127.0.0.1:{PORT}"
-    head = ("--head", f"--port={PORT}", "--node-ip-address=127.0.0.1", "--include-dashboard=false", f"--temp-dir={folder}/r")
+    head = (
+        "--head",
+        f"--port={PORT}",
+        "--node-ip-address=127.0.0.1",
+        "--include-dashboard=false",
+        f"--temp-dir={folder}/r",
+    )
     nodes = [start(folder, *head, "--num-cpus=0")]
     try:
         for number in range(2):

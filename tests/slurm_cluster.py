@@ -1,4 +1,4 @@
-"""A Slurm cluster of this machine alone, for tests: munged, slurmctld and slurmd of Debian's packages, all on 127.0.0.1.
+"""A Slurm cluster of this machine alone, for tests: munged, slurmctld and slurmd as Debian has them, all on 127.0.0.1.
 
 ``python tests/slurm_cluster.py FOLDER`` starts one, prints the variable that its commands need, and ends it at Ctrl-C.
 """
@@ -107,7 +107,11 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
 def _free_port() -> int:
     """Return the first of two ports in a row that nobody listens on."""
     for port in range(26817, 28000, 2):
-        with suppress(OSError), socket.create_server(("127.0.0.1", port)), socket.create_server(("127.0.0.1", port + 1)):
+        with (
+            suppress(OSError),
+            socket.create_server(("127.0.0.1", port)),
+            socket.create_server(("127.0.0.1", port + 1)),
+        ):
             return port
     raise AssertionError("no two free ports")
 

@@ -106,7 +106,10 @@ def test_jobs_that_are_killed_and_requeued_learn_bit_for_bit_what_they_learn_on_
 
     text = (tmp_path / "output.txt").read_text()
     assert "Traceback" not in text
-    states = {job["run_folder"]: (job["state"], job["cause"]) for job in json.loads((sweep / "sweep.json").read_text())["jobs"]}
+    states = {
+        job["run_folder"]: (job["state"], job["cause"])
+        for job in json.loads((sweep / "sweep.json").read_text())["jobs"]
+    }
     assert states.pop(killed.name) == ("failed", "killed by SIGKILL")
     assert {*states.values()} == {("done", "")}
     log = (warned / "job.log").read_text()

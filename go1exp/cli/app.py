@@ -72,7 +72,6 @@ class App:
                 else:
                     failure.append(error)  # Hydra would print a report of its own
 
-        version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
         title = f"go1exp {self.title or self.name}"
         formatwarning = warnings.formatwarning  # usually two lines, one of them of code
         warnings.formatwarning = lambda message, *rest, **keywords: f"{title}: warning: {message}\n"
@@ -81,10 +80,7 @@ class App:
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
             sys.argv = [title, *map(protected, as_hydra_takes_them(overrides))]
             with seen_by(self.name, folders), _composed_once(overrides, folders):
-                try:
-                    hydra.main(**version, config_path=None, config_name=self.name)(task)()
-                except Left as left:
-                    status.append(left.work())
+                self._under_hydra(task, status)
             if failure:
                 raise failure[0]
             sys.stdout.flush()
@@ -104,6 +100,14 @@ class App:
             if before is None:
                 os.environ.pop("HYDRA_FULL_ERROR", None)
         return next((s for s in status if s), 0) or 0
+
+    def _under_hydra(self, task: Callable[[DictConfig], None], status: list[int | None]) -> None:
+        """Have Hydra compose and call ``task``, and do the work for which that leaves Hydra."""
+        version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
+        try:
+            hydra.main(**version, config_path=None, config_name=self.name)(task)()
+        except Left as left:
+            status.append(left.work())
 
     def failed_in_sweep(self, error: Exception, number: int, overrides: Sequence[str]) -> int:
         """Print what went wrong with a job of a sweep and return its status: the other jobs do not depend on it."""

@@ -16,6 +16,7 @@ from go1exp.schema import settings as schema
 from go1exp.schema.registry import NonNegative, Positive
 from go1exp.schema.settings import settings
 from go1exp.sim_robot.settings import SimConfig
+from go1exp.sweep.settings import TuneSettings
 
 T = TypeVar("T")
 
@@ -353,40 +354,6 @@ class BenchSettings:
     threads: Annotated[int, Field(ge=0)]
     overrides: tuple[str, ...]
     out: str | None
-
-
-@settings
-class TuneSettings:
-    """``conf/tune.yaml``.
-
-    Attributes:
-        space: what to draw from, such as ["ppo.gamma=interval(0.97,0.995)"]; also tag(log,interval(..)), range(..),
-            choice(..).
-        overrides: settings of every trial, such as ["experiment=five_minutes"].
-        trials: trainings of the whole search, those of earlier commands and of other machines counted.
-        workers: trainings at once on this machine, its cores shared out.
-        metric: column of metrics.csv that says how good a training is.
-        direction: whether more of it is better.
-        average: newest iterations that the metric is averaged over.
-        warmup: iterations before a training may be ended early.
-        prune: end a training whose metric is below the median of the others at the same iteration.
-        storage: where trials are kept, as Optuna names databases; null is a SQLite file in out.
-        seed: of the draws.
-        out: folder of the search: a run folder for each trial, and an index as sweeps have.
-    """
-
-    space: tuple[str, ...]
-    overrides: tuple[str, ...]
-    trials: Count
-    workers: Count
-    metric: Annotated[str, Field(min_length=1)]
-    direction: Literal["maximize", "minimize"]
-    average: Count
-    warmup: Annotated[int, Field(ge=0)]
-    prune: bool
-    storage: str | None
-    seed: Annotated[int, Field(ge=0)]
-    out: Annotated[str, Field(min_length=1)]
 
 
 EXAMPLES = {

@@ -33,7 +33,7 @@ from go1exp.sweep.command import CORES, PARENT, Command, Ended
 
 if TYPE_CHECKING:
     from go1exp.sweep.index import Index
-    from go1exp.sweep.launchers import Launcher, Task
+    from go1exp.sweep.task import Launcher, Task
 
 LOG = "job.log"
 """In the run folder of a job that ran in a process of its own: what it printed."""
@@ -122,7 +122,7 @@ def begin(rules: Rules, folder: Path, listed: Sequence[list[str]], launcher: dic
     from go1exp.sweep import index, launchers
     from go1exp.train import run_lock
 
-    runs = launchers.chosen(launcher).launcher()
+    runs = launchers.built(launchers.chosen(launcher))
     common = set.intersection(*map(set, listed)) if len(listed) > 1 else set()
     names = [" ".join(o for o in overrides if o not in common) for overrides in listed]
     places = index.folder_names(names)
@@ -163,7 +163,7 @@ def go_on(rules: Rules, folder: Path, overrides: list[str], launcher: dict[str, 
 
     known = index.read(folder)
     known = replace(known, launcher=launcher or known.launcher)
-    runs = launchers.chosen(known.launcher).launcher()
+    runs = launchers.built(launchers.chosen(known.launcher))
     runs.check()
     problems: dict[str, list[int]] = {}
     with contextlib.chdir(known.cwd):
@@ -203,11 +203,11 @@ def _checked(
         show(number + 1, len(listed))
     _refuse(problems, names)
     runs.check()
-    seen: list[dict[str, Any]] = []
+    checked: list[dict[str, Any]] = []
     for number, job in enumerate([] if runs.remote else jobs):
         about = {key: value for key, value in job.container.items() if key != "seed"}
-        if about not in seen:  # a seed changes nothing that this machine could lack
-            seen.append(about)
+        if about not in checked:  # a seed changes nothing that this machine could lack
+            checked.append(about)
             with _noting(rules.app, problems, number):
                 rules.check(job)
     _refuse(problems, names)
@@ -284,7 +284,7 @@ class _Watch:
 def _launch(rules: Rules, folder: Path, known: Index, runs: Launcher, overrides: list[str]) -> int:
     """Run what is not done in a folder that is locked; tell of the sweep; return the exit status."""
     from go1exp.sweep import index
-    from go1exp.sweep.launchers import Task
+    from go1exp.sweep.task import Task
 
     fresh = tuple(replace(job, state="waiting", cause="") for job in known.jobs)
     watch = _Watch(folder, index.looked_at(replace(known, jobs=fresh), folder))
@@ -295,7 +295,9 @@ def _launch(rules: Rules, folder: Path, known: Index, runs: Launcher, overrides:
             continue
         run = folder / job.run_folder
         given = [*overrides, *_share_of_cores(rules, run, known, runs)]
-        tasks.append(Task(job.name, job.run_folder, _command(run, given, known.cwd), _here(rules, watch, job, given)))
+        tasks.append(
+            Task(job.name, job.run_folder, _command(run, given, known.cwd), _in_process(rules, watch, job, given))
+        )
     print(f"sweep {folder}: {len(tasks)} of {len(known.jobs)} jobs to run", flush=True)
     try:
         if tasks:
@@ -323,7 +325,7 @@ def _command(run: Path, overrides: Sequence[str], cwd: str) -> Command:
     return Command(words, cwd, str(run / LOG), {"PYTHONPATH": path} if path else {})
 
 
-def _here(rules: Rules, watch: _Watch, job: Any, overrides: list[str]) -> Callable[[], None]:
+def _in_process(rules: Rules, watch: _Watch, job: Any, overrides: list[str]) -> Callable[[], None]:
     """Return what runs a job in this process and outlives its failure."""
 
     def work() -> None:

@@ -76,9 +76,9 @@ def _task(container: dict[str, Any]) -> int | None:
     best = Search(settings, ranges, plan).run()
     if best is None:
         return FAILED
-    found = [f"{key}={value}" for key, value in best.params.items()]
+    drawn = [f"{key}={value}" for key, value in best.params.items()]
     print(f"best: trial {best.number}, {settings.metric} = {best.value:.5g}")
-    print(f"now: {command('train', *settings.overrides, *found)}")
+    print(f"now: {command('train', *settings.overrides, *drawn)}")
     return None
 
 

@@ -29,7 +29,8 @@ class Command:
     """What to run.
 
     Attributes:
-        words: the interpreter, its options, the module, and the arguments; ``PARENT`` and ``CORES`` stand for what is known later.
+        words: the interpreter, its options, the module, and the arguments; ``PARENT`` and ``CORES`` stand for what is
+            known later.
         cwd: folder to run it from.
         log: file that its output is appended to.
         variables: environment variables beside those that are there.
@@ -80,7 +81,9 @@ class Running:
 
     def wait(self) -> Ended:
         """Copy what it prints to the log until it ends; a log that cannot be written ends nothing."""
-        self._copy()
+        assert self.process.stdout is not None
+        with self.process.stdout:
+            self._copy()
         return Ended(self.process.wait(), self._end.decode(errors="replace").strip().rpartition("\n")[2].strip())
 
     def outlast(self) -> None:

@@ -139,10 +139,15 @@ def folder_names(names: Sequence[str]) -> list[str]:
     return folders
 
 
+BRACKETS = "[]{}()'\""
+"""Round values of several words."""
+
+
 def _plain(name: str) -> str:
     parts = []
     for override in name.split(" "):
         key, equals, value = override.partition("=")
         key = key.lstrip("+").rsplit("/", 1)[-1].replace("~", "no-")
-        parts.append(re.sub(r"[^A-Za-z0-9_.+-]+", "-", f"{key}{'-' if equals else ''}{value}").strip("-"))
+        text = f"{key}{'-' if equals else ''}{value.strip(BRACKETS)}"
+        parts.append(re.sub(r"[^A-Za-z0-9_.+-]+", "-", text).strip("-"))
     return "_".join(part for part in parts if part).lstrip(".")

@@ -14,7 +14,8 @@ from pathlib import Path
 from go1exp import signals
 from go1exp.schema.registry import ConfigError
 from go1exp.sweep.command import Command, Ended, Running
-from go1exp.sweep.launchers import JoblibSettings, Task, Watch
+from go1exp.sweep.settings import JoblibSettings
+from go1exp.sweep.task import Task, Watch
 
 
 class Basic:
@@ -29,7 +30,7 @@ class Basic:
         """Run the tasks (see ``Launcher``)."""
         for task in tasks:
             try:
-                task.here()
+                task.in_process()
             finally:
                 watch.changed()
 

@@ -7,6 +7,7 @@ the training goes on from its checkpoint, which lies in a folder that all nodes 
 from __future__ import annotations
 
 import importlib.util
+import logging
 import os
 import socket
 import sys
@@ -18,7 +19,8 @@ from go1exp.errors import Expected
 from go1exp.schema.registry import ConfigError
 from go1exp.sweep import command
 from go1exp.sweep.command import Ended
-from go1exp.sweep.launchers import RaySettings, Task, Watch
+from go1exp.sweep.settings import RaySettings
+from go1exp.sweep.task import Task, Watch
 
 LOOK_S = 2.0
 """Time between two looks at the run folders, s."""
@@ -77,13 +79,13 @@ class Ray:
         _refuse_silence(address)
         try:
             if address is None:
-                ray.init(address="local", include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+                ray.init(address="local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
             else:
-                ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         except Exception as error:  # ConnectionError and others, by how the cluster is missing
             where = "a private cluster could not be started" if address is None else f"no cluster at {address!r}"
-            said = " ".join(str(error).split())[:200]
-            raise Expected(f"ray: {where} ({said}); hydra.launcher.address=null starts one here") from None
+            reason = " ".join(str(error).split())[:200]
+            raise Expected(f"ray: {where} ({reason}); hydra.launcher.address=null starts one here") from None
         from ray import cloudpickle
 
         cloudpickle.register_pickle_by_value(command)  # the workers of a cluster need not find this package
@@ -97,8 +99,8 @@ class Ray:
             most = {kind: max((node.get(kind, 0.0) for node in nodes), default=0.0) for kind in wanted}
             raise ConfigError(
                 [
-                    f"hydra.launcher.cpus = {self.settings.cpus}, hydra.launcher.gpus = {self.settings.gpus:g}: no node of "
-                    f"Ray's cluster has as many; the largest have {most['CPU']:g} cores, {most['GPU']:g} GPUs"
+                    f"hydra.launcher.cpus = {self.settings.cpus}, hydra.launcher.gpus = {self.settings.gpus:g}: no "
+                    f"node of Ray's cluster has as many; the largest have {most['CPU']:g} cores, {most['GPU']:g} GPUs"
                 ]
             )
 
@@ -116,9 +118,7 @@ def _refuse_silence(address: str | None) -> None:
         socket.create_connection((host, int(port)), timeout=5.0).close()
     except OSError as error:
         why = error.strerror or error
-        raise Expected(
-            f"ray: no cluster at {address!r} ({why}); hydra.launcher.address=null starts one here"
-        ) from None
+        raise Expected(f"ray: no cluster at {address!r} ({why}); hydra.launcher.address=null starts one here") from None
 
 
 def _follow(ray: Any, tasks: dict[Any, Task], watch: Watch) -> None:

@@ -24,7 +24,8 @@ from go1exp.errors import Expected
 from go1exp.files import write_json
 from go1exp.schema.registry import ConfigError
 from go1exp.sweep.command import Command, Ended, Running
-from go1exp.sweep.launchers import SlurmSettings, Task, Watch
+from go1exp.sweep.settings import SlurmSettings
+from go1exp.sweep.task import Task, Watch
 
 FOLDER = "slurm"
 """In the sweep's folder: scripts, logs and results of submitit, and ``jobs.json``: run folder -> id of its job."""
@@ -139,7 +140,7 @@ class Slurm:
 
     def _follow(self, place: Path, tasks: dict[str, Task], watch: Watch) -> None:
         """Look at the queue until none of the jobs is in it."""
-        left, lost, told = dict(tasks), 0, set(USUAL)
+        left, lost, known = dict(tasks), 0, set(USUAL)
         while left:
             try:
                 queued, lost = _queued(left), 0
@@ -151,10 +152,10 @@ class Slurm:
             for job in [job for job in left if job not in queued]:
                 watch.ended(left.pop(job), _result(place, job))
             watch.changed()
-            for reason in sorted(set(queued.values()) - told):
+            for reason in sorted(set(queued.values()) - known):
                 waiting = sum(why == reason for why in queued.values())
                 print(f"slurm: {waiting} jobs wait: {reason} (scontrol show job says more)", flush=True)
-                told.add(reason)
+                known.add(reason)
             if left:
                 time.sleep(self.settings.poll_s)
 
@@ -170,8 +171,8 @@ def _asked(*words: str) -> str:
     except subprocess.TimeoutExpired:
         raise Expected(f"slurm: the controller does not answer ({words[0]} waited {ANSWER_S:.0f} s)") from None
     if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise Expected(f"slurm: the controller does not answer ({said})")
+        reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise Expected(f"slurm: the controller does not answer ({reason})")
     return done.stdout
 
 
@@ -223,5 +224,3 @@ def _leave(queued: Sequence[str], folder: Path) -> None:
         print(f"cancelled {len(queued)} jobs")
     else:
         print(f"\n{len(queued)} jobs stay in the queue; to cancel them: scancel {' '.join(array)}")
-
-

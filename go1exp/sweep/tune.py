@@ -16,35 +16,20 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any
 
 from go1exp.errors import Expected
 from go1exp.files import write_json
 from go1exp.sweep import index
 from go1exp.sweep.command import CORES, PARENT, Command, Ended, Running
 from go1exp.sweep.local import shares
+from go1exp.sweep.settings import TuneSettings
 
 LOOK_S = 0.5
 """Time between two looks at the metrics of a trial, s."""
 
 FOLDER = "folder"
 """Attribute of a trial that was stopped, and of the one that goes on with it: its run folder."""
-
-
-class Wishes(Protocol):
-    """The settings of ``conf/tune.yaml`` that are read here."""
-
-    overrides: tuple[str, ...]
-    trials: int
-    workers: int
-    metric: str
-    direction: Literal["maximize", "minimize"]
-    average: int
-    warmup: int
-    prune: bool
-    storage: str | None
-    seed: int
-    out: str
 
 
 @dataclass(frozen=True)
@@ -83,7 +68,7 @@ class Search:
     """One search, from its first trial or where it stopped."""
 
     def __init__(
-        self, settings: Wishes, ranges: dict[str, Range], plan: Callable[[Sequence[str], Path], None]
+        self, settings: TuneSettings, ranges: dict[str, Range], plan: Callable[[Sequence[str], Path], None]
     ) -> None:
         """Prepare it.
 
@@ -140,8 +125,8 @@ class Search:
                 load_if_exists=True,
             )
         except Exception as error:  # SQLAlchemy's, Optuna's, a driver's
-            said = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            raise Expected(f"storage = {storage!r}: cannot be used ({said})") from None
+            result = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise Expected(f"storage = {storage!r}: cannot be used ({result})") from None
         about = {"metric": settings.metric, "space": sorted(self.ranges)}
         if study.user_attrs and study.user_attrs != about:
             raise Expected(f"{self.folder}: holds a search for {study.user_attrs}; use another out")
@@ -169,45 +154,44 @@ class Search:
         with self._lock:  # composing is not made for threads
             self.plan(overrides, run)
         how, values, hopeless = self._train(trial, run, share)
-        said = ""
         if self._stopping:
             study.tell(trial, state=optuna.trial.TrialState.FAIL)
             study.enqueue_trial(trial.params, user_attrs={FOLDER: run.name})
-            said = "stopped; goes on next time"
+            result = "stopped; goes on next time"
         elif hopeless:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-            said = f"ended early at iteration {values[-1][0]}: {values[-1][1]:.5g}"
+            result = f"ended early at iteration {values[-1][0]}: {values[-1][1]:.5g}"
         elif how.status == 0 and values:
             study.tell(trial, values[-1][1])
-            said = f"{values[-1][1]:.5g}"
+            result = f"{values[-1][1]:.5g}"
         else:
             study.tell(trial, state=optuna.trial.TrialState.FAIL)
-            said = f"failed ({how.cause or f'metrics.csv has no {self.settings.metric}'})"
+            result = f"failed ({how.cause or f'metrics.csv has no {self.settings.metric}'})"
         with self._lock:
             self._write(study)
             words = " ".join(f"{key}={value}" for key, value in drawn.items())
-            print(f"trial {trial.number}: {said}  {words}", flush=True)
+            print(f"trial {trial.number}: {result}  {words}", flush=True)
 
-    def _train(
-        self, trial: Any, run: Path, share: tuple[int, ...]
-    ) -> tuple[Ended, list[tuple[int, float]], bool]:
+    def _train(self, trial: Any, run: Path, share: tuple[int, ...]) -> tuple[Ended, list[tuple[int, float]], bool]:
         """Run a trial's training; return how it ended, its metric by iteration, and whether it was hopeless."""
         words = (sys.executable, "-m", "go1exp.cli.child", PARENT, CORES, "train", f"resume='{run}'")
-        command = Command((*words, f"hydra.run.dir='{run}'", "hydra.output_subdir=null"), os.getcwd(), str(run / "job.log"))
+        command = Command(
+            (*words, f"hydra.run.dir='{run}'", "hydra.output_subdir=null"), os.getcwd(), str(run / "job.log")
+        )
         command = replace(command, cores=share, variables={"OMP_NUM_THREADS": str(len(share))})
         running = Running(command)
         self._running[trial.number] = running
         ended: list[Ended] = []
         waiting = threading.Thread(target=lambda: ended.append(running.wait()))
         waiting.start()
-        hopeless, told = False, 0
+        hopeless, newest = False, 0
         while waiting.is_alive():
             waiting.join(LOOK_S)
             values = self._values(run)
             for iteration, value in values:
-                if iteration > told and not hopeless:
+                if iteration > newest and not hopeless:
                     trial.report(value, iteration)
-                    told, hopeless = iteration, trial.should_prune()
+                    newest, hopeless = iteration, trial.should_prune()
                     if hopeless:
                         values = [v for v in values if v[0] <= iteration]
                         running.stop()
