@@ -23,7 +23,12 @@ ONE = (*SMALL, "ppo.iterations=1")
 ONE_AT_A_TIME = {
     "joblib": ("hydra.launcher.n_jobs=1",),
     "ray": (f"hydra.launcher.cpus={os.cpu_count()}",),
-    "slurm": ("hydra.launcher.at_once=1", "hydra.launcher.cpus=1", "hydra.launcher.mem_gb=2", "hydra.launcher.poll_s=1"),
+    "slurm": (
+        "hydra.launcher.at_once=1",
+        "hydra.launcher.cpus=1",
+        "hydra.launcher.mem_gb=2",
+        "hydra.launcher.poll_s=1",
+    ),
 }
 TASK = ("experiment=five_minutes", "ppo.iterations=6", "logger.tensorboard=false", "torch_threads=0")
 
@@ -42,7 +47,9 @@ def plain(folder: Path) -> float:
 def between_jobs(folder: Path, launcher: str) -> list[float]:
     """Return the seconds from the end of each job to the first iteration of the next one."""
     seeds = ",".join(map(str, range(JOBS)))
-    train("-m", *ONE, f"seed={seeds}", f"hydra/launcher={launcher}", *ONE_AT_A_TIME[launcher], f"hydra.sweep.dir={folder}")
+    train(
+        "-m", *ONE, f"seed={seeds}", f"hydra/launcher={launcher}", *ONE_AT_A_TIME[launcher], f"hydra.sweep.dir={folder}"
+    )
     rows = sorted((r / "metrics.csv").stat().st_mtime for r in folder.glob("seed-*"))
     ends = sorted((r / "state.json").stat().st_mtime for r in folder.glob("seed-*"))
     return [row - end for row, end in zip(rows[1:], ends, strict=False)]
@@ -62,9 +69,18 @@ def main(launchers: list[str]) -> None:
             for number in range(JOBS - 1):
                 alone.append(plain(folder / f"{launcher}-plain-{number}"))
             cost = statistics.median(jobs) - statistics.median(alone)
-            print(f"{launcher:8} {cost:6.2f} s a job over a plain run ({[round(s, 1) for s in jobs]}, plain {[round(s, 1) for s in alone]})")
+            print(
+                f"{launcher:8} {cost:6.2f} s a job over a plain run ({[round(s, 1) for s in jobs]}, plain {[round(s, 1) for s in alone]})"
+            )
         train(*TASK, f"hydra.run.dir={folder / 'alone'}")
-        train("-m", *TASK, "seed=1,2", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={folder / 'two'}")
+        train(
+            "-m",
+            *TASK,
+            "seed=1,2",
+            "hydra/launcher=joblib",
+            "hydra.launcher.n_jobs=2",
+            f"hydra.sweep.dir={folder / 'two'}",
+        )
         one, two = steps_per_s(folder / "alone"), [steps_per_s(folder / f"two/seed-{seed}") for seed in (1, 2)]
         print(f"two at once {sum(two):,.0f} steps/s over one alone {one:,.0f}: {sum(two) / one:.2f}")
 
