@@ -114,10 +114,10 @@ def test_a_command_that_is_stopped_says_its_last_words(tmp_path: Path) -> None:
     assert (ended[0].status, ended[0].last_line) == (130, "saved")
 
 
-def test_every_launcher_has_a_file_or_is_hydras() -> None:
+def test_every_launcher_has_a_file() -> None:
     assert chosen({"_target_": f"{BasicLauncher.__module__}.{BasicLauncher.__name__}"}).name == "basic"
     files = {file.stem: OmegaConf.to_container(OmegaConf.load(file)) for file in (CONF / "launcher").glob("*.yaml")}
-    assert {*LAUNCHERS} == {"basic", *files} - {"slurm_gpu"}
+    assert {*LAUNCHERS} == {*files} - {"slurm_gpu"}
     for name in {*files} - {"slurm_gpu"}:
         assert chosen(files[name]).name == name  # type: ignore[arg-type]
 
