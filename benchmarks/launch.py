@@ -69,9 +69,8 @@ def main(launchers: list[str]) -> None:
             for number in range(JOBS - 1):
                 alone.append(plain(folder / f"{launcher}-plain-{number}"))
             cost = statistics.median(jobs) - statistics.median(alone)
-            print(
-                f"{launcher:8} {cost:6.2f} s a job over a plain run ({[round(s, 1) for s in jobs]}, plain {[round(s, 1) for s in alone]})"
-            )
+            print(f"{launcher:8} {cost:6.2f} s a job over a plain run")
+            print(f"  jobs {[round(s, 1) for s in jobs]}, plain {[round(s, 1) for s in alone]}", flush=True)
         train(*TASK, f"hydra.run.dir={folder / 'alone'}")
         train(
             "-m",

@@ -93,7 +93,9 @@ EXEMPT = {
         f"launcher/{file.stem}.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py"
         for file in (CONF / "launcher").glob("*.yaml")
     },
-    **{f"study/{file.stem}.yaml:study": "jobs of a sweep: tests/test_configs.py" for file in (CONF / "study").iterdir()},
+    **{
+        f"study/{file.stem}.yaml:study": "jobs of a sweep: tests/test_configs.py" for file in (CONF / "study").iterdir()
+    },
     "actuator/net_simulated.yaml:actuator.period": "actuator/net.yaml has the same key",
     "train.yaml:sweep": "tests/test_sweeps.py shows what it does",
     "tune.yaml:hydra": "Hydra's own settings",
