@@ -149,11 +149,13 @@ def test_a_sweep_leaves_its_jobs_in_the_queue_and_finds_them_again(
 
 
 def test_what_slurm_refuses_is_one_line(tmp_path: Path, variables: dict[str, str]) -> None:
-    wrong = run_alone(tmp_path, "train", "-m", "seed=1,2", *SLURM, "hydra.launcher.partition=gpu", **variables)
+    wrong = run_alone(
+        tmp_path, "train", "-m", "seed=1,2", *SLURM, "hydra.launcher.partition=gpu", SLURM_CONF=variables["SLURM_CONF"]
+    )
     assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1), wrong.stderr
     assert "hydra.launcher.partition = 'gpu': no such partition; there are cpu" in wrong.stderr
-    gone = {"SLURM_CONF": str(tmp_path / "slurm.conf")}
-    nobody = run_alone(tmp_path, "train", "-m", "seed=1,2", *SLURM, **gone)
+    gone = str(tmp_path / "slurm.conf")
+    nobody = run_alone(tmp_path, "train", "-m", "seed=1,2", *SLURM, SLURM_CONF=gone)
     assert (nobody.returncode, nobody.stderr.count("\n")) == (1, 1), nobody.stderr
     assert "slurm: the controller does not answer" in nobody.stderr
     assert list(tmp_path.iterdir()) == []
