@@ -13,11 +13,11 @@ LOCK_VENV := build/lock-venv
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo quick test test-all check sanitise bench runtime image lock clean
+.PHONY: help setup demo quick test test-all test-slurm test-ray check sanitise bench runtime image lock clean
 
 help: ## list the verbs
 	@echo "usage: make VERB"
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 setup: $(OK) ## make .venv with the locked packages and go1exp in it (redone when pyproject.toml, the lock or C++ changes)
 
@@ -68,6 +68,18 @@ test: setup ## run the tests that must hold
 
 test-all: SLOW := all
 test-all: test ## run every test
+
+test-slurm: setup ## sweeps on a real Slurm of this machine alone, started and ended here; needs root, slurm-wlm, munge
+	@echo "test-slurm 1/2: submitit"
+	@$(PIP) install -qq "submitit>=1.5.4,<2"
+	@echo "test-slurm 2/2: pytest"
+	@GO1EXP_TEST_SLURM=1 $(BIN)/python -m pytest -q --slow=all tests/test_slurm.py
+
+test-ray: setup ## sweeps on a Ray cluster of this machine, one node of which is killed; needs root
+	@echo "test-ray 1/2: ray"
+	@$(PIP) install -qq "ray>=2.60,<3"
+	@echo "test-ray 2/2: pytest"
+	@GO1EXP_TEST_RAY=1 $(BIN)/python -m pytest -q --slow=all tests/test_ray.py
 
 check: setup ## formatting, lint and types; changes nothing
 	@echo "check 1/3: ruff format"

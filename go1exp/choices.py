@@ -17,7 +17,7 @@ from go1exp import data_root
 CONFIG_DIR = ("--config-dir", "-cd")
 """Hydra's option for a user's own folder of choices."""
 
-FOLDERS = {"rand": "randomization"}
+FOLDERS = {"rand": "randomization", "hydra/launcher": "launcher"}
 """Group -> its folder, where that has another name."""
 
 _GROUP_OF_FOLDER = {folder: group for group, folder in FOLDERS.items()}
@@ -41,7 +41,10 @@ def groups_of(verb: str) -> dict[str, str | None]:
     chosen: dict[str, str | None] = {}
     for item in load(config_folder() / f"{verb}.yaml").get("defaults", ()):
         if isinstance(item, dict):
-            chosen |= {str(group): choice for group, choice in item.items() if not str(group).startswith("override ")}
+            for group, choice in item.items():
+                name = str(group).removeprefix("override ")
+                if name == str(group) or name in FOLDERS:  # Hydra's own groups are ours where they have a folder
+                    chosen[name] = choice
     return chosen
 
 

@@ -24,7 +24,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from go1exp.choices import choice_files, config_folder, groups_of
+from go1exp.choices import FOLDERS, choice_files, config_folder, groups_of
 from go1exp.config_source import seen_by
 from go1exp.schema.registry import ConfigError, nearest, unknown_name
 
@@ -161,7 +161,9 @@ def composition_problem(
 ) -> str | None:
     """Return in words why Hydra refused ``overrides`` of ``conf/<name>.yaml``; None if that is not what happened."""
     if isinstance(error, MissingConfigException):
-        group, _, choice = (error.missing_cfg_file or "").partition("/")
+        missing = error.missing_cfg_file or ""
+        ours = next((group for group in FOLDERS if "/" in group and missing.startswith(f"{group}/")), "")
+        group, _, choice = (ours, "", missing.removeprefix(f"{ours}/")) if ours else missing.partition("/")
         known = choice_files(group, [config_folder(), *folders])
         if choice and known:
             return unknown_name(f"{group}={choice}", choice, known, f"choice of {group}")

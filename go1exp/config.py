@@ -124,6 +124,7 @@ class ProcessConfig:
         devices: GPUs of this machine that share the robots and each minibatch; more than 1 needs backend=warp.
         torch_threads: threads of torch, 0 for its own choice.
         resume: run folder to continue; nothing but iterations, checkpoints, threads, devices and backend may change.
+        sweep: sweep folder to go on with: its jobs that are not done; launcher, threads and so on may change.
         start_from: run folder, or name of a shipped policy, whose weights a new run begins with.
         plugins: files and packages with terms of your own, such as [my_terms.py] (docs/extending.md).
     """
@@ -134,7 +135,8 @@ class ProcessConfig:
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
     torch_threads: CountOrZero
     resume: str | None
-    start_from: str | None = None  # runs of older versions have neither key
+    start_from: str | None = None  # runs of older versions have none of these keys
+    sweep: str | None = None
     plugins: str | tuple[str, ...] = ()
     devices: Annotated[int, Field(ge=1, le=64)] = 1
 

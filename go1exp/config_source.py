@@ -54,6 +54,10 @@ def _pickled(file: Path, mtime_ns: int, size: int) -> bytes:
     return pickle.dumps((config, FileConfigSource._get_header_dict(text[:512])))
 
 
+HYDRAS_OWN = ("hydra/launcher/basic",)
+"""Choices that Hydra has itself; our file is for help and completion."""
+
+
 class VerbSource(FileConfigSource):
     """Files of a folder without the groups that a verb does not have; the group ``rand`` is the folder of its files."""
 
@@ -71,7 +75,12 @@ class VerbSource(FileConfigSource):
 
     def _place(self, config_path: str) -> str | None:
         """Return where a configuration lies below the folder; None if the verb does not see it."""
-        first, slash, rest = config_path.strip("/").partition("/")
+        path = config_path.strip("/")
+        if path in HYDRAS_OWN:
+            return None
+        for group in (g for g in FOLDERS if "/" in g and (path == g or path.startswith(f"{g}/"))):
+            return None if FOLDERS[group] in self._hidden else FOLDERS[group] + path.removeprefix(group)
+        first, slash, rest = path.partition("/")
         if first in self._hidden or first in FOLDERS.values() or FOLDERS.get(first) in self._hidden:
             return None
         return folder_of(first, Path(self.path)).name + slash + rest if first else ""

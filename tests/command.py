@@ -169,7 +169,8 @@ def server(preload: str) -> Server:
 def environment(**changes: str) -> dict[str, str]:
     """Return the variables of this process without those that change what the command line prints or opens."""
     inherited = {k: v for k, v in os.environ.items() if k not in ("HYDRA_FULL_ERROR", "DISPLAY", "WAYLAND_DISPLAY")}
-    return {**inherited, "PYTHONPATH": str(data_root()), **changes}
+    path = os.pathsep.join([str(data_root()), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**inherited, "PYTHONPATH": path, **changes}
 
 
 def run(

@@ -190,3 +190,11 @@ def test_completion_is_installed_and_taken_away(action: str, shell: str, capsys:
 
     assert completion.serve(f"{action}={shell}") == 0
     assert "go1exp" in capsys.readouterr().out
+
+
+def test_launchers_and_studies_are_completed() -> None:
+    assert completions("go1exp train hydra/launcher=") == [
+        f"hydra/launcher={name}" for name in ("basic", "joblib", "ray", "slurm", "slurm_gpu")
+    ]
+    assert completions("go1exp train hydra/l") == ["hydra/launcher="]
+    assert completions("go1exp train study=") == ["study=ablations", "study=ablations_cpu"]

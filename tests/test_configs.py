@@ -55,7 +55,14 @@ def choices() -> list[str]:
     return found
 
 
-ABLATIONS = [c.removeprefix("experiment=ablation/") for c in choices() if c.startswith("experiment=ablation/")]
+OF_THE_STUDY = ("none", "no_curriculum", "no_adaptive_rate", "no_latency", "no_actuator_net")
+"""Ablations of ``experiment=study``, which has what they take away; tested below."""
+
+ABLATIONS = [
+    c.removeprefix("experiment=ablation/")
+    for c in choices()
+    if c.startswith("experiment=ablation/") and not c.endswith(tuple(f"/{name}" for name in OF_THE_STUDY))
+]
 NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
 
 
@@ -154,6 +161,40 @@ def test_an_ablation_works_on_the_papers_setting() -> None:
         expected = ablated(name, base)
         assert flat(compose("train", [f"experiment=[paper,ablation/{name}]"])) == expected
         assert flat(compose("train", ["experiment=paper", f"+experiment/ablation={name}"])) == expected
+
+
+@pytest.mark.parametrize("recipe", ["study", "study_cpu"])
+def test_the_study_takes_one_part_of_the_recipe_away_each(recipe: str) -> None:
+    base = flat(compose("train", [f"experiment={recipe}"]))
+    drive = "actuator.drive."
+    expected = {
+        "none": base,
+        "no_curriculum": {k: v for k, v in base.items() if not k.startswith("curriculum.")},
+        "no_adaptive_rate": {**base, "ppo.schedule": "fixed"},
+        "no_latency": {**base, "actuator.command": [0.0, 0.0]},
+        "no_actuator_net": {
+            **{k: v for k, v in base.items() if not k.startswith(drive)},
+            **{f"{drive}{k}": v for k, v in flat(compose("train", ["actuator=pd"])["actuator"]).items()},
+        },
+    }
+    assert {*expected} == {*OF_THE_STUDY}
+    assert base["ppo.schedule"] == "adaptive"
+    for name, values in expected.items():
+        container = compose("train", [f"experiment={recipe}", f"+experiment/ablation={name}"])
+        parse_train(container)
+        assert flat(container) == values, name
+        assert name == "none" or values != base
+
+
+@pytest.mark.parametrize("study", ["ablations", "ablations_cpu"])
+def test_a_study_has_every_part_of_the_recipe_by_five_seeds(study: str) -> None:
+    params = OmegaConf.to_container(OmegaConf.load(CONF / f"study/{study}.yaml").hydra.sweeper.params)
+    assert isinstance(params, dict)
+    assert params["seed"] == "0,1,2,3,4"
+    names = {name.strip() for name in params["+experiment/ablation"].split(",")}
+    rows = {f"no_rand_{term}" for term in TABLE_1} | {"no_rand", "no_push", "no_noise"}
+    tracking = {"no_linear_velocity_error", "no_angular_velocity_error"}
+    assert names == {*REWARD_GROUPS, *OF_THE_STUDY, *rows, *tracking}
 
 
 def test_the_command_line_beats_an_experiment() -> None:

@@ -74,6 +74,23 @@ REPORT = (
 
 COMPARE = ("subjects", "same_robot", "seed", "physics_dt", "folder", "plugins", "hydra")
 
+TUNE = (
+    *(
+        "space",
+        "overrides",
+        "trials",
+        "workers",
+        "metric",
+        "direction",
+        "average",
+        "warmup",
+        "prune",
+        "storage",
+        "seed",
+    ),
+    *("out", "plugins"),
+)
+
 EXEMPT = {
     "backend/cpu.yaml:backend.name": "the other engine is an extra: tests/contracts/test_backends.py",
     "engine/mujoco.yaml:engine": "backend/cpu.yaml has the same keys; tests/test_physx.py shows the other engine",
@@ -82,6 +99,17 @@ EXEMPT = {
     "controller/mpc.yaml:controller": "tests/test_controller.py shows what each key does",
     "controller/policy.yaml:controller": "the name of the choice",
     "reward/paper_literal.yaml:reward.air_time_variance.weight": "as printed, the term is zero for every gait",
+    **{
+        f"launcher/{file.stem}.yaml:launcher": "needs several cores, or a cluster: tests/test_sweeps.py, test_slurm.py"
+        for file in (CONF / "launcher").glob("*.yaml")
+    },
+    **{
+        f"study/{file.stem}.yaml:study": "jobs of a sweep: tests/test_configs.py" for file in (CONF / "study").iterdir()
+    },
+    "actuator/net_simulated.yaml:actuator.period": "actuator/net.yaml has the same key",
+    "train.yaml:sweep": "tests/test_sweeps.py shows what it does",
+    "tune.yaml:hydra": "Hydra's own settings",
+    **{f"tune.yaml:{key}": "needs an extra: tests/test_tune.py" for key in TUNE},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("train", "eval", "play", "list", "bench")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
@@ -127,6 +155,10 @@ NEEDS = {
         "observation.gait_clock.rate=3.1",  # neither the file's nor the experiment's, which the rewards take over
     ],
     "experiment/five_minutes": ["reward=clock"],
+    "experiment/ablation/no_latency": ["actuator=delay"],
+    "experiment/ablation/no_adaptive_rate": ["ppo=paper"],
+    "experiment/study": ["experiment=paper", "actuator=delay", "backend=cpu"],
+    "experiment/study_cpu": ["experiment=study", "backend=cpu", "ppo=small"],
     "experiment/robust": ["experiment=trot", "backend=cpu"],
     "experiment/paper_trot": ["reward=paper_trot", "command=widening", "actuator=delay", "ppo=gpu"],
     "experiment/reference_second": ["experiment=reference", "backend=cpu"],  # it changes what that one adds

@@ -67,11 +67,11 @@ class App:
                 status.append(self.task(plugins.begin(self.name, as_container(config))))
             except Exception as error:
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
-                    status.append(self._failed_in_sweep(error))
+                    about = HydraConfig.get()
+                    status.append(self.failed_in_sweep(error, about.job.num, list(about.overrides.task)))
                 else:
                     failure.append(error)  # Hydra would print a report of its own
 
-        version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
         title = f"go1exp {self.title or self.name}"
         formatwarning = warnings.formatwarning  # usually two lines, one of them of code
         warnings.formatwarning = lambda message, *rest, **keywords: f"{title}: warning: {message}\n"
@@ -80,7 +80,7 @@ class App:
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
             sys.argv = [title, *map(protected, as_hydra_takes_them(overrides))]
             with seen_by(self.name, folders), _composed_once(overrides, folders):
-                hydra.main(**version, config_path=None, config_name=self.name)(task)()
+                self._under_hydra(task, status)
             if failure:
                 raise failure[0]
             sys.stdout.flush()
@@ -101,16 +101,22 @@ class App:
                 os.environ.pop("HYDRA_FULL_ERROR", None)
         return next((s for s in status if s), 0) or 0
 
-    def _failed_in_sweep(self, error: Exception) -> int:
+    def _under_hydra(self, task: Callable[[DictConfig], None], status: list[int | None]) -> None:
+        """Have Hydra compose and call ``task``, and do the work for which that leaves Hydra."""
+        version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
+        try:
+            hydra.main(**version, config_path=None, config_name=self.name)(task)()
+        except Left as left:
+            status.append(left.work())
+
+    def failed_in_sweep(self, error: Exception, number: int, overrides: Sequence[str]) -> int:
         """Print what went wrong with a job of a sweep and return its status: the other jobs do not depend on it."""
-        about = HydraConfig.get()
-        overrides = list(about.overrides.task)
         try:
             status, message = self._explain(error, overrides)
         except Exception:
             traceback.print_exc()
             status, message = FAILED, self.cause(error)
-        name = f"go1exp {self.title or self.name}: job {about.job.num} ({' '.join(overrides)})"
+        name = f"go1exp {self.title or self.name}: job {number} ({' '.join(overrides)})"
         print(f"{name}: {message}", file=sys.stderr, flush=True)
         return status
 
@@ -177,6 +183,14 @@ class Refused(BaseException):
     def __init__(self, error: ConfigError) -> None:
         super().__init__(str(error))
         self.error = error
+
+
+class Left(BaseException):
+    """Leaves Hydra for work that it has no part in; its callbacks would turn an ``Exception`` into a warning."""
+
+    def __init__(self, work: Callable[[], int | None]) -> None:
+        super().__init__()
+        self.work = work
 
 
 def _without_config_dir(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:

@@ -295,7 +295,7 @@ def _keys(verb: str, word: str, before: Sequence[str], folders: Sequence[Path]) 
         if mark == "~":
             keys.append(f"{path}{dot}{name}")
         elif name in groups:
-            keys += [f"{name}=", f"{name}."] if is_mapping and word and not mark else [f"{name}="]
+            keys += [f"{name}=", f"{name}."] if is_mapping and word and not mark and "/" not in name else [f"{name}="]
         else:
             keys.append(f"{path}{dot}{name}{'.' if is_mapping else '='}")
     if not dot:

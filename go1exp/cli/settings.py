@@ -17,6 +17,7 @@ from go1exp.schema import settings as schema
 from go1exp.schema.registry import NonNegative, Positive
 from go1exp.schema.settings import settings
 from go1exp.sim_robot.settings import SimConfig, SimSettings
+from go1exp.sweep.settings import TuneSettings
 
 T = TypeVar("T")
 
@@ -364,6 +365,7 @@ class BenchSettings:
 
 
 EXAMPLES = {
+    "space": """'space=["ppo.gamma=interval(0.97,0.995)"]'""",
     "run": "run=runs/NAME",
     "subjects": "go1exp compare trot paper protocol=kicks",
     "folders": "go1exp report runs/sweep_NAME",
@@ -393,6 +395,7 @@ SETTINGS: dict[str, type] = {
     "fit-actuator": FitActuatorSettings,
     "list": ListSettings,
     "bench": BenchSettings,
+    "tune": TuneSettings,
 }
 """Verbs besides ``train``, whose sections are in ``go1exp.config``, and the class of each one's settings."""
 

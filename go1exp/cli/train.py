@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from go1exp.choices import config_folder
+from go1exp.choices import config_folder, given_folders
 from go1exp.cli import sweep
 from go1exp.cli.app import App, discard, run_dir
 from go1exp.cli.quoting import command
@@ -94,7 +94,7 @@ class TrainJob:
     resumed: bool
 
 
-def _resolved(container: dict[str, Any], overrides: list[str], run: Path) -> TrainJob:
+def resolved(container: dict[str, Any], overrides: list[str], run: Path) -> TrainJob:
     """Return the training that a composed configuration stands for; touches no file.
 
     Args:
@@ -109,16 +109,12 @@ def _resolved(container: dict[str, Any], overrides: list[str], run: Path) -> Tra
 
     config = parse_train(container)
     if config.process.resume:
-        from go1exp.train import kept_plugins
-
-        run = existing(config.process.resume, "resume")
-        container = _resumed(run, overrides)
-        return TrainJob(run, parse_train(kept_plugins.with_copies(run, container)), container, resumed=True)
+        return _planned(existing(config.process.resume, "resume"), overrides)
     _refuse_other(run, container)
     return TrainJob(run, config, container, resumed=False)
 
 
-def _check(job: TrainJob) -> None:
+def check(job: TrainJob) -> None:
     """Refuse what cannot be trained on this machine, before anything is written."""
     from go1exp.train import preflight
 
@@ -127,15 +123,52 @@ def _check(job: TrainJob) -> None:
 
 def _task(container: dict[str, Any]) -> int | None:
     folder = run_dir()
+    overrides = list(HydraConfig.get().overrides.task)
     try:
-        job = _resolved(container, list(HydraConfig.get().overrides.task), folder)
-        _check(job)
+        if container.get("sweep"):
+            sweep.leave_to_go_on(container, overrides)
+        job = resolved(container, overrides, folder)
+        check(job)
     except BaseException:
         discard(folder)
         raise
     if job.resumed:
         discard(folder)
+    return _run(job)
 
+
+def _go_on(run: Path, overrides: list[str]) -> int | None:
+    """Do what a job of a sweep does in its run folder; return the exit status."""
+    job = _planned(run, overrides)
+    check(job)
+    return _run(job)
+
+
+def _planned(run: Path, overrides: list[str]) -> TrainJob:
+    """Return the training of which ``run`` holds the configuration, with what ``overrides`` may change.
+
+    Raises:
+        ConfigError: if they change what they may not.
+    """
+    from go1exp.config import parse_train
+    from go1exp.train import kept_plugins
+
+    container = _resumed(run, overrides)
+    return TrainJob(run, parse_train(kept_plugins.with_copies(run, container)), container, resumed=True)
+
+
+def plan(job: TrainJob) -> None:
+    """Write the run folder of a job that has not begun; one that has begun stays as it is."""
+    from go1exp.schema import plugins
+    from go1exp.train import run_folder, run_state
+
+    if run_state.read(job.run).state == "not started":
+        with plugins.restored():
+            run_folder.write(job.run, job.container)
+
+
+def _run(job: TrainJob) -> int | None:
+    """Train as the only one in the run folder; return the exit status."""
     from go1exp.train import run_lock
 
     with run_lock.locked(job.run):
@@ -187,7 +220,7 @@ def _train(job: TrainJob, first: Weights | None) -> int | None:
         trainer.train(job.config, job.container, job.run, first)
     except trainer.Stopped as stopped:
         run_state.write(job.run, "done" if stopped.finished else "stopped")
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
+        if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
             raise KeyboardInterrupt from None  # the jobs after this one do not start
         if not stopped.finished:
             print(f"stopped; go on with: {command('train', settings={'resume': job.run})}")
@@ -210,9 +243,9 @@ class _Train(App):
 
     def run(self, arguments: Sequence[str]) -> int:
         """Run with command-line arguments; return the exit status."""
-        with sweep.watched(self, arguments, _resolved, _check) as current:
-            status = super().run(arguments)
-        return status or current.status
+        folders = given_folders(arguments)[1:]
+        with sweep.watched(sweep.Rules(self, folders, resolved, check, plan, _planned, _go_on)):
+            return super().run(arguments)
 
 
 APP = _Train("train", _task)

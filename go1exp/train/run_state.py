@@ -12,6 +12,9 @@ from go1exp.files import write_json
 from go1exp.train import run_lock
 
 FILE = "state.json"
+KILLED = "was killed"
+"""Cause of what ended without a word."""
+
 State = Literal["running", "done", "stopped", "failed", "not started"]
 
 
@@ -46,5 +49,5 @@ def read(run: Path) -> RunState:
     except (OSError, ValueError, KeyError, TypeError):
         return RunState("not started")
     if known.state == "running" and not run_lock.in_use(run):
-        return RunState("failed", "was killed")
+        return RunState("failed", KILLED)
     return known

@@ -1,0 +1,85 @@
+"""``go1exp tune``."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
+from hydra.errors import HydraException
+
+from go1exp.cli.app import FAILED, App
+from go1exp.cli.quoting import command
+from go1exp.compose import compose_checked
+from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.sweep.tune import Range
+
+FORMS = "key=interval(low,high), key=tag(log,interval(low,high)), key=range(first,end) or key=choice(a,b)"
+
+
+def _ranges(space: Sequence[str]) -> dict[str, Range]:
+    """Return what each key is drawn from.
+
+    Raises:
+        ConfigError: with every entry that is no range of a key.
+    """
+    ranges: dict[str, Range] = {}
+    problems = []
+    for text in space:
+        try:
+            (override,) = OverridesParser.create().parse_overrides([text])
+            ranges[override.key_or_group] = _range(override)
+        except (HydraException, ValueError, TypeError):
+            problems.append(f"space: {text!r} is none of {FORMS}")
+    if problems or not ranges:
+        raise ConfigError(problems or [f"space: is empty; give entries such as {FORMS}"])
+    return ranges
+
+
+def _range(override: Override) -> Range:
+    """Return the range that an override in Hydra's grammar for sweeps stands for; ValueError if it is none."""
+    from go1exp.sweep.tune import Range
+
+    value = override.value()
+    if isinstance(value, IntervalSweep) and value.start is not None and value.end is not None:
+        return Range(low=value.start, high=value.end, log="log" in value.tags)
+    if isinstance(value, RangeSweep) and isinstance(value.start, int) and isinstance(value.stop, int):
+        return Range(low=value.start, high=value.stop - 1, step=int(value.step))
+    if isinstance(value, ChoiceSweep):
+        return Range(choices=tuple(override.sweep_string_iterator()))
+    raise ValueError(override.input_line)
+
+
+def _task(container: dict[str, Any]) -> int | None:
+    from go1exp.cli.settings import TuneSettings, parse
+
+    settings = parse(TuneSettings, container)
+    ranges = _ranges(settings.space)
+    if importlib.util.find_spec("optuna") is None:
+        raise ConfigError(["go1exp tune needs the package optuna: pip install 'go1exp[tune]'"])
+
+    from go1exp.cli import train
+    from go1exp.sweep.tune import Search
+
+    def plan(overrides: Sequence[str], run: Path) -> None:
+        job = train.resolved(compose_checked("train", overrides), list(overrides), run)
+        train.check(job)
+        train.plan(job)
+
+    lowest = [f"{key}={drawn.example}" for key, drawn in ranges.items()]
+    train.check(train.resolved(compose_checked("train", [*settings.overrides, *lowest]), lowest, Path(settings.out)))
+    best = Search(settings, ranges, plan).run()
+    if best is None:
+        return FAILED
+    drawn = [f"{key}={value}" for key, value in best.params.items()]
+    print(f"best: trial {best.number}, {settings.metric} = {best.value:.5g}")
+    print(f"now: {command('train', *settings.overrides, *drawn)}")
+    return None
+
+
+APP = App("tune", _task)
