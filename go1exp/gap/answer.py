@@ -13,11 +13,11 @@ from go1exp.effects.tolerances import Tolerances, declared, effect_class, sizes
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.score.linear import Layout
+from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import significance, tolerances
 from go1exp.gap.search.evidence import inaudible
 from go1exp.gap.search.fit import fit
 from go1exp.gap.search.stepwise import SILENT, Search
-from go1exp.gap.search.trial import excess, removed
 from go1exp.schema.registry import members
 
 MOST = 0.75

@@ -8,6 +8,7 @@ from scipy.stats import false_discovery_control
 from go1exp.gap.data.windows import held
 from go1exp.gap.result import Localisation
 from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.robust import weighted_excess
 
 REGIMES = (
     *("stick", "reversal", "slow", "fast", "high torque", "after an edge", "drives off"),
@@ -93,7 +94,9 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     inside = regimes(scorer, windows)
     count = inside.sum((1, 2))
     score = np.log(np.maximum(square, 1e-3)) * w.valid[windows][..., None]  # a few violent samples must not decide
-    excess = np.divide((square * inside).sum((1, 2)), count, where=count > 0, out=np.full(count.shape, np.nan)) - 1.0
+    samples = inside.sum(2)  # R V J
+    of_window = np.divide((square * inside).sum(2), samples, where=samples > 0, out=np.ones(samples.shape))
+    excess = weighted_excess(np.moveaxis(of_window, 1, 0), np.moveaxis(samples, 1, 0))
     p = np.full(count.shape, np.nan)
     observed = _means(score, inside, count)
     larger = np.zeros(count.shape)

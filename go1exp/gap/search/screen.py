@@ -14,6 +14,7 @@ from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta, variants
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table, differences, predicted
+from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import strain, tolerances
 
 PROBE = 2.0
@@ -188,8 +189,8 @@ class _Ranking:
             bounds.low[layout.part(np.arange(known, len(probes)))] = -np.inf
         relief = (self.plain - strain.price(matrix, right, strict)) / self.count
         x = tolerances.solve(matrix, right, limits)
-        after = predicted(part, layout, x) / self.size
-        gain = float(np.mean(np.log(self.before.sum(1) / np.maximum(after, 0.3).sum(1))))
+        after = np.maximum(predicted(part, layout, x), 0.0) / self.size  # rounding can make it negative
+        gain = float(np.mean(log_chi2(self.before) - log_chi2(after)))
         start = _start(theta, variant, self.present.probes, layout, x, self.machine)
         columns = [*added, *(k for k, p in enumerate(self.present.probes) if p.key[0] == variant.effect)]
         signal = _signal(self.grams, self.full.probes, columns, self.size, self.may.tolerances)

@@ -13,11 +13,12 @@ from go1exp.gap.data.splits import Splits
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import Candidate, GapSettings
 from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import evidence, significance, single_cause, strain, tolerances
 from go1exp.gap.search.fit import Model, fit, misfit
 from go1exp.gap.search.screen import Screened, library, outside, screen
 from go1exp.gap.search.state import State
-from go1exp.gap.search.trial import Trial, excess, removed, tried
+from go1exp.gap.search.trial import Trial, tried
 
 SILENT = 0.02
 """An effect that adds less than this to the chi2 of every window, at twice its tolerance, is not excited."""

@@ -11,6 +11,7 @@ import numpy as np
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout
+from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import evidence, significance, tolerances
 from go1exp.gap.search.fit import Model, scores
 from go1exp.gap.search.strain import CLEAR
@@ -20,16 +21,6 @@ FEW = 0.5
 
 MOSTLY = 0.7
 """Share of a small excess, of a model that is adequate already, that a term must remove: the right one leaves none."""
-
-
-def excess(chi2: np.ndarray) -> float:
-    """Return the mean excess of chi2 per value (V, G)."""
-    return float(chi2.mean() - 1.0) if chi2.size else math.nan
-
-
-def removed(before: float, after: float) -> float:
-    """Return the share of an excess that is gone; what lies below the floor counts as nothing."""
-    return 1.0 - max(after, 0.0) / before if before > 0 else 0.0
 
 
 @dataclass(frozen=True)

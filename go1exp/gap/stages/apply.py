@@ -21,8 +21,8 @@ from go1exp.gap.files import GapFileError
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search.fit import scores
-from go1exp.gap.search.trial import excess, removed
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.schema.joint_values import spread
