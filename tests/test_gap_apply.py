@@ -18,7 +18,7 @@ import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp.audit import audit
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
-from go1exp.config import parse_task
+from go1exp.config import parse_parts, parse_task
 from go1exp.env.core import Go1Core
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
@@ -158,6 +158,18 @@ def test_the_public_face_of_gap_has_every_name_that_it_promises() -> None:
     assert all(getattr(gap, name) is not None for name in gap.__all__)
     with pytest.raises(AttributeError, match="has no attribute 'explian'"):
         gap.explian  # noqa: B018
+
+
+def test_training_is_offered_only_where_there_is_something_to_train_with(capsys: pytest.CaptureFixture[str]) -> None:
+    from go1exp.cli.gap import _print_next
+
+    robot = hung(parse_parts(compose("gap", ["logs=x"]), ("robot",))[0]["robot"])
+    _print_next({}, robot, Path("gap/effect.yaml"))
+    empty = capsys.readouterr().out
+    assert "train" not in empty.replace("training", "")
+    assert "nothing is certified" in empty
+    _print_next({"coulomb": {"bound": 0.2}}, robot, Path("gap/effect.yaml"))
+    assert capsys.readouterr().out == "now: go1exp train effect=gap/effect.yaml\n"
 
 
 # ---------------------------------------------------------------------- what training reads
