@@ -88,9 +88,7 @@ def test_a_file_that_says_none_is_none(tmp_path: Path, run: Run) -> None:
     assert compose("train", choices_from_files(["effect=mine.yaml"], "train"))["effect"] == {}
 
 
-def test_a_file_is_taken_though_a_shipped_choice_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_taken_though_a_shipped_choice_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """``model=so101.yaml`` in a folder of one's own is that file, not the model of that name in conf/."""
     monkeypatch.chdir(tmp_path)
     mine = (config_folder() / "model/so101.yaml").read_text().replace("mjcf: ", "mjcf: elsewhere/")

@@ -93,7 +93,8 @@ def _named(item: Mapping[str, Any]) -> NamedEffect:
         for param, places in item["interval"].items()
     }
     tuples = {name: tuple(item[name]) for name in ("joints", "alias_set")}
-    return NamedEffect(**{**item, **tuples, "params": _numbers(item["params"]), "interval": interval})
+    share = _number(item.get("share"))  # older results say none
+    return NamedEffect(**{**item, **tuples, "params": _numbers(item["params"]), "interval": interval, "share": share})
 
 
 def _candidate(item: Mapping[str, Any]) -> Candidate:

@@ -170,6 +170,8 @@ class NamedEffect:
         interval: parameter -> joint (or ``robot``) -> 95 % interval.
         alias_set: effects that do as well on these data, this one first.
         status: ``certified``, or ``compensating`` if it may stand for something that no effect describes.
+        reason: why it is not certified; empty if it is.
+        share: part of the held-out excess within the tolerances that comes back without this effect; NaN if not known.
     """
 
     effect: str
@@ -178,6 +180,8 @@ class NamedEffect:
     interval: dict[str, dict[str, tuple[float, float]]]
     alias_set: tuple[str, ...]
     status: Literal["certified", "compensating"]
+    reason: str = ""
+    share: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -212,7 +216,8 @@ class GapResult:
         candidates: the evidence, best first.
         floors: None if the log is bad.
         excess: held-out excess of the plain model (``null``), within its tolerances (``box``), with what was named
-            (``final``), and that on the episodes kept for the last check (``confirm``).
+            (``final``), that on windows kept for the last check (``confirm``), and that of what the written files
+            hold, on the windows whose numbers are ``judged`` in the provenance (``written``).
         closed: share of the held-out excess that the named effects removed; NaN without one.
         before: localisation of the plain model; None if the log is bad.
         after: localisation with what was named.

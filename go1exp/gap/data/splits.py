@@ -9,7 +9,6 @@ import numpy as np
 
 from go1exp.recording import Meta
 
-
 STRETCH = 3
 """Windows of a stretch."""
 
@@ -34,6 +33,11 @@ class Splits:
     confirm: np.ndarray
     alone: tuple[str, ...] = ()
     shared: tuple[str, ...] = ()
+
+    @property
+    def judged(self) -> np.ndarray:
+        """Windows that no fitted value has seen: those of the last check, or if there are none the held-out ones."""
+        return self.confirm if len(self.confirm) else self.select
 
 
 def _stretch(episode: np.ndarray) -> np.ndarray:
@@ -64,8 +68,8 @@ def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.r
     What only one episode shows, at the gains that show it, cannot be fitted if that episode judges, nor judged if it
     is fitted. So of episodes of one motion and gain set half are fitted and half judge; one that is alone is cut into
     stretches of three windows, which take turns. For the last check whole episodes are kept of motions of which there
-    are more; if those are fewer than ``confirm`` asks for, every fifth stretch of episodes that are alone is. An episode
-    and its repetition count as one.
+    are more; if those are fewer than ``confirm`` asks for, every fifth stretch of episodes that are alone is. An
+    episode and its repetition count as one.
 
     Args:
         metas: of the recordings.
@@ -85,15 +89,15 @@ def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.r
     for kind in dict.fromkeys(kinds):
         shuffled = rng.permutation([u for u in range(len(units)) if kinds[u] == kind and u not in kept])
         if len(shuffled) == 1:
-            name, here = units[shuffled[0]], unit == shuffled[0]
+            name, inside = units[shuffled[0]], unit == shuffled[0]
             alone.append(name)
-            stretch = np.unique(_stretch(episode)[here], return_inverse=True)[1]
+            stretch = np.unique(_stretch(episode)[inside], return_inverse=True)[1]
             spared = (before + stretch) % KEPT_EVERY == KEPT_EVERY - 1
             if cut and spared.any() and (len(units) > 3 or stretch.max() >= KEPT_EVERY - 1):
                 shared.append(name)
-                confirmed[here] = spared
+                confirmed[inside] = spared
             before += int(stretch.max()) + 1 if len(units) > 3 else 0
-            select[here] = (stretch + len(alone)) % 2 == 1
+            select[inside] = (stretch + len(alone)) % 2 == 1
         else:
             select |= np.isin(unit, shuffled[: len(shuffled) // 2])
     train, held, last_check = (np.flatnonzero(m) for m in (~select & ~confirmed, select & ~confirmed, confirmed))

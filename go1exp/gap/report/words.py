@@ -28,7 +28,7 @@ ERRORS: dict[str, str] = {
     "null": "model as it is",
     "box": "within its tolerances",
     "final": "with what is named",
-    "confirm": "on the episodes kept for the last check",
+    "confirm": "on windows kept for the last check",
 }
 """Key of ``GapResult.excess`` -> what it is of."""
 
@@ -208,16 +208,14 @@ def would_change(result: GapResult) -> list[str]:
         at = f", largest at {rest}" if rest else ""
         changes.append(
             f"An effect that takes the held-out error to {allowed} or less; {error(final)} is left{at}. "
-            "No effect of the library does."
+            "None that was fitted does."
         )
     for named in result.named:
         if rivals(named):
             changes.append(f"Data that separate {named.effect} from {' and '.join(rivals(named))} may change the name.")
         if named.status == "compensating":
-            bar = share(limit(result, "certified"))
-            changes.append(
-                f"{named.effect} is certified only if it is named again in {bar} of the bootstraps and little is left."
-            )
+            why = named.reason or "it is not certain"
+            changes.append(f"{named.effect} is not certified: {why}.")
     if result.verdict == "unexplained" and result.candidates:
         near = max(result.candidates, key=lambda c: c.log_gain)
         if near.status == "rejected":

@@ -1,4 +1,4 @@
-"""The one measure of how wrong a model is on windows, of which a few may be wild, and others nothing but a joint at rest.
+"""The one measure of how wrong a model is on windows, of which a few may be wild, and others show a joint at rest.
 
 ``log_chi2`` is what fits make small and what tests compare, window by window. ``excess`` is the level that is reported
 and compared with limits. Everything in the workflow that judges a model uses these two.
@@ -31,8 +31,8 @@ def excess(chi2: np.ndarray) -> float:
 def weighted_excess(chi2: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the typical excess (...) of chi2 per value (N, ...), each with its weight (N, ...); NaN without any.
 
-    The mean f^-1(mean f(chi2)) of Kolmogorov (1930) with f the identity up to ``KNEE`` and a logarithm beyond: the plain
-    mean where no window is wild, and close to the geometric mean where all are far from the floor.
+    The mean f^-1(mean f(chi2)) of Kolmogorov (1930) with f the identity up to ``KNEE`` and a logarithm beyond: the
+    plain mean where no window is wild, and close to the geometric mean where all are far from the floor.
     """
     value = np.minimum(chi2, KNEE) + KNEE * np.log(np.maximum(chi2, KNEE) / KNEE)
     whole = np.asarray(weight.sum(axis=0), dtype=float)

@@ -70,6 +70,11 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
             f"Of {len(parts.alone)} episodes there is no other with the same motion and gains; stretches of them judge "
             "what was fitted on the rest of them."
         )
+    if parts.shared:
+        warnings.append(
+            f"The last check has stretches of {len(parts.shared)} episodes and few or no whole ones: of their "
+            "motions there is no other episode."
+        )
     if not len(parts.confirm):
         warnings.append("Too few episodes to keep some for a last check.")
     search = Search(comparison.scorer, parts, settings, comparison.dt, rng, on_progress)
@@ -80,7 +85,7 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
     if unseen <= settings.adequate:
         return search
     warnings.append(
-        f"Episodes kept for a last check show an error of {1 + unseen:.3g} times the floor, others do not: "
+        f"Windows kept for a last check show an error of {1 + unseen:.3g} times the floor, others do not: "
         "they were taken into the search, with nothing left for a last check."
     )
     search = Search(comparison.scorer, comparison.split(rng, confirm=0.0), settings, comparison.dt, rng, on_progress)
@@ -139,6 +144,7 @@ def provenance(
         "seed": settings.seed,
         "physics_dt": comparison.dt,
         "windows": len(comparison.windows),
+        "judged": [int(k) for k in parts.judged],
         "split": {name: sorted({recordings[e].meta.episode for e in episode[w]}) for name, w in kinds.items()},
     }
 
