@@ -17,7 +17,7 @@ from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import significance, tolerances
-from go1exp.gap.search.evidence import inaudible
+from go1exp.gap.search.evidence import deviation, inaudible
 from go1exp.gap.search.fit import fit
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import SILENT, Search
@@ -166,12 +166,14 @@ def name_terms(
     for effect in search.state.terms:
         per_joint = [key for key in sizes(effect) if known.param(key).per == "joint"]
         at = _joints_beyond(per_joint, theta, drawn, joints, known)
+        reason = doubt(search, effect, theta, at, adequate, check)
+        if per_joint and not at:
+            at = (_strongest(per_joint, theta, joints, known),)
         params: dict[str, dict[str, float]] = {}
         interval: dict[str, dict[str, tuple[float, float]]] = {}
         for key in (key for key in theta if key[0] == effect):
             samples = drawn.get(key, np.ravel(theta[key])[None])
             params[key[1]], interval[key[1]] = _by_joint(key, theta[key], samples, joints, at)
-        reason = doubt(search, effect, theta, at, adequate, check)
         status: Literal["certified", "compensating"] = "compensating" if reason else "certified"
         share = search.share_of(effect)
         named.append(NamedEffect(effect, at, params, interval, search.aliases[effect], status, reason, share))
@@ -181,17 +183,20 @@ def name_terms(
 def _joints_beyond(
     keys: Sequence[Key], theta: Theta, drawn: Mapping[Key, np.ndarray], joints: Sequence[str], known: Tolerances
 ) -> tuple[str, ...]:
-    """Return the joints at which one of the parameters leaves its tolerance, and is not null, beyond doubt."""
-    beyond, at_best = np.zeros(len(joints), dtype=bool), np.zeros(len(joints), dtype=bool)
+    """Return the joints at which one of the parameters leaves its tolerance and its interval does not hold null."""
+    beyond = np.zeros(len(joints), dtype=bool)
     for key in keys:
         p = known.param(key)
         low, high = np.quantile(drawn[key], QUANTILES, axis=0)
         value = np.broadcast_to(theta[key], len(joints))
-        at_best |= np.abs(value - p.null) > p.tolerance
         beyond |= (np.abs(value - p.null) > p.tolerance) & ((low > p.null) | (high < p.null))
-    if not beyond.any():  # few windows show it: a resample without them does not show where it is
-        beyond = at_best
     return tuple(j for j, b in zip(joints, beyond, strict=True) if b)
+
+
+def _strongest(keys: Sequence[Key], theta: Theta, joints: Sequence[str], known: Tolerances) -> str:
+    """Return the joint that is furthest from null, in tolerances."""
+    away = [np.broadcast_to(deviation(theta, key, known), len(joints)) for key in keys]
+    return joints[int(np.max(away, axis=0).argmax())]
 
 
 def _by_joint(

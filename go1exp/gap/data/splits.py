@@ -92,11 +92,12 @@ def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.r
             name, inside = units[shuffled[0]], unit == shuffled[0]
             alone.append(name)
             stretch = np.unique(_stretch(episode)[inside], return_inverse=True)[1]
+            count = int(stretch.max(initial=-1)) + 1
             spared = (before + stretch) % KEPT_EVERY == KEPT_EVERY - 1
-            if cut and spared.any() and (len(units) > 3 or stretch.max() >= KEPT_EVERY - 1):
+            if cut and spared.any() and (len(units) > 3 or count >= KEPT_EVERY):
                 shared.append(name)
                 confirmed[inside] = spared
-            before += int(stretch.max()) + 1 if len(units) > 3 else 0
+            before += count if len(units) > 3 else 0
             select[inside] = (stretch + len(alone)) % 2 == 1
         else:
             select |= np.isin(unit, shuffled[: len(shuffled) // 2])

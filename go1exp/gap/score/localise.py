@@ -41,17 +41,14 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
     w = scorer.windows
     q, qd = w.y[windows, :, 0], w.y[windows, :, 1]
     t = w.t[windows]
-    target, on, edge = np.empty_like(q), np.empty(t.shape, dtype=bool), np.zeros(q.shape, dtype=bool)
+    on, edge = np.empty(t.shape, dtype=bool), np.zeros(q.shape, dtype=bool)
     for row, k in enumerate(windows):
-        target[row] = held(w.edges[k], t[row])
         on[row] = held(w.switches[k], t[row])
         when, values = w.edges[k]
         jump = np.abs(np.diff(values, axis=0, prepend=values[:1])) > EDGE
         since = t[row][:, None] - when
         edge[row] = np.einsum("te,ej->tj", ((since >= 0) & (since < 0.06)).astype(int), jump.astype(int)) > 0
-    kp, kd = w.kp[windows][:, None], w.kd[windows][:, None]
-    asked = np.where((kp == 0.0) & (kd == 0.0), target, kp * (target - q) - kd * qd)  # without gains, of torques
-    demand = np.abs(asked) * on[..., None]
+    demand = np.abs(w.demanded(windows))
     span = max(int(TURN_S / w.period), 1)
     turn = np.zeros(q.shape, dtype=bool)
     turn[:, span:-span] = qd[:, : -2 * span] * qd[:, 2 * span :] < 0

@@ -14,6 +14,7 @@ from go1exp.gap.result import Candidate, GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import significance
+from go1exp.gap.search.fit import Model
 from go1exp.gap.search.state import State
 
 
@@ -52,6 +53,7 @@ class Ledger:
         steps: (what, held-out excess) after every accepted term.
         single: the term that explains nearly everything alone, if there is one (``gap/search/single_cause.py``).
         strained: whether the first term was accepted although the tolerances explain the data nearly as well.
+        rivals: fitted models that nearly did as well as the first term, best first.
         returned: term -> share of the excess within the tolerances that came back without it, as it was last looked at.
     """
 
@@ -72,6 +74,7 @@ class Ledger:
     steps: list[tuple[str, float]] = field(default_factory=list)
     single: str = ""
     strained: bool = False
+    rivals: list[Model] = field(default_factory=list)
     returned: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ from go1exp.gap.score.robust import excess
 from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, tolerances
 from go1exp.gap.search.fit import Model, fit, misfit
 from go1exp.gap.search.ledger import Ledger
-from go1exp.gap.search.screen import Screened, library, outside, screen
+from go1exp.gap.search.screen import Screened, library, motion, outside, screen
 from go1exp.gap.search.state import State
 from go1exp.gap.search.trial import Trial, tried
 
@@ -21,6 +21,9 @@ SILENT = 0.02
 
 SCREENED = 20
 """Windows in which candidates are screened, at most."""
+
+RIVALS = 2
+"""Candidates beside the first term that are tried in the place of several terms."""
 
 LOOSENED = 3
 """Most effects that join the tolerance box because the data ask for some of them, within their tolerances."""
@@ -44,8 +47,10 @@ class Search(Ledger):
         if self.state.terms:
             self.progress("is all of it needed", 0.85)
             reduction.eliminate(self)
+            reduction.unite(self)
             reduction.simplify(self)
             reduction.prune(self)
+            reduction.symmetrical(self)
         sizes_of_terms = [evidence.size(t, self.state.theta, self.state.tolerances) for t in self.state.terms]
         if self.strained and sizes_of_terms and max(sizes_of_terms) <= strain.CLEAR:
             self.withdraw("it leaves its tolerance by too little to be called missing")
@@ -73,7 +78,12 @@ class Search(Ledger):
         """Look for one more term, or one more effect to move within its tolerance; return whether to go on."""
         term = len(self.state.terms) + 1
         share = 0.15 + 0.7 * (term - 1) / self.settings.max_terms
-        small = excess(self.select_chi2) < self.settings.material
+        level = excess(self.select_chi2)
+        if level < 0.0:  # below the floor there is nothing to explain
+            if not self.signal:
+                self._note_signals(self._screened())
+            return False
+        small = level < self.settings.material
         fitted = self._proposals(term, share, small)
         accepted, inside = self._judged(fitted, self.state, self.state.train_chi2, self.select_chi2, small)
         if accepted is not None:
@@ -152,8 +162,8 @@ class Search(Ledger):
     def _screened(self) -> list[Screened]:
         """Rank all ways in which an effect could be missing, on some of the windows of the fit."""
         linear, machine = self.state.table, self.state.machine
-        mean = self.state.scorer.windows.y[:, :, 0].mean((0, 1))
-        variants = library(machine, mean, [*self.state.terms, *self.state.loosened])
+        moved = motion(self.state.scorer.windows, machine.effort)
+        variants = library(machine, moved, [*self.state.terms, *self.state.loosened])
         if self.settings.effects:
             variants = [v for v in variants if v.effect in self.settings.effects]
         count = len(linear.windows)
@@ -231,6 +241,10 @@ class Search(Ledger):
         if trial.chosen is None:
             return None, inside
         accepted = fitted[trial.chosen]
+        if not self.state.terms:
+            near = trial.mean > significance.LEAST * trial.mean[trial.chosen]
+            order = [k for k in np.argsort(-trial.mean) if near[k] and trial.sizes[k] > 1.0 and k != trial.chosen]
+            self.rivals = [fitted[k] for k in order[:RIVALS]]
         self.aliases[accepted.name] = (accepted.name, *(n for n in names if n != accepted.name))
         on_train = significance.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None]))
         every = np.concatenate([on_train, trial.gain], axis=1)
