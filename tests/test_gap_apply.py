@@ -22,7 +22,7 @@ from go1exp.config import parse_parts, parse_task
 from go1exp.env.core import Go1Core
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
-from go1exp.gap.result import Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
+from go1exp.gap.result import AngleErrors, Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.stages.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
 from go1exp.gap.stages.explain import explain
@@ -65,6 +65,7 @@ def whole() -> GapResult:
             Candidate("cogging", (), {"count": 38.0}, NAN, NAN, NAN, NAN, ("cogging",), "not excited", "", stage=2),
         ),
         floors=Floors({"q": 1e-4, "qd": NAN}, {"q": 1e-5}, {"q": 2e-4}),
+        errors=AngleErrors(12, (0.012, 0.003), 0.75, NAN, {"a": (0.01, NAN)}, {"chirp_0": (0.012, 0.003)}),
         excess={"null": 56.3, "box": 40.2, "final": 0.3, "confirm": NAN},
         before=where,
         after=replace(where, flagged=~where.flagged),

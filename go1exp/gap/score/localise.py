@@ -7,8 +7,9 @@ from scipy.stats import false_discovery_control
 
 from go1exp.gap.data.windows import held
 from go1exp.gap.result import Localisation
+from go1exp.gap.score.angle_errors import unexplained
 from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.score.robust import weighted_excess
+from go1exp.gap.score.robust import log_chi2, weighted_excess
 
 REGIMES = (
     *("stick", "reversal", "slow", "fast", "high torque", "after an edge", "drives off"),
@@ -78,19 +79,14 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     window to another: whether the excess is larger there than elsewhere in the same joint.
     """
     w, groups = scorer.windows, np.array(scorer.replayer.machine.groups)
-    state = scorer.state[windows].astype(float)
-    inner = np.swapaxes(state, -1, -2) @ state + np.eye(state.shape[-1])
-    cross = np.swapaxes(state, -1, -2) @ residual[..., None]
-    left = residual - (state @ np.linalg.solve(inner, cross))[..., 0]
-    n, quantities = w.t.shape[1], len(w.quantities)
-    split = left.reshape(len(windows), len(groups), n, quantities, -1)
-    square = np.empty((len(windows), n, len(w.joints)))
+    split = unexplained(scorer, residual, windows)
+    square = np.empty((len(windows), w.t.shape[1], len(w.joints)))
     for g, joints in enumerate(groups):
         scored = np.isfinite(scorer.scale[windows][:, : w.of_joints, joints]).sum(1)  # V K quantities
         square[:, :, joints] = (split[:, g, :, : w.of_joints] ** 2).sum(axis=2) / np.maximum(scored, 1)[:, None]
     inside = regimes(scorer, windows)
     count = inside.sum((1, 2))
-    score = np.log(np.maximum(square, 1e-3)) * w.valid[windows][..., None]  # a few violent samples must not decide
+    score = log_chi2(square) * w.valid[windows][..., None]  # a few violent samples must not decide
     samples = inside.sum(2)  # R V J
     of_window = np.divide((square * inside).sum(2), samples, where=samples > 0, out=np.ones(samples.shape))
     excess = weighted_excess(np.moveaxis(of_window, 1, 0), np.moveaxis(samples, 1, 0))

@@ -16,8 +16,9 @@ from go1exp.gap.answer import Answer, advice, concluded, evidence, not_excited, 
 from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.replay.rows import Theta, variants
-from go1exp.gap.result import GapResult, GapSettings, NamedEffect, Overlay
+from go1exp.gap.result import AngleErrors, GapResult, GapSettings, NamedEffect, Overlay
 from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.score.angle_errors import angle_errors
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import localise
 from go1exp.gap.score.robust import excess
@@ -116,6 +117,7 @@ def written(
         floors=comparison.floors(),
         excess=answer.excess,
         closed=answer.closed,
+        errors=_angle_errors(comparison, search),
         before=localise(score, before, shown, search.rng),
         after=localise(score, after, shown, search.rng),
         not_excited=silent,
@@ -129,6 +131,13 @@ def written(
         warnings=tuple(warnings),
         seconds=time.perf_counter() - start,
     )
+
+
+def _angle_errors(comparison: Comparison, search: Search) -> AngleErrors:
+    """Return the errors of the angles before and after, on windows that no fitted value has seen."""
+    score, windows = search.state.scorer, search.splits.judged
+    before, after = residuals(score, [{}, search.state.theta], windows, search.dt)
+    return angle_errors(score, before, after, windows, [r.meta.episode for r in comparison.recordings])
 
 
 def provenance(
