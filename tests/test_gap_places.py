@@ -115,7 +115,7 @@ def test_a_limit_of_the_torque_is_looked_for_below_what_was_asked_for(demand: fl
     peaks = [1.0 + p.delta for p in probes if p.key == ("torque_speed_limit", "peak")]
     thigh = np.array([peak[1] for peak in peaks])
     low = 0.2  # of the parameter
-    assert (thigh < max(demand, low) + 1e-9).any()
+    assert len({p for p in thigh if p < max(min(demand, 1.0), low) + 1e-9}) >= (4 if demand > 1.0 else 1)
     assert np.all(thigh <= 0.95 + 1e-9)
     assert {p.place for p in probes} == {0, 1, 2}  # part by part, not one value for all
 

@@ -135,7 +135,7 @@ def _periods(machine: Machine, effect: str, periodic: Periodic) -> Iterator[Vari
         yield Variant(effect, tuple(Probe(key, p.place, p.delta, also) for also in phases for p in plain), at)
 
 
-SHARES = (0.9, 0.75, 0.55)
+SHARES = (0.9, 0.75, 0.55, 0.35)
 """Shares of the largest torque that a joint was asked for at which a limit of the torque is looked for."""
 
 
@@ -144,7 +144,8 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
     levels: list[Mapping[str, float | np.ndarray]] = [*how.levels]
     if how.limits_torque:
         limit = machine.tolerances.param((effect, how.limits_torque))
-        tried = [(share * moved.demand).clip(limit.low, limit.null - limit.tolerance) for share in SHARES]
+        reached = np.minimum(moved.demand, limit.null)  # what is asked for beyond the peak is cut off anyway
+        tried = [(share * reached).clip(limit.low, limit.null - limit.tolerance) for share in SHARES]
         levels += [{how.limits_torque: values - limit.null} for values in tried]
     for chosen in how.shapes or ({},):
         shapes: Theta = {(effect, name): moved.angle(value) for name, value in chosen.items()}
