@@ -328,6 +328,10 @@ def test_the_right_effect_is_proved_and_a_wrong_one_is_not(tmp_path: Path) -> No
     assert not bad.holds
     assert bad.before == good.before
     assert bad.after > 10.0
+    worse = replace(right, named=(named("coulomb", bound={j: 9.0 * v for j, v in HIDDEN.items()}),))
+    harmful = proof(tmp_path, replace(worse, excess={"final": 1e6, "written": 1e6}))
+    assert harmful.after > harmful.before
+    assert not harmful.holds  # as good as was reported, and yet worse than nothing
 
 
 def test_what_is_proved_is_compared_on_the_windows_on_which_it_was_reported(tmp_path: Path) -> None:

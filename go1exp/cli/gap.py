@@ -146,7 +146,9 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
         f"floor ({1 + proof.before:.3g} without; {1 + proof.effect_only:.3g} with {apply.EFFECT} alone)"
     )
     if not proof.holds:
-        print(f"NOT applied: it was {1 + proof.reported:.3g} in the search, and is worse at this step")
+        better = "in the search it was" if proof.after <= proof.before else "the model as it is has"
+        least = proof.reported if proof.after <= proof.before else proof.before
+        print(f"NOT applied: the error is {1 + proof.after:.3g} with the files at this step; {better} {1 + least:.3g}")
         return DOES_NOT_HOLD
     _print_next(contents[apply.EFFECT], robot, out / apply.EFFECT)  # type: ignore[arg-type]
     return 0

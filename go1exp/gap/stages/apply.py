@@ -51,7 +51,8 @@ class Applied:
         effect_only: with ``effect.yaml`` alone.
         reported: excess that the search had at its own step with what ``effect.yaml`` holds.
         closed: share of the excess that the files remove.
-        holds: whether the model with the files is as good at this step as was reported.
+        holds: whether the model with the files is as good at this step as was reported, and not worse than
+            the plain one.
     """
 
     files: tuple[Path, ...]
@@ -265,7 +266,7 @@ def prove(
         values = _proposals(contents, robot)
         plain, effect_only, both = (excess(_held_out(comparison, theta, windows)) for theta in values)
     reported = _reported(result)
-    holds = both <= max(settings.adequate, 1.5 * reported + 0.1)
+    holds = both <= max(settings.adequate, min(plain, 1.5 * reported + 0.1))
     closed = removed(plain, both)
     return Applied((), comparison.dt, plain, both, effect_only, reported, closed, bool(holds))
 
