@@ -11,7 +11,8 @@ import pytest
 
 from go1exp.effects.tolerances import DECLARED
 from go1exp.gap.replay.rows import Theta
-from go1exp.gap.search import evidence, places
+from go1exp.gap.score.linear import Layout
+from go1exp.gap.search import evidence, places, tolerances
 from go1exp.gap.search.screen import Motion, library
 from go1exp.gap.search.tolerances import Freedom
 from go1exp.gap.search.trial import _choice
@@ -113,11 +114,25 @@ def test_a_limit_of_the_torque_is_looked_for_below_what_was_asked_for(demand: fl
     motion = Motion(np.zeros(12), -np.ones(12), np.ones(12), asked)
     probes = [p for v in library(MACHINE, motion) if v.effect == "torque_speed_limit" for p in v.probes]
     peaks = [1.0 + p.delta for p in probes if p.key == ("torque_speed_limit", "peak")]
-    thigh = np.array([peak[1] for peak in peaks])
-    low = 0.2  # of the parameter
-    assert len({p for p in thigh if p < max(min(demand, 1.0), low) + 1e-9}) >= (4 if demand > 1.0 else 1)
-    assert np.all(thigh <= 0.95 + 1e-9)
-    assert {p.place for p in probes} == {0, 1, 2}  # part by part, not one value for all
+    thighs = [peak[1] for peak in peaks if (peak < 1.0).sum() == 4 and peak[1] < 1.0]  # part by part
+    assert len(thighs) == 4
+    assert len({p for p in thighs if p < max(min(demand, 1.0), 0.2) + 1e-9}) >= (4 if demand > 1.0 else 1)
+    assert max(thighs) <= 0.95 + 1e-9
+
+
+def test_what_shares_a_value_moves_only_where_it_is() -> None:
+    """A limit at the four thighs: a step of the fit must not pull the other joints along."""
+    key = ("torque_speed_limit", "peak")
+    theta = {key: np.tile([1.0, 0.7, 1.0], 4)}
+    (probe,) = tolerances.probes(MACHINE, [key], theta)
+    assert set(np.flatnonzero(probe.delta)) == {1, 4, 7, 10}
+    layout = Layout.from_probes(MACHINE, [probe])
+    after = tolerances.moved(theta, layout, [probe], np.array([-0.1]), MACHINE)[key]
+    np.testing.assert_allclose(after, np.tile([1.0, 0.6, 1.0], 4))
+    limits = tolerances.bounds(layout, [probe], theta, Freedom(DECLARED).also("torque_speed_limit"))
+    np.testing.assert_allclose((limits.low, limits.high), ([-0.5], [0.3]))
+    nowhere = tolerances.probes(MACHINE, [key], {})[0]
+    assert np.all(nowhere.delta != 0.0)
 
 
 def test_a_spring_is_looked_for_at_rest_angles_of_the_whole_range() -> None:

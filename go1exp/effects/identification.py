@@ -53,13 +53,13 @@ class Identification:
         rank: place among the nominal effects, smaller first, then in the order of registration. Resampling draws its
             random numbers in this order, so a change of it changes intervals within their own uncertainty.
         needs_ground: it acts on the trunk or on the feet; a robot whose trunk is held does not feel it.
-        common: its parameters have one value for all joints. For effects that few joints ever show.
+        common: its parameters have one value for all joints at which it is. For effects that few joints ever show.
         weighs_on_legs: one such error, equal at all joints, moves the legs of a standing robot as a change of weight
             does; an effect of the trunk must explain recordings better than it.
         levels: changes from null, by parameter, in its unit, at which it is probed; each may become the start of a fit.
             For effects with a threshold, or far from linear. Empty: twice the tolerance of each parameter.
-        limits_torque: parameter that is a limit of the torque as a share of the peak; it is also probed at shares of
-            the largest torque that each joint was asked for, since a limit above does nothing. Empty for none.
+        limits_torque: parameter that is a limit of the torque as a share of the peak; it is also probed part by part,
+            at shares of the largest torque that a part was asked for, since one above does nothing. Empty for none.
         shapes: values of its shape parameters with which it is tried. Empty: their null values.
         free_shapes: shape parameters that a full fit may change.
         periodic: its parameters, if it is a torque that is periodic in the angle.

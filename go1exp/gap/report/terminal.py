@@ -29,9 +29,9 @@ def text(result: GapResult) -> str:
             lines.append(f"{words.share(result.closed)} of the excess is gone.")
         lines.append("")
     if result.errors is not None:
-        head = ("error of the angle, mrad", "before", "after")
+        title = ("error of the angle, mrad", "before", "after")
         rows = words.angle_rows(result.errors, MOST_EPISODES)
-        lines += [*_wrapped(words.angles(result.errors)), "", *_table([head, *rows]), ""]
+        lines += [*_wrapped(words.angles(result.errors)), "", *_table([title, *rows]), ""]
     for todo in words.next_recordings(result):
         lines += [*_wrapped(f"Next: {todo.why}"), f"  {todo.command}"]
     lines += [line for warning in result.warnings for line in _wrapped(f"Warning: {warning}")]

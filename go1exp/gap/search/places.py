@@ -83,7 +83,7 @@ def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.
     """
     joints, known = linear.machine.joints, linear.may.tolerances
     outside = frozenset(int(j) for j in np.flatnonzero(evidence.beyond(name, linear.theta, joints, known)))
-    if len(outside) < 2:
+    if len(outside) < 2 or tolerances.identification(name).common:  # what shares a value is where it was found
         return outside
     prices: dict[frozenset[int], float] = {}
 

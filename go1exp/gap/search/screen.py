@@ -136,7 +136,7 @@ def _periods(machine: Machine, effect: str, periodic: Periodic) -> Iterator[Vari
 
 
 SHARES = (0.9, 0.75, 0.55, 0.35)
-"""Shares of the largest torque that a joint was asked for at which a limit of the torque is looked for."""
+"""Shares of the largest torque that a part was asked for at which a limit of the torque is looked for."""
 
 
 def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -> Iterator[Variant]:
@@ -144,9 +144,12 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
     levels: list[Mapping[str, float | np.ndarray]] = [*how.levels]
     if how.limits_torque:
         limit = machine.tolerances.param((effect, how.limits_torque))
-        reached = np.minimum(moved.demand, limit.null)  # what is asked for beyond the peak is cut off anyway
-        tried = [(share * reached).clip(limit.low, limit.null - limit.tolerance) for share in SHARES]
-        levels += [{how.limits_torque: values - limit.null} for values in tried]
+        for part in np.array(machine.groups).T:  # the same place of each group
+            largest = min(float(moved.demand[part].max()), limit.null)  # what is asked for beyond the peak is cut off
+            for share in SHARES:
+                change = np.zeros(len(machine.joints))
+                change[part] = np.clip(share * largest, limit.low, limit.null - limit.tolerance) - limit.null
+                levels.append({how.limits_torque: change})
     for chosen in how.shapes or ({},):
         shapes: Theta = {(effect, name): moved.angle(value) for name, value in chosen.items()}
         for level in levels or [{}]:
