@@ -380,6 +380,19 @@ def test_a_speed_that_trails_is_found_and_sized() -> None:
     assert size(report, "lag", "qd_FR_thigh") == pytest.approx(20, abs=2)
 
 
+@pytest.mark.parametrize("late", [0.016, 1 / 49])
+def test_a_speed_that_is_a_sample_late_is_found_on_a_slow_log(late: float) -> None:
+    """At 49 Hz a sample is 20 ms: a servo's speed that is that late must not pass as if read at the same time."""
+    quick, t = made("gait", rate=1000.0), np.arange(round(49 * (SECONDS - 0.1))) / 49
+    channels = {k: np.interp(t, quick.t, v) for k, v in quick.channels.items() if k.startswith(("q_", "qd_"))}
+    sound = Recording(replace(META, rate_hz=49.0), {"t": t, **channels})
+    assert [f for f in audit(sound).flaws if f.check == "lag"] == []
+    speed = np.interp(t - late, quick.t, quick.channels["qd_FR_thigh"])
+    report = audit(with_(sound, qd_FR_thigh=speed))
+    assert ("lag", "qd_FR_thigh", "suspect") in flaws(report)
+    assert size(report, "lag", "qd_FR_thigh") == pytest.approx(1e3 * late, abs=2)
+
+
 @pytest.mark.parametrize(("factor", "what"), [(1 / 9.81, "it looks like g "), (0.8, "gravity is 9.81")])
 def test_the_accelerometers_unit_is_checked(factor: float, what: str) -> None:
     changed = {k: factor * v for k, v in made().channels.items() if k.startswith("imu_acc")}

@@ -88,6 +88,25 @@ def test_a_file_that_says_none_is_none(tmp_path: Path, run: Run) -> None:
     assert compose("train", choices_from_files(["effect=mine.yaml"], "train"))["effect"] == {}
 
 
+def test_a_file_is_taken_though_a_shipped_choice_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``model=so101.yaml`` in a folder of one's own is that file, not the model of that name in conf/."""
+    monkeypatch.chdir(tmp_path)
+    mine = (config_folder() / "model/so101.yaml").read_text().replace("mjcf: ", "mjcf: elsewhere/")
+    (tmp_path / "so101.yaml").write_text(mine)
+    shipped = compose("gap", ["logs=x", "model=so101"])["model"]
+    chosen = compose("gap", choices_from_files(["logs=x", "model=so101.yaml"], "gap"))["model"]
+    assert chosen["mjcf"] == str(tmp_path / "elsewhere" / shipped["mjcf"])
+    assert {**chosen, "mjcf": ""} == {**shipped, "mjcf": ""}
+
+
+def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a-b.yaml").write_text("coulomb: {bound: 0.1}\n")
+    (tmp_path / "a_b.yaml").write_text("coulomb: {bound: 0.2}\n")
+    both = [compose("train", choices_from_files([f"effect={name}.yaml"], "train")) for name in ("a-b", "a_b")]
+    assert [c["effect"]["coulomb"]["bound"] for c in both] == [0.1, 0.2]
+
+
 @pytest.mark.parametrize(
     ("words", "status", "said"),
     [

@@ -18,11 +18,11 @@ import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp.audit import audit
 from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
-from go1exp.config import parse_task
+from go1exp.config import parse_parts, parse_task
 from go1exp.env.core import Go1Core
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
-from go1exp.gap.result import Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
+from go1exp.gap.result import AngleErrors, Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.stages.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
 from go1exp.gap.stages.explain import explain
@@ -65,6 +65,7 @@ def whole() -> GapResult:
             Candidate("cogging", (), {"count": 38.0}, NAN, NAN, NAN, NAN, ("cogging",), "not excited", "", stage=2),
         ),
         floors=Floors({"q": 1e-4, "qd": NAN}, {"q": 1e-5}, {"q": 2e-4}),
+        errors=AngleErrors(12, (0.012, 0.003), 0.75, NAN, {"a": (0.01, NAN)}, {"chirp_0": (0.012, 0.003)}),
         excess={"null": 56.3, "box": 40.2, "final": 0.3, "confirm": NAN},
         before=where,
         after=replace(where, flagged=~where.flagged),
@@ -158,6 +159,18 @@ def test_the_public_face_of_gap_has_every_name_that_it_promises() -> None:
     assert all(getattr(gap, name) is not None for name in gap.__all__)
     with pytest.raises(AttributeError, match="has no attribute 'explian'"):
         gap.explian  # noqa: B018
+
+
+def test_training_is_offered_only_where_there_is_something_to_train_with(capsys: pytest.CaptureFixture[str]) -> None:
+    from go1exp.cli.gap import _print_next
+
+    robot = hung(parse_parts(compose("gap", ["logs=x"]), ("robot",))[0]["robot"])
+    _print_next({}, robot, Path("gap/effect.yaml"))
+    empty = capsys.readouterr().out
+    assert "train" not in empty.replace("training", "")
+    assert "nothing is certified" in empty
+    _print_next({"coulomb": {"bound": 0.2}}, robot, Path("gap/effect.yaml"))
+    assert capsys.readouterr().out == "now: go1exp train effect=gap/effect.yaml\n"
 
 
 # ---------------------------------------------------------------------- what training reads
@@ -315,6 +328,24 @@ def test_the_right_effect_is_proved_and_a_wrong_one_is_not(tmp_path: Path) -> No
     assert not bad.holds
     assert bad.before == good.before
     assert bad.after > 10.0
+    worse = replace(right, named=(named("coulomb", bound={j: 9.0 * v for j, v in HIDDEN.items()}),))
+    harmful = proof(tmp_path, replace(worse, excess={"final": 1e6, "written": 1e6}))
+    assert harmful.after > harmful.before
+    assert not harmful.holds  # as good as was reported, and yet worse than nothing
+
+
+def test_what_is_proved_is_compared_on_the_windows_on_which_it_was_reported(tmp_path: Path) -> None:
+    """Another split has other windows, whose error may be twice as large: what holds would be refused (exit 15)."""
+    small = named("coulomb", half=0.01, bound={j: 0.5 * v for j, v in HIDDEN.items()})
+    alone = [proof(tmp_path, result(small, provenance={"windows": 8, "judged": [k]})) for k in (0, 7)]
+    assert alone[0].after != alone[1].after
+    for k, one in zip((0, 7), alone, strict=True):
+        told = result(small, excess={"final": 0.0, "written": one.after}, provenance={"windows": 8, "judged": [k]})
+        again = proof(tmp_path, told)
+        assert again.holds
+        assert again.reported == again.after == one.after
+    with pytest.raises(files.GapFileError, match="8 windows, 13 in the search that found this"):
+        proof(tmp_path, result(small, provenance={"windows": 13, "judged": [0]}))
 
 
 def test_a_calibration_counts_with_the_effect_and_not_alone(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from go1exp.gap.robots.hung import HungGo1
 from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
-from go1exp.gap.search.screen import free_shapes, library
+from go1exp.gap.search.screen import Motion, free_shapes, library
 from go1exp.schema import registry
 from go1exp.schema.registry import members
 
@@ -51,6 +51,9 @@ USUAL = """shapes=({"speed": 0.3}, {"speed": 2.0}), free_shapes=("speed",), simp
 confounded=("coulomb",), told_apart_by="record slow_ramps at two gain sets" """
 
 
+STILL = Motion(*np.zeros((4, 12)))
+
+
 class Robots:
     """A held Go1 and one on its feet, with nothing of their configuration."""
 
@@ -76,7 +79,7 @@ def registered(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[None]
 @pytest.mark.usefixtures("registered")
 def test_a_new_effect_is_screened_fitted_and_worded_by_its_own_file() -> None:
     assert "creep" not in tolerances.nominal(Robots.held)
-    variants = [v for v in library(Robots.held, np.zeros(12)) if v.effect == "creep"]
+    variants = [v for v in library(Robots.held, STILL) if v.effect == "creep"]
     assert [v.shapes[("creep", "speed")].item() for v in variants] == [0.3, 2.0]
     for variant in variants:
         assert variant.free == (("creep", "size"), ("creep", "speed"))
@@ -94,7 +97,7 @@ def test_a_new_effect_is_screened_fitted_and_worded_by_its_own_file() -> None:
 def test_a_new_effect_that_every_model_has_moves_within_its_tolerance() -> None:
     for robot in (Robots.held, Robots.standing):
         assert tolerances.nominal(robot)[-1] == "creep"
-        (variant,) = [v for v in library(robot, np.zeros(12)) if v.effect == "creep"]
+        (variant,) = [v for v in library(robot, STILL) if v.effect == "creep"]
         assert variant.probes == ()  # its columns are those of the nominal model
     theta = {("creep", "size"): np.full(12, 0.5)}
     back = tolerances.without(theta, "creep", Robots.held.tolerances)
@@ -104,9 +107,9 @@ def test_a_new_effect_that_every_model_has_moves_within_its_tolerance() -> None:
 @pytest.mark.parametrize("registered", ["needs_ground=True, common=True, levels=({'size': 0.5},)"], indirect=True)
 @pytest.mark.usefixtures("registered")
 def test_a_new_effect_that_needs_ground_is_left_out_where_the_trunk_is_held() -> None:
-    assert all(v.effect != "creep" for v in library(Robots.held, np.zeros(12)))
+    assert all(v.effect != "creep" for v in library(Robots.held, STILL))
     assert answer.not_excited({})["creep"] == "chirp"
-    (variant,) = [v for v in library(Robots.standing, np.zeros(12)) if v.effect == "creep"]
+    (variant,) = [v for v in library(Robots.standing, STILL) if v.effect == "creep"]
     (probe,) = variant.probes
     assert probe.place is None
     np.testing.assert_array_equal(probe.delta, 0.5)

@@ -163,6 +163,30 @@ def test_episodes_without_a_like_are_cut_into_stretches() -> None:
     assert set(np.diff(np.flatnonzero(np.diff(np.isin(np.arange(12), found.select))))) == {3}
 
 
+def test_a_motion_of_which_there_is_one_is_not_kept_whole_for_the_last_check() -> None:
+    """Its kind would be judged by models that never saw it: drives off, say, where all others have them on."""
+    metas = [meta(f"{k}", "chirp", float(k)) for k in range(3)] + [meta("off", "torque_off", 9.0)]
+    for seed in range(20):
+        found = splits(metas, np.repeat(np.arange(4), 12), 0.2, np.random.default_rng(seed))
+        assert len(found.confirm) == 12
+        assert 3 not in set(np.repeat(np.arange(4), 12)[found.confirm])
+    alike = [meta(f"{k}", f"motion{k}", 1.0) for k in range(5)]
+    episode = np.repeat(np.arange(5), 12)
+    found = splits(alike, episode, 0.2, np.random.default_rng(0))
+    assert len(found.confirm) == 12  # every fifth stretch, of all
+    assert len(found.shared) == 4
+    assert all(set(episode[p]) == set(range(5)) for p in (found.train, found.select))
+    assert sorted([*found.train, *found.select, *found.confirm]) == list(range(60))
+
+
+def test_one_long_episode_lends_stretches_to_the_last_check() -> None:
+    found = splits([meta("all", "chirp", 1.0)], np.zeros(60, dtype=int), 0.2, np.random.default_rng(0))
+    assert len(found.confirm) == 12
+    assert found.shared == ("all",)
+    assert abs(len(found.train) - len(found.select)) <= 3
+    assert not len(splits([meta("all", "chirp", 1.0)], np.zeros(60, dtype=int), 0.0, np.random.default_rng(0)).confirm)
+
+
 # ---------------------------------------------------------------------- windows
 
 

@@ -25,10 +25,10 @@ from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.score.initial_state import settled
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import ON_FEET, REGIMES, localise
+from go1exp.gap.score.robust import excess
 from go1exp.gap.search import profile_likelihood
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
-from go1exp.gap.search.trial import excess
 from go1exp.gap.stages.explain import explain
 from go1exp.physics.legs import Legs
 from go1exp.physics.scene import build_model

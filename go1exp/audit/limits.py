@@ -70,7 +70,8 @@ SCALE = (0.05, 0.20)
 LAG_RANGE = 0.06
 """s: largest lag, in either direction, at which a speed is compared with its angle."""
 LAG = 4e-3
-"""s beyond one sample period: a speed that trails its angle by more was filtered, or read at another time."""
+"""s beyond one sample period, but of that no more than as much again: a speed that trails its angle by more was
+filtered, or read at another time. At 49 Hz a whole sample is 20 ms, a fifth of what a joint needs for a step."""
 LAG_GAIN = 1.5
 """Unexplained part at no lag over that at the best lag: below this ratio the lag may be chance."""
 MOTION = 5.0

@@ -78,12 +78,19 @@ def speed(log: Log) -> Iterator[Finding]:
         yield from _scale_finding("scale", name, f"the change of {angle}", s, limits.SCALE)
         rest, rest_now = 1 - peak[j, j] ** 2, 1 - match[most, j, j] ** 2
         sharp = s.correlation > limits.CLEARLY and rest_now > limits.LAG_GAIN * rest + 1e-3
-        if sharp and abs(lag) * log.dt > limits.LAG + log.dt:
-            verb = "trails" if lag > 0 else "leads"
-            message = (
-                f"{verb} the change of {angle} by {abs(lag) * log.dt * 1e3:.3g} ms: filtered, or read at another time"
-            )
-            yield finding("lag", name, "suspect", lag * log.dt * 1e3, "ms", message)
+        late = (lag + _vertex(match[:, j, j], int(best[j, j]))) * log.dt
+        if sharp and abs(late) > limits.LAG + min(log.dt, limits.LAG):
+            verb = "trails" if late > 0 else "leads"
+            message = f"{verb} the change of {angle} by {abs(late) * 1e3:.3g} ms: filtered, or read at another time"
+            yield finding("lag", name, "suspect", late * 1e3, "ms", message)
+
+
+def _vertex(match: np.ndarray, k: int) -> float:
+    """Return how far the top of a parabola through three points about ``match[k]`` lies from k, in points."""
+    if k in (0, len(match) - 1):
+        return 0.0
+    a, b, c = match[k - 1 : k + 2]
+    return float(0.5 * (a - c) / (a - 2.0 * b + c)) if a - 2.0 * b + c < 0.0 else 0.0
 
 
 def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:

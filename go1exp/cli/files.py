@@ -10,7 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from yaml import MarkedYAMLError, YAMLError
 
-from go1exp.choices import config_folder, groups_in, groups_of
+from go1exp.choices import choice_files, config_folder, groups_in, groups_of
 from go1exp.schema.registry import ConfigError
 
 PATHS = {"model": "mjcf"}
@@ -86,6 +86,16 @@ def _choice(group: str, file: str) -> str:
     named = content.get(PATHS.get(group, ""))
     if isinstance(named, str):
         content[PATHS[group]] = str((path.parent / named).resolve())
-    name = re.sub(r"\W", "_", str(path.with_suffix("")), flags=re.ASCII)  # else Hydra's grammar refuses it
+    name = _free_name(group, path)
     ConfigStore.instance().store(group=group, name=name, node=content, provider=str(path))
+    return name
+
+
+def _free_name(group: str, path: Path) -> str:
+    """Return a name for a file that no choice of the group has: Hydra would silently take that in place of the file."""
+    name = re.sub(r"\W", "_", str(path.with_suffix("")), flags=re.ASCII)  # else Hydra's grammar refuses it
+    shipped = choice_files(group, [config_folder()])
+    stored = ConfigStore.instance().repo.get(group, {})
+    while name in shipped or getattr(stored.get(f"{name}.yaml"), "provider", str(path)) != str(path):
+        name += "_file"
     return name

@@ -133,7 +133,6 @@ def _replay(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int
 def _apply(result: GapResult, recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Write the effect files, read them back as training does, and score them at training's step."""
     from go1exp.gap.stages import apply
-    from go1exp.robot import JOINTS
 
     out = Path(settings.out)
     written = apply.write(result, out)
@@ -147,11 +146,22 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
         f"floor ({1 + proof.before:.3g} without; {1 + proof.effect_only:.3g} with {apply.EFFECT} alone)"
     )
     if not proof.holds:
-        print(f"NOT applied: it was {1 + proof.reported:.3g} in the search, and is worse at this step")
+        better = "in the search it was" if proof.after <= proof.before else "the model as it is has"
+        least = proof.reported if proof.after <= proof.before else proof.before
+        print(f"NOT applied: the error is {1 + proof.after:.3g} with the files at this step; {better} {1 + least:.3g}")
         return DOES_NOT_HOLD
-    if result.named and robot.joints == JOINTS:
-        print(f"now: {command('train', settings={'effect': out / apply.EFFECT})}")
+    _print_next(contents[apply.EFFECT], robot, out / apply.EFFECT)  # type: ignore[arg-type]
     return 0
+
+
+def _print_next(lacking: dict[str, Any], robot: Robot, file: Path) -> None:
+    """Say how to train with the effects in ``file``, if there are any, and a robot that is trained."""
+    from go1exp.robot import JOINTS
+
+    if not lacking:
+        print(f"nothing is certified: {file} is empty, and training with it would change nothing")
+    elif robot.joints == JOINTS:
+        print(f"now: {command('train', settings={'effect': file})}")
 
 
 def _report(result: GapResult, out: Path) -> int:

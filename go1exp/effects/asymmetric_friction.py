@@ -31,7 +31,9 @@ class AsymmetricFriction(Effect):
         Param("forward", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "further friction while the angle grows"),
         Param("backward", "N m", 0.0, 2.0, 0.0, 0.05, "joint", "further friction while the angle falls"),
     )
-    identification = Identification(simpler="coulomb", excitation="slow_ramps")
+    identification = Identification(
+        simpler="coulomb", simpler_if_equal=("forward", "backward"), excitation="slow_ramps"
+    )
     forward: Tensor
     backward: Tensor
 

@@ -10,8 +10,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-MEAN_ANGLE = math.nan
-"""Stands in ``Identification.shapes`` for the angle at which each joint is on average, rad."""
+MEAN_ANGLE, LEAST_ANGLE, LARGEST_ANGLE = math.nan, -math.inf, math.inf
+"""Stand in ``Identification.shapes`` for the angle at which each joint is on average, and for the least and the largest
+that it reaches, rad."""
 
 LAST = 100
 """Rank of an effect that does not choose one."""
@@ -52,15 +53,18 @@ class Identification:
         rank: place among the nominal effects, smaller first, then in the order of registration. Resampling draws its
             random numbers in this order, so a change of it changes intervals within their own uncertainty.
         needs_ground: it acts on the trunk or on the feet; a robot whose trunk is held does not feel it.
-        common: its parameters have one value for all joints. For effects that few joints ever show.
+        common: its parameters have one value for all joints at which it is. For effects that few joints ever show.
         weighs_on_legs: one such error, equal at all joints, moves the legs of a standing robot as a change of weight
             does; an effect of the trunk must explain recordings better than it.
         levels: changes from null, by parameter, in its unit, at which it is probed; each may become the start of a fit.
             For effects with a threshold, or far from linear. Empty: twice the tolerance of each parameter.
+        limits_torque: parameter that is a limit of the torque as a share of the peak; it is also probed part by part,
+            at shares of the largest torque that a part was asked for, since one above does nothing. Empty for none.
         shapes: values of its shape parameters with which it is tried. Empty: their null values.
         free_shapes: shape parameters that a full fit may change.
         periodic: its parameters, if it is a torque that is periodic in the angle.
         simpler: effect that explains nearly the same with fewer numbers, and is taken where it does as well.
+        simpler_if_equal: two parameters that make it the simpler effect where they are equal.
         excitation: motion that shows it best (``go1exp list excitations``).
         confounded: effects that many recordings cannot tell from it. It is enough if one of two names the other.
         told_apart_by: what to record to tell them apart, the end of a sentence that begins with "record".
@@ -72,10 +76,12 @@ class Identification:
     common: bool = False
     weighs_on_legs: bool = False
     levels: tuple[Mapping[str, float], ...] = ()
+    limits_torque: str = ""
     shapes: tuple[Mapping[str, float], ...] = ()
     free_shapes: tuple[str, ...] = ()
     periodic: Periodic | None = None
     simpler: str = ""
+    simpler_if_equal: tuple[str, ...] = ()
     excitation: str = "chirp"
     confounded: tuple[str, ...] = ()
     told_apart_by: str = ""

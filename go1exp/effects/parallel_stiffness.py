@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from go1exp.effects.base import Effect, Param
-from go1exp.effects.identification import MEAN_ANGLE, Identification
+from go1exp.effects.identification import LARGEST_ANGLE, LEAST_ANGLE, MEAN_ANGLE, Identification
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -27,7 +27,11 @@ class ParallelStiffness(Effect):
         Param("stiffness", "N m/rad", 0.0, 20.0, 0.0, 0.1, "joint", "torque per angle"),
         Param("rest", "rad", -5.0, 5.0, 0.0, math.inf, "joint", "angle without torque"),
     )
-    identification = Identification(shapes=({"rest": MEAN_ANGLE},), free_shapes=("rest",), excitation="slow_ramps")
+    identification = Identification(
+        shapes=tuple({"rest": angle} for angle in (MEAN_ANGLE, LEAST_ANGLE, LARGEST_ANGLE)),
+        free_shapes=("rest",),
+        excitation="slow_ramps",
+    )
     stiffness: Tensor
     rest: Tensor
 

@@ -40,11 +40,12 @@ class TorqueSpeedLimit(Effect):
         Param("stall", "-", 1.0, 3.0, 1.0, math.inf, "joint", "torque of the line at rest over the peak"),
     )
     identification = Identification(
-        common=True,  # few joints ever reach a limit, and one supply feeds them all
+        common=True,  # few joints ever reach a limit, and one supply feeds them all, or all of a part
         levels=(
             *({"peak": -change} for change in (0.1, 0.3, 0.55, 0.7)),
             *({"droop": change} for change in (0.2, 0.6, 1.0, 1.6)),
         ),
+        limits_torque="peak",
         free_shapes=("stall",),
         excitation="steps",
     )

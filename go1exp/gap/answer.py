@@ -6,22 +6,22 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 
 from go1exp.effects.tolerances import Tolerances, declared, effect_class, sizes
+from go1exp.gap.certainty import HALF, doubt
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.score.linear import Layout
+from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import significance, tolerances
-from go1exp.gap.search.evidence import inaudible
+from go1exp.gap.search.evidence import deviation, inaudible
 from go1exp.gap.search.fit import fit
+from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import SILENT, Search
-from go1exp.gap.search.trial import excess, removed
 from go1exp.schema.registry import members
-
-MOST = 0.75
-"""Share of the excess that terms must remove before the first of them is certified although a gap remains."""
 
 QUANTILES = (0.025, 0.975)
 """Of a 95 % interval."""
@@ -91,14 +91,13 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
     """
     settings = search.settings
     plain = excess(search.state.held_out({}))
-    if search.state.terms and not search.confirmed():
-        warnings.append(
-            f"Withdrawn, since episodes kept for a last check do not bear it out: {', '.join(search.state.terms)}."
-        )
-        search.withdraw("episodes kept for a last check do not bear it out")
+    check = search.last_check()
+    if search.state.terms and not check.helps and removed(search.first, search.steps[-1][1]) <= HALF:
+        warnings.append(f"Withdrawn, since the last check does not bear it out: {', '.join(search.state.terms)}.")
+        search.withdraw("the last check does not bear it out")
     first, final = search.first, search.steps[-1][1]
     theta, drawn = resampled_values(search)
-    named = name_terms(search, theta, drawn, final <= settings.adequate, removed(first, final) > MOST)
+    named = name_terms(search, theta, drawn, final <= settings.adequate, check)
     if named and first <= settings.adequate and not any(n.status == "certified" for n in named):
         doubtful = ", ".join(n.effect for n in named)
         warnings.append(f"Withdrawn, since the tolerances explain these logs and nothing else is sure: {doubtful}.")
@@ -110,7 +109,10 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
         confirmed = reached["confirm"] = excess(search.state.held_out(windows=search.splits.confirm))
         if named and verdict == "explained" and confirmed > 2.0 * settings.adequate:
             verdict = "partly explained"
-            warnings.append(f"On episodes kept for a last check the error is {1 + confirmed:.3g} times the floor.")
+            warnings.append(f"On windows kept for a last check the error is {1 + confirmed:.3g} times the floor.")
+    unsure = {n.effect for n in named if n.status != "certified"}
+    certain = {key: value for key, value in theta.items() if key[0] not in unsure}
+    reached["written"] = excess(search.state.held_out(certain, search.splits.judged))
     return Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan)
 
 
@@ -148,7 +150,7 @@ def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
 
 
 def name_terms(
-    search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], adequate: bool, mostly: bool
+    search: Search, theta: Theta, drawn: Mapping[Key, np.ndarray], adequate: bool, check: LastCheck
 ) -> tuple[NamedEffect, ...]:
     """Return the accepted effects with intervals, at the joints where they leave their tolerances beyond doubt.
 
@@ -157,42 +159,44 @@ def name_terms(
         theta: fitted values.
         drawn: resampled values by parameter (B, J) or (B, 1).
         adequate: whether the model with them counts as right.
-        mostly: whether they remove most of the excess, so that the first may be certified although a gap remains.
+        check: what they do on the last check.
     """
     joints, known = search.state.scorer.windows.joints, search.state.tolerances
     named = []
-    for number, effect in enumerate(search.state.terms):
+    for effect in search.state.terms:
         per_joint = [key for key in sizes(effect) if known.param(key).per == "joint"]
         at = _joints_beyond(per_joint, theta, drawn, joints, known)
+        reason = doubt(search, effect, theta, at, adequate, check)
+        if per_joint and not at:
+            at = (_strongest(per_joint, theta, joints, known),)
         params: dict[str, dict[str, float]] = {}
         interval: dict[str, dict[str, tuple[float, float]]] = {}
         for key in (key for key in theta if key[0] == effect):
             samples = drawn.get(key, np.ravel(theta[key])[None])
             params[key[1]], interval[key[1]] = _by_joint(key, theta[key], samples, joints, at)
-        stable = search.shares.get(effect, 0.0) >= search.settings.certified
-        somewhere = bool(at) or not per_joint
-        certified = stable and somewhere and (adequate or (number == 0 and mostly))
-        status = "certified" if certified else "compensating"
-        named.append(
-            NamedEffect(effect, at, params, interval, search.aliases[effect], status)  # type: ignore[arg-type]
-        )
+        status: Literal["certified", "compensating"] = "compensating" if reason else "certified"
+        share = search.share_of(effect)
+        named.append(NamedEffect(effect, at, params, interval, search.aliases[effect], status, reason, share))
     return tuple(named)
 
 
 def _joints_beyond(
     keys: Sequence[Key], theta: Theta, drawn: Mapping[Key, np.ndarray], joints: Sequence[str], known: Tolerances
 ) -> tuple[str, ...]:
-    """Return the joints at which one of the parameters leaves its tolerance, and is not null, beyond doubt."""
-    beyond, at_best = np.zeros(len(joints), dtype=bool), np.zeros(len(joints), dtype=bool)
+    """Return the joints at which one of the parameters leaves its tolerance and its interval does not hold null."""
+    beyond = np.zeros(len(joints), dtype=bool)
     for key in keys:
         p = known.param(key)
         low, high = np.quantile(drawn[key], QUANTILES, axis=0)
         value = np.broadcast_to(theta[key], len(joints))
-        at_best |= np.abs(value - p.null) > p.tolerance
         beyond |= (np.abs(value - p.null) > p.tolerance) & ((low > p.null) | (high < p.null))
-    if not beyond.any():  # few windows show it: a resample without them does not show where it is
-        beyond = at_best
     return tuple(j for j, b in zip(joints, beyond, strict=True) if b)
+
+
+def _strongest(keys: Sequence[Key], theta: Theta, joints: Sequence[str], known: Tolerances) -> str:
+    """Return the joint that is furthest from null, in tolerances."""
+    away = [np.broadcast_to(deviation(theta, key, known), len(joints)) for key in keys]
+    return joints[int(np.max(away, axis=0).argmax())]
 
 
 def _by_joint(
@@ -241,7 +245,7 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggesti
     """
     everyone = search.state.scorer.windows.joints
     first, final = 1.0 + answer.excess["box"], 1.0 + answer.excess["final"]
-    parts = [_opening(answer.verdict, first), *(_lacking(effect, everyone) for effect in answer.named)]
+    parts = [_opening(answer.verdict, first, search), *(_lacking(effect, everyone) for effect in answer.named)]
     if answer.named:
         parts.append(
             f"With that the held-out error falls from {first:.3g} to {final:.3g} times the noise floor (floor 1)."
@@ -259,14 +263,24 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggesti
     return " ".join([*filter(None, parts), *suggestions])
 
 
-def _opening(verdict: Verdict, first: float) -> str:
+def _opening(verdict: Verdict, first: float, search: Search) -> str:
     """Return the sentence of a verdict that names nothing; ``first`` is the error within the tolerances, in floors."""
     return {
         "no gap": f"The model agrees with these logs within its tolerances: error {first:.3g} times the noise floor.",
         "not excited": "These logs move too little to compare the model with.",
-        "unexplained": f"The model is wrong, with an error of {first:.3g} times the noise floor, and no effect of the "
-        "library explains it.",
+        "unexplained": f"The model is wrong, with an error of {first:.3g} times the noise floor, {_nearest(search)}",
     }.get(verdict, "")
+
+
+def _nearest(search: Search) -> str:
+    """Return the end of a sentence about a gap for which nothing is named: what came near, if anything did."""
+    tried = [c for c in search.candidates if c.stage == 1 and math.isfinite(c.excess_after)]
+    near = min(tried, key=lambda c: c.excess_after, default=None)
+    share = removed(search.first, near.excess_after) if near else 0.0
+    if near is None or share <= HALF:
+        return "and no effect of the library explains it."
+    title = f"{effect_class(near.effect).title} ({near.effect})"
+    return f"of which {title} takes {share:.0%} away and yet is not named: {near.reason}."
 
 
 def _lacking(effect: NamedEffect, everyone: Sequence[str]) -> str:
@@ -281,9 +295,9 @@ def _lacking(effect: NamedEffect, everyone: Sequence[str]) -> str:
             unit = "" if p.unit == "-" else f" {p.unit}"
             texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}")
     at = f" at {where(effect.joints, everyone)}" if effect.joints else ""
-    doubt = "" if effect.status == "certified" else " (compensating, not certified)"
+    doubted = "" if effect.status == "certified" else f" (compensating, not certified: {effect.reason})"
     title = f"{effect_class(effect.effect).title} ({effect.effect})"
-    return f"The model lacks {title}{at}: {'; '.join(texts)}{doubt}."
+    return f"The model lacks {title}{at}: {'; '.join(texts)}{doubted}."
 
 
 def evidence(search: Search) -> tuple[Candidate, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.files import write_json
-from go1exp.gap.result import EXIT_CODES, Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
+from go1exp.gap.result import EXIT_CODES, AngleErrors, Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
 from go1exp.schema.registry import Expected
 
 RESULT = "verdict.json"
@@ -55,6 +55,7 @@ def from_dict(plain: Mapping[str, Any]) -> GapResult:
     if plain["verdict"] not in EXIT_CODES:
         raise ValueError(f"verdict {plain['verdict']!r}")
     values["floors"] = None if plain["floors"] is None else _floors(plain["floors"])
+    values["errors"] = _errors(plain.get("errors"))  # older results have none
     values["before"], values["after"] = (_localisation(plain[key]) for key in ("before", "after"))
     values["overlays"] = tuple(_overlay(item) for item in plain["overlays"])
     values["waterfall"] = tuple((str(label), _number(value)) for label, value in plain["waterfall"])
@@ -81,6 +82,19 @@ def _numbers(plain: Any) -> Any:
     return [_numbers(value) for value in plain] if isinstance(plain, list) else _number(plain)
 
 
+def _errors(item: Mapping[str, Any] | None) -> AngleErrors | None:
+    if item is None:
+        return None
+    pairs = {name: {k: _pair(v) for k, v in item[name].items()} for name in ("by_joint", "by_episode")}
+    numbers = {name: _number(item[name]) for name in ("removed", "worse")}
+    return AngleErrors(**{**item, **numbers, **pairs, "median": _pair(item["median"])})
+
+
+def _pair(item: Sequence[float | None]) -> tuple[float, float]:
+    first, second = item
+    return _number(first), _number(second)
+
+
 def _floors(item: Mapping[str, Any]) -> Floors:
     repeated = item["repeatability"]
     noise, numerical = _numbers(item["noise"]), _numbers(item["numerical"])
@@ -93,7 +107,8 @@ def _named(item: Mapping[str, Any]) -> NamedEffect:
         for param, places in item["interval"].items()
     }
     tuples = {name: tuple(item[name]) for name in ("joints", "alias_set")}
-    return NamedEffect(**{**item, **tuples, "params": _numbers(item["params"]), "interval": interval})
+    share = _number(item.get("share"))  # older results say none
+    return NamedEffect(**{**item, **tuples, "params": _numbers(item["params"]), "interval": interval, "share": share})
 
 
 def _candidate(item: Mapping[str, Any]) -> Candidate:

@@ -170,6 +170,8 @@ class NamedEffect:
         interval: parameter -> joint (or ``robot``) -> 95 % interval.
         alias_set: effects that do as well on these data, this one first.
         status: ``certified``, or ``compensating`` if it may stand for something that no effect describes.
+        reason: why it is not certified; empty if it is.
+        share: part of the held-out excess within the tolerances that comes back without this effect; NaN if not known.
     """
 
     effect: str
@@ -178,6 +180,8 @@ class NamedEffect:
     interval: dict[str, dict[str, tuple[float, float]]]
     alias_set: tuple[str, ...]
     status: Literal["certified", "compensating"]
+    reason: str = ""
+    share: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -202,6 +206,30 @@ class Overlay:
 
 
 @dataclass(frozen=True)
+class AngleErrors:
+    """Root mean square errors of the angles on windows that no fitted value has seen: medians of windows, rad.
+
+    Each pair is of the model as it is, and with what was named and the tolerances used. What the unknown initial state
+    of a window explains is taken out.
+
+    Attributes:
+        windows: how many.
+        median: of all joints together.
+        removed: share of the error that is gone, median of windows.
+        worse: share of the windows that are worse.
+        by_joint: joint -> pair.
+        by_episode: episode -> pair, of all joints together.
+    """
+
+    windows: int
+    median: tuple[float, float]
+    removed: float
+    worse: float
+    by_joint: dict[str, tuple[float, float]]
+    by_episode: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
 class GapResult:
     """The answer.
 
@@ -212,8 +240,10 @@ class GapResult:
         candidates: the evidence, best first.
         floors: None if the log is bad.
         excess: held-out excess of the plain model (``null``), within its tolerances (``box``), with what was named
-            (``final``), and that on the episodes kept for the last check (``confirm``).
+            (``final``), that on windows kept for the last check (``confirm``), and that of what the written files
+            hold, on the windows whose numbers are ``judged`` in the provenance (``written``).
         closed: share of the held-out excess that the named effects removed; NaN without one.
+        errors: of the angles, in rad, before and after; None if the log is bad.
         before: localisation of the plain model; None if the log is bad.
         after: localisation with what was named.
         not_excited: effect -> excitation to record next.
@@ -235,6 +265,7 @@ class GapResult:
     floors: Floors | None = None
     excess: dict[str, float] = field(default_factory=dict)
     closed: float = math.nan
+    errors: AngleErrors | None = None
     before: Localisation | None = None
     after: Localisation | None = None
     not_excited: dict[str, str] = field(default_factory=dict)

@@ -82,6 +82,20 @@ class Windows:
         """Name, quantity and place of every reading."""
         return tuple((f"{q}_{j}", c, i) for c, q in enumerate(self.quantities) for i, j in enumerate(self.joints))
 
+    def demanded(self, windows: np.ndarray) -> np.ndarray:
+        """Return the torques (V, n, J), N m, that were asked for in some windows (V,), by what was measured.
+
+        Of the PD law; where there are no gains, the targets are torques. 0 while the drives are off.
+        """
+        q, qd, t = self.y[windows, :, 0], self.y[windows, :, 1], self.t[windows]
+        target, on = np.empty_like(q), np.empty(t.shape, dtype=bool)
+        for row, k in enumerate(windows):
+            target[row] = held(self.edges[k], t[row])
+            on[row] = held(self.switches[k], t[row])
+        kp, kd = self.kp[windows][:, None], self.kd[windows][:, None]
+        asked = np.where((kp == 0.0) & (kd == 0.0), target, kp * (target - q) - kd * qd)
+        return np.asarray(asked * on[..., None])
+
     def by_quantity(self, values: np.ndarray) -> dict[str, float]:
         """Return the median of values (W, C, J) by quantity."""
         return {name: float(np.median(values[:, c])) for c, name in enumerate(self.quantities)}

@@ -31,6 +31,10 @@ class Machine(Protocol):
         """Changes of a free base's initial state by which its influence is measured; empty for one that is held."""
 
     @property
+    def effort(self) -> tuple[float, ...]:
+        """Peak torque (J,), N m."""
+
+    @property
     def tolerances(self) -> Tolerances:
         """How far the nominal parameters may be off."""
 

@@ -13,6 +13,9 @@ from go1exp.gap.result import GapResult, Localisation
 
 WIDTH = 100
 
+MOST_EPISODES = 6
+"""Episodes that are listed, those with the largest error left; the page has all."""
+
 
 def text(result: GapResult) -> str:
     """Return the summary for a terminal: plain text without markup, lines of up to 100 characters but for commands."""
@@ -25,6 +28,10 @@ def text(result: GapResult) -> str:
         if not math.isnan(result.closed):
             lines.append(f"{words.share(result.closed)} of the excess is gone.")
         lines.append("")
+    if result.errors is not None:
+        title = ("error of the angle, mrad", "before", "after")
+        rows = words.angle_rows(result.errors, MOST_EPISODES)
+        lines += [*_wrapped(words.angles(result.errors)), "", *_table([title, *rows]), ""]
     for todo in words.next_recordings(result):
         lines += [*_wrapped(f"Next: {todo.why}"), f"  {todo.command}"]
     lines += [line for warning in result.warnings for line in _wrapped(f"Warning: {warning}")]

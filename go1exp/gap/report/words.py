@@ -15,7 +15,7 @@ import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
 from go1exp.effects.base import Param
 from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.gap.answer import where
-from go1exp.gap.result import GapResult, GapSettings, Localisation, NamedEffect
+from go1exp.gap.result import AngleErrors, GapResult, GapSettings, Localisation, NamedEffect
 from go1exp.schema.registry import members
 
 NOTHING = "–"
@@ -28,7 +28,7 @@ ERRORS: dict[str, str] = {
     "null": "model as it is",
     "box": "within its tolerances",
     "final": "with what is named",
-    "confirm": "on the episodes kept for the last check",
+    "confirm": "on windows kept for the last check",
 }
 """Key of ``GapResult.excess`` -> what it is of."""
 
@@ -65,6 +65,25 @@ def errors(result: GapResult) -> list[tuple[str, str]]:
     """Return (of what, error) of the held-out errors that there are."""
     keys = [k for k in ERRORS if k in result.excess and (result.named or k != "final")]
     return [(ERRORS[k], error(result.excess[k])) for k in keys]
+
+
+def angles(errors: AngleErrors) -> str:
+    """Return the errors of the angles as a sentence."""
+    before, after = (number(1e3 * value) for value in errors.median)
+    return (
+        f"Angles in the median of {errors.windows} held-out windows: {before} mrad off as the model is, {after} mrad "
+        f"with what is named and the tolerances used; {share(errors.removed)} of a window's error is gone in the "
+        f"median, and {share(errors.worse)} of the windows are worse."
+    )
+
+
+def angle_rows(errors: AngleErrors, most: int | None = None) -> list[tuple[str, str, str]]:
+    """Return (joint or episode, before, after) of the errors of the angles, mrad; of ``most`` episodes, the worst."""
+    episodes = errors.by_episode.items()
+    if most is not None:
+        episodes = sorted(episodes, key=lambda item: -item[1][1])[:most]  # type: ignore[assignment]
+    both = [*errors.by_joint.items(), *episodes]
+    return [(name, *(number(1e3 * value) for value in pair)) for name, pair in both]  # type: ignore[misc]
 
 
 def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | None:
@@ -208,16 +227,15 @@ def would_change(result: GapResult) -> list[str]:
         at = f", largest at {rest}" if rest else ""
         changes.append(
             f"An effect that takes the held-out error to {allowed} or less; {error(final)} is left{at}. "
-            "No effect of the library does."
+            "None that was fitted does."
         )
     for named in result.named:
         if rivals(named):
             changes.append(f"Data that separate {named.effect} from {' and '.join(rivals(named))} may change the name.")
         if named.status == "compensating":
             bar = share(limit(result, "certified"))
-            changes.append(
-                f"{named.effect} is certified only if it is named again in {bar} of the bootstraps and little is left."
-            )
+            needs = f"that needs its name again in {bar} of the bootstraps and little left"  # of an older result
+            changes.append(f"{named.effect} is not certified: {named.reason or needs}.")
     if result.verdict == "unexplained" and result.candidates:
         near = max(result.candidates, key=lambda c: c.log_gain)
         if near.status == "rejected":

@@ -51,6 +51,11 @@ class HungGo1:
     base_probe: tuple[float, ...] = ()
     tolerances: Tolerances = DECLARED
 
+    @property
+    def effort(self) -> tuple[float, ...]:
+        """Peak torque (J,), N m."""
+        return tuple(float(v) for v in robot.per_joint(self.config.effort_limit))
+
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
         w, x, y, z = base_quat

@@ -59,6 +59,11 @@ class StandingGo1:
     base_probe: tuple[float, ...] = BASE_PROBE
     tolerances: Tolerances = DECLARED
 
+    @property
+    def effort(self) -> tuple[float, ...]:
+        """Peak torque (J,), N m."""
+        return tuple(float(v) for v in robot.per_joint(self.config.effort_limit))
+
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
         model, blocks = build_model(self.config, build_terrain(TerrainConfig(kind="flat")), physics_dt)

@@ -17,6 +17,7 @@ from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Rows, Theta, variants
 from go1exp.gap.score.likelihood import Scorer, scorer
+from go1exp.gap.score.robust import log_chi2
 
 ROUNDS = 6
 """Times that states are moved at most; most have settled after two."""
@@ -127,7 +128,7 @@ def _fitted(score: Scorer, rows: Rows, theta: Theta, dt: float) -> Scorer:
         if len(moved):
             fresh = scorer(score.replayer, theta, score.scale, dt, score.clock_s, moved)
             score.state[moved] = fresh.state
-        active = active[np.log(before) - np.log(best) > GAIN]
+        active = active[log_chi2(before) - log_chi2(best) > GAIN]
         if not len(active):
             break
     return score

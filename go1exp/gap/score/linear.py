@@ -94,7 +94,8 @@ def differences(scorer: Scorer, y: np.ndarray, window: np.ndarray, probes: Seque
     columns = []
     for k, probe in enumerate(probes):
         per = scorer.unit(y[:, 1 + k] - y[:, 0], window)
-        delta = probe.delta[:1] if probe.place is None else probe.delta[groups[:, probe.place]]
+        largest = probe.delta[[int(np.argmax(np.abs(probe.delta)))]]  # of what is shared: 0 where it is not
+        delta = largest if probe.place is None else probe.delta[groups[:, probe.place]]
         columns.append(per / delta.astype(np.float32)[:, None])
     shape = (*scorer.unit(y[:, 0], window).shape, 0)
     return np.stack(columns, axis=-1) if columns else np.zeros(shape, np.float32)

@@ -7,7 +7,9 @@ from scipy.stats import false_discovery_control
 
 from go1exp.gap.data.windows import held
 from go1exp.gap.result import Localisation
+from go1exp.gap.score.angle_errors import unexplained
 from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.robust import log_chi2, weighted_excess
 
 REGIMES = (
     *("stick", "reversal", "slow", "fast", "high torque", "after an edge", "drives off"),
@@ -40,17 +42,14 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
     w = scorer.windows
     q, qd = w.y[windows, :, 0], w.y[windows, :, 1]
     t = w.t[windows]
-    target, on, edge = np.empty_like(q), np.empty(t.shape, dtype=bool), np.zeros(q.shape, dtype=bool)
+    on, edge = np.empty(t.shape, dtype=bool), np.zeros(q.shape, dtype=bool)
     for row, k in enumerate(windows):
-        target[row] = held(w.edges[k], t[row])
         on[row] = held(w.switches[k], t[row])
         when, values = w.edges[k]
         jump = np.abs(np.diff(values, axis=0, prepend=values[:1])) > EDGE
         since = t[row][:, None] - when
         edge[row] = np.einsum("te,ej->tj", ((since >= 0) & (since < 0.06)).astype(int), jump.astype(int)) > 0
-    kp, kd = w.kp[windows][:, None], w.kd[windows][:, None]
-    asked = np.where((kp == 0.0) & (kd == 0.0), target, kp * (target - q) - kd * qd)  # without gains, of torques
-    demand = np.abs(asked) * on[..., None]
+    demand = np.abs(w.demanded(windows))
     span = max(int(TURN_S / w.period), 1)
     turn = np.zeros(q.shape, dtype=bool)
     turn[:, span:-span] = qd[:, : -2 * span] * qd[:, 2 * span :] < 0
@@ -80,20 +79,17 @@ def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.
     window to another: whether the excess is larger there than elsewhere in the same joint.
     """
     w, groups = scorer.windows, np.array(scorer.replayer.machine.groups)
-    state = scorer.state[windows].astype(float)
-    inner = np.swapaxes(state, -1, -2) @ state + np.eye(state.shape[-1])
-    cross = np.swapaxes(state, -1, -2) @ residual[..., None]
-    left = residual - (state @ np.linalg.solve(inner, cross))[..., 0]
-    n, quantities = w.t.shape[1], len(w.quantities)
-    split = left.reshape(len(windows), len(groups), n, quantities, -1)
-    square = np.empty((len(windows), n, len(w.joints)))
+    split = unexplained(scorer, residual, windows)
+    square = np.empty((len(windows), w.t.shape[1], len(w.joints)))
     for g, joints in enumerate(groups):
         scored = np.isfinite(scorer.scale[windows][:, : w.of_joints, joints]).sum(1)  # V K quantities
         square[:, :, joints] = (split[:, g, :, : w.of_joints] ** 2).sum(axis=2) / np.maximum(scored, 1)[:, None]
     inside = regimes(scorer, windows)
     count = inside.sum((1, 2))
-    score = np.log(np.maximum(square, 1e-3)) * w.valid[windows][..., None]  # a few violent samples must not decide
-    excess = np.divide((square * inside).sum((1, 2)), count, where=count > 0, out=np.full(count.shape, np.nan)) - 1.0
+    score = log_chi2(square) * w.valid[windows][..., None]  # a few violent samples must not decide
+    samples = inside.sum(2)  # R V J
+    of_window = np.divide((square * inside).sum(2), samples, where=samples > 0, out=np.ones(samples.shape))
+    excess = weighted_excess(np.moveaxis(of_window, 1, 0), np.moveaxis(samples, 1, 0))
     p = np.full(count.shape, np.nan)
     observed = _means(score, inside, count)
     larger = np.zeros(count.shape)

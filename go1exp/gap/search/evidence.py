@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from go1exp.effects.tolerances import Tolerances, sizes
+from go1exp.effects.tolerances import Tolerances, effect_class, sizes
+from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate
 from go1exp.gap.search.fit import Model
@@ -34,6 +35,15 @@ def beyond(effect: str, theta: Theta, joints: Sequence[str], tolerances: Toleran
         if tolerances.param(key).per == "joint":
             outside |= np.broadcast_to(deviation(theta, key, tolerances) > 1.0, len(joints))
     return outside
+
+
+def count(effect: str, theta: Theta, machine: Machine) -> int:
+    """Return how many values of an effect leave their tolerance, at least 1; one for all joints counts once."""
+    beyond_it = 0
+    for key in sizes(effect):
+        outside = np.atleast_1d(deviation(theta, key, machine.tolerances) > 1.0)
+        beyond_it += min(int(outside.sum()), 1) if effect_class(effect).identification.common else int(outside.sum())
+    return max(beyond_it, 1)
 
 
 def candidate(model: Model, joints: Sequence[str], **judged: object) -> Candidate:

@@ -11,6 +11,7 @@ from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Rows, Theta, null, variants
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table, differences
+from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import tolerances
 
 STEPS = (1.0, 0.3)
@@ -79,7 +80,7 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
     first = common.residual[None] if len(models) == 1 and models[0].theta is common.theta else None
     tried = residuals(scorer, [m.theta for m in models], windows, dt) if first is None else first
     best = [_scored(scorer, m, r, windows) for m, r in zip(models, tried, strict=True)]
-    origin = np.log(scorer.chi2(common.residual, windows)).sum()
+    origin = log_chi2(scorer.chi2(common.residual, windows)).sum()
     alive = list(range(len(models)))
     for turn in range(iterations):
         if not alive:
@@ -100,7 +101,7 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
 
 def misfit(model: Model) -> float:
     """Return what a fit makes small: the sum of log chi2 over windows and groups."""
-    return float(np.log(_chi2(model)).sum())
+    return float(log_chi2(_chi2(model)).sum())
 
 
 Move = tuple[list[Probe], Layout, np.ndarray, tolerances.Bounds]
@@ -155,7 +156,7 @@ def _longest(
     machine, layout = scorer.replayer.machine, move[1]
     chi2 = np.stack([_chi2(model), *(scorer.chi2(r, windows) for r in tried)])  # L V G
     lengths = np.array([0.0, *STEPS])
-    value = (scorer.size[windows][:, None] * np.log(chi2)).sum(axis=1)  # L G
+    value = (scorer.size[windows][:, None] * log_chi2(chi2)).sum(axis=1)  # L G
     value += np.stack([_prior(machine, move, length) for length in lengths])
     which = value.argmin(axis=0)
     shared = int(value.sum(axis=1).argmin())

@@ -18,6 +18,7 @@ from go1exp.effects.base import Param
 from go1exp.gap.replay.rows import Key, Theta, variants
 from go1exp.gap.score.initial_state import FARTHEST, solved
 from go1exp.gap.score.likelihood import Scorer, gram, scorer
+from go1exp.gap.score.robust import log_chi2
 
 ROUNDS = 2
 """Steps of the initial states, all by the changes that were measured at the nominal model."""
@@ -83,7 +84,7 @@ def chi2(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndar
 
 def cost(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> float:
     """Return what fits make small, the mean log :func:`chi2` (arguments as there)."""
-    return float(np.log(chi2(score, theta, windows, dt)).mean())
+    return float(log_chi2(chi2(score, theta, windows, dt)).mean())
 
 
 def fitted(

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from go1exp.effects.identification import Identification, Periodic
 from go1exp.effects.tolerances import Tolerances, sizes
+from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta, variants
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table, differences, predicted
+from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import strain, tolerances
 
 PROBE = 2.0
@@ -71,8 +73,43 @@ def free_shapes(effect: str) -> tuple[Key, ...]:
     return tuple((effect, name) for name in tolerances.identification(effect).free_shapes)
 
 
-def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -> list[Variant]:
-    """Return every way in which an effect could be missing; ``mean`` (J,) are the joints' average angles, rad."""
+@dataclass(frozen=True)
+class Motion:
+    """What joints did in the recordings: where shapes and thresholds of effects are looked for.
+
+    Attributes:
+        mean: (J,) average angles, rad.
+        least: (J,) least angles.
+        largest: (J,) largest angles.
+        demand: (J,) largest torque that was asked for, over the peak torque.
+    """
+
+    mean: np.ndarray
+    least: np.ndarray
+    largest: np.ndarray
+    demand: np.ndarray
+
+    def angle(self, value: float) -> np.ndarray:
+        """Return what a shape's value stands for (J,) or (1,); see ``effects/identification.py``."""
+        if math.isnan(value):
+            return self.mean.copy()
+        if math.isinf(value):
+            return (self.least if value < 0 else self.largest).copy()
+        return np.array([value])
+
+
+def motion(windows: Windows, effort: Sequence[float]) -> Motion:
+    """Return what joints did in the windows; ``effort`` (J,) are their peak torques, N m."""
+    which = np.arange(len(windows))
+    q, there = windows.y[:, :, 0], windows.valid[..., None]
+    asked = np.abs(windows.demanded(which)) * there
+    least, largest = (np.where(there, q, other).reshape(-1, q.shape[-1]) for other in (np.inf, -np.inf))
+    mean = (q * there).sum((0, 1)) / np.maximum(there.sum(), 1)
+    return Motion(mean, least.min(0), largest.max(0), asked.max((0, 1)) / np.asarray(effort))
+
+
+def library(machine: Machine, moved: Motion, exclude: Collection[str] = ()) -> list[Variant]:
+    """Return every way in which an effect could be missing in recordings of some motion."""
     variants: list[Variant] = []
     within = tolerances.nominal(machine)
     for effect in tolerances.felt(machine):
@@ -84,7 +121,7 @@ def library(machine: Machine, mean: np.ndarray, exclude: Collection[str] = ()) -
         elif how.periodic:
             variants += _periods(machine, effect, how.periodic)
         else:
-            variants += _levels(machine, effect, how, mean)
+            variants += _levels(machine, effect, how, moved)
     return variants
 
 
@@ -98,18 +135,29 @@ def _periods(machine: Machine, effect: str, periodic: Periodic) -> Iterator[Vari
         yield Variant(effect, tuple(Probe(key, p.place, p.delta, also) for also in phases for p in plain), at)
 
 
-def _levels(machine: Machine, effect: str, how: Identification, mean: np.ndarray) -> Iterator[Variant]:
+SHARES = (0.9, 0.75, 0.55, 0.35)
+"""Shares of the largest torque that a part was asked for at which a limit of the torque is looked for."""
+
+
+def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -> Iterator[Variant]:
     """Yield a variant for each choice of shapes and each level at which the effect is probed."""
+    levels: list[Mapping[str, float | np.ndarray]] = [*how.levels]
+    if how.limits_torque:
+        limit = machine.tolerances.param((effect, how.limits_torque))
+        for part in np.array(machine.groups).T:  # the same place of each group
+            largest = min(float(moved.demand[part].max()), limit.null)  # what is asked for beyond the peak is cut off
+            for share in SHARES:
+                change = np.zeros(len(machine.joints))
+                change[part] = np.clip(share * largest, limit.low, limit.null - limit.tolerance) - limit.null
+                levels.append({how.limits_torque: change})
     for chosen in how.shapes or ({},):
-        shapes: Theta = {
-            (effect, name): mean.copy() if math.isnan(value) else np.array([value]) for name, value in chosen.items()
-        }
-        for level in how.levels or ({},):
+        shapes: Theta = {(effect, name): moved.angle(value) for name, value in chosen.items()}
+        for level in levels or [{}]:
             keys = [key for key in sizes(effect) if not level or key[1] in level]
-            probes = [
-                Probe(p.key, p.place, np.full_like(p.delta, level[p.key[1]]) if level else p.delta, shapes)
-                for p in tolerances.probes(machine, keys, {}, PROBE)
-            ]
+            probes = []
+            for p in tolerances.probes(machine, keys, {}, PROBE):
+                delta = np.broadcast_to(level[p.key[1]], p.delta.shape).copy() if level else p.delta
+                probes.append(Probe(p.key, p.place, delta, shapes))
             yield Variant(effect, tuple(probes), shapes)
 
 
@@ -188,8 +236,8 @@ class _Ranking:
             bounds.low[layout.part(np.arange(known, len(probes)))] = -np.inf
         relief = (self.plain - strain.price(matrix, right, strict)) / self.count
         x = tolerances.solve(matrix, right, limits)
-        after = predicted(part, layout, x) / self.size
-        gain = float(np.mean(np.log(self.before.sum(1) / np.maximum(after, 0.3).sum(1))))
+        after = np.maximum(predicted(part, layout, x), 0.0) / self.size  # rounding can make it negative
+        gain = float(np.mean(log_chi2(self.before) - log_chi2(after)))
         start = _start(theta, variant, self.present.probes, layout, x, self.machine)
         columns = [*added, *(k for k, p in enumerate(self.present.probes) if p.key[0] == variant.effect)]
         signal = _signal(self.grams, self.full.probes, columns, self.size, self.may.tolerances)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from go1exp.gap.score.robust import log_chi2
+
 FLIPS = 4000
 """Sign flips of a test: the smallest p-value is 1 / (FLIPS + 1)."""
 
@@ -26,7 +28,7 @@ def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
         before: chi2 per value (V, G).
         after: the same of each model (M, V, G).
     """
-    return np.asarray(np.log(before) - np.log(after)).reshape(len(after), -1)
+    return np.asarray(log_chi2(before) - log_chi2(after)).reshape(len(after), -1)
 
 
 def max_t(gain: np.ndarray, rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:

@@ -18,10 +18,10 @@ from go1exp.effects.tolerances import sizes
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import table
+from go1exp.gap.score.robust import excess, log_chi2, removed
 from go1exp.gap.search import profile_likelihood, significance, tolerances
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.state import State
-from go1exp.gap.search.trial import excess, removed
 from go1exp.schema.registry import members
 
 ITERATIONS = 4
@@ -50,7 +50,7 @@ def stretched(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> M
                 theta[key] = (p.null + factor * (value - p.null)).clip(p.low, p.high)
             tries.append(theta)
         chi2 = scores(scorer, tries, windows, dt)
-        k = int(np.log(chi2).mean(axis=(1, 2)).argmin())
+        k = int(log_chi2(chi2).mean(axis=(1, 2)).argmin())
         model = replace(model, theta=tries[k], chi2=chi2[k])
         if k == 0:
             break

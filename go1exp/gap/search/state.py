@@ -14,6 +14,7 @@ from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Table, table
+from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.screen import free_shapes
@@ -105,7 +106,7 @@ class State:
             (best,) = fit(self.scorer, [self.model(theta)], linear, STEPS_PER_ROUND, self.dt)
             theta = best.theta
             assert best.chi2 is not None
-            before, reached = reached, float(np.log(best.chi2).mean())
+            before, reached = reached, float(log_chi2(best.chi2).mean())
             if reached > before - SETTLED or (reached < SETTLED and not self.terms):
                 break
         assert best.residual is not None

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from go1exp.effects.tolerances import sizes
-from go1exp.gap.data.splits import Splits
-from go1exp.gap.replay.rows import Theta
-from go1exp.gap.result import Candidate, GapSettings
-from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.search import evidence, significance, single_cause, strain, tolerances
+from go1exp.gap.score.robust import excess
+from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, tolerances
 from go1exp.gap.search.fit import Model, fit, misfit
-from go1exp.gap.search.screen import Screened, library, outside, screen
+from go1exp.gap.search.ledger import Ledger
+from go1exp.gap.search.screen import Screened, library, motion, outside, screen
 from go1exp.gap.search.state import State
-from go1exp.gap.search.trial import Trial, excess, removed, tried
+from go1exp.gap.search.trial import Trial, tried
 
 SILENT = 0.02
 """An effect that adds less than this to the chi2 of every window, at twice its tolerance, is not excited."""
@@ -25,58 +22,16 @@ SILENT = 0.02
 SCREENED = 20
 """Windows in which candidates are screened, at most."""
 
+RIVALS = 2
+"""Candidates beside the first term that are tried in the place of several terms."""
+
 LOOSENED = 3
 """Most effects that join the tolerance box because the data ask for some of them, within their tolerances."""
 
-NEEDED = 12.0
-"""Fall of chi2 that a joint must bring before it may leave the tolerance of a term's effect."""
-
 
 @dataclass
-class Search:
-    """A search in progress, and its result.
-
-    Attributes:
-        scorer: of the windows, as the search begins.
-        splits: which windows are for what.
-        settings: the user's.
-        dt: physics step, s.
-        rng: of tests and bootstraps.
-        progress: called with what is being done, and which share of all is finished.
-        state: the present model.
-        select_chi2: (V, G) chi2 per value of the present model on held-out windows.
-        nominal: values of the model within its tolerances, before any term.
-        first: held-out excess with these.
-        aliases: effect -> effects that do as well.
-        shares: effect -> share of bootstraps in which it wins.
-        candidates: the evidence.
-        signal: effect -> chi2 that it would add at twice its tolerance.
-        steps: (what, held-out excess) after every accepted term.
-        single: the term that explains nearly everything alone, if there is one (``gap/search/single_cause.py``).
-        strained: whether the first term was accepted although the tolerances explain the data nearly as well.
-    """
-
-    scorer: Scorer
-    splits: Splits
-    settings: GapSettings
-    dt: float
-    rng: np.random.Generator
-    progress: Callable[[str, float], None]
-    state: State = field(init=False)
-    select_chi2: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
-    nominal: Theta = field(default_factory=dict)
-    first: float = math.nan
-    aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    shares: dict[str, float] = field(default_factory=dict)
-    candidates: list[Candidate] = field(default_factory=list)
-    signal: dict[str, float] = field(default_factory=dict)
-    steps: list[tuple[str, float]] = field(default_factory=list)
-    single: str = ""
-    strained: bool = False
-
-    def __post_init__(self) -> None:
-        """Begin with a model without terms at its nominal values."""
-        self.state = State(self.scorer, self.splits, self.settings, self.dt)
+class Search(Ledger):
+    """A search in progress, and its result (``gap/search/ledger.py``)."""
 
     # ------------------------------------------------------------------ the search
 
@@ -91,10 +46,13 @@ class Search:
             pass
         if self.state.terms:
             self.progress("is all of it needed", 0.85)
-            self._eliminate()
-            self._simplify()
-            self._prune()
-        if self.strained and self.state.terms and max(map(self._size, self.state.terms)) <= strain.CLEAR:
+            reduction.eliminate(self)
+            reduction.unite(self)
+            reduction.simplify(self)
+            reduction.prune(self)
+            reduction.symmetrical(self)
+        sizes_of_terms = [evidence.size(t, self.state.theta, self.state.tolerances) for t in self.state.terms]
+        if self.strained and sizes_of_terms and max(sizes_of_terms) <= strain.CLEAR:
             self.withdraw("it leaves its tolerance by too little to be called missing")
 
     def single_cause(self) -> Model | None:
@@ -108,23 +66,6 @@ class Search:
         self.state = self.state.settled(1)
         self._note_signals(self._screened())
 
-    def confirmed(self) -> bool:
-        """Return whether the terms help on the episodes kept for a last check, or there is nothing to help there."""
-        kept = self.splits.confirm
-        if not len(kept):
-            return True
-        before, after = (self.state.held_out(theta, kept) for theta in (self.nominal, self.state.theta))
-        least = 0.0 if excess(before) > self.settings.material else -significance.SAME
-        return bool(significance.gains(before, after[None]).mean() > least)
-
-    def withdraw(self, why: str) -> None:
-        """Take back all terms."""
-        self._reject(self.state.terms, why)
-        self.state = replace(self.state, terms=(), theta=self.nominal)
-        self.steps.append(("withdrawn", self.first))
-
-    # ------------------------------------------------------------------ one term
-
     def _fit_nominal(self) -> None:
         """Fit the model within its tolerances."""
         self.progress("fitting the model within its tolerances", 0.1)
@@ -137,7 +78,12 @@ class Search:
         """Look for one more term, or one more effect to move within its tolerance; return whether to go on."""
         term = len(self.state.terms) + 1
         share = 0.15 + 0.7 * (term - 1) / self.settings.max_terms
-        small = excess(self.select_chi2) < self.settings.material
+        level = excess(self.select_chi2)
+        if level < 0.0:  # below the floor there is nothing to explain
+            if not self.signal:
+                self._note_signals(self._screened())
+            return False
+        small = level < self.settings.material
         fitted = self._proposals(term, share, small)
         accepted, inside = self._judged(fitted, self.state, self.state.train_chi2, self.select_chi2, small)
         if accepted is not None:
@@ -178,7 +124,7 @@ class Search:
             return True
         self.first = first
         self.steps.pop()
-        self._reject([model.name], "with all else fitted again the held-out error grows")
+        self.reject([model.name], "with all else fitted again the held-out error grows")
         return False
 
     def _with_term(self, model: Model) -> tuple[State, np.ndarray]:
@@ -216,8 +162,8 @@ class Search:
     def _screened(self) -> list[Screened]:
         """Rank all ways in which an effect could be missing, on some of the windows of the fit."""
         linear, machine = self.state.table, self.state.machine
-        mean = self.state.scorer.windows.y[:, :, 0].mean((0, 1))
-        variants = library(machine, mean, [*self.state.terms, *self.state.loosened])
+        moved = motion(self.state.scorer.windows, machine.effort)
+        variants = library(machine, moved, [*self.state.terms, *self.state.loosened])
         if self.settings.effects:
             variants = [v for v in variants if v.effect in self.settings.effects]
         count = len(linear.windows)
@@ -295,6 +241,10 @@ class Search:
         if trial.chosen is None:
             return None, inside
         accepted = fitted[trial.chosen]
+        if not self.state.terms:
+            near = trial.mean > significance.LEAST * trial.mean[trial.chosen]
+            order = [k for k in np.argsort(-trial.mean) if near[k] and trial.sizes[k] > 1.0 and k != trial.chosen]
+            self.rivals = [fitted[k] for k in order[:RIVALS]]
         self.aliases[accepted.name] = (accepted.name, *(n for n in names if n != accepted.name))
         on_train = significance.gains(train, np.stack([m.chi2 for m in fitted if m.chi2 is not None]))
         every = np.concatenate([on_train, trial.gain], axis=1)
@@ -330,54 +280,3 @@ class Search:
             close = mean >= mean.max() - significance.same(mean.max())
             wins += bool(close[alias].any())
         return wins / max(self.settings.bootstraps, 1)
-
-    def _reject(self, names: Sequence[str], why: str) -> None:
-        for k, c in enumerate(self.candidates):
-            if c.status == "accepted" and c.effect in names:
-                self.candidates[k] = replace(c, status="rejected", reason=why)
-
-    # ------------------------------------------------------------------ fewer and simpler terms
-
-    def _size(self, effect: str) -> float:
-        return evidence.size(effect, self.state.theta, self.state.tolerances)
-
-    def _eliminate(self) -> None:
-        """Drop terms without which the rest does as well."""
-        for name in [t for t in self.state.terms if t != self.single and len(self.state.terms) > 1]:
-            rest = self.state.without(name).settled(1)
-            without = rest.held_out()
-            gain = significance.gains(without, self.select_chi2[None])
-            needed = removed(excess(without), excess(self.select_chi2)) > self.settings.min_share
-            if not needed or significance.max_t(gain, self.rng)[0] >= self.settings.alpha:
-                self.state, self.select_chi2 = rest, without
-                self.steps.append((f"without {name}", excess(without)))
-
-    def _simplify(self) -> None:
-        """Replace terms by effects that explain as much with fewer numbers, where they do."""
-        for name in self.state.terms:
-            simpler = tolerances.identification(name).simpler
-            if not simpler or simpler in self.state.terms:
-                continue
-            rest = self.state.without(name, simpler).settled(2)
-            before, after = self.state.held_out(self.nominal), self.state.held_out()
-            gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
-            large = evidence.size(simpler, rest.theta, rest.tolerances) > 1.0
-            if less > gain - significance.same(gain) and large:
-                self.state = rest
-                self.aliases[simpler], self.shares[simpler] = (simpler,), self.shares[name]
-                self.steps.append((f"{simpler} in place of {name}", excess(self.state.held_out())))
-
-    def _prune(self) -> None:
-        """Bring back within tolerance what leaves it at a joint for next to nothing."""
-        cost, may, kept = strain.cost(self.state.scorer, self.state.table), self.state.may, self.state.kept
-        for name in self.state.terms:
-            theta, joints = self.state.theta, self.state.machine.joints
-            out = np.flatnonzero(evidence.beyond(name, theta, joints, self.state.tolerances))
-            without = {int(j): cost(replace(may, kept=kept | {(name, int(j))})) for j in out}
-            for j in sorted(without, key=lambda j: without[j])[: len(out) - 1]:  # where it brings most, it stays
-                candidate = kept | {(name, j)}
-                if cost(replace(may, kept=candidate)) - cost(replace(may, kept=kept)) < NEEDED:
-                    kept = candidate
-        if kept != self.state.kept:
-            self.state = self.state.keeping(kept).settled(2)
-            self.steps.append(("at fewer joints", excess(self.state.held_out())))

@@ -16,7 +16,7 @@ from scipy.optimize import lsq_linear
 
 from go1exp.effects.base import Param
 from go1exp.effects.identification import Identification
-from go1exp.effects.tolerances import Tolerances, effect_class
+from go1exp.effects.tolerances import Tolerances, effect_class, sizes
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.linear import Layout
@@ -55,6 +55,15 @@ def step(p: Param, value: float | None = None, factor: float = 1.0) -> float:
     return factor * size if at + factor * size <= p.high else -factor * size
 
 
+def present(effect: str, theta: Mapping[Key, np.ndarray], machine: Machine) -> np.ndarray:
+    """Return at which joints (J,) an effect with one value for several joints is; at all if it is at none yet."""
+    away = np.zeros(len(machine.joints), dtype=bool)
+    for key in sizes(effect):
+        null = machine.tolerances.param(key).null
+        away |= np.broadcast_to(theta.get(key, np.array([null])) != null, away.shape)
+    return away if away.any() else ~away
+
+
 SMALL = 0.1
 """Change of a parameter for a derivative, in tolerances. Much that moves a robot can be scaled together and leaves no
 trace; that only shows if columns are exact, and differences over a whole tolerance are not (coulomb and kd were off by
@@ -73,6 +82,9 @@ def probes(
         values = np.broadcast_to(theta.get(key, np.array([p.null])), (wide,))
         delta = np.array([step(p, float(v), factor) for v in values])
         by_joint = p.per == "joint" and not identification(key[0]).common
+        if p.per == "joint" and not by_joint:
+            at = present(key[0], theta, machine)
+            delta = np.where(at, delta[int(at.argmax())], 0.0)
         places: list[int | None] = list(range(len(machine.groups[0]))) if by_joint else [None]
         columns += [Probe(key, place, delta) for place in places]
     return columns
@@ -133,7 +145,7 @@ def bounds(
         probe = columns[layout.probe[i]]
         assert isinstance(probe.key, tuple)
         p = may.tolerances.param(probe.key)
-        j = max(int(layout.joint[i]), 0)
+        j = int(layout.joint[i]) if layout.joint[i] >= 0 else int(np.argmax(np.abs(probe.delta)))
         value = float(
             np.ravel(theta.get(probe.key, np.array([p.null])))[
                 j if probe.key in theta and theta[probe.key].size > 1 else 0
@@ -206,7 +218,8 @@ def moved(theta: Theta, layout: Layout, columns: Sequence[Probe], x: np.ndarray,
         p = machine.tolerances.param(probe.key)
         wide = len(machine.joints) if p.per == "joint" else 1
         full = np.broadcast_to(values.get(probe.key, np.array([p.null])), (wide,)).copy()
-        full[layout.joint[i] if layout.joint[i] >= 0 else slice(None)] += x[i]
+        shared = probe.delta != 0.0 if len(probe.delta) == wide else slice(None)
+        full[layout.joint[i] if layout.joint[i] >= 0 else shared] += x[i]
         values[probe.key] = full.clip(p.low, p.high)
     return values
 

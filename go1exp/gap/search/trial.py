@@ -11,6 +11,7 @@ import numpy as np
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout
+from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import evidence, significance, tolerances
 from go1exp.gap.search.fit import Model, scores
 from go1exp.gap.search.strain import CLEAR
@@ -18,18 +19,11 @@ from go1exp.gap.search.strain import CLEAR
 FEW = 0.5
 """A candidate that removes more than this share of the excess without being significant is seen in too few windows."""
 
+MANY = 3.0
+"""Times as many values beyond their tolerances that make an effect the less simple of two."""
+
 MOSTLY = 0.7
 """Share of a small excess, of a model that is adequate already, that a term must remove: the right one leaves none."""
-
-
-def excess(chi2: np.ndarray) -> float:
-    """Return the mean excess of chi2 per value (V, G)."""
-    return float(chi2.mean() - 1.0) if chi2.size else math.nan
-
-
-def removed(before: float, after: float) -> float:
-    """Return the share of an excess that is gone; what lies below the floor counts as nothing."""
-    return 1.0 - max(after, 0.0) / before if before > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -132,7 +126,7 @@ def tried(
     sizes = np.array([evidence.size(m.name, m.theta, m.may.tolerances) for m in fitted])
     helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
     outside = helps & (sizes > (CLEAR if small else 1.0))
-    numbers = np.array([len(m.keys) for m in fitted])
+    numbers = np.array([(evidence.count(m.name, m.theta, scorer.replayer.machine), len(m.keys)) for m in fitted])
     chosen, alias, aside = _choice(gain, outside, helps & (sizes <= 1.0), numbers, rng)
     names = [m.name for m in fitted]
     return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, aside, chosen)
@@ -147,7 +141,7 @@ def _choice(
         gain: (M, V G) fall of log chi2 of each candidate.
         outside: (M,) which help and leave their tolerances.
         inside: (M,) which help within their tolerances.
-        numbers: (M,) how many parameters each has.
+        numbers: (M, 2) how many values of each leave their tolerance, and how many parameters it has.
         rng: of the tests.
     """
     none = np.zeros(len(gain), dtype=bool)
@@ -156,7 +150,11 @@ def _choice(
     mean = np.asarray(gain.mean(axis=1))
     best = int(max(np.flatnonzero(outside), key=lambda k: mean[k]))
     alias = significance.equals(gain, best, rng) & outside
-    aside = alias & (numbers > numbers[alias].min())  # what explains the same with more numbers is no rival
+    # What explains the same with more numbers is no rival: a tilt is two, the offsets that imitate it are twelve.
+    equal = alias & (mean >= mean[best] - significance.same(mean[best]))
+    many = equal & (numbers[:, 0] >= MANY * numbers[equal, 0].min())
+    rest = alias & ~many
+    aside = many | (rest & (numbers[:, 1] > numbers[rest, 1].min()))
     alias &= ~aside
     chosen = int(max(np.flatnonzero(alias), key=lambda k: mean[k]))
     if inside.any() and mean[inside].max() >= mean[chosen] - significance.same(mean[chosen]):

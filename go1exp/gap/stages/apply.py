@@ -21,8 +21,8 @@ from go1exp.gap.files import GapFileError
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search.fit import scores
-from go1exp.gap.search.trial import excess, removed
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.schema.joint_values import spread
@@ -51,7 +51,8 @@ class Applied:
         effect_only: with ``effect.yaml`` alone.
         reported: excess that the search had at its own step with what ``effect.yaml`` holds.
         closed: share of the excess that the files remove.
-        holds: whether the model with the files is as good at this step as was reported.
+        holds: whether the model with the files is as good at this step as was reported, and not worse than
+            the plain one.
     """
 
     files: tuple[Path, ...]
@@ -198,7 +199,12 @@ def theta_of(terms: Sequence[Term], joints: Sequence[str]) -> Theta:
 
 
 def _reported(result: GapResult) -> float:
-    """Return the excess that the search had with the certified effects alone; NaN if it did not say."""
+    """Return the excess that the search had, on the same windows, with what the files hold; NaN if it did not say.
+
+    Results of older versions do not have it; theirs is of other windows, the held-out ones.
+    """
+    if "written" in result.excess:
+        return result.excess["written"]
     certified = [n.effect for n in result.named if n.status == "certified"]
     if len(certified) == len(result.named):
         return result.excess.get("final", float("nan"))
@@ -238,7 +244,7 @@ def prove(
     contents: Mapping[str, Mapping[str, Any]],
     physics_dt: float,
 ) -> Applied:
-    """Score written files at the step of training, on the windows kept for a last check (if none, the held-out ones).
+    """Score written files at the step of training, on the windows on which the search scored what they hold.
 
     Args:
         recordings: those of the search.
@@ -256,9 +262,11 @@ def prove(
     _same_search(recordings, settings, result, robot.tolerances)
     with one_thread():
         comparison = compare(recordings, robot, settings, physics_dt=physics_dt, fewest=1)
-        plain, effect_only, both = (excess(_held_out(comparison, theta)) for theta in _proposals(contents, robot))
+        windows = _judged(comparison, result)
+        values = _proposals(contents, robot)
+        plain, effect_only, both = (excess(_held_out(comparison, theta, windows)) for theta in values)
     reported = _reported(result)
-    holds = both <= max(settings.adequate, 1.5 * reported + 0.1)
+    holds = both <= max(settings.adequate, min(plain, 1.5 * reported + 0.1))
     closed = removed(plain, both)
     return Applied((), comparison.dt, plain, both, effect_only, reported, closed, bool(holds))
 
@@ -270,10 +278,24 @@ def _proposals(contents: Mapping[str, Mapping[str, Any]], robot: Robot) -> tuple
     return {}, effect, both
 
 
-def _held_out(comparison: Comparison, theta: Theta) -> np.ndarray:
-    """Return chi2 (V, G) of a model, by floors and initial states that suit it, on windows of the last check if any."""
-    parts = comparison.split(np.random.default_rng(comparison.settings.seed))
-    windows = parts.confirm if len(parts.confirm) else parts.select  # values were fitted on all but the former
+def _judged(comparison: Comparison, result: GapResult) -> np.ndarray:
+    """Return the windows on which the search scored what it wrote: another split would be of other windows.
+
+    Raises:
+        GapFileError: if the recordings are cut otherwise now.
+    """
+    count, numbers = result.provenance.get("windows"), result.provenance.get("judged")
+    if not numbers:  # an older version's result
+        parts = comparison.split(np.random.default_rng(comparison.settings.seed))
+        return parts.judged
+    if count != len(comparison.windows):
+        now = len(comparison.windows)
+        raise GapFileError(f"logs: {now} windows, {count} in the search that found this; run go1exp gap explain again")
+    return np.array(numbers, dtype=int)
+
+
+def _held_out(comparison: Comparison, theta: Theta, windows: np.ndarray) -> np.ndarray:
+    """Return chi2 (V, G) of a model on some windows, by floors and initial states that suit it."""
     renewed = comparison.scorer.renewed
     scorer = comparison.scorer if renewed is None or not theta else renewed(theta)
     return scores(scorer, [theta], windows, comparison.dt)[0]

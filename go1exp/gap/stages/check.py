@@ -12,9 +12,9 @@ from go1exp.gap.comparison import NotComparable, Progress, compare, robot_from
 from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.localise import localise
+from go1exp.gap.score.robust import excess
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
-from go1exp.gap.search.trial import excess
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.tensors.threads import one_thread

@@ -16,13 +16,14 @@ from go1exp.gap.answer import Answer, advice, concluded, evidence, not_excited, 
 from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.replay.rows import Theta, variants
-from go1exp.gap.result import GapResult, GapSettings, NamedEffect, Overlay
+from go1exp.gap.result import AngleErrors, GapResult, GapSettings, NamedEffect, Overlay
 from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.score.angle_errors import angle_errors
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import localise
+from go1exp.gap.score.robust import excess
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
-from go1exp.gap.search.trial import excess
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.tensors.threads import one_thread
@@ -70,6 +71,11 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
             f"Of {len(parts.alone)} episodes there is no other with the same motion and gains; stretches of them judge "
             "what was fitted on the rest of them."
         )
+    if parts.shared:
+        warnings.append(
+            f"The last check has stretches of {len(parts.shared)} episodes and few or no whole ones: of their "
+            "motions there is no other episode."
+        )
     if not len(parts.confirm):
         warnings.append("Too few episodes to keep some for a last check.")
     search = Search(comparison.scorer, parts, settings, comparison.dt, rng, on_progress)
@@ -80,7 +86,7 @@ def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[st
     if unseen <= settings.adequate:
         return search
     warnings.append(
-        f"Episodes kept for a last check show an error of {1 + unseen:.3g} times the floor, others do not: "
+        f"Windows kept for a last check show an error of {1 + unseen:.3g} times the floor, others do not: "
         "they were taken into the search, with nothing left for a last check."
     )
     search = Search(comparison.scorer, comparison.split(rng, confirm=0.0), settings, comparison.dt, rng, on_progress)
@@ -111,6 +117,7 @@ def written(
         floors=comparison.floors(),
         excess=answer.excess,
         closed=answer.closed,
+        errors=_angle_errors(comparison, search),
         before=localise(score, before, shown, search.rng),
         after=localise(score, after, shown, search.rng),
         not_excited=silent,
@@ -126,6 +133,13 @@ def written(
     )
 
 
+def _angle_errors(comparison: Comparison, search: Search) -> AngleErrors:
+    """Return the errors of the angles before and after, on windows that no fitted value has seen."""
+    score, windows = search.state.scorer, search.splits.judged
+    before, after = residuals(score, [{}, search.state.theta], windows, search.dt)
+    return angle_errors(score, before, after, windows, [r.meta.episode for r in comparison.recordings])
+
+
 def provenance(
     comparison: Comparison, search: Search, logs: Sequence[Recording], settings: GapSettings
 ) -> dict[str, Any]:
@@ -139,6 +153,7 @@ def provenance(
         "seed": settings.seed,
         "physics_dt": comparison.dt,
         "windows": len(comparison.windows),
+        "judged": [int(k) for k in parts.judged],
         "split": {name: sorted({recordings[e].meta.episode for e in episode[w]}) for name, w in kinds.items()},
     }
 

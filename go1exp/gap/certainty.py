@@ -1,0 +1,77 @@
+"""Whether a term that helps is certain, or only makes up for something: ``certified`` or ``compensating``, and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from go1exp.effects.tolerances import sizes
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.search.ledger import LastCheck, Ledger
+
+MOST = 0.75
+"""Share of the excess that a term must remove by itself to be certified although a gap remains."""
+
+HALF = 0.5
+"""Share of the excess that is most of it: what removes more is not withdrawn, and must remove as much on the last check
+to be certified."""
+
+AT_BOUND = 0.02
+"""Distance from a bound, in tolerances, that counts as being there: the data would have the value go further."""
+
+
+def on_bound(search: Ledger, effect: str, theta: Theta, joints: Sequence[str]) -> str:
+    """Return which value of a term lies on the bound of its parameter, in words; empty if none does.
+
+    Args:
+        search: that found it.
+        effect: the term.
+        theta: fitted values.
+        joints: where it is named; empty for an effect of the whole robot.
+    """
+    everyone = search.state.scorer.windows.joints
+    for key in sizes(effect):
+        p = search.state.tolerances.param(key)
+        of_joint = p.per == "joint"
+        values = np.broadcast_to(theta.get(key, np.array([p.null])), len(everyone) if of_joint else 1)
+        for k, value in enumerate(values):
+            if of_joint and everyone[k] not in joints:
+                continue
+            near = [b for b in (p.low, p.high) if abs(value - b) <= AT_BOUND * p.tolerance]
+            if near and abs(value - p.null) > p.tolerance:
+                unit = "" if p.unit == "-" else f" {p.unit}"
+                at = f" at {everyone[k]}" if of_joint else ""
+                return f"{p.name}{at} lies on its bound, {near[0]:g}{unit}"
+    return ""
+
+
+def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adequate: bool, check: LastCheck) -> str:
+    """Return why a term is not certified; empty if it is.
+
+    Args:
+        search: that found it.
+        effect: the term.
+        theta: fitted values.
+        joints: where it is named.
+        adequate: whether the model with all terms counts as right.
+        check: what the terms do on the last check.
+    """
+    stable, alone = search.shares.get(effect, 0.0), search.share_of(effect)
+    rivals = [name for name in search.aliases.get(effect, ()) if name != effect]
+    if not check.helps:
+        return "the last check does not bear it out"
+    if not math.isnan(check.closed) and check.closed < HALF:
+        return f"on the last check only {max(check.closed, 0.0):.0%} of the excess goes"
+    if stable < search.settings.certified:
+        return f"it is named again in {stable:.0%} of the resamples only"
+    if not joints and any(search.state.tolerances.param(key).per == "joint" for key in sizes(effect)):
+        return "it leaves its tolerance at no joint beyond doubt"
+    if bound := on_bound(search, effect, theta, joints):
+        return bound
+    if adequate:
+        return ""
+    if not alone > MOST:  # NaN too
+        return f"a gap remains, of which it alone removes {'less' if math.isnan(alone) else f'{max(alone, 0.0):.0%}'}"
+    return f"a gap remains, and {' and '.join(rivals)} would do as well" if rivals else ""

@@ -1,0 +1,58 @@
+"""How far the angles are off, in rad: what a user asks for first, beside chi2."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from go1exp.gap.result import AngleErrors
+from go1exp.gap.score.likelihood import Scorer
+
+
+def unexplained(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np.ndarray:
+    """Return residuals (V, G, m) of windows without what their initial states explain, (V, G, n, C, K), in noises."""
+    state = scorer.state[windows].astype(float)
+    inner = np.swapaxes(state, -1, -2) @ state + np.eye(state.shape[-1])
+    cross = np.swapaxes(state, -1, -2) @ residual[..., None]
+    left = residual - (state @ np.linalg.solve(inner, cross))[..., 0]
+    n, quantities = scorer.windows.t.shape[1], len(scorer.windows.quantities)
+    return np.asarray(left.reshape(*left.shape[:2], n, quantities, -1))
+
+
+def of_angles(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np.ndarray:
+    """Return the root mean square error of each joint's angle in each window (V, J), rad."""
+    w = scorer.windows
+    left = unexplained(scorer, residual, windows)[:, :, :, 0]  # V G n K
+    square = np.empty((len(windows), len(w.joints)))
+    valid = w.valid[windows][:, None, :, None]
+    for g, joints in enumerate(scorer.replayer.machine.groups):
+        total = (left[:, g : g + 1] ** 2 * valid).sum(axis=(1, 2))
+        square[:, list(joints)] = total / np.maximum(w.valid[windows].sum(1), 1)[:, None]
+    return np.asarray(np.sqrt(square) * scorer.scale[windows][:, 0])
+
+
+def angle_errors(
+    scorer: Scorer, before: np.ndarray, after: np.ndarray, windows: np.ndarray, episodes: Sequence[str]
+) -> AngleErrors:
+    """Compare two models by their residuals (V, G, m) on windows (V,); ``episodes`` are the names of the recordings.
+
+    Medians of windows, so that a few wild ones do not decide.
+    """
+    pair = np.stack([of_angles(scorer, residual, windows) for residual in (before, after)])  # 2 V J
+    whole = np.sqrt((pair**2).mean(axis=2))
+    episode = scorer.windows.episode[windows]
+    gone = 1.0 - whole[1] / np.maximum(whole[0], 1e-300)
+
+    def medians(errors: np.ndarray) -> tuple[float, float]:
+        first, second = np.median(errors, axis=1)
+        return float(first), float(second)
+
+    return AngleErrors(
+        windows=len(windows),
+        median=medians(whole),
+        removed=float(np.median(gone)),
+        worse=float(np.mean(gone < 0.0)),
+        by_joint={name: medians(pair[:, :, j]) for j, name in enumerate(scorer.windows.joints)},
+        by_episode={episodes[e]: medians(whole[:, episode == e]) for e in np.unique(episode)},
+    )

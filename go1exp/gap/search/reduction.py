@@ -1,0 +1,127 @@
+"""Fewer and simpler terms: what is not needed is dropped, replaced, or kept to fewer joints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.score.linear import Layout
+from go1exp.gap.score.robust import excess, removed
+from go1exp.gap.search import evidence, places, significance, tolerances
+from go1exp.gap.search.ledger import Ledger
+from go1exp.gap.search.state import State
+
+DRAWS = 40
+"""Bootstraps from which it is read whether two parameters are equal."""
+
+
+def eliminate(search: Ledger) -> None:
+    """Drop terms without which the rest does as well."""
+    for name in [t for t in search.state.terms if t != search.single and len(search.state.terms) > 1]:
+        rest = search.state.without(name).settled(1)
+        without = rest.held_out()
+        gain = significance.gains(without, search.select_chi2[None])
+        needed = removed(excess(without), excess(search.select_chi2)) > search.settings.min_share
+        search.returned[name] = removed(search.first, search.first + excess(search.select_chi2) - excess(without))
+        if not needed or significance.max_t(gain, search.rng)[0] >= search.settings.alpha:
+            search.state, search.select_chi2 = rest, without
+            search.steps.append((f"without {name}", excess(without)))
+
+
+def simplify(search: Ledger) -> None:
+    """Replace terms by effects that explain as much with fewer numbers, where they do."""
+    for name in search.state.terms:
+        simpler = tolerances.identification(name).simpler
+        if not simpler or simpler in search.state.terms:
+            continue
+        rest = search.state.without(name, simpler).settled(2)
+        before, after = search.state.held_out(search.nominal), search.state.held_out()
+        gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
+        large = evidence.size(simpler, rest.theta, rest.tolerances) > 1.0
+        if less > gain - significance.same(gain) and large:
+            replaced(search, name, simpler, rest)
+
+
+def prune(search: Ledger) -> None:
+    """Bring back within tolerance what leaves it at a joint for too little (``gap/search/places.py``)."""
+    linear, kept = places.Linear(search.state), search.state.kept
+    for name in search.state.terms:
+        theta, joints = search.state.theta, search.state.machine.joints
+        outside = np.flatnonzero(evidence.beyond(name, theta, joints, search.state.tolerances))
+        inside = places.chosen(linear, name, kept, search.rng)
+        kept |= {(name, int(j)) for j in outside if j not in inside}
+    if kept == search.state.kept:
+        return
+    sparse = search.state.keeping(kept).settled(2)
+    chi2 = sparse.held_out()
+    if significance.gains(search.select_chi2, chi2[None]).mean() < -significance.SAME:
+        return  # what looked small in the linear model was not
+    search.state, search.select_chi2 = sparse, chi2
+    search.steps.append(("at fewer joints", excess(chi2)))
+
+
+def symmetrical(search: Ledger) -> None:
+    """Replace a term by the simpler effect that it is if two parameters are equal, where their difference may be 0."""
+    for name in search.state.terms:
+        how = tolerances.identification(name)
+        if not how.simpler_if_equal or how.simpler in search.state.terms:
+            continue
+        first, second = ((name, parameter) for parameter in how.simpler_if_equal)
+        theta, joints = search.state.theta, search.state.machine.joints
+        outside = evidence.beyond(name, theta, joints, search.state.tolerances)
+        differences = np.stack([draw[first] - draw[second] for draw in resampled(search)])
+        low, high = np.quantile(differences, (0.025, 0.975), axis=0)
+        if not np.all(((low <= 0.0) & (high >= 0.0))[outside]):
+            continue
+        rest = search.state.without(name, how.simpler).settled(2)
+        if evidence.size(how.simpler, rest.theta, rest.tolerances) > 1.0:
+            replaced(search, name, how.simpler, rest)
+
+
+def resampled(search: Ledger) -> list[Theta]:
+    """Return values of the model by bootstraps of the windows of the fit, to first order."""
+    state = search.state
+    linear, scorer = state.table, state.scorer
+    layout = Layout.from_probes(state.machine, linear.probes)
+    grams = linear.grams(scorer) / np.maximum(state.train_chi2, 1.0)[..., None, None]
+    limits = tolerances.bounds(layout, linear.probes, state.theta, state.may)
+    episode = scorer.windows.episode[linear.windows]
+    draws = []
+    for _ in range(DRAWS):
+        matrix, right = layout.total(grams[significance.resampled(episode, search.rng)])
+        x = tolerances.solve(matrix, right, limits)
+        draws.append(tolerances.moved(state.theta, layout, linear.probes, x, state.machine))
+    return draws
+
+
+def replaced(search: Ledger, name: str, instead: str, rest: State) -> None:
+    """Put a fitted model with another term in the place of the present one."""
+    search.state = rest
+    search.aliases[instead], search.shares[instead] = (instead,), search.shares[name]
+    search.returned[instead] = search.returned.get(name, math.nan)
+    search.select_chi2 = rest.held_out()
+    search.steps.append((f"{instead} in place of {name}", excess(search.select_chi2)))
+
+
+def unite(search: Ledger) -> None:
+    """Replace several terms by one that does as well, if one does: a rival of the first that was set aside for it."""
+    several = search.state.terms
+    if len(several) < 2:
+        return
+    for model in search.rivals:
+        if model.name in several:
+            continue
+        theta = {key: v for key, v in model.theta.items() if key[0] in (model.name, *search.state.loosened)}
+        rest = replace(search.state, terms=(model.name,), kept=frozenset(), theta=theta).settled(4)
+        chi2 = rest.held_out()
+        before = search.state.held_out(search.nominal)
+        gain, less = significance.gains(before, np.stack([search.select_chi2, chi2])).mean(axis=1)
+        as_well = less > gain - significance.same(gain)
+        as_well &= excess(chi2) <= excess(search.select_chi2) + significance.SAME
+        if as_well and evidence.size(model.name, rest.theta, rest.tolerances) > 1.0:
+            search.reject(several, f"{model.name} alone does as well")
+            replaced(search, several[0], model.name, rest)
+            return

@@ -1,0 +1,92 @@
+"""What is certified, what only makes up for something, and that the answer says why (``go1exp/gap/certainty.py``)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from go1exp.effects.tolerances import DECLARED, declared
+from go1exp.gap.answer import Answer, sentence
+from go1exp.gap.certainty import doubt
+from go1exp.gap.result import Candidate, GapSettings
+from go1exp.gap.search.ledger import LastCheck
+
+JOINTS = ("a_hip", "a_thigh", "b_hip", "b_thigh")
+BORNE_OUT = LastCheck(True, 0.9)
+
+
+@dataclass
+class Stub:
+    """The part of a search that is read: one term at all joints, which took 90 % by itself."""
+
+    shares: dict[str, float] = field(default_factory=lambda: {"coulomb": 1.0, "encoder_offset": 1.0})
+    aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    candidates: list[Candidate] = field(default_factory=list)
+    signal: dict[str, float] = field(default_factory=dict)
+    own: float = 0.9
+    first: float = 100.0
+    settings: GapSettings = field(default_factory=GapSettings)
+    state: Any = field(
+        default_factory=lambda: SimpleNamespace(
+            tolerances=DECLARED, scorer=SimpleNamespace(windows=SimpleNamespace(joints=JOINTS))
+        )
+    )
+
+    def share_of(self, term: str) -> float:
+        return self.own
+
+
+def why(
+    search: Stub,
+    effect: str = "coulomb",
+    value: float = 0.3,
+    adequate: bool = False,
+    check: LastCheck = BORNE_OUT,
+) -> str:
+    theta = {(effect, "bound" if effect == "coulomb" else "offset"): np.full(4, value)}
+    return doubt(search, effect, theta, JOINTS, adequate, check)  # type: ignore[arg-type]
+
+
+def test_a_term_that_took_most_of_a_gap_is_certain_though_some_remains() -> None:
+    assert why(Stub()) == ""
+
+
+@pytest.mark.parametrize("own", [0.4, math.nan])
+def test_a_term_is_judged_by_what_it_took_itself_not_by_what_all_took(own: float) -> None:
+    assert "a gap remains, of which it alone removes" in why(Stub(own=own))
+    assert why(Stub(own=own), adequate=True) == ""
+
+
+def test_a_value_on_its_bound_is_no_certain_one() -> None:
+    high = declared(("encoder_offset", "offset")).high
+    assert "offset at a_hip lies on its bound" in why(Stub(), "encoder_offset", high, adequate=True)
+    assert why(Stub(), "encoder_offset", 0.5 * high, adequate=True) == ""
+
+
+def test_where_another_does_as_well_and_a_gap_remains_neither_is_certain() -> None:
+    pair = Stub(aliases={"coulomb": ("coulomb", "load_friction")})
+    assert "load_friction would do as well" in why(pair)
+    assert why(pair, adequate=True) == ""  # the set explains everything, and is named as a set
+
+
+def test_what_the_last_check_does_not_bear_out_is_not_certain() -> None:
+    assert "does not bear it out" in why(Stub(), check=LastCheck(False, -0.2), adequate=True)
+    assert "only 30% of the excess goes" in why(Stub(), check=LastCheck(True, 0.3), adequate=True)
+    assert why(Stub(), check=LastCheck(True, math.nan), adequate=True) == ""  # there was no gap on it
+
+
+def test_what_took_most_of_a_gap_is_said_though_it_is_not_named() -> None:
+    def tried(after: float) -> list[Candidate]:
+        return [Candidate("coulomb", (), {}, after, 1.0, 0.2, 3.0, ("coulomb",), "rejected", "too few windows show it")]
+
+    answer = Answer("unexplained", (), {}, {"box": 100.0, "final": 100.0}, math.nan)
+    text = sentence(answer, Stub(candidates=tried(26.0)), {}, ())  # type: ignore[arg-type]
+    assert "no effect of the library" not in text
+    assert "takes 74% away and yet is not named: too few windows show it" in text
+    text = sentence(answer, Stub(candidates=tried(80.0)), {}, ())  # type: ignore[arg-type]
+    assert "no effect of the library explains it" in text

@@ -1,0 +1,143 @@
+"""Which joints, and which name: sparse places (``go1exp/gap/search/places.py``) and the simpler of two."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from go1exp.effects.tolerances import DECLARED
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.score.linear import Layout
+from go1exp.gap.search import evidence, places, tolerances
+from go1exp.gap.search.screen import Motion, library
+from go1exp.gap.search.tolerances import Freedom
+from go1exp.gap.search.trial import _choice
+from go1exp.robot import JOINTS
+
+LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(4))
+MACHINE: Any = SimpleNamespace(
+    joints=JOINTS, groups=LEGS, base_probe=(), tolerances=DECLARED, effort=(23.7, 23.7, 35.55) * 4
+)
+
+
+@dataclass
+class Quadratic:
+    """A linear model whose chi2 is known: every joint that is kept within its tolerance costs ``cost`` (12,)."""
+
+    theta: Theta
+    cost: np.ndarray
+    gain: np.ndarray
+    may: Freedom = field(default_factory=lambda: Freedom(DECLARED))
+    machine: Any = field(default_factory=lambda: MACHINE)
+
+    def price(self, kept: frozenset[tuple[str, int]]) -> float:
+        return float(sum(self.cost[j] for _, j in kept))
+
+    def held_out(self, kept: frozenset[tuple[str, int]]) -> np.ndarray:
+        worse = np.zeros((40, 4))
+        for _, j in kept:
+            worse[:, j // 3] += self.gain[j] + 0.05 * np.random.default_rng(j).standard_normal(40)
+        return worse
+
+
+def at(cost: np.ndarray, gain: np.ndarray | None = None) -> set[str]:
+    theta = {("link_mass", "scale"): np.full(12, 1.6)}
+    linear: Any = Quadratic(theta, cost, 0.01 * cost if gain is None else gain)
+    inside = places.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0))
+    return {JOINTS[j] for j in inside}
+
+
+def test_one_loaded_link_is_one_joint_though_all_were_free() -> None:
+    cost = np.full(12, 4.0)
+    cost[5] = 900.0
+    assert at(cost) == {JOINTS[5]}
+
+
+def test_an_effect_that_is_everywhere_is_named_everywhere() -> None:
+    assert at(np.full(12, 300.0)) == set(JOINTS)
+
+
+def test_a_part_of_the_robot_is_found_as_one() -> None:
+    cost = np.tile([3.0, 3.0, 250.0], 4)
+    assert at(cost) == {j for j in JOINTS if j.endswith("calf")}
+
+
+def test_a_joint_that_held_out_windows_do_not_miss_is_left_out() -> None:
+    """It pays on the windows of the fit, by 2 % of what the loaded link brings, and nowhere else."""
+    cost, gain = np.full(12, 1.0), np.zeros(12)
+    cost[[5, 8]], gain[5] = (900.0, 18.0), 0.5
+    assert at(cost, gain) == {JOINTS[5]}
+    gain[8] = 0.5
+    assert at(cost, gain) == {JOINTS[5], JOINTS[8]}
+
+
+def test_joints_that_are_within_their_tolerance_are_not_asked() -> None:
+    scale = np.ones(12)
+    scale[3] = 2.0
+    linear: Any = Quadratic({("link_mass", "scale"): scale}, np.full(12, 500.0), np.zeros(12))
+    assert places.chosen(linear, "link_mass", frozenset(), np.random.default_rng(0)) == {3}
+
+
+def test_pieces_are_joints_parts_legs_sides_and_all() -> None:
+    sets = {frozenset(JOINTS[j] for j in piece) for piece in places.pieces(JOINTS)}
+    assert len(sets) == 12 + 3 + 4 + 4 + 1
+    assert frozenset(j for j in JOINTS if j[1] == "R") in sets  # the right side
+    assert places.pieces(["shoulder", "elbow"]) == [frozenset([0]), frozenset([1]), frozenset([0, 1])]
+
+
+# ---------------------------------------------------------------------- names
+
+
+def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
+    offsets = {("encoder_offset", "offset"): np.full(12, 0.02)}
+    tilt = {("base_tilt", "roll"): np.array([0.03]), ("base_tilt", "pitch"): np.array([-0.02])}
+    values = [("encoder_offset", offsets), ("base_tilt", tilt)]
+    numbers = np.array([(evidence.count(name, theta, MACHINE), len(theta)) for name, theta in values])
+    gain = np.random.default_rng(0).normal(2.0, 0.1, (2, 60))
+    gain[1] = gain[0] - 0.01  # half a per cent less: the same
+    all_out, none = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
+    chosen, alias, aside = _choice(gain, all_out, none, numbers, np.random.default_rng(0))
+    assert chosen == 1
+    np.testing.assert_array_equal((alias, aside), ([False, True], [True, False]))
+    gain[1] = 0.8 * gain[0]  # but it must explain as much
+    assert _choice(gain, all_out, none, numbers, np.random.default_rng(0))[0] == 0
+
+
+@pytest.mark.parametrize("demand", [0.2, 0.5, 1.4])
+def test_a_limit_of_the_torque_is_looked_for_below_what_was_asked_for(demand: float) -> None:
+    """A limit of 0.9 of the peak does nothing in recordings that ask for a fifth of it."""
+    asked = np.tile([0.3, demand, 0.1], 4)
+    motion = Motion(np.zeros(12), -np.ones(12), np.ones(12), asked)
+    probes = [p for v in library(MACHINE, motion) if v.effect == "torque_speed_limit" for p in v.probes]
+    peaks = [1.0 + p.delta for p in probes if p.key == ("torque_speed_limit", "peak")]
+    thighs = [peak[1] for peak in peaks if (peak < 1.0).sum() == 4 and peak[1] < 1.0]  # part by part
+    assert len(thighs) == 4
+    assert len({p for p in thighs if p < max(min(demand, 1.0), 0.2) + 1e-9}) >= (4 if demand > 1.0 else 1)
+    assert max(thighs) <= 0.95 + 1e-9
+
+
+def test_what_shares_a_value_moves_only_where_it_is() -> None:
+    """A limit at the four thighs: a step of the fit must not pull the other joints along."""
+    key = ("torque_speed_limit", "peak")
+    theta = {key: np.tile([1.0, 0.7, 1.0], 4)}
+    (probe,) = tolerances.probes(MACHINE, [key], theta)
+    assert set(np.flatnonzero(probe.delta)) == {1, 4, 7, 10}
+    layout = Layout.from_probes(MACHINE, [probe])
+    after = tolerances.moved(theta, layout, [probe], np.array([-0.1]), MACHINE)[key]
+    np.testing.assert_allclose(after, np.tile([1.0, 0.6, 1.0], 4))
+    limits = tolerances.bounds(layout, [probe], theta, Freedom(DECLARED).also("torque_speed_limit"))
+    np.testing.assert_allclose((limits.low, limits.high), ([-0.5], [0.3]))
+    nowhere = tolerances.probes(MACHINE, [key], {})[0]
+    assert np.all(nowhere.delta != 0.0)
+
+
+def test_a_spring_is_looked_for_at_rest_angles_of_the_whole_range() -> None:
+    motion = Motion(np.zeros(12), np.full(12, -0.7), np.full(12, 0.4), np.ones(12))
+    rests = [
+        v.shapes["parallel_stiffness", "rest"] for v in library(MACHINE, motion) if v.effect == "parallel_stiffness"
+    ]
+    np.testing.assert_allclose(sorted(float(r[0]) for r in rests), [-0.7, 0.0, 0.4])

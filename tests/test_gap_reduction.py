@@ -1,0 +1,89 @@
+"""Fewer and simpler terms (``go1exp/gap/search/reduction.py``), on models whose error is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from go1exp.effects.tolerances import DECLARED
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.search import reduction, tolerances
+from go1exp.robot import JOINTS
+
+NONE: Theta = {}
+
+
+@dataclass(frozen=True)
+class Known:
+    """A model whose held-out chi2 is a function of its terms."""
+
+    chi2: Callable[[tuple[str, ...]], float]
+    terms: tuple[str, ...]
+    theta: Theta
+    loosened: tuple[str, ...] = ()
+    kept: frozenset[tuple[str, int]] = frozenset()
+    machine: Any = field(default_factory=lambda: SimpleNamespace(joints=JOINTS, tolerances=DECLARED))
+    tolerances: Any = DECLARED
+
+    def settled(self, rounds: int) -> Known:
+        return self
+
+    def without(self, term: str, instead: str = "") -> Known:
+        bound = 0.5 * (self.theta[term, "forward"] + self.theta[term, "backward"])
+        names = tuple(filter(None, (instead if name == term else name for name in self.terms)))
+        theta = {**tolerances.without(self.theta, term, DECLARED), ("coulomb", "bound"): bound}
+        return Known(self.chi2, names, theta)
+
+    def held_out(self, theta: Theta | None = None) -> np.ndarray:
+        return np.full((30, 4), 100.0 if theta is NONE else self.chi2(self.terms))
+
+
+def search(state: Known, *rivals: Any) -> Any:
+    notes = SimpleNamespace(
+        state=state,
+        nominal=NONE,
+        rivals=list(rivals),
+        select_chi2=state.held_out(),
+        aliases={},
+        shares=dict.fromkeys(state.terms, 1.0),
+        returned={},
+        steps=[],
+        rejected=[],
+    )
+    notes.reject = lambda names, why: notes.rejected.append((tuple(names), why))
+    return notes
+
+
+@pytest.mark.parametrize(("difference", "name"), [(0.03, "coulomb"), (0.30, "asymmetric_friction")])
+def test_friction_that_is_equal_both_ways_is_dry_friction(
+    difference: float, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The difference is known to 0.05 N m; where it may be zero the simpler name wins, though it fits worse."""
+    forward, backward = np.full(12, 0.4 + difference), np.full(12, 0.4)
+    theta = {("asymmetric_friction", "forward"): forward, ("asymmetric_friction", "backward"): backward}
+    rng = np.random.default_rng(0)
+
+    def draws(_: Any) -> list[Theta]:
+        noise = 0.05 * rng.standard_normal((40, 12))
+        return [{**theta, ("asymmetric_friction", "forward"): forward + n} for n in noise]
+
+    monkeypatch.setattr(reduction, "resampled", draws)
+    asked = search(Known(lambda terms: 1.0 if "asymmetric_friction" in terms else 1.2, ("asymmetric_friction",), theta))
+    reduction.symmetrical(asked)
+    assert asked.state.terms == (name,)
+    assert (name == "coulomb") == bool(asked.steps)
+
+
+@pytest.mark.parametrize(("alone", "names"), [(1.01, ("payload",)), (2.0, ("strength", "link_mass"))])
+def test_one_cause_takes_the_place_of_two_if_it_does_as_well(alone: float, names: tuple[str, ...]) -> None:
+    two = Known(lambda terms: alone if terms == ("payload",) else 1.0, ("strength", "link_mass"), {})
+    rival = SimpleNamespace(name="payload", theta={("payload", "mass"): np.array([2.0])})
+    asked = search(two, rival)
+    reduction.unite(asked)
+    assert asked.state.terms == names
+    assert bool(asked.rejected) == (names == ("payload",))
