@@ -29,7 +29,7 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.gap.robots.description import parse_model
     from go1exp.schema.settings import MISSING
 
-    if container.get("stage") == "report" and container.get("logs") == MISSING:
+    if container.get("stage") in ("report", "view") and container.get("logs") == MISSING:
         container = {**container, "logs": []}  # it reads the answer alone
     settings, parts = parse_with_groups(GapVerb, container, ("robot",), model=parse_model)
     out = Path(settings.out)
@@ -39,6 +39,8 @@ def _task(container: dict[str, Any]) -> int:
 
     if settings.stage == "report":
         return _report(files.load(out), out)
+    if settings.stage == "view":
+        return _view(settings, parts)
     recordings = long_enough(read_all(settings.logs), settings.search.window_s + settings.search.burn_s)
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
@@ -66,6 +68,15 @@ def _task(container: dict[str, Any]) -> int:
     if settings.stage == "all":
         _report(result, out)
     return status
+
+
+def _view(settings: GapVerb, parts: dict[str, Any]) -> int:
+    """Show the answer in the browser."""
+    from go1exp.cli.play_web import gap
+    from go1exp.gap.robots.choice import robot_of
+
+    gap(settings, robot_of(parts["model"], parts["robot"]), parts["robot"])
+    return 0
 
 
 def _progress() -> Callable[[str, float], None]:

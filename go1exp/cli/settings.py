@@ -98,6 +98,9 @@ class EvalSettings:
             raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
 
 
+Port = Annotated[int, Field(ge=0, le=65535)]
+
+
 @settings
 class PlaySettings:
     """``conf/play.yaml``.
@@ -106,10 +109,14 @@ class PlaySettings:
         controller: what moves the robot: policy, the one of run or policy, or mpc.
         run: run folder to watch; or give policy.
         policy: name of a policy that comes with the package, such as paper, in place of run.
+        bundle: file of go1exp export, in place of run: its policy as the robot's computer runs it.
+        log: recording to show in the browser, in place of a robot that walks.
         checkpoint: file of the run; null takes the newest.
-        velocity: commanded velocity, x m/s, y m/s, yaw rad/s; arrow keys change it in the live viewer.
+        velocity: commanded velocity, x m/s, y m/s, yaw rad/s; arrow keys change it in the live viewer and the browser.
         seconds: length of the clip, s.
-        viewer: clip, live, or auto, which is live where there is a display.
+        viewer: clip, live (a window), web (a page for the browser), or auto, which is live where there is a display.
+        host: interface on which viewer=web listens; 127.0.0.1 is this machine alone.
+        port: on which it listens; 0 takes the first free one from 8080 on.
         fps: frames per second of the clip.
         noise: add the observation noise of training.
         randomize: randomise the robot as in training; false takes the nominal robot.
@@ -124,10 +131,14 @@ class PlaySettings:
     controller: Any = None
     run: RunFolder | None
     policy: str | None
+    bundle: str | None
+    log: str | None
     checkpoint: str | None
     velocity: tuple[float, float, float]
     seconds: Positive
-    viewer: Literal["auto", "clip", "live"]
+    viewer: Literal["auto", "clip", "live", "web"]
+    host: str
+    port: Port
     fps: Annotated[int, Field(ge=1, le=50)]
     noise: bool
     randomize: bool
@@ -305,16 +316,20 @@ class GapVerb:
 
     Attributes:
         logs: folder of recordings, or a list of folders and files.
-        stage: check, localise, replay, explain, apply or report; all runs explain, apply and report.
+        stage: check, localise, replay, explain, apply, report or view; all runs explain, apply and report.
         out: folder for verdict.json, effect.yaml, report.html.
         train_dt: physics step of training, s, at which the answer must hold; also that of replay.
+        host: interface on which view listens; 127.0.0.1 is this machine alone.
+        port: on which view listens; 0 takes the first free one from 8080 on.
         search: how the missing effect is searched for.
     """
 
     logs: str | tuple[str, ...]
-    stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report"]
+    stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report", "view"]
     out: str
     train_dt: Annotated[float, Field(gt=0, le=0.02)]
+    host: str
+    port: Port
     search: GapSettings
 
 
