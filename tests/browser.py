@@ -11,6 +11,7 @@ import tempfile
 import time
 import urllib.request
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -32,9 +33,10 @@ class Browser:
     Args:
         width: of the window, pixels.
         height: of the window, pixels.
+        scale: pixels that are drawn for each of these, in either direction.
     """
 
-    def __init__(self, width: int = 1280, height: int = 800) -> None:
+    def __init__(self, width: int = 1280, height: int = 800, scale: float = 1.0) -> None:
         assert CHROMIUM is not None
         self._folder = tempfile.TemporaryDirectory(prefix="chromium_", ignore_cleanup_errors=True)
         flags = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--remote-debugging-port=0", *SOFTWARE_GL)
@@ -42,7 +44,7 @@ class Browser:
         self._process = subprocess.Popen(
             [CHROMIUM, *flags, *size, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
-        self._number = 0
+        self._number, self._open = 0, ExitStack()
         self.messages: list[str] = []
         """What the page has written to its console."""
         try:
@@ -52,7 +54,8 @@ class Browser:
             raise
         self.call("Page.enable")
         self.call("Runtime.enable")
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        about = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **about)
 
     def _connected(self) -> ClientConnection:
         """Wait for Chromium to listen, and return a connection to its page."""
@@ -65,7 +68,7 @@ class Browser:
                 return [target for target in json.load(answer) if target["type"] == "page"]
 
         wait_until(lambda: bool(pages()), 30.0, "a page of Chromium")
-        return connect(pages()[0]["webSocketDebuggerUrl"], max_size=2**26, compression=None)
+        return self._open.enter_context(connect(pages()[0]["webSocketDebuggerUrl"], max_size=2**26, compression=None))
 
     def __enter__(self) -> Browser:
         return self
@@ -75,6 +78,7 @@ class Browser:
 
     def close(self) -> None:
         """End Chromium."""
+        self._open.close()
         self._process.terminate()
         try:
             self._process.wait(10.0)
@@ -97,8 +101,9 @@ class Browser:
                 return dict(answer["result"])
 
     def go(self, address: str) -> None:
-        """Open an address."""
+        """Open an address, and wait until there is a page."""
         self.call("Page.navigate", url=address)
+        wait_until(lambda: self.evaluate("document.body !== null") is True, 60.0, f"page of {address}")
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression."""
@@ -112,30 +117,25 @@ class Browser:
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
-        """Press the left button at one point and release it at another."""
-        common = {"button": "left", "clickCount": 1}
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=start[0], y=start[1])
-        time.sleep(0.2)
-        self.call("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], buttons=1, **common)
-        time.sleep(0.2)
-        for k in range(1, steps + 1):
-            x, y = (a + (b - a) * k / steps for a, b in zip(start, end, strict=True))
-            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, buttons=1, button="left")
-            time.sleep(0.05)
-        time.sleep(0.2)
-        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], **common)
+    def hold(self, x: float, y: float, *, until: Callable[[], bool], seconds: float) -> None:
+        """Press the left mouse button at a point until something is so: a slow page looks at the mouse now and then."""
+        about = {"x": x, "y": y, "button": "left", "clickCount": 1}
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        time.sleep(1.0)
+        self.call("Input.dispatchMouseEvent", type="mousePressed", buttons=1, **about)
+        try:
+            wait_until(until, seconds, "answer to the mouse")
+        finally:
+            self.call("Input.dispatchMouseEvent", type="mouseReleased", **about)
 
-    def click(self, x: float, y: float) -> None:
-        """Click."""
-        self.drag((x, y), (x, y), 1)
-
-    def press(self, key: str, code: int, hold: float = 0.15) -> None:
-        """Press and release a key of the name, such as ArrowUp, and number that browsers have for it."""
-        about = {"key": key, "code": key, "windowsVirtualKeyCode": code, "nativeVirtualKeyCode": code}
+    def hold_key(self, key: str, code: str, number: int, *, until: Callable[[], bool], seconds: float) -> None:
+        """Press a key until something is so, by the three names that browsers have for it."""
+        about = {"key": key, "code": code, "windowsVirtualKeyCode": number, "nativeVirtualKeyCode": number}
         self.call("Input.dispatchKeyEvent", type="rawKeyDown", **about)
-        time.sleep(hold)
-        self.call("Input.dispatchKeyEvent", type="keyUp", **about)
+        try:
+            wait_until(until, seconds, f"answer to {key}")
+        finally:
+            self.call("Input.dispatchKeyEvent", type="keyUp", **about)
 
 
 def wait_until(true: Callable[[], bool], seconds: float, what: str) -> float:

@@ -76,6 +76,9 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     "deploy.yaml:hydra": "Hydra's own settings",
+    **{f"play.yaml:{key}": "tests/test_viewer_browser.py, tests/test_viewer.py" for key in ("host", "port", "log")},
+    **{f"gap.yaml:{key}": "of the stage view: tests/test_viewer.py" for key in ("host", "port")},
+    "play.yaml:bundle": "in place of run, as of eval: tests/test_viewer.py",
     **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},
     **{f"eval.yaml:{key}": "not of the grid: tests/test_protocol_commands.py" for key in ("bundle", "folder")},
     **{

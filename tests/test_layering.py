@@ -22,7 +22,21 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
 
 FOREIGN = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra")
-OWN = ("physics", "env", "train", "evaluate", "record", "fit", "gap", "export", "sim_robot", "bench", "protocol", "cli")
+OWN = (
+    "physics",
+    "env",
+    "train",
+    "evaluate",
+    "record",
+    "fit",
+    "gap",
+    "export",
+    "sim_robot",
+    "bench",
+    "protocol",
+    "viewer",
+    "cli",
+)
 
 
 def up(*but: str) -> tuple[str, ...]:
@@ -122,6 +136,13 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "evaluate/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
     "protocol/": ("mujoco", "hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
+    # what is seen and asked for in a browser; the sessions behind it know none
+    "viewer/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.train", "go1exp.bench", "go1exp.cli"),
+    "viewer/session.py": ("mujoco", "hydra", "omegaconf", "go1exp.cli"),
+    "viewer/replay.py": ("mujoco", "torch", "hydra", "omegaconf", "go1exp.cli"),
+    "viewer/requests.py": (*FOREIGN, "torch", "numpy", "go1exp"),
+    "viewer/history.py": (*FOREIGN, "torch", "go1exp"),
+    "viewer/gate.py": (*FOREIGN, "torch", "numpy", "go1exp"),
 }
 """File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""
 
@@ -240,9 +261,13 @@ def test_sb3_stays_at_its_border_and_in_the_learner() -> None:
     assert {n for n in importers("stable_baselines3") if not n.startswith("train/")} <= allowed
 
 
+BROWSER = {f"viewer/{n}.py" for n in ("web", "window", "drive_window", "curve_plots", "replay_show", "replay_window")}
+"""Files that build on MuJoCo Studio, or draw shapes of MuJoCo in its window."""
+
+
 def test_mujoco_stays_in_the_physics_and_where_pictures_are_made() -> None:
     outside = {name for name in importers("mujoco") if not name.startswith("physics/")}
-    assert outside <= {"evaluate/camera.py", "evaluate/video.py", "evaluate/stick.py", "bench/env.py"}
+    assert outside <= {"evaluate/camera.py", "evaluate/video.py", "evaluate/stick.py", "bench/env.py", *BROWSER}
 
 
 def test_wandb_and_tensorboard_stay_in_the_metrics() -> None:

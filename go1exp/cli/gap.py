@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from go1exp.cli.app import App, spinner
+from go1exp.cli.play_web import address
 from go1exp.cli.quoting import command
 from go1exp.files import opened, write_json
 
@@ -32,7 +33,7 @@ def _task(container: dict[str, Any]) -> int:
     if container.get("stage") in ("report", "view") and container.get("logs") == MISSING:
         container = {**container, "logs": []}  # it reads the answer alone
     settings, parts = parse_with_groups(GapVerb, container, ("robot",), model=parse_model)
-    out = Path(settings.out)
+    out, where = Path(settings.out), address(settings.host, settings.port)
 
     from go1exp.cli.logs import long_enough, read_all, writable
     from go1exp.gap import files
@@ -40,7 +41,7 @@ def _task(container: dict[str, Any]) -> int:
     if settings.stage == "report":
         return _report(files.load(out), out)
     if settings.stage == "view":
-        return _view(settings, parts)
+        return _view(settings, parts, where)
     recordings = long_enough(read_all(settings.logs), settings.search.window_s + settings.search.burn_s)
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
@@ -70,12 +71,12 @@ def _task(container: dict[str, Any]) -> int:
     return status
 
 
-def _view(settings: GapVerb, parts: dict[str, Any]) -> int:
+def _view(settings: GapVerb, parts: dict[str, Any], where: tuple[str, int]) -> int:
     """Show the answer in the browser."""
     from go1exp.cli.play_web import gap
     from go1exp.gap.robots.choice import robot_of
 
-    gap(settings, robot_of(parts["model"], parts["robot"]), parts["robot"])
+    gap(settings, robot_of(parts["model"], parts["robot"]), parts["robot"], where)
     return 0
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
+from go1exp.cli.play_web import address
 from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
@@ -29,8 +30,9 @@ def _task(container: dict[str, Any]) -> None:
     other, container = other_robot.split(container)
     ground = _ground(container.pop("terrain", None))
     settings = parse(PlaySettings, container)
+    where = address(settings.host, settings.port)
     if settings.log is not None:
-        _log(settings)
+        _log(settings, where)
         return
     if ground is not None and settings.train_ground:
         raise ConfigError(["train_ground = True and terrain: only one of them says what the ground is"])
@@ -43,7 +45,7 @@ def _task(container: dict[str, Any]) -> None:
     if settings.viewer == "web":
         from go1exp.cli.play_web import walk
 
-        walk(subject, other, ground, judge, settings)
+        walk(subject, other, ground, judge, settings, where)
         return
 
     from go1exp.cli.subjects import driver
@@ -75,17 +77,19 @@ def _ground(given: Any) -> TerrainConfig | None:
     return ground
 
 
-def _log(settings: PlaySettings) -> None:
+def _log(settings: PlaySettings, where: tuple[str, int]) -> None:
     """Show a recording in the browser."""
     given = {name: getattr(settings, name) for name in ("run", "policy", "bundle", "checkpoint", "out")}
-    wrong = [f"log = {settings.log!r} and {name} = {value!r}: only one of them" for name, value in given.items() if value]
+    wrong = [
+        f"log = {settings.log!r} and {name} = {value!r}: only one of them" for name, value in given.items() if value
+    ]
     if settings.viewer not in ("auto", "web"):
         wrong.append(f"viewer = {settings.viewer!r}: a recording (log=) is shown by viewer=web alone")
     if wrong:
         raise ConfigError(wrong)
     from go1exp.cli.play_web import log
 
-    log(Path(str(settings.log)), settings.host, settings.port)
+    log(Path(str(settings.log)), where)
 
 
 def _subject(settings: PlaySettings) -> Named:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from go1exp.choices import choice_files, config_folder, load
 from go1exp.cli.runs import shipped_policies
 from go1exp.errors import Expected
+from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb, PlaySettings
@@ -32,6 +33,17 @@ GIVEN = "given"
 """Name of a ground that is none of ``conf/terrain``."""
 
 
+def address(host: str, port: int) -> tuple[str, int]:
+    """Return where to listen.
+
+    Raises:
+        ConfigError: if the host is none.
+    """
+    if not host or any(c.isspace() for c in host) or (":" in host and host.count(":") == 1):
+        raise ConfigError([f"host = {host!r}: is the address of an interface, such as 127.0.0.1; see also port={port}"])
+    return host, port
+
+
 def require_studio() -> None:
     """Refuse, before anything is built, where MuJoCo's web viewer is not installed.
 
@@ -50,7 +62,12 @@ def require_studio() -> None:
 
 
 def walk(
-    subject: Named, other: dict[str, Any], ground: TerrainConfig | None, judge: BackendConfig, settings: PlaySettings
+    subject: Named,
+    other: dict[str, Any],
+    ground: TerrainConfig | None,
+    judge: BackendConfig,
+    settings: PlaySettings,
+    where: tuple[str, int],
 ) -> None:
     """Show a robot that walks, until Ctrl-C.
 
@@ -60,6 +77,7 @@ def walk(
         ground: to walk on; None takes that of the settings.
         judge: what moves the robot.
         settings: of the verb.
+        where: to listen, host and port.
     """
     require_studio()
     from go1exp.tensors.threads import one_thread
@@ -89,7 +107,7 @@ def walk(
         robots = Robots(_drivers(subject, first, other), grounds, effects)
         session = Session(robots, subject.label, setup, settings.velocity)
         title = f"go1exp: {subject.label}"
-        web.run(WalkShow(session), [DriveWindow()], title=title, host=settings.host, port=settings.port)
+        web.run(WalkShow(session), [DriveWindow()], title=title, host=where[0], port=where[1])
     print(f"\nclosed after {session.time:.0f} s of walking, {session.falls} falls")
 
 
@@ -148,12 +166,13 @@ def _effects(task: TaskConfig, randomize: bool) -> tuple[dict[str, Term], dict[s
 
 def _acts(term: Term) -> bool:
     from go1exp.schema.joint_values import numbers
+    from go1exp.viewer.conditions import params_of
 
-    nulls = {p.name: p.null for p in term.entry.target.params}
+    nulls = {p.name: p.null for p in params_of(term)}
     return any(v != nulls[name] for name, value in term.parameters.items() for v in numbers(value))
 
 
-def log(file: Path, host: str, port: int) -> None:
+def log(file: Path, where: tuple[str, int]) -> None:
     """Show a recording, until Ctrl-C."""
     require_studio()
     from go1exp.recording import read
@@ -167,16 +186,17 @@ def log(file: Path, host: str, port: int) -> None:
 
     parts, _ = parse_parts({"robot": load(config_folder() / "robot" / "go1.yaml")}, ("robot",))
     show = ReplayShow(of_recording(recording), parts["robot"])
-    web.run(show, [ReplayWindow()], title=f"go1exp: {file.name}", host=host, port=port)
+    web.run(show, [ReplayWindow()], title=f"go1exp: {file.name}", host=where[0], port=where[1])
 
 
-def gap(settings: GapVerb, robot: Robot, config: RobotConfig) -> None:
+def gap(settings: GapVerb, robot: Robot, config: RobotConfig, where: tuple[str, int]) -> None:
     """Show the answer of ``go1exp gap`` in a folder, until Ctrl-C.
 
     Args:
         settings: of the verb.
         robot: that it is about.
         config: of the Go1, if it is one.
+        where: to listen, host and port.
     """
     require_studio()
     from go1exp.gap import files
@@ -196,4 +216,4 @@ def gap(settings: GapVerb, robot: Robot, config: RobotConfig) -> None:
         raise Expected(f"{folder / files.RESULT}: is about joints that the robot has not ({strange}); say model=...")
     model = None if set(robot.joints) == set(JOINTS) else model_of(robot)
     show = ReplayShow(story, config, model)
-    web.run(show, [ReplayWindow()], title=f"go1exp gap: {folder}", host=settings.host, port=settings.port)
+    web.run(show, [ReplayWindow()], title=f"go1exp gap: {folder}", host=where[0], port=where[1])

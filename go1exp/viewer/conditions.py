@@ -89,10 +89,16 @@ def resized(term: Term, size: float) -> Term:
     A parameter per joint keeps its joints; one of which every value is null, a shape, stays.
     """
     parameters = dict(term.parameters)
-    for p in term.entry.target.params:
+    for p in params_of(term):
         if p.name in parameters:
             parameters[p.name] = _scaled(parameters[p.name], p, size)
     return dataclasses.replace(term, parameters=parameters, slots={**term.slots, "spread": {}})
+
+
+def params_of(term: Term) -> tuple[Param, ...]:
+    """Return the declarations of an effect's parameters."""
+    declared: tuple[Param, ...] = vars(term.entry.target)["params"]
+    return declared
 
 
 def _scaled(value: JointValues, param: Param, size: float) -> Any:
@@ -178,4 +184,3 @@ def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effe
     ground = known[setup.ground].built(setup.level)
     made = dataclasses.replace(evaluation_task(task, config), terrain=ground, effect=acting)
     return delayed(made, setup.delay + delay_of_effects(made)) if setup.delay > 0.0 else made
-

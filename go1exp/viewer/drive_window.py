@@ -56,7 +56,11 @@ HELP = ("arrows: forward, back, turn", "comma, full stop: left, right", "0 stand
 
 
 class DriveWindow(Window):
-    """Panels for a robot that walks."""
+    """Panels for a robot that walks.
+
+    Attributes:
+        places: where controls are on the page, left, top, right, bottom, pixels.
+    """
 
     def __init__(self) -> None:
         super().__init__("Robot", "Curves")
@@ -64,6 +68,7 @@ class DriveWindow(Window):
         self._impulse, self._direction = 20.0, 90.0
         self._plots = curve_plots.Curves()
         self._draft: dict[str, float] = {}
+        self.places: dict[str, tuple[float, float, float, float]] = {}
 
     # ------------------------------------------------------------------ keys and gamepad
 
@@ -136,6 +141,11 @@ class DriveWindow(Window):
         """Return the arrows."""
         return [arrow_shape(arrow) for arrow in self.view.arrows]
 
+    def _note(self, name: str) -> None:
+        """Note where the last control is."""
+        low, high = imgui.GetItemRectMin(), imgui.GetItemRectMax()
+        self.places[name] = (low.x, low.y, high.x, high.y)
+
     def _time(self, view: WalkView) -> None:
         pace = view.pace
         if imgui.Button("Run" if pace.paused else "Pause"):
@@ -167,6 +177,7 @@ class DriveWindow(Window):
         for axis, (name, (low, high)) in enumerate(zip(AXES, view.limits, strict=True)):
             imgui.SetNextItemWidth(-85.0)
             changed, value = imgui.SliderFloat(name, self._command[axis], low, high, "%.2f")
+            self._note(name)
             if changed:
                 self._command[axis] = value
                 self._steer()
@@ -197,6 +208,7 @@ class DriveWindow(Window):
         imgui.SetItemTooltip("where to, from the robot's heading: 0 forward, 90 to its left")
         if imgui.Button("Push (P)", Vec2(-1.0, 0.0)):
             self._push()
+        self._note("push")
 
     def _ground_panel(self, view: WalkView) -> None:
         setup, names = view.setup, list(view.grounds)
@@ -218,9 +230,7 @@ class DriveWindow(Window):
                 self.ask(ask.Walk(setup.ground, level, setup.tile))
 
     def _conditions_panel(self, view: WalkView) -> None:
-        now = ask.Conditions(
-            view.setup.noise, view.setup.delay, view.setup.physics_dt, view.setup.trunk_velocity
-        )
+        now = ask.Conditions(view.setup.noise, view.setup.delay, view.setup.physics_dt, view.setup.trunk_velocity)
         wanted: dict[str, Any] = {}
         changed, noise = imgui.Checkbox("sensor noise", now.noise)
         if changed:

@@ -60,9 +60,8 @@ class Gate:
             cookie = "; ".join(headers.get_all("Cookie"))
             if not self.admits(request.path, cookie, headers.get("Origin"), headers.get("Host", "")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, REFUSAL)
-            answer = process(connection, request)
-            if hasattr(answer, "__await__"):
-                answer = await answer
+            given = process(connection, request)
+            answer = await given if isinstance(given, Awaitable) else given
             if answer is not None:
                 answer.headers["Set-Cookie"] = self.header
                 answer.headers["Referrer-Policy"] = "no-referrer"

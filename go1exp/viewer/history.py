@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ class History:
         self.widths, self.dt = dict(widths), dt
         self._rows = max(2, round(SPAN / dt))
         ends = np.cumsum([0, *self.widths.values()])
-        spans = zip(ends[:-1], ends[1:], strict=True)
+        spans = pairwise(ends)
         self._place = {name: slice(int(a), int(b)) for name, (a, b) in zip(self.widths, spans, strict=True)}
         self._values = np.full((self._rows, int(ends[-1])), np.nan)
         self.count = 0

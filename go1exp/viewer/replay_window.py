@@ -9,7 +9,7 @@ import mujoco
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
-from go1exp.viewer.replay import MOST, UNITS, Choose, Magnify, Piece, Play, Seek, thinned
+from go1exp.viewer.replay import MODELS, MOST, UNITS, Choose, Magnify, Piece, Play, Seek, thinned
 from go1exp.viewer.replay_show import Ghost, ReplayView
 from go1exp.viewer.window import Vec2, Window, section
 
@@ -189,10 +189,10 @@ def _lines(piece: Piece, joint: str) -> dict[str, Any]:
     for quantity, by_joint in piece.curves.items():
         curves = by_joint[joint]
         values = [(name, t, thinned(v)) for name, v in curves.items()]
-        errors = [(name, t, thinned(v - curves["measured"])) for name, v in curves.items() if name in ("before", "after")]
+        models = {name: v for name, v in curves.items() if name in MODELS}
+        errors = [(name, t, thinned(v - curves["measured"])) for name, v in models.items()]
         if errors and joint in piece.noise.get(quantity, {}):
             level = piece.noise[quantity][joint]
             errors += [("noise", t, [sign * level] * len(t)) for sign in (1.0, -1.0)]
         drawn[quantity] = {"values": values, "errors": errors}
     return drawn
-

@@ -1,4 +1,4 @@
-"""A robot that walks while a user steers, pushes and changes it: no browser, no engine of its own, one step at a time."""
+"""A robot that walks while a user steers, pushes and changes it: one period of the policy at a time, no browser."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from go1exp.mdp.actions import clipped
 from go1exp.protocol.disturbances import Impulses, Kicker, heading
 from go1exp.protocol.drivers import Driver
 from go1exp.schema.registry import ConfigError, Term
-from go1exp.viewer import requests as ask
+from go1exp.viewer import requests as wish
 from go1exp.viewer.conditions import Ground, Setup, task_under
 from go1exp.viewer.estimate import Estimate
 from go1exp.viewer.history import History
@@ -77,7 +77,7 @@ class Session:
         setup: what the robot walks under.
         label: who drives.
         command: the velocity that is asked for.
-        history: the curves.
+        rewards: names of the reward terms.
         paused: whether time stands still.
         speed: simulated seconds per second.
         time: simulated seconds since the session began.
@@ -86,7 +86,7 @@ class Session:
         push: the last one.
     """
 
-    def __init__(self, robots: Robots, label: str, setup: Setup, velocity: ask.Velocity) -> None:
+    def __init__(self, robots: Robots, label: str, setup: Setup, velocity: wish.Velocity) -> None:
         """Build the robot and put it at the start.
 
         Raises:
@@ -95,6 +95,8 @@ class Session:
         self.robots, self.command = robots, velocity
         self._loaded: dict[str, Driver] = {}
         self.paused, self.speed, self.time, self.falls = False, 1.0, 0.0, 0
+        self._history: History | None = None
+        self.rewards: tuple[str, ...] = ()
         self.message, self.push = "", PushMade(-math.inf, 0.0, 0.0)
         self._since, self._single = 0.0, False
         self._build(label, setup)
@@ -122,8 +124,7 @@ class Session:
         require_agreement(task)
         core = Go1Core(task, 1, setup.seed, noise=setup.noise, imu=True)
         pilot = driver.begin(core, setup.trunk_velocity, setup.seed)
-        none = Impulses(*(np.full((1, 1), v) for v in (math.nan, 0.0, 0.0)), duration=PUSH_S)
-        self._kicker = Kicker(core.backend, task.sim.physics_dt, none)
+        self._kicker = Kicker(core.backend, task.sim.physics_dt, _one_push(math.nan, 0.0, 0.0))
         try:
             self._estimate: Estimate | None = Estimate(core, setup.seed)
         except EstimatorError:
@@ -133,8 +134,8 @@ class Session:
         names = tuple(t.key for t in core.terms.rewards)
         widths = {"command": 3, "true": 3, "estimated": 3, "height": 1, "torque": 12, "contact": 4, "push": 1}
         widths["reward"] = len(names)
-        if not hasattr(self, "history") or (self.rewards, self.history.dt) != (names, self.dt):
-            self.history = History(widths, self.dt)
+        if self._history is None or (self.rewards, self._history.dt) != (names, self.dt):
+            self._history = History(widths, self.dt)
         self.rewards = names
 
     def _begin(self) -> None:
@@ -182,33 +183,33 @@ class Session:
 
     # ------------------------------------------------------------------ what is asked for
 
-    def ask(self, request: ask.Request) -> None:
+    def ask(self, request: wish.Request) -> None:
         """Do what is asked, or say in ``message`` why not."""
         try:
             self._do(request)
         except (ConfigError, Expected) as error:
             self.message = " ".join(str(error).split())
 
-    def _do(self, request: ask.Request) -> None:
+    def _do(self, request: wish.Request) -> None:
         match request:
-            case ask.Steer(velocity):
+            case wish.Steer(velocity):
                 self.command = velocity
-            case ask.Push(impulse, direction):
+            case wish.Push(impulse, direction):
                 self._push(impulse, direction)
-            case ask.Pace(paused, speed):
+            case wish.Pace(paused, speed):
                 self.paused, self.speed = paused, speed
-            case ask.Step():
+            case wish.Step():
                 self._single = True
-            case ask.Reset():
+            case wish.Reset():
                 self._begin()
                 self.message = ""
-            case ask.Hand(label):
+            case wish.Hand(label):
                 self._exchange(label, self.setup)
-            case ask.Effects(sizes):
+            case wish.Effects(sizes):
                 self._exchange(self.label, dataclasses.replace(self.setup, sizes=dict(sizes)))
-            case ask.Conditions():
+            case wish.Conditions():
                 self._exchange(self.label, dataclasses.replace(self.setup, **dataclasses.asdict(request)))
-            case ask.Walk(ground, level, tile):
+            case wish.Walk(ground, level, tile):
                 self._build(self.label, dataclasses.replace(self.setup, ground=ground, level=level, tile=tile))
                 self._begin()
                 self.message = ""
@@ -222,12 +223,17 @@ class Session:
         self.message = ""
 
     def _push(self, impulse: float, direction: float) -> None:
-        kick = [np.full((1, 1), v) for v in (self._kicker.time, impulse, direction)]
-        self._kicker.use(Impulses(*kick, duration=PUSH_S))
+        self._kicker.use(_one_push(self._kicker.time, impulse, direction))
         angle = float(heading(self.core.backend.qpos[:, 3:7])[0]) + direction
         self.push = PushMade(self.time, impulse, angle)
 
     # ------------------------------------------------------------------ time
+
+    @property
+    def history(self) -> History:
+        """The curves."""
+        assert self._history is not None
+        return self._history
 
     @property
     def dt(self) -> float:
@@ -293,3 +299,9 @@ class Session:
     def velocity(self, seconds: float = 0.5) -> Vector:
         """Return the mean true velocity (3,) of the last ``seconds`` s: x and y, m/s, and yaw rate, rad/s."""
         return np.asarray(self.history.last("true", seconds).mean(0))
+
+
+def _one_push(start: float, impulse: float, direction: float) -> Impulses:
+    """Return one push on one robot; a start that is NaN is none."""
+    begins, size, angle = (np.full((1, 1), v) for v in (start, impulse, direction))
+    return Impulses(begins, size, angle, duration=PUSH_S)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from go1exp.evaluate.camera import ARROW_SCALE, COMMAND_RGB, LEAST_DRAWN, MEASURED_RGB, VELOCITY_TIME, Stage
 from go1exp.viewer import requests as ask
-from go1exp.viewer.conditions import Ground, Setup
+from go1exp.viewer.conditions import Ground, Setup, params_of
 from go1exp.viewer.session import PUSH_SHOWN_S, Session
 
 VIEWS_PER_S = 25.0
@@ -178,7 +178,7 @@ class WalkShow:
         curves = {name: h.series(name).T.tolist() for name in ("command", "true", "estimated", "torque")}
         t = h.times().tolist()
         pushed = h.series("push")[:, 0] > 0.0
-        begins = np.flatnonzero(pushed & ~np.concatenate([[False], pushed[:-1]])) if len(pushed) else []
+        begins = np.flatnonzero(np.diff(pushed, prepend=False) & pushed)
         return WalkView(
             label=s.label,
             labels=tuple(s.robots.drivers),
@@ -237,7 +237,7 @@ class WalkShow:
         arrows = []
         for speed, height, rgb in drawn:
             if np.hypot(*speed) >= LEAST_DRAWN:
-                base = start + [0.0, 0.0, height]
+                base = start + np.array([0.0, 0.0, height])
                 arrows.append(Arrow(base, base + ARROW_SCALE * np.array([*speed, 0.0]), rgb))
         if s.time - s.push.time < PUSH_SHOWN_S:
             reach = PUSH_SCALE * s.push.impulse * np.array([math.cos(s.push.angle), math.sin(s.push.angle), 0.0])
@@ -262,7 +262,7 @@ EFFECT_TEXTS = _EffectTexts()
 
 
 def _about(term: Any) -> str:
-    units = {p.name: "" if p.unit == "-" else f" {p.unit}" for p in term.entry.target.params}
+    units = {p.name: "" if p.unit == "-" else f" {p.unit}" for p in params_of(term)}
     values = ", ".join(f"{name} {value}{units.get(name, '')}" for name, value in term.parameters.items())
     return f"{term.entry.target.title}; at size 1: {values}"
 
