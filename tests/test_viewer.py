@@ -75,7 +75,7 @@ def test_a_push_moves_the_robot_where_it_points_and_is_marked(session: Session) 
     assert -0.35 < view.pushes[0] < -0.2
 
 
-@pytest.mark.parametrize("other", ["robust", "mpc"])
+@pytest.mark.parametrize("other", ["paper", "mpc"])
 def test_another_driver_takes_over_while_the_robot_walks(session: Session, other: str) -> None:
     if other not in session.robots.drivers:
         pytest.skip("the extra mpc is not installed")
@@ -398,7 +398,7 @@ def test_a_time_beyond_the_ends_is_an_end() -> None:
 
 
 def test_own_effects_of_a_run_that_do_nothing_are_off(robots: Robots) -> None:
-    subject = named(None, "robust", None, None, "play.mp4")
+    subject = named(None, "paper", None, None, "play.mp4")
     task = driver(subject, {}).task
     _, sizes = _effects(task, False)
     assert [name for name, size in sizes.items() if size] == []

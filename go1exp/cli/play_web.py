@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb, PlaySettings
     from go1exp.cli.subjects import Named
     from go1exp.config import TaskConfig
+    from go1exp.evaluate.drivers import Driver
     from go1exp.gap.robots.protocol import Robot
-    from go1exp.protocol.drivers import Driver
     from go1exp.robot import RobotConfig
     from go1exp.schema.backends import BackendConfig
     from go1exp.schema.registry import Term
@@ -51,10 +51,10 @@ def require_studio() -> None:
         Expected: in that case.
     """
     try:
-        found = importlib.util.find_spec("mujoco.studio.web.web_server")
+        server = importlib.util.find_spec("mujoco.studio.web.web_server")
     except ImportError:
-        found = None
-    if found is None:
+        server = None
+    if server is None:
         raise Expected(
             "viewer=web needs MuJoCo Studio, which comes with the package mujoco and not with mujoco-core alone: "
             "pip install 'mujoco>=4'"

@@ -119,12 +119,12 @@ class ReplayShow:
 
     def _ghosts(self) -> tuple[Ghost, ...]:
         poses = {m.name: self._qpos(m) for m in self.player.piece.motions}
-        here = np.zeros(3)
+        in_place = np.zeros(3)
         if self.player.story.kind == "log":
-            return tuple(Ghost(name, qpos, here) for name, qpos in poses.items() if name != "measured")
+            return tuple(Ghost(name, qpos, in_place) for name, qpos in poses.items() if name != "measured")
         measured = poses["measured"]
         return (
-            Ghost("measured", measured, here),
+            Ghost("measured", measured, in_place),
             Ghost("after", poses["after"], self._apart),
             Ghost("measured", measured, self._apart),
         )

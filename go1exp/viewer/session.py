@@ -16,10 +16,10 @@ from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
 from go1exp.errors import Expected
 from go1exp.estimation import EstimatorError
+from go1exp.evaluate.drivers import Driver
 from go1exp.evaluate.engine import require_agreement
 from go1exp.mdp.actions import clipped
 from go1exp.protocol.disturbances import Impulses, Kicker, heading
-from go1exp.protocol.drivers import Driver
 from go1exp.schema.registry import ConfigError, Term
 from go1exp.viewer import requests as wish
 from go1exp.viewer.conditions import Ground, Setup, task_under
@@ -186,11 +186,11 @@ class Session:
     def ask(self, request: wish.Request) -> None:
         """Do what is asked, or say in ``message`` why not."""
         try:
-            self._do(request)
+            self._fulfil(request)
         except (ConfigError, Expected) as error:
             self.message = " ".join(str(error).split())
 
-    def _do(self, request: wish.Request) -> None:
+    def _fulfil(self, request: wish.Request) -> None:
         match request:
             case wish.Steer(velocity):
                 self.command = velocity

@@ -184,7 +184,7 @@ class WalkShow:
             labels=tuple(s.robots.drivers),
             setup=s.setup,
             grounds=s.robots.grounds,
-            effects=EFFECT_TEXTS.of(s.robots.effects),
+            effects=EFFECT_TEXTS.lines(s.robots.effects),
             command=s.command,
             limits=self._limits(),
             pace=ask.Pace(s.paused, s.speed),
@@ -251,7 +251,7 @@ class _EffectTexts:
     def __init__(self) -> None:
         self._texts: dict[int, dict[str, str]] = {}
 
-    def of(self, effects: Mapping[str, Any]) -> dict[str, str]:
+    def lines(self, effects: Mapping[str, Any]) -> dict[str, str]:
         """Return a line for each effect: its words, and its values at size 1."""
         if id(effects) not in self._texts:
             self._texts = {id(effects): {name: _about(term) for name, term in effects.items()}}
