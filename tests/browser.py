@@ -26,6 +26,9 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 """WebGL 2 without a graphics card."""
 
+SLOWEST = 180.0
+"""How long a page may take to answer that draws without a graphics card beside other work, s."""
+
 
 class Browser:
     """One page.
@@ -68,7 +71,8 @@ class Browser:
                 return [target for target in json.load(answer) if target["type"] == "page"]
 
         wait_until(lambda: bool(pages()), 30.0, "a page of Chromium")
-        return self._open.enter_context(connect(pages()[0]["webSocketDebuggerUrl"], max_size=2**26, compression=None))
+        page = connect(pages()[0]["webSocketDebuggerUrl"], max_size=2**26, compression=None, ping_interval=None)
+        return self._open.enter_context(page)
 
     def __enter__(self) -> Browser:
         return self
@@ -92,7 +96,7 @@ class Browser:
         self._number += 1
         self._page.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._page.recv(timeout=60.0))
+            answer = json.loads(self._page.recv(timeout=SLOWEST))
             if answer.get("method") == "Runtime.consoleAPICalled":
                 self.messages.append(" ".join(str(a.get("value", "")) for a in answer["params"]["args"]))
             if answer.get("id") == self._number:
