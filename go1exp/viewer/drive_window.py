@@ -13,7 +13,7 @@ from go1exp.viewer import curve_plots
 from go1exp.viewer import requests as ask
 from go1exp.viewer.conditions import LARGEST
 from go1exp.viewer.walk import WalkView
-from go1exp.viewer.window import Vec2, Window, arrow_shape, section
+from go1exp.viewer.window import Vec2, Window, arrow_shape, paragraph, section
 
 SLOW = imgui.Vec4(1.0, 0.7, 0.3, 1.0)
 
@@ -171,7 +171,7 @@ class DriveWindow(Window):
         if not pace.paused and view.achieved < 0.9 * pace.speed:
             imgui.TextColored(SLOW, "this computer is too slow for that")
         if view.message:
-            imgui.TextWrapped(view.message)
+            paragraph(view.message)
 
     def _command_panel(self, view: WalkView) -> None:
         for axis, (name, (low, high)) in enumerate(zip(AXES, view.limits, strict=True)):

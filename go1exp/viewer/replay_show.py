@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp.config import RobotConfig
+from go1exp.evaluate.camera import AZIMUTH
 from go1exp.physics.scene import build_model
 from go1exp.terrain import TerrainConfig, build_terrain
 from go1exp.viewer.replay import HELD_AT, STEP_S, Motion, Player, Request, Story
@@ -17,7 +19,7 @@ from go1exp.viewer.replay import HELD_AT, STEP_S, Motion, Player, Request, Story
 Array = NDArray[np.float64]
 
 APART = 0.9
-"""Distance between the model before and after, in extents of the robot."""
+"""Distance to the right, as the camera sees it, of the model after from that before, in extents of the robot."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,8 @@ class ReplayShow:
         if min(ids) < 0:
             raise ValueError(f"the model has no joint {names[ids.index(-1)]!r}")
         self._at = model.jnt_qposadr[ids]
-        self._apart = np.array([0.0, -APART * float(model.stat.extent) * (0.4 if self._free else 1.0), 0.0])
+        wide = APART * float(model.stat.extent) * (0.4 if self._free else 1.0)
+        self._apart = wide * np.array([math.sin(math.radians(AZIMUTH)), -math.cos(math.radians(AZIMUTH)), 0.0])
         self._place()
 
     def ask(self, request: Request) -> None:

@@ -6,17 +6,18 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import mujoco
+import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
 from go1exp.viewer.replay import MODELS, MOST, UNITS, Choose, Magnify, Piece, Play, Seek, thinned
 from go1exp.viewer.replay_show import Ghost, ReplayView
-from go1exp.viewer.window import Vec2, Window, section
+from go1exp.viewer.window import Vec2, Window, paragraph, section
 
 COLOURS: dict[str, tuple[float, float, float, float]] = {
     "measured": (0.35, 0.65, 1.0, 0.45),
     "target": (1.0, 0.75, 0.2, 0.3),
-    "after": (0.35, 0.8, 0.4, 1.0),
+    "after": (0.45, 0.75, 0.5, 1.0),
 }
 """Of the robots beside the model's own: red, green, blue, opacity."""
 
@@ -43,6 +44,12 @@ class ReplayWindow(Window):
         self._lines: dict[str, Any] = {}
 
     # ------------------------------------------------------------------ the scene
+
+    def sight(self) -> tuple[Any, float]:
+        """Return a place between the robots, from far enough to see all."""
+        shift = max((ghost.shift for ghost in self.view.ghosts), key=lambda v: float(abs(v).sum()), default=np.zeros(3))
+        self.follow = self.follow and not shift.any()
+        return 0.5 * shift, 1.6 + float(np.linalg.norm(shift))
 
     def scene(self) -> Iterable[Any]:
         """Return the shapes of the robots beside the model's own."""
@@ -91,7 +98,7 @@ class ReplayWindow(Window):
         """Draw time line, pieces and joints."""
         view: ReplayView = self.view
         piece = view.story.pieces[view.number]
-        imgui.TextWrapped(view.story.about)
+        paragraph(view.story.about)
         if section("Time"):
             self._time(view, piece)
         if view.story.kind == "gap" and section("Shown"):
@@ -118,9 +125,8 @@ class ReplayWindow(Window):
         changed, time = imgui.SliderFloat("s", view.time, 0.0, piece.duration, "%.3f")
         if changed:
             self.ask(Seek(time))
-        imgui.PushTextWrapPos(0.0)
-        imgui.TextDisabled("space: play, pause.  arrows: time, window")
-        imgui.PopTextWrapPos()
+        imgui.TextDisabled("space: play, pause")
+        imgui.TextDisabled("arrows: time, window")
 
     def _shown(self, view: ReplayView) -> None:
         imgui.SetNextItemWidth(-110.0)
@@ -128,7 +134,7 @@ class ReplayWindow(Window):
         if changed:
             self.ask(Magnify(times))
         _, self._ghosts_shown = imgui.Checkbox("measured, and after", self._ghosts_shown)
-        imgui.TextWrapped("left: the model as it was. Right, green: with what was named. Blue, over both: measured.")
+        paragraph("left: the model as it was. Right, green: with what was named. Blue, over both: measured.")
 
     def _joints(self, piece: Piece) -> None:
         errors = piece.errors()
@@ -191,6 +197,8 @@ def _lines(piece: Piece, joint: str) -> dict[str, Any]:
         values = [(name, t, thinned(v)) for name, v in curves.items()]
         models = {name: v for name, v in curves.items() if name in MODELS}
         errors = [(name, t, thinned(v - curves["measured"])) for name, v in models.items()]
+        if errors:  # a line for what was measured, so that the others keep their colours
+            errors.insert(0, ("measured", t, [0.0] * len(t)))
         if errors and joint in piece.noise.get(quantity, {}):
             level = piece.noise[quantity][joint]
             errors += [("noise", t, [sign * level] * len(t)) for sign in (1.0, -1.0)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
 from typing import Any
 
@@ -56,6 +57,10 @@ class Window(plugin.ViewerPlugin):
         """Return shapes (``MjvGeom``) beside the model's own."""
         return ()
 
+    def sight(self) -> tuple[Any, float]:
+        """Return where to look at first, from the robot, m, and from how far, in distances of a clip's camera."""
+        return np.zeros(3), 1.6
+
     # ------------------------------------------------------------------ messages
 
     def ask(self, request: Any) -> None:
@@ -75,7 +80,7 @@ class Window(plugin.ViewerPlugin):
         inputs.handle_mouse_events(
             model, data, camera, self.viewer.vis_options, self.viewer.perturb, self._ux, move_camera=flying
         )
-        if model.nbody > 1:
+        if model.nbody > 1 and self.view is not None:
             self._look()
         self.viewer.extra_geoms[:] = list(self.scene()) if self.view is not None else []
 
@@ -84,8 +89,9 @@ class Window(plugin.ViewerPlugin):
         camera = self.viewer.camera
         if not self._looking:
             self._looking = True
-            camera.lookat[:] = self.viewer.data.xpos[1]
-            camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, 1.6 * DISTANCE
+            place, times = self.sight()
+            camera.lookat[:] = self.viewer.data.xpos[1] + place
+            camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, times * DISTANCE
         tracking = camera.type == int(mujoco.mjtCamera.mjCAMERA_TRACKING)
         if self.follow and not tracking:
             camera.type, camera.trackbodyid = int(mujoco.mjtCamera.mjCAMERA_TRACKING), 1
@@ -136,10 +142,17 @@ def arrow_shape(arrow: Arrow) -> Any:
     return geom
 
 
+def paragraph(text: str) -> None:
+    """Write text over several lines, broken between words (ImGui's own breaks fall within them)."""
+    columns = int(imgui.GetContentRegionAvail().x / imgui.CalcTextSize("n").x)
+    for line in textwrap.wrap(text, max(columns, 10)):
+        imgui.TextUnformatted(line)
+
+
 def section(label: str, is_open: bool = True) -> bool:
     """Begin a section that can be folded; return whether it is unfolded."""
     flags = int(imgui.TreeNodeFlags.DefaultOpen) if is_open else 0
     return bool(imgui.CollapsingHeader(label, flags))
 
 
-__all__ = ["Vec2", "Window", "arrow_shape", "imgui", "section"]
+__all__ = ["Vec2", "Window", "arrow_shape", "imgui", "paragraph", "section"]
