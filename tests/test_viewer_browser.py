@@ -149,17 +149,18 @@ def test_the_command_ends_by_ctrl_c_and_a_second_one_takes_the_next_port(tmp_pat
 
     def start() -> subprocess.Popen[str]:
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        return subprocess.Popen([*command, "viewer=web"], cwd=tmp_path, env=ENVIRONMENT, text=True, **pipes)  # type: ignore[call-overload, no-any-return]
+        return subprocess.Popen([*command, "viewer=web"], cwd=tmp_path, env=ENVIRONMENT, text=True, **pipes)  # type: ignore[call-overload]
 
     with start() as first, start() as second:
         assert first.stdout is not None
         assert second.stdout is not None
-        opened = [process.stdout.readline() for process in (first, second)]
+        outputs = first.stdout, second.stdout
+        opened = [output.readline() for output in outputs]
         ports = [int(line.split(":")[2].split("/")[0]) for line in opened]
         assert ports[0] != ports[1]
         assert len({line.split("token=")[1] for line in opened}) == 2
-        for process, port in ((first, ports[0]), (second, ports[1])):
-            assert f"ssh -L {port}:127.0.0.1:{port}" in process.stdout.readline()
+        for process, output, port in zip((first, second), outputs, ports, strict=True):
+            assert f"ssh -L {port}:127.0.0.1:{port}" in output.readline()
             process.send_signal(signal.SIGINT)
             said, complained = process.communicate(timeout=60)
             assert (process.returncode, complained) == (0, "")

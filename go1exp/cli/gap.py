@@ -24,15 +24,21 @@ DOES_NOT_HOLD = 15
 """Exit status if what was found is not as good at the step of training."""
 
 
+def with_logs(container: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings with no logs where none are needed: ``report`` and ``view`` read the answer alone."""
+    from go1exp.schema.settings import MISSING
+
+    if container.get("stage") in ("report", "view") and container.get("logs") == MISSING:
+        return {**container, "logs": []}
+    return container
+
+
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.settings import GapVerb
     from go1exp.gap.robots.description import parse_model
-    from go1exp.schema.settings import MISSING
 
-    if container.get("stage") in ("report", "view") and container.get("logs") == MISSING:
-        container = {**container, "logs": []}  # it reads the answer alone
-    settings, parts = parse_with_groups(GapVerb, container, ("robot",), model=parse_model)
+    settings, parts = parse_with_groups(GapVerb, with_logs(container), ("robot",), model=parse_model)
     out, where = Path(settings.out), address(settings.host, settings.port)
 
     from go1exp.cli.logs import long_enough, read_all, writable
