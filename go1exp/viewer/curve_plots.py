@@ -125,8 +125,10 @@ class Curves:
         imgui.Dummy(Vec2(width, SPARK))
         imgui.TableNextColumn()
         flags = int(implot.Flags.CanvasOnly) | int(implot.Flags.NoInputs) | int(implot.Flags.NoFrame)
+        implot.PushStyleVar(int(implot.StyleVar.PlotPadding), Vec2(0.0, 1.0))  # or nothing is left of so small a plot
         if reward.curve and implot.BeginPlot(f"##{reward.name}", Vec2(-1.0, SPARK), flags):
             axis = int(implot.AxisFlags.NoDecorations) | int(implot.AxisFlags.AutoFit)
             implot.SetupAxes("", "", axis, axis)
             implot.PlotLine("value", list(range(len(reward.curve))), reward.curve)
             implot.EndPlot()
+        implot.PopStyleVar()
