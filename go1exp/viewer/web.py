@@ -24,6 +24,7 @@ from go1exp.viewer.gate import Gate, listening, words
 try:
     from mujoco.studio import launch_thread, messages, plugin, viewer_handle, viewer_protocol, web_viewer
     from mujoco.studio.web import web_server
+    from websockets.exceptions import ConnectionClosed
 except ImportError as error:
     raise Expected(
         f"viewer=web needs MuJoCo Studio, which comes with the package mujoco and not with mujoco-core ({error}): "
@@ -123,11 +124,18 @@ class _Messenger(plugin.SimPlugin):
         return True  # the robot is ours: nothing is loaded over it
 
 
+def _not_a_browser_that_left(record: logging.LogRecord) -> bool:
+    """Return whether a message of the server's loop is about anything else than a page that was closed."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, ConnectionClosed | ConnectionError)
+
+
 def _opened(
     title: str, gate: Gate, sock: Any, windows: list[plugin.ViewerPlugin], show: Show
 ) -> viewer_handle.ViewerHandle:
     """Start Studio's viewer in a thread of its own."""
     logging.getLogger("WebServer").setLevel(logging.WARNING)
+    logging.getLogger("asyncio").addFilter(_not_a_browser_that_left)
 
     def target(endpoint: Any) -> None:
         with _behind(gate, sock):
