@@ -23,6 +23,7 @@ import go1exp.record.policy  # noqa: F401  (registers every importer and excitat
 from go1exp import cli, data_root
 from go1exp.cli import listing, settings
 from go1exp.cli.files import choices_from_files
+from go1exp.cli.gap import with_logs
 from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.plugins import begin
 from go1exp.cli.record import RIG
@@ -411,7 +412,7 @@ def test_the_page_on_the_paper_has_every_row() -> None:
 
 def parse(verb: str, container: dict[str, Any]) -> None:
     """Raise if the verb would refuse its settings."""
-    container = begin(verb, container)
+    container = with_logs(begin(verb, container))
     if verb == "train":
         parse_train(container)
         return

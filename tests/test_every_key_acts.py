@@ -118,6 +118,9 @@ EXEMPT = {
     "logger/wandb.yaml:logger.wandb.tags": "tests/test_logging.py reads them back",
     **{f"report.yaml:{key}": "tests/test_report.py shows what it does" for key in REPORT},
     **{f"train.yaml:{key}": "tests/test_beside.py shows what it does" for key in ("eval", "video", "stop")},
+    **{f"play.yaml:{key}": "tests/test_viewer_browser.py, tests/test_viewer.py" for key in ("host", "port", "log")},
+    **{f"gap.yaml:{key}": "of the stage view: tests/test_viewer.py" for key in ("host", "port")},
+    "play.yaml:bundle": "in place of run, as of eval: tests/test_viewer.py",
     **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},
     **{f"eval.yaml:{key}": "not of the grid: tests/test_protocol_commands.py" for key in ("bundle", "folder")},
     **{

@@ -35,6 +35,7 @@ OWN = (
     "bench",
     "protocol",
     "report",
+    "viewer",
     "cli",
 )
 
@@ -141,6 +142,13 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
     "report/": (*FOREIGN, "torch", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
     "protocol/": ("mujoco", "hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
+    # what is seen and asked for in a browser; the sessions behind it know none
+    "viewer/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.train", "go1exp.bench", "go1exp.cli"),
+    "viewer/session.py": ("mujoco", "hydra", "omegaconf", "go1exp.cli"),
+    "viewer/replay.py": ("mujoco", "torch", "hydra", "omegaconf", "go1exp.cli"),
+    "viewer/requests.py": (*FOREIGN, "torch", "numpy", "go1exp"),
+    "viewer/history.py": (*FOREIGN, "torch", "go1exp"),
+    "viewer/gate.py": (*FOREIGN, "torch", "numpy", "go1exp"),
 }
 """File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""
 
@@ -267,9 +275,13 @@ def test_sb3_stays_at_its_border_and_in_the_learner() -> None:
     assert {n for n in importers("stable_baselines3") if not n.startswith("train/")} <= allowed
 
 
+BROWSER = {f"viewer/{n}.py" for n in ("web", "window", "drive_window", "curve_plots", "replay_show", "replay_window")}
+"""Files that build on MuJoCo Studio, or draw shapes of MuJoCo in its window."""
+
+
 def test_mujoco_stays_in_the_physics_and_where_pictures_are_made() -> None:
     outside = {name for name in importers("mujoco") if not name.startswith("physics/")}
-    assert outside <= {"evaluate/camera.py", "evaluate/video.py", "evaluate/stick.py", "bench/env.py"}
+    assert outside <= {"evaluate/camera.py", "evaluate/video.py", "evaluate/stick.py", "bench/env.py", *BROWSER}
 
 
 def test_wandb_and_tensorboard_stay_in_the_metrics() -> None:

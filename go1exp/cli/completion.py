@@ -18,13 +18,14 @@ from go1exp.choices import CONFIG_DIR, choice_files, config_folder, given_folder
 from go1exp.cli.verbs import POSITIONAL, SUBVERBS, VALUED, VERBS
 
 OPTIONS = ("--help", "--cfg", "--multirun", "--config-dir", "--resolve", "--package", "--info")
-STAGES = ("check", "localise", "replay", "explain", "apply", "report")
+STAGES = ("check", "localise", "replay", "explain", "apply", "report", "view")
 """Words after ``gap``."""
 
 RUNS = ("run", "resume", "start_from")
 POLICIES = ("policy", "start_from")
 SUFFIXES = {
     "logs": (".parquet",),
+    "log": (".parquet",),
     "recordings": (".parquet",),
     "files": (".parquet",),
     "bundle": (".zip",),
@@ -40,8 +41,8 @@ WORDS = {
     "command": ("sinusoid", "keyboard", "gamepad"),
     "robot": ("sim", "go1"),
     "trunk_velocity": ("exact", "estimated"),
-    "viewer": ("auto", "clip", "live"),
     "suite": ("env", "train", "actuator", "deploy", "mpc", "report", "gpu"),
+    "viewer": ("auto", "clip", "live", "web"),
     "what": ("all", "terms", "groups"),
     "stage": ("all", *STAGES),
     "support": ("auto", "hung", "ground"),

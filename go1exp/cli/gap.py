@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from go1exp.cli.app import App, spinner
+from go1exp.cli.play_web import address
 from go1exp.cli.quoting import command
 from go1exp.files import opened, write_json
 
@@ -23,22 +24,30 @@ DOES_NOT_HOLD = 15
 """Exit status if what was found is not as good at the step of training."""
 
 
+def with_logs(container: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings with no logs where none are needed: ``report`` and ``view`` read the answer alone."""
+    from go1exp.schema.settings import MISSING
+
+    if container.get("stage") in ("report", "view") and container.get("logs") == MISSING:
+        return {**container, "logs": []}
+    return container
+
+
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.settings import GapVerb
     from go1exp.gap.robots.description import parse_model
-    from go1exp.schema.settings import MISSING
 
-    if container.get("stage") == "report" and container.get("logs") == MISSING:
-        container = {**container, "logs": []}  # it reads the answer alone
-    settings, parts = parse_with_groups(GapVerb, container, ("robot",), model=parse_model)
-    out = Path(settings.out)
+    settings, parts = parse_with_groups(GapVerb, with_logs(container), ("robot",), model=parse_model)
+    out, where = Path(settings.out), address(settings.host, settings.port)
 
     from go1exp.cli.logs import long_enough, read_all, writable
     from go1exp.gap import files
 
     if settings.stage == "report":
         return _report(files.load(out), out)
+    if settings.stage == "view":
+        return _view(settings, parts, where)
     recordings = long_enough(read_all(settings.logs), settings.search.window_s + settings.search.burn_s)
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
@@ -66,6 +75,15 @@ def _task(container: dict[str, Any]) -> int:
     if settings.stage == "all":
         _report(result, out)
     return status
+
+
+def _view(settings: GapVerb, parts: dict[str, Any], where: tuple[str, int]) -> int:
+    """Show the answer in the browser."""
+    from go1exp.cli.play_web import gap
+    from go1exp.gap.robots.choice import robot_of
+
+    gap(settings, robot_of(parts["model"], parts["robot"]), parts["robot"], where)
+    return 0
 
 
 def _progress() -> Callable[[str, float], None]:

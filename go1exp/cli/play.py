@@ -2,59 +2,104 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
+from go1exp.cli.play_web import address
 from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import PlaySettings
+    from go1exp.cli.subjects import Named
     from go1exp.env.core import Go1Core
     from go1exp.evaluate.policy import Policy
+    from go1exp.terrain import TerrainConfig
 
 FORMATS = (".mp4", ".gif")
 """Endings of a clip's file; the picture beside it is a .png."""
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.runs import checkpoint_file, trained
     from go1exp.cli.settings import PlaySettings, parse
 
     judge, container = engine.split(container)
     other, container = other_robot.split(container)
+    ground = _ground(container.pop("terrain", None))
     settings = parse(PlaySettings, container)
-    controller = controllers.chosen(settings.controller)
-    names = (settings.run, settings.policy, "play.mp4", settings.out)
-    if controller is None:
-        run, out = trained(*names)
-        checkpoint = checkpoint_file(run, settings.checkpoint)
-    else:
-        trained_on, out = controllers.conditions(*names)
+    where = address(settings.host, settings.port)
+    if settings.log is not None:
+        _log(settings, where)
+        return
+    if ground is not None and settings.train_ground:
+        raise ConfigError(["train_ground = True and terrain: only one of them says what the ground is"])
+    subject = _subject(settings)
+    out = Path(settings.out or subject.folder)
+    if out.is_dir():
+        raise ConfigError([f"out = {str(out)!r}: is a folder; name the file, such as out={out / 'play.mp4'}"])
     if out.suffix.lower() not in FORMATS:
         raise ConfigError([f"out = {str(out)!r}: a clip is {' or '.join(FORMATS)}"])
+    if settings.viewer == "web":
+        from go1exp.cli.play_web import walk
 
-    from go1exp.controller.batch import Driven
+        walk(subject, other, ground, judge, settings, where)
+        return
+
+    from go1exp.cli.subjects import driver
     from go1exp.env.core import Go1Core
     from go1exp.evaluate.engine import require_agreement
-    from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 
-    policy: Policy
-    if controller is None:
-        of_run, policy, _ = load_run(run, checkpoint)
-        trained_on = of_run.task
+    drives = driver(subject, other)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
     shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), engine=judge, **whole)
-    task = other_robot.replaced(trained_on, other)
-    shown_task = evaluation_task(task, shown)
+    shown_task = evaluation_task(drives.task, shown)
+    if ground is not None:
+        shown_task = dataclasses.replace(shown_task, terrain=ground)
     require_agreement(shown_task)
-    core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise, imu=controller is not None)
-    if controller is not None:
-        policy = Driven(core, controllers.maker(controller, task), noise=settings.noise, seed=settings.seed)
-    _show(core, policy, settings, out)
+    core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise, imu=drives.senses)
+    _show(core, drives.begin(core, "exact", settings.seed), settings, out)
+
+
+def _ground(given: Any) -> TerrainConfig | None:
+    """Return the ground that the group ``terrain`` names, None without it; raise ConfigError if it is none."""
+    if given is None:
+        return None
+    from go1exp.config import parse_parts
+
+    parts, problems = parse_parts({"terrain": given}, ("terrain",))
+    if problems:
+        raise ConfigError(problems)
+    ground: TerrainConfig = parts["terrain"]
+    return ground
+
+
+def _log(settings: PlaySettings, where: tuple[str, int]) -> None:
+    """Show a recording in the browser."""
+    given = {name: getattr(settings, name) for name in ("run", "policy", "bundle", "checkpoint", "out")}
+    wrong = [
+        f"log = {settings.log!r} and {name} = {value!r}: only one of them" for name, value in given.items() if value
+    ]
+    if settings.viewer not in ("auto", "web"):
+        wrong.append(f"viewer = {settings.viewer!r}: a recording (log=) is shown by viewer=web alone")
+    if wrong:
+        raise ConfigError(wrong)
+    from go1exp.cli.play_web import log
+
+    log(Path(str(settings.log)), where)
+
+
+def _subject(settings: PlaySettings) -> Named:
+    """Return who walks; raise ConfigError if that is not there."""
+    from go1exp.cli.subjects import driven, named
+
+    controller = controllers.chosen(settings.controller)
+    if controller is None:
+        return named(settings.run, settings.policy, settings.bundle, settings.checkpoint, "play.mp4")
+    return driven(controller, settings.run, settings.policy, settings.bundle, "play.mp4")
 
 
 def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path) -> None:

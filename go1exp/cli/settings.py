@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
+from go1exp.cli.play_settings import PlaySettings as PlaySettings
+from go1exp.cli.play_settings import Port, RunFolder
 from go1exp.deploy.controller import Stages
 from go1exp.fit.settings import FitSettings
 from go1exp.gap.result import GapSettings
@@ -22,7 +24,6 @@ from go1exp.sweep.settings import TuneSettings
 T = TypeVar("T")
 
 Count = Annotated[int, Field(ge=1)]
-RunFolder = Annotated[str, Field(min_length=1)]
 
 
 @settings
@@ -98,46 +99,6 @@ class EvalSettings:
         """Check what concerns two settings."""
         if self.settle_s >= self.duration_s:
             raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
-
-
-@settings
-class PlaySettings:
-    """``conf/play.yaml``.
-
-    Attributes:
-        controller: what moves the robot: policy, the one of run or policy, or mpc.
-        run: run folder to watch; or give policy.
-        policy: name of a policy that comes with the package, such as paper, in place of run.
-        checkpoint: file of the run; null takes the newest.
-        velocity: commanded velocity, x m/s, y m/s, yaw rad/s; arrow keys change it in the live viewer.
-        seconds: length of the clip, s.
-        viewer: clip, live, or auto, which is live where there is a display.
-        fps: frames per second of the clip.
-        noise: add the observation noise of training.
-        randomize: randomise the robot as in training; false takes the nominal robot.
-        push: push the robot as in training.
-        train_ground: use the ground of training; false is flat.
-        physics_dt: another physics step, s, such as 0.002 for a policy trained with coarser steps; null keeps that of
-            training.
-        seed: seed of everything random.
-        out: clip (.mp4, .gif); null writes play.mp4 in the run folder. A picture, .png, goes beside it.
-    """
-
-    controller: Any = None
-    run: RunFolder | None
-    policy: str | None
-    checkpoint: str | None
-    velocity: tuple[float, float, float]
-    seconds: Positive
-    viewer: Literal["auto", "clip", "live"]
-    fps: Annotated[int, Field(ge=1, le=50)]
-    noise: bool
-    randomize: bool
-    push: bool
-    train_ground: bool
-    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
-    seed: Annotated[int, Field(ge=0)]
-    out: str | None
 
 
 @settings
@@ -314,16 +275,20 @@ class GapVerb:
 
     Attributes:
         logs: folder of recordings, or a list of folders and files.
-        stage: check, localise, replay, explain, apply or report; all runs explain, apply and report.
+        stage: check, localise, replay, explain, apply, report or view; all runs explain, apply and report.
         out: folder for verdict.json, effect.yaml, report.html.
         train_dt: physics step of training, s, at which the answer must hold; also that of replay.
+        host: interface on which view listens; 127.0.0.1 is this machine alone.
+        port: on which view listens; 0 takes the first free one from 8080 on.
         search: how the missing effect is searched for.
     """
 
     logs: str | tuple[str, ...]
-    stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report"]
+    stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report", "view"]
     out: str
     train_dt: Annotated[float, Field(gt=0, le=0.02)]
+    host: str
+    port: Port
     search: GapSettings
 
 

@@ -1,0 +1,219 @@
+"""``go1exp play viewer=web`` and ``go1exp play log=FILE``: what there is to choose from, and the window."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from go1exp.choices import choice_files, config_folder, load
+from go1exp.cli.runs import shipped_policies
+from go1exp.errors import Expected
+from go1exp.schema.registry import ConfigError
+
+if TYPE_CHECKING:
+    from go1exp.cli.settings import GapVerb, PlaySettings
+    from go1exp.cli.subjects import Named
+    from go1exp.config import TaskConfig
+    from go1exp.evaluate.drivers import Driver
+    from go1exp.gap.robots.protocol import Robot
+    from go1exp.robot import RobotConfig
+    from go1exp.schema.backends import BackendConfig
+    from go1exp.schema.registry import Term
+    from go1exp.terrain import TerrainConfig
+    from go1exp.viewer.conditions import Ground
+
+RUNS, MOST_RUNS = Path("runs"), 12
+"""Where runs are looked for, and how many of the newest are offered."""
+
+GIVEN = "given"
+"""Name of a ground that is none of ``conf/terrain``."""
+
+
+def address(host: str, port: int) -> tuple[str, int]:
+    """Return where to listen.
+
+    Raises:
+        ConfigError: if the host is none.
+    """
+    if not host or any(c.isspace() for c in host) or (":" in host and host.count(":") == 1):
+        raise ConfigError([f"host = {host!r}: is the address of an interface, such as 127.0.0.1; see also port={port}"])
+    return host, port
+
+
+def require_studio() -> None:
+    """Refuse, before anything is built, where MuJoCo's web viewer is not installed.
+
+    Raises:
+        Expected: in that case.
+    """
+    try:
+        server = importlib.util.find_spec("mujoco.studio.web.web_server")
+    except ImportError:
+        server = None
+    if server is None:
+        raise Expected(
+            "viewer=web needs MuJoCo Studio, which comes with the package mujoco and not with mujoco-core alone: "
+            "pip install 'mujoco>=4'"
+        )
+
+
+def walk(
+    subject: Named,
+    other: dict[str, Any],
+    ground: TerrainConfig | None,
+    judge: BackendConfig,
+    settings: PlaySettings,
+    where: tuple[str, int],
+) -> None:
+    """Show a robot that walks, until Ctrl-C.
+
+    Args:
+        subject: who drives first.
+        other: choices of another robot (``other_robot.split``).
+        ground: to walk on; None takes that of the settings.
+        judge: what moves the robot.
+        settings: of the verb.
+        where: to listen, host and port.
+    """
+    require_studio()
+    from go1exp.tensors.threads import one_thread
+
+    with one_thread():
+        from go1exp.cli.subjects import driver
+        from go1exp.viewer import web
+        from go1exp.viewer.conditions import Setup
+        from go1exp.viewer.drive_window import DriveWindow
+        from go1exp.viewer.session import Robots, Session
+        from go1exp.viewer.walk import WalkShow
+
+        first = driver(subject, other)
+        name, grounds = _grounds(ground or (first.task.terrain if settings.train_ground else None))
+        effects, sizes = _effects(first.task, settings.randomize)
+        setup = Setup(
+            ground=name,
+            level=grounds[name].hardest / 2,
+            sizes=sizes,
+            noise=settings.noise,
+            physics_dt=settings.physics_dt,
+            randomize=settings.randomize,
+            push=settings.push,
+            engine=judge,
+            seed=settings.seed,
+        )
+        robots = Robots(_drivers(subject, first, other), grounds, effects)
+        session = Session(robots, subject.label, setup, settings.velocity)
+        title = f"go1exp: {subject.label}"
+        web.run(WalkShow(session), [DriveWindow()], title=title, host=where[0], port=where[1])
+    print(f"\nclosed after {session.time:.0f} s of walking, {session.falls} falls")
+
+
+def _drivers(subject: Named, first: Driver, other: dict[str, Any]) -> dict[str, Callable[[], Driver]]:
+    """Return who could drive this robot, loaded when they are asked for: shipped policies, newest runs, the MPC."""
+    from go1exp.cli.subjects import driver, word
+
+    def loader(name: str) -> Callable[[], Driver]:
+        return lambda: driver(word(name, "play"), other, robot_of=first.task)
+
+    runs = sorted((p.parent for p in RUNS.glob("*/config.yaml")), key=lambda p: -p.stat().st_mtime)
+    walked = [run for run in runs if (run / "checkpoints").is_dir()][:MOST_RUNS]
+    names = [*shipped_policies(), *(str(run) for run in walked if run != subject.run)]
+    if importlib.util.find_spec("daqp") is not None:
+        names.append("mpc")
+    return {subject.label: lambda: first} | {name: loader(name) for name in names if name != subject.label}
+
+
+def _grounds(wanted: TerrainConfig | None) -> tuple[str, dict[str, Ground]]:
+    """Return the name of the ground that is wanted, and every ground; those of one kind that differ get a name."""
+    from go1exp.config import parse_parts
+    from go1exp.viewer.conditions import FLAT, grounds
+
+    known: dict[str, TerrainConfig] = {}
+    for name, file in choice_files("terrain", [config_folder()]).items():
+        parts, problems = parse_parts({"terrain": load(file)}, ("terrain",))
+        if not problems:
+            known[name] = parts["terrain"]
+    if wanted is None or wanted.kind == "flat":
+        return FLAT, grounds(known)
+    if wanted not in known.values():
+        known[GIVEN] = wanted
+    name = next(name for name, config in known.items() if config == wanted)
+    return name, grounds(known)
+
+
+def _effects(task: TaskConfig, randomize: bool) -> tuple[dict[str, Term], dict[str, float]]:
+    """Return every effect by name at size 1, and the sizes of those that the robot has.
+
+    One of the robot's own that does nothing, since only its spread did in training, is as its choice has it, and off.
+    """
+    from go1exp.config import parse_parts
+
+    known: dict[str, Term] = {}
+    for file in choice_files("effect", [config_folder()]).values():
+        parts, problems = parse_parts({"effect": load(file)}, ("effect",))
+        if not problems:
+            known |= {term.key: term for term in parts["effect"]}
+    sizes = dict.fromkeys(known, 0.0)
+    for term in task.effect:
+        spread = randomize and any(term.slots.get("spread", {}).values())
+        if spread or _acts(term):
+            known[term.key], sizes[term.key] = term if spread else replace(term, slots={"spread": {}}), 1.0
+    return dict(sorted(known.items())), sizes
+
+
+def _acts(term: Term) -> bool:
+    from go1exp.schema.joint_values import numbers
+    from go1exp.viewer.conditions import params_of
+
+    nulls = {p.name: p.null for p in params_of(term)}
+    return any(v != nulls[name] for name, value in term.parameters.items() for v in numbers(value))
+
+
+def log(file: Path, where: tuple[str, int]) -> None:
+    """Show a recording, until Ctrl-C."""
+    require_studio()
+    from go1exp.recording import read
+
+    recording = read(file)
+    from go1exp.config import parse_parts
+    from go1exp.viewer import web
+    from go1exp.viewer.replay import of_recording
+    from go1exp.viewer.replay_show import ReplayShow
+    from go1exp.viewer.replay_window import ReplayWindow
+
+    parts, _ = parse_parts({"robot": load(config_folder() / "robot" / "go1.yaml")}, ("robot",))
+    show = ReplayShow(of_recording(recording), parts["robot"])
+    web.run(show, [ReplayWindow()], title=f"go1exp: {file.name}", host=where[0], port=where[1])
+
+
+def gap(settings: GapVerb, robot: Robot, config: RobotConfig, where: tuple[str, int]) -> None:
+    """Show the answer of ``go1exp gap`` in a folder, until Ctrl-C.
+
+    Args:
+        settings: of the verb.
+        robot: that it is about.
+        config: of the Go1, if it is one.
+        where: to listen, host and port.
+    """
+    require_studio()
+    from go1exp.gap import files
+    from go1exp.robot import JOINTS
+
+    folder = Path(settings.out)
+    result = files.load(folder)
+    from go1exp.viewer import web
+    from go1exp.viewer.replay import of_result
+    from go1exp.viewer.replay_show import ReplayShow, model_of
+    from go1exp.viewer.replay_window import ReplayWindow
+
+    story = of_result(result, str(folder / files.RESULT))
+    joints = story.pieces[0].joints
+    if not set(joints) <= set(robot.joints):
+        strange = ", ".join(joint for joint in joints if joint not in robot.joints)
+        raise Expected(f"{folder / files.RESULT}: is about joints that the robot has not ({strange}); say model=...")
+    model = None if set(robot.joints) == set(JOINTS) else model_of(robot)
+    show = ReplayShow(story, config, model)
+    web.run(show, [ReplayWindow()], title=f"go1exp gap: {folder}", host=where[0], port=where[1])
