@@ -19,7 +19,7 @@ from go1exp.env.core import Go1Core
 from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.commands import FixedVelocity
-from go1exp.measures.statistics import share_interval
+from go1exp.statistics.intervals import share_interval
 
 USAGE = (
     "usage: python -m benchmarks.rough_ground run=FOLDER [speed=1.0] [robots=200] [seconds=12] [seed=1] [out=F.json]"

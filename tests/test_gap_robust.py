@@ -98,8 +98,8 @@ def test_errors_are_told_in_mrad_by_joint_and_episode() -> None:
     before[..., 1] = np.sqrt(2.0) * np.array([8.0, 8.0, 16.0, 16.0])[:, None, None] * wave  # 4 and 8 mrad
     after = before * np.array([1.0, 0.5])
     after[3] *= 100.0  # one wild window
-    flat = [r.reshape(4, 1, -1) for r in (before, after)]
-    errors = angle_errors(scorer, *flat, np.arange(4), ["slow", "fast"])
+    flat, halved = (r.reshape(4, 1, -1) for r in (before, after))
+    errors = angle_errors(scorer, flat, halved, np.arange(4), ["slow", "fast"])
     assert errors.by_joint["hip"][0] < 0.1e-3
     assert errors.by_joint["calf"] == pytest.approx((6e-3, 3e-3), rel=0.02)
     assert errors.by_episode["slow"] == pytest.approx((4e-3 / np.sqrt(2), 2e-3 / np.sqrt(2)), rel=0.02)

@@ -297,7 +297,7 @@ def recording(base: str = "floating", **about: str) -> Recording:
             f"imu_quat_{axis}": np.full(500, value) for axis, value in zip("wxyz", (1.0, 0, 0, 0), strict=True)
         }
     quat = (1.0, 0.0, 0.0, 0.0) if base == "fixed" else None
-    known = {"robot": "go1", "episode": "walk", "tool": "test", "notes": "", **about}
+    known: dict[str, Any] = {"robot": "go1", "episode": "walk", "tool": "test", "notes": "", **about}
     meta = Meta(
         joints=robot.JOINTS,
         rate_hz=500.0,
