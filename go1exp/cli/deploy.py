@@ -11,7 +11,6 @@ from go1exp.cli.app import App
 from go1exp.cli.other_robot import CHOICES
 from go1exp.controller.settings import MpcSettings
 from go1exp.schema.registry import ConfigError
-from go1exp.schema.settings import MISSING
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import DeploySettings
@@ -22,8 +21,6 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.settings import DeploySettings, parse
     from go1exp.schema.settings import subset
 
-    if container.get("check") is True and container.get("bundle") == MISSING:
-        container = {**container, "bundle": None}
     other = {name: container[name] for name in CHOICES if container.get(name) is not None}
     settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in CHOICES})
     controller = controllers.chosen(settings.controller)
@@ -71,10 +68,10 @@ def _task(container: dict[str, Any]) -> int:
 
 def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled: bool) -> None:
     """Raise ConfigError if settings do not go together; ``other``: choices of the simulated robot's groups."""
+    from go1exp.cli.settings import EXAMPLES
+
     if settings.bundle is None:
-        raise ConfigError(
-            ["bundle = null: only check=true needs none; give it as in go1exp deploy runs/NAME/bundle.zip"]
-        )
+        raise ConfigError([f"bundle: required, such as {EXAMPLES['bundle']}"])
     real = settings.robot != "sim"
     if real and other:
         raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
