@@ -36,11 +36,14 @@ class Variant:
         effect: registered name.
         probes: what was changed to see it; empty for one whose columns the box has.
         shapes: values of its shapes.
+        exact: whether it is judged and begun just as it was probed, since it is far from linear: half of a limit that
+            bites may bite nothing.
     """
 
     effect: str
     probes: tuple[Probe, ...] = ()
     shapes: Theta = field(default_factory=dict)
+    exact: bool = False
 
     @property
     def quadrature(self) -> bool:
@@ -135,7 +138,7 @@ def _periods(machine: Machine, effect: str, periodic: Periodic) -> Iterator[Vari
         yield Variant(effect, tuple(Probe(key, p.place, p.delta, also) for also in phases for p in plain), at)
 
 
-SHARES = (0.9, 0.75, 0.55, 0.35)
+SHARES = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4)
 """Shares of the largest torque that a part was asked for at which a limit of the torque is looked for."""
 
 
@@ -158,7 +161,8 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
             for p in tolerances.probes(machine, keys, {}, PROBE):
                 delta = np.broadcast_to(level[p.key[1]], p.delta.shape).copy() if level else p.delta
                 probes.append(Probe(p.key, p.place, delta, shapes))
-            yield Variant(effect, tuple(probes), shapes)
+            exact = bool(how.limits_torque) and isinstance(level.get(how.limits_torque), np.ndarray)
+            yield Variant(effect, tuple(probes), shapes, exact)
 
 
 @dataclass(frozen=True)
@@ -234,6 +238,10 @@ class _Ranking:
         limits, strict = (tolerances.bounds(layout, probes, theta, freed, back) for back in (False, True))
         for bounds in (limits, strict) if variant.quadrature else ():
             bounds.low[layout.part(np.arange(known, len(probes)))] = -np.inf
+        if variant.exact:
+            for i in layout.part(np.arange(known, len(probes))):
+                delta, joint = probes[layout.probe[i]].delta, int(layout.joint[i])
+                limits.low[i] = limits.high[i] = delta[joint if joint >= 0 else int(np.argmax(np.abs(delta)))]
         relief = (self.plain - strain.price(matrix, right, strict)) / self.count
         x = tolerances.solve(matrix, right, limits)
         after = np.maximum(predicted(part, layout, x), 0.0) / self.size  # rounding can make it negative
