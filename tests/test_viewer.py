@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import socket
+from typing import Any
 
 import numpy as np
 import pytest
