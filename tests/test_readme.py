@@ -56,6 +56,9 @@ LEFT_OUT = {
     "go1exp eval policy=paper protocol=paper": "takes eight minutes: tests/test_protocols.py plays each one",
     "go1exp compare paper mpc trot@physx protocol=kicks": "needs an extra: tests/test_protocol_commands.py",
     "go1exp play policy=paper viewer=web": "goes on until Ctrl-C: tests/test_viewer_browser.py",
+    "go1exp train -m study=ablations_cpu hydra/launcher=joblib": "takes an hour: tests/test_sweeps.py",
+    "go1exp sim": "goes on until Ctrl-C: tests/test_go1_walk.py",
+    "go1exp deploy robot=go1 check=true": "needs a robot: tests/test_go1_walk.py lets it look at a simulated one",
     "go1exp gap view out=gap": "goes on until Ctrl-C: tests/test_viewer.py, and the page itself as of play",
     "go1exp gap logs=recordings model=go2 out=gap": "needs recordings of a Go2: tests/test_gap_machines.py",
 }
