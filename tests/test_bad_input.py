@@ -123,7 +123,7 @@ def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypa
         ("gap logs=.", 1, "go1exp gap: .: no *.parquet in it"),
         ("export check .", 1, "go1exp export check: Is a directory: ."),
         ("deploy nowhere.zip", 1, "go1exp deploy: No such file or directory: nowhere.zip"),
-        ("deploy walk.zip robot=sm", 2, "go1exp deploy: robot = 'sm': input should be 'sim' or 'go1'"),
+        ("deploy walk.zip robot=sm", 2, "go1exp deploy: robot = 'sm': input should be 'sim', 'go1' or 'go1_sdk'"),
         (
             "train reward=shrt",
             2,

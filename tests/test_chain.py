@@ -60,7 +60,7 @@ def test_from_training_to_the_replayed_log(
     assert verb("train", *SMALL, *LIVELY, "hydra.run.dir=run") == 0
     assert verb("export", "run=run", "out=walk.zip", "seconds=0.2") == 0
     assert verb("export", "check", "walk.zip") == 0
-    words = ["command=[0.4,0,0]", "seconds=1", "stand_up=0.5", "lie_down=1", "brake=0.2", "stale=5"]
+    words = ["command=[0.4,0,0]", "seconds=1", "stand_up=0.5", "lie_down=1.5", "brake=0.5", "stale=5"]
     robot = ["sim.start=lying", "sim.noise=0.1", "truth=true"]
     assert verb("deploy", "walk.zip", *words, *robot, "out=logs") == 0
     (kept,) = (tmp_path / "logs").glob("*.parquet")

@@ -538,7 +538,7 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
     ]
     sent: list[LowCmd] = []
     observed: list[Any] = []
-    link = SimpleNamespace(receive=lambda: [states[len(sent)]], send=sent.append)
+    link = SimpleNamespace(receive=lambda: [states[len(sent)]], send=sent.append, sent_at=0.0)
     commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
     estimator = SimpleNamespace(update=lambda state: trace["input.base_lin_vel_b"][len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))

@@ -43,7 +43,7 @@ DAMAGES = (
     *("swapped_joints", "flipped_sign", "dropped", "shifted_commands", "degrees", "truncated", "frozen", "repeated"),
 )
 
-HUNG = tuple(e for e in known.LIBRARY if e not in known.GROUND_ONLY)
+HUNG = tuple(e for e in known.LIBRARY if e not in (*known.GROUND_ONLY, *known.NEVER_HIDDEN))
 """Effects that a hung robot feels."""
 
 Values = dict[str, np.ndarray | float]

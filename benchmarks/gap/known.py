@@ -21,6 +21,7 @@ TOLERANCES: dict[str, dict[str, float]] = {
     "coulomb": {"bound": 0.05},
     "encoder_offset": {"offset": 0.003},
     "external_wrench": {"x": 1.0, "y": 1.0, "z": 1.0, "roll": 0.2, "pitch": 0.2, "yaw": 0.2},
+    "fixed_point": {"steps": 1.0},
     "flexibility": {"compliance": 5e-4},
     "foot_friction": {"scale": 0.1},
     "ground_compliance": {"time_constant": 0.003},
@@ -46,7 +47,7 @@ TOLERANCES: dict[str, dict[str, float]] = {
 
 Units: friction, cogging N m; viscous N m s/rad; drag N m s2/rad2; delays and lag s; angles rad; ``link_*`` shares of
 a link's own; ``payload`` kg on the trunk; armature kg m2; shift m; stiffness N m/rad; compliance
-rad/(N m); rate 1/s.
+rad/(N m); rate 1/s; steps over those of a Go1's packets.
 """
 
 LIBRARY = tuple(TOLERANCES)
@@ -54,6 +55,9 @@ LIBRARY = tuple(TOLERANCES)
 
 GROUND_ONLY = ("com_offset", "external_wrench", "foot_friction", "ground_compliance", "payload")
 """Effects that a robot whose trunk is held does not feel."""
+
+NEVER_HIDDEN = ("fixed_point",)
+"""Effects that no case hides: on logs at one gain they are ``kp_scale`` and ``viscous`` to the last bit."""
 
 ALIASES: tuple[frozenset[str], ...] = (
     frozenset({"kd_scale", "viscous"}),
