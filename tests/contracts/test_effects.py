@@ -294,7 +294,7 @@ def test_shapes_and_levels_are_parameters_within_their_bounds(entry: Entry) -> N
         assert {*shapes} <= {*how.free_shapes}, "a shape that is tried and then held fast"
         for name, value in shapes.items():
             p = by_name[name]
-            assert (p.per == "joint" and p.unit == "rad") if math.isnan(value) else p.low <= value <= p.high
+            assert (p.per == "joint" and p.unit == "rad") if not math.isfinite(value) else p.low <= value <= p.high
     for level in how.levels:
         assert {*level} <= names_of(entry, shapes=False)
         for name, change in level.items():
