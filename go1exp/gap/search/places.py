@@ -98,7 +98,9 @@ def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.
     sets = [piece & outside for piece in pieces(joints) if piece & outside]
     inside = frozenset[int]()
     while inside != outside:
-        larger = min((inside | piece for piece in sets), key=lambda some: price(some) + NEEDED * len(some))
+        larger = min(
+            (inside | piece for piece in sets), key=lambda joints_of: price(joints_of) + NEEDED * len(joints_of)
+        )
         if price(larger) + NEEDED * len(larger) >= price(inside) + NEEDED * len(inside):
             break
         inside = larger
