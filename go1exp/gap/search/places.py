@@ -95,14 +95,13 @@ def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.
             prices[inside] = linear.price(without(inside))
         return prices[inside]
 
-    def cost(inside: frozenset[int]) -> float:
-        return price(inside) + NEEDED * len(inside)
-
     sets = [piece & outside for piece in pieces(joints) if piece & outside]
     inside = frozenset[int]()
     while inside != outside:
-        larger = min((inside | piece for piece in sets), key=cost)
-        if cost(larger) >= cost(inside):
+        larger = min(
+            (inside | piece for piece in sets), key=lambda joints_of: price(joints_of) + NEEDED * len(joints_of)
+        )
+        if price(larger) + NEEDED * len(larger) >= price(inside) + NEEDED * len(inside):
             break
         inside = larger
     brings = {j: price(inside - {j}) - price(inside) for j in inside}

@@ -135,7 +135,7 @@ def written(
 
 def _angle_errors(comparison: Comparison, search: Search) -> AngleErrors:
     """Return the errors of the angles before and after, on windows that no fitted value has seen."""
-    score, windows = search.state.scorer, search.splits.judged
+    score, windows = comparison.scorer, search.splits.judged  # the same floors for both, whatever was named
     before, after = residuals(score, [{}, search.state.theta], windows, search.dt)
     return angle_errors(score, before, after, windows, [r.meta.episode for r in comparison.recordings])
 
