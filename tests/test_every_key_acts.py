@@ -251,6 +251,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "record_import:source": lambda walk: ["so101_arm"],
     "record_import:path": lambda walk: [str(walk.logs(1))],
     "record_import:options": lambda walk: [{"rate_hz": 100.0}],
+    "record_import:columns": lambda walk: [{"q_hip": "jpos1"}],
     "fit-actuator:recordings": lambda walk: [str(walk.recorded("noisy", {**FIVE, "sensors.qd.noise": 0.3}))],
     "fit-actuator:gains": lambda walk: [[20.0, 0.5]],
     "fit-actuator:inputs": lambda walk: [["position_error"]],
@@ -655,6 +656,9 @@ class Walk:
             return ["backend.threads=1", *walk, *stand]
         if leaf.program == "record_audit":
             return [f"files=[{self.recorded('whole', {})}]"]
+        if leaf.program == "record_import" and leaf.key == "columns":
+            table = ["source=csv", f"path={self.logs(0)}", "options={robot: go2, rate_hz: 100.0}"]
+            return [*table, "columns={q_hip: jpos0}"]
         if leaf.program == "record_import":
             return ["source=go2_in_air", f"path={self.logs(0)}"]
         if leaf.program == "fit-actuator" and leaf.key == "gains":

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
@@ -65,6 +66,32 @@ def _unquoted(item: str) -> str:
 def _choice(group: str, file: str) -> str:
     """Make a file a choice of ``group`` and return its name there."""
     path, key = Path(file).expanduser(), f"{group}={file}"
+    content = _mapping(path, key, f"without any, use {group}=none", f"as the files of conf/{group} are")
+    named = content.get(PATHS.get(group, ""))
+    if isinstance(named, str):
+        content[PATHS[group]] = str((path.parent / named).resolve())
+    name = _free_name(group, path)
+    ConfigStore.instance().store(group=group, name=name, node=content, provider=str(path))
+    return name
+
+
+def mapping_of(given: Mapping[str, Any] | str | None, key: str) -> dict[str, Any]:
+    """Return a setting that is a mapping or the ``FILE.yaml`` of one; an empty one for None.
+
+    Raises:
+        ConfigError: if the file is missing, empty, no YAML or no mapping, naming ``key``.
+    """
+    if given is None:
+        return {}
+    if not isinstance(given, str):
+        return dict(given)
+    path = Path(given).expanduser()
+    content = _mapping(path, f"{key}={given}", f"without any, leave {key} out", "or a FILE.yaml that holds one")
+    return {str(k): v for k, v in OmegaConf.to_container(content, resolve=True).items()}  # type: ignore[union-attr]
+
+
+def _mapping(path: Path, key: str, when_empty: str, like: str) -> DictConfig:
+    """Return what a YAML file holds; raise ConfigError, beginning with ``key``, if that is no mapping."""
     if not path.exists():
         raise ConfigError([f"{key}: no such file"])
     try:
@@ -80,15 +107,10 @@ def _choice(group: str, file: str) -> str:
         why = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
         raise ConfigError([f"{key}: cannot be read ({why})"]) from None
     if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
-        raise ConfigError([f"{key}: is empty; without any, use {group}=none"])
+        raise ConfigError([f"{key}: is empty; {when_empty}"])
     if not isinstance(content, DictConfig):
-        raise ConfigError([f"{key}: must be a mapping, as the files of conf/{group} are"])
-    named = content.get(PATHS.get(group, ""))
-    if isinstance(named, str):
-        content[PATHS[group]] = str((path.parent / named).resolve())
-    name = _free_name(group, path)
-    ConfigStore.instance().store(group=group, name=name, node=content, provider=str(path))
-    return name
+        raise ConfigError([f"{key}: must be a mapping, {like}"])
+    return content
 
 
 def _free_name(group: str, path: Path) -> str:

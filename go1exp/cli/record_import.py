@@ -10,11 +10,15 @@ from go1exp.cli.app import App
 
 def _task(container: dict[str, Any]) -> None:
     from go1exp import recording
+    from go1exp.cli.files import mapping_of
     from go1exp.cli.settings import ImportSettings, parse
     from go1exp.importers import import_recordings
 
     settings = parse(ImportSettings, container)
-    recordings = import_recordings(settings.source, Path(settings.path), settings.options or {})
+    options = mapping_of(settings.options, "options")
+    if settings.columns is not None:
+        options["columns"] = mapping_of(settings.columns, "columns")
+    recordings = import_recordings(settings.source, Path(settings.path), options)
     out = Path(settings.out)
     for r in recordings:
         recording.write(out / f"{r.meta.episode}.parquet", r)

@@ -155,13 +155,15 @@ class ImportSettings:
     Attributes:
         source: name of the importer (go1exp list importer).
         path: its file, or a folder of them.
-        options: the importer's own parameters, such as {rate_hz: 100.0}.
+        options: the importer's own parameters, such as {rate_hz: 100.0}, or a FILE.yaml of them.
+        columns: of source=csv: channel -> column, such as {t: time, q_knee: {column: pos, unit: deg}}, or a FILE.yaml.
         out: folder for the recordings.
     """
 
     source: str
     path: str
-    options: dict[str, Any] | None
+    options: dict[str, Any] | str | None
+    columns: dict[str, Any] | str | None
     out: str
 
 

@@ -1,0 +1,242 @@
+"""Any CSV as a recording: the mapping of columns to channels, units and signs, and what is said of wrong ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from go1exp import recording
+from go1exp.importers import import_recordings
+from go1exp.importers.csv_table import UNITS
+from go1exp.recording import JOINT_QUANTITIES, VECTORS, Recording, RecordingError
+from go1exp.schema.registry import ConfigError
+from tests.command import LIGHT, run
+
+ROWS = 40
+K = np.arange(ROWS)
+TABLE = {
+    "stamp": 5.0 * K + 1000.0,  # ms
+    "angle [deg]": np.round(20.0 * np.sin(0.1 * K), 3),
+    "goal": np.round(0.4 * np.sin(0.1 * K + 0.2), 4),
+    "ticks": K % 7,
+    "volt": 12.0 + 0 * K,
+}
+COLUMNS: dict[str, Any] = {
+    "t": {"column": "stamp", "unit": "ms"},
+    "q_knee": {"column": "angle [deg]", "unit": "deg", "scale": -1.0, "offset": 0.5},
+    "q_target_knee": "goal",
+    "tau_est_knee": {"column": "ticks", "unit": "mN m"},
+}
+OPTIONS: dict[str, Any] = {"robot": "arm", "columns": COLUMNS, "kp": 3.0, "kd": {"knee": 0.1}, "excitation": "sine"}
+
+
+def lay(path: Path, delimiter: str = ",", decimal: str = ".", before: str = "", header: bool = True) -> Path:
+    names = [delimiter.join(TABLE)] if header else []
+    rows = [delimiter.join(f"{v:g}".replace(".", decimal) for v in row) for row in zip(*TABLE.values(), strict=True)]
+    path.write_text(before + "\n".join([*names, *rows]) + "\n")
+    return path
+
+
+def imported(path: Path, **changes: Any) -> Recording:
+    (one,) = import_recordings("csv", path, {**OPTIONS, **changes})
+    return one
+
+
+def refusal(path: Path, **changes: Any) -> str:
+    with pytest.raises((ConfigError, RecordingError)) as caught:
+        imported(path, **changes)
+    return str(caught.value)
+
+
+def test_columns_become_channels_with_unit_sign_and_offset(tmp_path: Path) -> None:
+    r = imported(lay(tmp_path / "run_7.csv"))
+    np.testing.assert_allclose(r.t, 0.005 * K, atol=1e-12)
+    np.testing.assert_allclose(r.joint("q")[:, 0], 0.5 - np.radians(TABLE["angle [deg]"]), atol=1e-7)
+    np.testing.assert_allclose(r.joint("q_target")[:, 0], TABLE["goal"], atol=1e-7)
+    np.testing.assert_allclose(r.joint("tau_est")[:, 0], 1e-3 * TABLE["ticks"], atol=1e-12)
+    meta = r.meta
+    assert (meta.robot, meta.joints, meta.episode, meta.rate_hz) == ("arm", ("knee",), "run_7", 200.0)
+    assert (meta.kp, meta.kd, meta.tau_limit, meta.base_quat) == ((3.0,), (0.1,), None, (1.0, 0.0, 0.0, 0.0))
+    assert (meta.source, meta.excitation, r.has("qd")) == ("measured", "sine", False)
+    assert "left out: volt" in meta.notes
+    recording.write(tmp_path / "run_7.parquet", r)
+    np.testing.assert_array_equal(recording.read(tmp_path / "run_7.parquet").t, r.t)
+
+
+def test_the_same_table_in_other_notations_is_the_same_recording(tmp_path: Path) -> None:
+    usual = imported(lay(tmp_path / "a.csv"))
+    european = imported(lay(tmp_path / "b.csv", ";", ",", "made by X\n\n"), delimiter=";", decimal=",", skip_lines=2)
+    numbered = {
+        name: {**value, "column": str(list(TABLE).index(value["column"]) + 1)} if isinstance(value, dict) else 3
+        for name, value in COLUMNS.items()
+    }
+    nameless = imported(lay(tmp_path / "c.csv", header=False), columns=numbered, header=False)
+    marked = tmp_path / "d.csv"
+    marked.write_text("\ufeff" + lay(tmp_path / "a.csv").read_text().replace(",", " , ", 4), encoding="utf-8")
+    for other in (european, nameless, imported(marked)):
+        assert other.channels.keys() == usual.channels.keys()
+        for name, values in usual.channels.items():
+            np.testing.assert_array_equal(other.channels[name], values, name)
+
+
+def test_a_folder_is_an_episode_for_each_file(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        lay(tmp_path / f"{name}.csv")
+    assert [r.meta.episode for r in import_recordings("csv", tmp_path, OPTIONS)] == ["one", "two"]
+
+
+def test_nanoseconds_since_1970_keep_their_steps(tmp_path: Path) -> None:
+    start = 1_700_000_000_123_456_789
+    (tmp_path / "x.csv").write_text("n,p\n" + "".join(f"{start + 1_000_001 * k},0.{k}\n" for k in range(5)))
+    r = imported(tmp_path / "x.csv", columns={"t": {"column": "n", "unit": "ns"}, "q_knee": "p"})
+    np.testing.assert_allclose(np.diff(r.t), 1.000001e-3, rtol=1e-9)
+    assert "t = 0 is 1700000000123456789 in the column 'n'" in r.meta.notes
+
+
+def test_a_column_may_become_broken_numbers_after_a_million_whole_ones(tmp_path: Path) -> None:
+    rows = ["0,0"] * 400_000 + ["0,0.25"]  # more than a block of Arrow's reader
+    (tmp_path / "x.csv").write_text("p,c\n" + "\n".join(rows) + "\n")
+    r = imported(tmp_path / "x.csv", columns={"q_knee": "c"}, rate_hz=500.0)
+    assert (r.joint("q")[-1, 0], len(r.t)) == (0.25, 400_001)
+
+
+def test_without_a_clock_the_rate_makes_the_time(tmp_path: Path) -> None:
+    columns = {name: value for name, value in COLUMNS.items() if name != "t"}
+    r = imported(lay(tmp_path / "x.csv"), columns=columns, rate_hz=250.0)
+    np.testing.assert_allclose(r.t, K / 250.0)
+    assert "No clock in the source" in r.meta.notes
+
+
+def test_a_flag_is_zero_or_one(tmp_path: Path) -> None:
+    columns = {**COLUMNS, "torque_enable": "on"}
+    text = lay(tmp_path / "x.csv").read_text().splitlines()
+    for values, right in (((0, 1), True), ((0, 2), False)):
+        lines = [text[0] + ",on", *(f"{line},{values[k % 2]}" for k, line in enumerate(text[1:]))]
+        (tmp_path / "x.csv").write_text("\n".join(lines) + "\n")
+        if right:
+            assert (
+                imported(tmp_path / "x.csv", columns=columns).channels["torque_enable"].tolist() == [False, True] * 20
+            )
+        else:
+            assert "column 'on' (for torque_enable): must be 0 or 1" in refusal(tmp_path / "x.csv", columns=columns)
+
+
+def test_every_quantity_has_units_of_which_the_first_is_ours() -> None:
+    assert UNITS.keys() == {"t", *JOINT_QUANTITIES, *VECTORS, "foot_force", "torque_enable"}
+    assert all(next(iter(units.values())) == 1.0 for units in UNITS.values())
+    assert UNITS["qd"]["rpm"] == pytest.approx(2 * np.pi / 60)
+
+
+def without(name: str) -> dict[str, Any]:
+    return {k: v for k, v in COLUMNS.items() if k != name}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"columns": None}, "importer.csv.columns: required, but not given; "),
+        ({"columns": None}, "has the columns stamp, angle [deg], goal, ticks, volt"),
+        ({"columns": {**COLUMNS, "q_knee": "Angle"}}, "no column 'Angle' (for q_knee); did you mean 'angle [deg]'?"),
+        ({"columns": {**COLUMNS, "q_targt_knee": "goal"}}, "columns.q_targt_knee: unknown channel; did you mean"),
+        ({"columns": {**COLUMNS, "qdd_knee": "goal"}}, "columns.qdd_knee: unknown channel; did you mean 'qd_knee'"),
+        ({"columns": {**COLUMNS, "current": "volt"}}, "columns.current: unknown channel; channels are t, q_JOINT"),
+        (
+            {"columns": {**COLUMNS, "t": {"column": "stamp", "unit": "sec"}}},
+            "columns.t.unit = 'sec': unknown unit; s, ms",
+        ),
+        (
+            {"columns": {**COLUMNS, "q_knee": {"colum": "goal"}}},
+            "columns.q_knee.colum: unknown key 'colum'; did you mean",
+        ),
+        (
+            {"columns": {**COLUMNS, "q_knee": {"column": "goal", "scale": 0.0}}},
+            "columns.q_knee.scale = 0.0: must not be 0",
+        ),
+        ({"columns": {**COLUMNS, "q_knee": ["goal"]}}, "columns.q_knee = ['goal']: must be a name, a number or"),
+        (
+            {"columns": without("t")},
+            "importer.csv.columns: no t; name the column of the time (t: time) or give rate_hz",
+        ),
+        ({"columns": without("q_knee")}, "importer.csv.columns: no angle of a joint"),
+        (
+            {"columns": {**COLUMNS, "q_hip": "goal"}, "kd": 0.1},
+            "columns: no q_target_hip; q_target is needed of all joints",
+        ),
+        ({"joints": ["knee", "hip"], "kd": 0.1}, "columns: no q_hip; q is needed of all joints"),
+        ({"joints": ["hip"], "kd": 0.1}, "columns.q_knee: unknown channel; joints are hip"),
+        ({"kp": [1.0, 2.0]}, "importer.csv.kp: 2 values for 1 joints"),
+        ({"kd": {"hip": 2.0}}, "importer.csv.kd: no joint is called 'hip'"),
+        ({"kp": -1.0}, "importer.csv.kp = -1.0: every value must be at least 0"),
+        ({"delimiter": ";"}, "is the delimiter ','?"),
+        ({"rate_hz": 20.0}, "t: steps by 0.005 s (median), but rate_hz = 20"),
+    ],
+)
+def test_whatever_is_wrong_is_told_by_its_name(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+    assert said in refusal(lay(tmp_path / "x.csv"), **changes)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("1200,hot,0,0,12", "column 'angle [deg]': must be numbers, but row 41 has 'hot'"),
+        ("1200,,0,0,12", "column 'angle [deg]': 1 cells are empty or NaN, the first in row 41"),
+        ("1200,inf,0,0,12", "column 'angle [deg]': inf in row 41; every value must be finite"),
+        ("1200,1,0", "Expected 5 columns, got 3"),
+        ("1195,1,0,0,12", "t: must increase strictly, but row 40 has"),
+    ],
+)
+def test_a_bad_row_is_told_by_column_and_row(tmp_path: Path, row: str, said: str) -> None:
+    path = lay(tmp_path / "x.csv")
+    path.write_text(path.read_text() + row + "\n")
+    message = refusal(path)
+    assert message.startswith(str(path))
+    assert said in message
+
+
+def test_an_empty_file_and_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("a, a\n1,2\n")
+    assert "two columns are called 'a'" in refusal(path)
+    path.write_text("a,b\n")
+    assert "has no rows" in refusal(path)
+    path.write_text("")
+    assert str(path) in refusal(path)
+
+
+def test_columns_come_from_a_file_or_the_command_line(tmp_path: Path) -> None:
+    lay(tmp_path / "x.csv")
+    (tmp_path / "arm.yaml").write_text("robot: arm\ncolumns: {t: {column: stamp, unit: ms}, q_knee: goal}\n")
+    (tmp_path / "map.yaml").write_text("t: {column: stamp, unit: ms}\nq_knee: ticks\n")
+    for number, (given, column) in enumerate(
+        [
+            (["options=arm.yaml"], "goal"),
+            (["options=arm.yaml", "columns=map.yaml"], "ticks"),
+            (["options={robot: arm}", "columns={t: {column: stamp, unit: ms}, q_knee: volt}"], "volt"),
+        ]
+    ):
+        done = run(tmp_path, "record", "import", "csv", "x.csv", *given, f"out=o{number}")
+        assert (done.returncode, done.stderr) == (0, "")
+        r = recording.read(tmp_path / f"o{number}/x.parquet")
+        np.testing.assert_allclose(r.joint("q")[:, 0], TABLE[column], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "columns=map.yaml: no such file"),
+        ("", "columns=map.yaml: is empty; without any, leave columns out"),
+        ("- t\n", "columns=map.yaml: must be a mapping, or a FILE.yaml that holds one"),
+        ("t: [\n", "columns=map.yaml: no YAML (line 2: "),
+    ],
+)
+def test_a_wrong_file_of_columns_is_told(tmp_path: Path, text: str | None, said: str) -> None:
+    lay(tmp_path / "x.csv")
+    if text is not None:
+        (tmp_path / "map.yaml").write_text(text)
+    done = run(tmp_path, "record", "import", "csv", "x.csv", "columns=map.yaml", "options={robot: arm}", preload=LIGHT)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert not (tmp_path / "recordings").exists()
