@@ -36,6 +36,7 @@ from go1exp.protocol.base import chosen
 from go1exp.schema import plugins, registry
 from go1exp.schema.registry import Term
 from tests.test_extending import files as files_of_extending
+from tests.test_own_robot import files as files_of_own_robot
 
 CONF = data_root() / "conf"
 DOCS = Path(__file__).parents[1] / "docs"
@@ -446,7 +447,7 @@ def beside(
             file = tmp_path / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(make_net().read_bytes() if file.suffix == ".npz" else b"coulomb: {bound: 0.3}")
-        for name, text in files_of_extending().items():
+        for name, text in {**files_of_extending(), **files_of_own_robot()}.items():
             if name in command:
                 (tmp_path / name).write_text(text)
 
