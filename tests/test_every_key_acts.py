@@ -271,6 +271,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "gap:search.min_share": lambda walk: [1.0],
     "gap:search.adequate": lambda walk: [1e6],
     "gap:search.material": lambda walk: [1e6],
+    "gap:accept": lambda walk: [1.0],
     "gap:search.confirm_fraction": lambda walk: [0.5],
     "gap:search.certified": lambda walk: [0.0],
     "gap:search.max_rows": lambda walk: [64],

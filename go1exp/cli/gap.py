@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +39,8 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.gap.robots.description import parse_model
 
     settings, parts = parse_with_groups(GapVerb, with_logs(container), ("robot",), model=parse_model)
+    if settings.accept:
+        settings = replace(settings, search=replace(settings.search, accept=settings.accept))
     out, where = Path(settings.out), address(settings.host, settings.port)
 
     from go1exp.cli.logs import long_enough, read_all, writable

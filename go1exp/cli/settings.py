@@ -11,7 +11,7 @@ from go1exp.cli.play_settings import PlaySettings as PlaySettings
 from go1exp.cli.play_settings import Port, RunFolder
 from go1exp.deploy.controller import Stages
 from go1exp.fit.settings import FitSettings
-from go1exp.gap.result import GapSettings
+from go1exp.gap.result import Angle, GapSettings
 from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
 from go1exp.report.settings import ReportSettings
@@ -282,6 +282,7 @@ class GapVerb:
         train_dt: physics step of training, s, at which the answer must hold; also that of replay.
         host: interface on which view listens; 127.0.0.1 is this machine alone.
         port: on which view listens; 0 takes the first free one from 8080 on.
+        accept: error of an angle that you would not care about, in rad or such as 2mrad; then it counts as right.
         search: how the missing effect is searched for.
     """
 
@@ -291,6 +292,7 @@ class GapVerb:
     train_dt: Annotated[float, Field(gt=0, le=0.02)]
     host: str
     port: Port
+    accept: Angle
     search: GapSettings
 
 

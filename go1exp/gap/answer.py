@@ -14,17 +14,21 @@ from go1exp.effects.tolerances import Tolerances, declared, effect_class, sizes
 from go1exp.gap.certainty import HALF, doubt
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
+from go1exp.gap.score import angle_errors
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import significance, tolerances
 from go1exp.gap.search.evidence import deviation, inaudible
-from go1exp.gap.search.fit import fit
+from go1exp.gap.search.fit import fit, residuals
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import SILENT, Search
 from go1exp.schema.registry import members
 
 QUANTILES = (0.025, 0.975)
 """Of a 95 % interval."""
+
+MOST_WINDOWS = 0.9
+"""Share of the held-out windows that must be within what the user accepts (chosen: one in ten may be off)."""
 
 FEWEST_BOOTSTRAPS = 20
 """Resamples from which an interval can be read, also where the user asks for fewer."""
@@ -73,6 +77,7 @@ class Answer:
         theta: values of the model with them.
         excess: as in :class:`~go1exp.gap.result.GapResult`.
         closed: share of the held-out excess that the named effects removed; NaN without one.
+        within: share of the held-out windows within what the user accepts; NaN if nothing is accepted.
     """
 
     verdict: Verdict
@@ -80,6 +85,7 @@ class Answer:
     theta: Theta
     excess: dict[str, float]
     closed: float
+    within: float = math.nan
 
 
 def concluded(search: Search, warnings: list[str]) -> Answer:
@@ -103,17 +109,35 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
         warnings.append(f"Withdrawn, since the tolerances explain these logs and nothing else is sure: {doubtful}.")
         search.withdraw("the tolerances suffice, and resamples of the logs do not agree on it")
         final, theta, named = search.first, search.state.theta, ()
-    verdict = decide(search, first, final)
+    within = share_accepted(search)
+    verdict = decide(search, first, final, within >= MOST_WINDOWS)
     reached = {"null": plain, "box": first, "final": final}
     if len(search.splits.confirm):
         confirmed = reached["confirm"] = excess(search.state.held_out(windows=search.splits.confirm))
-        if named and verdict == "explained" and confirmed > 2.0 * settings.adequate:
+        beyond = confirmed > 2.0 * settings.adequate and not within >= MOST_WINDOWS
+        if named and verdict == "explained" and beyond:
             verdict = "partly explained"
             warnings.append(f"On windows kept for a last check the error is {1 + confirmed:.3g} times the floor.")
     unsure = {n.effect for n in named if n.status != "certified"}
     certain = {key: value for key, value in theta.items() if key[0] not in unsure}
     reached["written"] = excess(search.state.held_out(certain, search.splits.judged))
-    return Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan)
+    return Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan, within)
+
+
+def share_accepted(search: Search) -> float:
+    """Return the share of held-out windows within what the user accepts; NaN if that is nothing.
+
+    Of those of the last check if it is less there.
+    """
+    scorer, accept = search.state.scorer, search.settings.accept
+    if not accept:
+        return math.nan
+    shares = []
+    for windows in (search.splits.select, search.splits.confirm):
+        if len(windows):
+            (residual,) = residuals(scorer, [search.state.theta], windows, search.dt)
+            shares.append(angle_errors.within(scorer, residual, windows, accept))
+    return min(shares)
 
 
 def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
@@ -211,13 +235,16 @@ def _by_joint(
     return {names[k]: float(values[k]) for k in kept}, intervals
 
 
-def decide(search: Search, first: float, final: float) -> Verdict:
-    """Return the verdict from the held-out excesses within the tolerances, and with the terms."""
+def decide(search: Search, first: float, final: float, accepted: bool) -> Verdict:
+    """Return the verdict from the held-out excesses within the tolerances, and with the terms.
+
+    ``accepted``: what remains is within what the user does not care about.
+    """
     settings = search.settings
     loud = [effect for effect, s in search.signal.items() if s >= SILENT]
     if search.state.terms:
-        return "explained" if final <= settings.adequate else "partly explained"
-    if first > settings.adequate:
+        return "explained" if accepted or final <= settings.adequate else "partly explained"
+    if first > settings.adequate and not accepted:
         return "unexplained"
     return "not excited" if len(loud) < 0.5 * len(search.signal) else "no gap"
 
@@ -250,6 +277,9 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggesti
         parts.append(
             f"With that the held-out error falls from {first:.3g} to {final:.3g} times the noise floor (floor 1)."
         )
+    if not math.isnan(answer.within):
+        accepted = 1e3 * search.settings.accept
+        parts.append(f"{answer.within:.0%} of the held-out windows are within the {accepted:.3g} mrad accepted.")
     if answer.verdict == "partly explained":
         parts.append("The rest is explained by nothing in the library, so what is named may stand for something else.")
     rejected = [c.effect for c in search.candidates if c.status == "rejected" and c.stage == 1][:2]

@@ -87,7 +87,8 @@ def _errors(item: Mapping[str, Any] | None) -> AngleErrors | None:
         return None
     pairs = {name: {k: _pair(v) for k, v in item[name].items()} for name in ("by_joint", "by_episode")}
     numbers = {name: _number(item[name]) for name in ("removed", "worse")}
-    return AngleErrors(**{**item, **numbers, **pairs, "median": _pair(item["median"])})
+    within = _pair(item["within"]) if item.get("within") else None  # older results have none
+    return AngleErrors(**{**item, **numbers, **pairs, "median": _pair(item["median"]), "within": within})
 
 
 def _pair(item: Sequence[float | None]) -> tuple[float, float]:

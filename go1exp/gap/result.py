@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field
 
 from go1exp.schema.registry import STRICT, Fraction, NonNegative, Positive
 
@@ -29,6 +30,23 @@ EXIT_CODES: dict[str, int] = {
 
 Share = Annotated[float, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(ge=1)]
+
+
+ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180}
+"""Unit of an angle -> rad."""
+
+
+def in_rad(given: Any) -> Any:
+    """Return an angle with a unit, such as ``2mrad``, in rad; anything else as it is."""
+    if not isinstance(given, str):
+        return given
+    match = re.fullmatch(r"\s*([\d.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", given)
+    if match is None or match[2] not in ANGLES:
+        raise ValueError(f"must be a number of rad, or one with {', '.join(ANGLES)}, such as 2mrad")
+    return float(match[1]) * ANGLES[match[2]]
+
+
+Angle = Annotated[float, BeforeValidator(in_rad), Field(ge=0)]
 
 
 @dataclass(frozen=True)
@@ -55,6 +73,8 @@ class GapSettings:
         iterations: Gauss-Newton steps of a fit.
         adequate: excess up to which the model counts as right (floor 1 is excess 0).
         material: excess of the model within its tolerances below which there is no gap.
+        accept: error of an angle that the user does not care about, rad: what remains counts as right if no joint is
+            further off in nine of ten held-out windows; 0 for none.
         confirm_fraction: share of the episodes that is kept for the last check.
         bootstraps: resamples of the episodes.
         certified: share of the bootstraps in which a term must be named again.
@@ -82,6 +102,7 @@ class GapSettings:
     iterations: Count = 3
     adequate: Positive = 0.5
     material: Positive = 0.1
+    accept: Angle = 0.0
     confirm_fraction: Fraction = 0.2
     bootstraps: Annotated[int, Field(ge=0)] = 40
     certified: Fraction = 0.8
@@ -219,6 +240,7 @@ class AngleErrors:
         worse: share of the windows that are worse.
         by_joint: joint -> pair.
         by_episode: episode -> pair, of all joints together.
+        within: share of the windows in which no joint is further off than accepted; None if nothing is.
     """
 
     windows: int
@@ -227,6 +249,7 @@ class AngleErrors:
     worse: float
     by_joint: dict[str, tuple[float, float]]
     by_episode: dict[str, tuple[float, float]]
+    within: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -70,10 +70,14 @@ def errors(result: GapResult) -> list[tuple[str, str]]:
 def angles(errors: AngleErrors) -> str:
     """Return the errors of the angles as a sentence."""
     before, after = (number(1e3 * value) for value in errors.median)
+    accepted = ""
+    if errors.within is not None:
+        first, second = (share(value) for value in errors.within)
+        accepted = f" Within what you accept: {first} of the windows before, {second} after."
     return (
         f"Angles in the median of {errors.windows} held-out windows: {before} mrad off as the model is, {after} mrad "
         f"with what is named and the tolerances used; {share(errors.removed)} of a window's error is gone in the "
-        f"median, and {share(errors.worse)} of the windows are worse."
+        f"median, and {share(errors.worse)} of the windows are worse.{accepted}"
     )
 
 
@@ -211,7 +215,7 @@ def would_change(result: GapResult) -> list[str]:
     """Return what would change the verdict, a sentence each."""
     allowed = number(1.0 + limit(result, "adequate"))
     final, box = (result.excess.get(k, math.nan) for k in ("final", "box"))
-    rest = worst(result.after)
+    rest, left = worst(result.after), final if result.named else box
     changes = []
     if result.verdict == "bad log":
         changes.append(
@@ -219,6 +223,11 @@ def would_change(result: GapResult) -> list[str]:
         )
     elif result.verdict == "not excited":
         changes.append("Recordings that move more: the last section says which.")
+    elif result.verdict in ("no gap", "explained") and limit(result, "accept") and left > limit(result, "adequate"):
+        changes.append(
+            f"A smaller accept than {number(1e3 * limit(result, 'accept'))} mrad: by the noise alone, {error(left)} "
+            f"is above {allowed}."
+        )
     elif result.verdict == "no gap":
         changes.append(f"A held-out error above {allowed} that the tolerances cannot take up; it is {error(box)}.")
     elif result.verdict == "explained":

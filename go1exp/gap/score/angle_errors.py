@@ -32,12 +32,24 @@ def of_angles(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np.n
     return np.asarray(np.sqrt(square) * scorer.scale[windows][:, 0])
 
 
+def within(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, accept: float) -> float:
+    """Return the share of the windows (V,) in which no joint is further off than ``accept`` rad beside the noise."""
+    allowed = np.hypot(accept, scorer.scale[windows][:, 0])
+    return float(np.mean((of_angles(scorer, residual, windows) <= allowed).all(axis=1)))
+
+
 def angle_errors(
-    scorer: Scorer, before: np.ndarray, after: np.ndarray, windows: np.ndarray, episodes: Sequence[str]
+    scorer: Scorer,
+    before: np.ndarray,
+    after: np.ndarray,
+    windows: np.ndarray,
+    episodes: Sequence[str],
+    accept: float = 0.0,
 ) -> AngleErrors:
     """Compare two models by their residuals (V, G, m) on windows (V,); ``episodes`` are the names of the recordings.
 
-    Medians of windows, so that a few wild ones do not decide.
+    ``accept`` is what the user does not care about, rad; 0 for nothing. Medians of windows, so that a few wild ones do
+    not decide.
     """
     pair = np.stack([of_angles(scorer, residual, windows) for residual in (before, after)])  # 2 V J
     whole = np.sqrt((pair**2).mean(axis=2))
@@ -55,4 +67,5 @@ def angle_errors(
         worse=float(np.mean(gone < 0.0)),
         by_joint={name: medians(pair[:, :, j]) for j, name in enumerate(scorer.windows.joints)},
         by_episode={episodes[e]: medians(whole[:, episode == e]) for e in np.unique(episode)},
+        within=(within(scorer, before, windows, accept), within(scorer, after, windows, accept)) if accept else None,
     )

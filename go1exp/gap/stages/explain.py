@@ -137,7 +137,8 @@ def _angle_errors(comparison: Comparison, search: Search) -> AngleErrors:
     """Return the errors of the angles before and after, on windows that no fitted value has seen."""
     score, windows = comparison.scorer, search.splits.judged  # the same floors for both, whatever was named
     before, after = residuals(score, [{}, search.state.theta], windows, search.dt)
-    return angle_errors(score, before, after, windows, [r.meta.episode for r in comparison.recordings])
+    names = [r.meta.episode for r in comparison.recordings]
+    return angle_errors(score, before, after, windows, names, search.settings.accept)
 
 
 def provenance(
