@@ -10,7 +10,7 @@ import pytest
 
 from go1exp import recording
 from go1exp.importers import import_recordings
-from go1exp.importers.csv_table import UNITS
+from go1exp.importers.csv import UNITS
 from go1exp.recording import JOINT_QUANTITIES, VECTORS, Recording, RecordingError
 from go1exp.schema.registry import ConfigError
 from tests.command import LIGHT, run

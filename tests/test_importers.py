@@ -425,7 +425,7 @@ def test_names_and_options_are_checked_before_any_file_is_opened() -> None:
 
 def test_every_importer_is_listed_with_a_sentence() -> None:
     recordings = members("importer")
-    assert set(recordings) == {*COUNTS, "mcap_joint_state"}
+    assert set(recordings) == {*COUNTS, "mcap_joint_state", "csv"}
     for entry in recordings.values():
         assert entry.doc.endswith(".")
         assert entry.schema.model_fields.keys() == entry.parameters.keys()

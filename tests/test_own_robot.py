@@ -22,7 +22,7 @@ from go1exp.compose import compose
 from go1exp.gap.result import EXIT_CODES, GapSettings
 from go1exp.gap.robots.description import Firmware, ModelConfig, SearchDefaults, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.importers.csv_table import UNITS
+from go1exp.importers.csv import UNITS
 from go1exp.physics.scene import RIGID
 from go1exp.recording import read
 from go1exp.schema.settings import attributes

@@ -13,7 +13,7 @@ from typing import Any
 
 from go1exp.importers import (
     ak80_double_pendulum,
-    csv_table,
+    csv,
     go1_walk_snippet,
     go2_in_air,
     mcap_joint_state,
@@ -26,7 +26,7 @@ from go1exp.schema.registry import ConfigError, find, members, unknown_name
 
 __all__ = [
     "ak80_double_pendulum",
-    "csv_table",
+    "csv",
     "go1_walk_snippet",
     "go2_in_air",
     "import_recordings",

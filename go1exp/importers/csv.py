@@ -86,7 +86,7 @@ def _columns(given: Mapping[str, Any]) -> tuple[dict[str, Column], list[str]]:
 
 
 @importer("csv")
-def csv_table(
+def csv(
     path: Path,
     *,
     robot: Annotated[str, Field(min_length=1)],
@@ -158,20 +158,21 @@ def _one(
     """Return one file as a recording."""
     table, unused = _read(path, mapping, layout)
     channels = {name: _channel(path, name, table[c.column], c) for name, c in mapping.items()}
-    said = [notes] if notes else []
+    remarks = [notes] if notes else []
     rows = len(next(iter(channels.values())))
     if "t" in channels:
         # Stamps may be seconds since 1970, of which float64 holds no more than parts of a microsecond.
         column, start = mapping["t"], table[mapping["t"].column][0]
         channels["t"] = _channel(path, "t", table[column.column] - start, column) - column.offset
-        said.append(f"t = 0 is {start} in the column {column.column!r}.")
+        remarks.append(f"t = 0 is {start} in the column {column.column!r}.")
     else:
+        assert rate_hz is not None  # checked with the mapping
         channels = {"t": np.arange(rows) / rate_hz} | channels
-        said.append(f"No clock in the source: t = row / {rate_hz:g} Hz.")
+        remarks.append(f"No clock in the source: t = row / {rate_hz:g} Hz.")
     if unused:
-        said.append(f"Columns of the source that are left out: {', '.join(unused)}.")
+        remarks.append(f"Columns of the source that are left out: {', '.join(unused)}.")
     hz = rate_hz or rate(path, channels["t"])
-    return recording(path, "csv", channels, rate_hz=hz, episode=path.stem, notes=" ".join(said), **about)
+    return recording(path, "csv", channels, rate_hz=hz, episode=path.stem, notes=" ".join(remarks), **about)
 
 
 # ---------------------------------------------------------------------- the mapping
@@ -273,20 +274,20 @@ def _table(path: Path, layout: Mapping[str, Any]) -> Any:
         RecordingError: if it is no table, or two columns have one name.
     """
     import pyarrow as pa
-    from pyarrow import csv
+    from pyarrow import csv as arrow_csv
 
     # One block, so that Arrow sees the whole column before it chooses a type: 0 in the first rows may be 0.5 later.
     block = min(max(path.stat().st_size + 1, 2**20), 2**31 - 1)
-    read = csv.ReadOptions(
+    read = arrow_csv.ReadOptions(
         use_threads=False,
         block_size=block,
         skip_rows=layout["skip_lines"],
         autogenerate_column_names=not layout["header"],
     )
-    parse = csv.ParseOptions(delimiter=layout["delimiter"])
-    convert = csv.ConvertOptions(decimal_point=layout["decimal"])
+    parse = arrow_csv.ParseOptions(delimiter=layout["delimiter"])
+    convert = arrow_csv.ConvertOptions(decimal_point=layout["decimal"])
     try:
-        table = csv.read_csv(path, read, parse, convert)
+        table = arrow_csv.read_csv(path, read, parse, convert)
     except (pa.ArrowException, OSError) as error:
         raise RecordingError(f"{path}: not a table of numbers ({str(error).splitlines()[0]})") from error
     if not layout["header"]:
