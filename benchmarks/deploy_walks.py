@@ -15,13 +15,13 @@ import json
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 USAGE = (
-    "usage: python -m benchmarks.deploy_walks bundle=FILE [seconds=12] [x=1.0] [rates=50,100,200,400] [loss=0] [jitter=0]"
+    "usage: python -m benchmarks.deploy_walks bundle=FILE "
+    "[seconds=12] [x=1.0] [rates=50,100,200,400] [loss=0] [jitter=0]"
 )
 
 EVERY_S = 1.0
@@ -92,9 +92,8 @@ def row(rate: int, account: dict[str, Any]) -> str:
     missed = f"{100 * t['missed_share']:.2f} %"
     memory = ", ".join(f"{value:.0f}" for value in account["memory"])
     ways = f"{account['link']['lost']} lost, {account['link']['late']} late"
-    return (
-        f"| {rate} Hz | {period} | {work} | {missed} | {v['mean'][0]:.2f} | {estimate} | {tracking} | {ways} | {memory} |"
-    )
+    cells = (f"{rate} Hz", period, work, missed, f"{v['mean'][0]:.2f}", estimate, tracking, ways, memory)
+    return f"| {' | '.join(cells)} |"
 
 
 def main(arguments: Sequence[str]) -> None:

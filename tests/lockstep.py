@@ -94,7 +94,9 @@ class Mutable(Server):
 class InProcess:
     """Stands for ``SimulatedRobot``."""
 
-    def __init__(self, world: World, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], keep: float) -> None:
+    def __init__(
+        self, world: World, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], keep: float
+    ) -> None:
         config = sim_config(dict(sim))
         robot = Listening(bundle_task(bundle, dict(other)), config)
         robot.world, world.robot = world, robot

@@ -38,8 +38,9 @@ class RefusedError(RobotError):
         super().__init__("; ".join(problems))
         self.problems = problems
 
+
 SPARE, SPARE_S = 1.5, 30.0
-"""The robot keeps more than the log: lost states make the log reach further back, and it stands before and lies after."""
+"""The robot keeps more than the log: lost states make the log reach further back, and it lives on after the walk."""
 
 
 class SimulatedRobot:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy.loop import MonotonicClock, Timing, run
-from go1exp.deploy.udp import HOST
+from go1exp.deploy.udp import HOST, arrival, ask_for_stamps
 from go1exp.sim_robot.machine import TICK, Robot
 from go1exp.sim_robot.protocols import OLD, language
 from go1exp.sim_robot.settings import SimConfig
@@ -138,11 +138,14 @@ class Server:
         peer: who it listens to; None before anybody has spoken.
         truth: the trunk's true motion, the newest of it.
         obeyed: what was in force, in the columns of ``OBEYED``, the newest of it.
+        on_heard: called for each datagram of ``peer``, with its time of arrival, s on ``time.perf_counter``'s clock.
+        on_tick: called after each tick.
     """
 
-    def __init__(
-        self, robot: Robot, config: SimConfig, port: int = 0, host: str = HOST, kept: float = KEPT_S
-    ) -> None:
+    on_heard: Callable[[float], None] | None = None
+    on_tick: Callable[[], None] | None = None
+
+    def __init__(self, robot: Robot, config: SimConfig, port: int = 0, host: str = HOST, kept: float = KEPT_S) -> None:
         """Listen at ``port``, or at any that is free if 0; keep the newest ``kept`` s of truth and commands.
 
         Raises:
@@ -150,13 +153,12 @@ class Server:
         """
         self.robot, self._language = robot, language(config)
         rng = np.random.default_rng([config.seed, 1])
-        self._uplink, self._downlink = (
-            Network(config.delay, config.loss, rng, config.jitter) for _ in range(2)
-        )
+        self._uplink, self._downlink = (Network(config.delay, config.loss, rng, config.jitter) for _ in range(2))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
             self._socket.bind((host, port))
+            ask_for_stamps(self._socket)
         except OSError:
             self._socket.close()
             raise
@@ -212,11 +214,13 @@ class Server:
                 self._send(late)
         self.counts.ticks += 1
         self.counts.lost = self._uplink.lost + self._downlink.lost
+        if self.on_tick is not None:
+            self.on_tick()
 
     def _listen(self, now: float) -> None:
         while True:
             try:
-                data, sender = self._socket.recvfrom(self._language.size + 1)
+                data, extra, _, sender = self._socket.recvmsg(self._language.size + 1, 64)
             except BlockingIOError:
                 return
             except ConnectionRefusedError:
@@ -228,6 +232,8 @@ class Server:
             else:
                 self.peer, self._heard = sender, now
                 self.counts.heard += 1
+                if self.on_heard is not None:
+                    self.on_heard(arrival(extra))
                 self._uplink.put(now, data)
 
     def _refuse(self, why: str) -> None:

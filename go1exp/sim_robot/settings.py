@@ -48,8 +48,14 @@ class SimSettings(SimConfig):
         address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to the network, to anybody in it.
         tile: row and column of the tile of terrain=rough on which it begins; rows grow harder.
         seconds: how long it lives, s; null until Ctrl-C.
+        viewer: web shows it in the browser, with the timing of whoever drives it; null prints lines alone.
+        host: interface on which viewer=web serves its page; another one than 127.0.0.1 opens it to the network.
+        port: of that page; 0 takes the first free one from 8080 on.
     """
 
     address: str = "127.0.0.1:8007"
     tile: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (0, 0)
     seconds: Positive | None = None
+    viewer: Literal["web"] | None = None
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 0
