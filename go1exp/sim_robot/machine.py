@@ -214,7 +214,7 @@ class Robot:
         return self._now
 
     def pose(self) -> np.ndarray:
-        """Return position, attitude and joint angles (19,) after the last step; a robot that hangs stays where it is."""
+        """Return position, attitude and joint angles (19,) after the last step; a robot that hangs has its place."""
         qpos: np.ndarray = self.backend.qpos[0].numpy().copy()
         held = (0.0, 0.0, HELD_HEIGHT, 1.0, 0.0, 0.0, 0.0)
         return qpos if len(qpos) > robot.NUM_JOINTS else np.concatenate([held, qpos])
