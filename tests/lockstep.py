@@ -144,5 +144,5 @@ def lockstep(
             udp, "time", host_time
         )  # stamps of arrival are not believed, and states are as old as the last cycle
         patch.setattr(walk, "MonotonicClock", clock)
-        patch.setattr(job, "SimulatedRobot", lambda *given, **more: InProcess(world, *given, **more))
+        patch.setattr(job, "SimulatedRobot", lambda *given, **options: InProcess(world, *given, **options))
         yield world

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from go1exp import robot
+from go1exp.cli.play_web import printed
 from go1exp.compose import compose
 from go1exp.config import parse_parts
 from go1exp.deploy import go1_wire
@@ -45,7 +46,7 @@ class Here:
         self.clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
 
     def send(self, request: ask.Request) -> None:
-        self.probe.do([request])
+        self.probe.fulfil([request])
 
     def look(self) -> Frame | None:
         return self.probe.frame()
@@ -209,9 +210,9 @@ def test_of_each_group_the_longest_interval_is_drawn() -> None:
 @pytest.mark.slow("go1exp/viewer/", "go1exp/sim_robot/", "go1exp/cli/simulate.py")
 def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(capfd: pytest.CaptureFixture[str]) -> None:
     groups = {name: CONTAINER[name] for name in GROUPS}
-    process = RobotProcess(groups, (0, 0), SimConfig(), ("127.0.0.1", 0), None)
+    process = RobotProcess(groups, (0, 0), SimConfig(), ("127.0.0.1", 0), None, printed)
     with pytest.raises(Expected, match=r"address = 127\.0\.0\.1:\d+: "):
-        RobotProcess(groups, (0, 0), SimConfig(), process.address, None)
+        RobotProcess(groups, (0, 0), SimConfig(), process.address, None, printed)
     show = SimShow(process, Body(**PARTS))
     ends = time.perf_counter() + 20.0
     view = None

@@ -193,7 +193,7 @@ def sim(
         where: to serve the page, host and port.
     """
     require_studio()
-    from go1exp.cli.simulate import listens
+    from go1exp.sim_robot.alone import greeting
     from go1exp.tensors.threads import one_thread
 
     with one_thread():
@@ -202,13 +202,18 @@ def sim(
         from go1exp.viewer.sim_show import SimShow
         from go1exp.viewer.sim_window import SimWindow
 
-        process = RobotProcess(groups, body.tile, config, robot_at, seconds)
+        process = RobotProcess(groups, body.tile, config, robot_at, seconds, printed)
         try:
-            print(listens(config.start, process.address), flush=True)
+            print(greeting(config.start, process.address), flush=True)
             show = SimShow(process, body)
             web.run(show, [SimWindow()], title="go1exp sim", host=where[0], port=where[1])
         finally:
             process.close()
+
+
+def printed(line: str) -> None:
+    """Print a line of the robot, which lives in another process."""
+    print(line, flush=True)
 
 
 def log(file: Path, where: tuple[str, int]) -> None:

@@ -34,24 +34,17 @@ def _task(container: dict[str, Any]) -> int:
 
     import torch
 
-    from go1exp.sim_robot.alone import serve
+    from go1exp.sim_robot.alone import greeting, serve
     from go1exp.sim_robot.server import Server
 
     torch.set_num_threads(1)
     server = Server(Robot(body, config), config, where[1], where[0])
-    print(listens(settings.start, server.address), flush=True)
+    print(greeting(settings.start, server.address), flush=True)
     try:
         serve(server, lambda: True, lambda line: print(line, flush=True), settings.seconds)
     finally:
         server.close()
     return 0
-
-
-def listens(start: str, address: tuple[str, int]) -> str:
-    """Return the line that says where a robot listens."""
-    host, port = address
-    line = f"a Go1 ({start}) listens at {host}:{port}; Ctrl-C ends it"
-    return line if host == HERE[0] else f"{line}\nnote: anybody in the network can command it"
 
 
 HERE = ("127.0.0.1", 8007)

@@ -62,8 +62,8 @@ class Network:
             self.lost += 1
             return
         self._count += 1
-        more = self._jitter * self._rng.random() if self._jitter else 0.0
-        heapq.heappush(self._way, (now + self._delay + more, self._count, data))
+        further = self._jitter * self._rng.random() if self._jitter else 0.0
+        heapq.heappush(self._way, (now + self._delay + further, self._count, data))
 
     def take(self, now: float) -> list[bytes]:
         """Return the datagrams that have arrived by ``now``, in the order of arrival."""

@@ -139,7 +139,7 @@ class Probe:
             message=self._message,
         )
 
-    def do(self, requests: Iterable[ask.Request]) -> None:
+    def fulfil(self, requests: Iterable[ask.Request]) -> None:
         """Push the robot or put it back; other requests are the client's affair and ignored."""
         for request in requests:
             match request:

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from go1exp.errors import Expected
 from go1exp.schema.registry import ConfigError
 from go1exp.signals import ending
+from go1exp.sim_robot.alone import Say
 from go1exp.sim_robot.machine import Body, Robot
 from go1exp.sim_robot.settings import SimConfig
 from go1exp.viewer import requests as ask
@@ -60,6 +61,7 @@ class RobotProcess:
         config: SimConfig,
         address: tuple[str, int],
         seconds: float | None,
+        say: Say,
     ) -> None:
         """Start it and wait until it listens.
 
@@ -69,6 +71,7 @@ class RobotProcess:
             config: how it is set up.
             address: where to listen.
             seconds: how long it lives, s; None until it is closed.
+            say: prints a line of it; an importable function, since it is called in the other process.
 
         Raises:
             ConfigError: if its settings are refused.
@@ -76,7 +79,7 @@ class RobotProcess:
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
-        given = (other, dict(groups), tile, config, address, seconds)
+        given = (other, dict(groups), tile, config, address, seconds, say)
         self._process = context.Process(target=_live, args=given, daemon=True)
         before = {number: signal.signal(number, signal.SIG_IGN) for number in ending()}
         try:
@@ -129,6 +132,7 @@ def _live(
     config: SimConfig,
     address: tuple[str, int],
     seconds: float | None,
+    say: Say,
 ) -> None:
     """Be the robot until the page's end of the pipe is closed."""
     import torch
@@ -152,7 +156,7 @@ def _live(
     pipe.send(Listening(server.address))
     answering = Answering(Probe(server), pipe)
     try:
-        serve(server, lambda: answering.going, lambda line: print(line, flush=True), seconds)
+        serve(server, lambda: answering.going, say, seconds)
     finally:
         server.close()
 
@@ -177,7 +181,7 @@ class Answering:
         try:
             if self._pipe.poll():
                 wishes: Sequence[ask.Request] = self._pipe.recv()
-                self._probe.do(wishes)
+                self._probe.fulfil(wishes)
                 self._pipe.send(self._probe.frame())
         except (EOFError, OSError):
             self.going = False
