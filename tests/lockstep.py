@@ -94,11 +94,13 @@ class Mutable(Server):
 class InProcess:
     """Stands for ``SimulatedRobot``."""
 
-    def __init__(self, world: World, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+    def __init__(
+        self, world: World, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], keep: float
+    ) -> None:
         config = sim_config(dict(sim))
         robot = Listening(bundle_task(bundle, dict(other)), config)
         robot.world, world.robot = world, robot
-        self.world, self._server = world, Mutable(robot, config)
+        self.world, self._server = world, Mutable(robot, config, kept=keep + 10.0)
         world.server = self._server
         world.on_server(world)
         self.port = self._server.port
@@ -142,5 +144,5 @@ def lockstep(
             udp, "time", host_time
         )  # stamps of arrival are not believed, and states are as old as the last cycle
         patch.setattr(walk, "MonotonicClock", clock)
-        patch.setattr(job, "SimulatedRobot", lambda *given: InProcess(world, *given))
+        patch.setattr(job, "SimulatedRobot", lambda *given, **options: InProcess(world, *given, **options))
         yield world

@@ -56,7 +56,7 @@ from go1exp.gap.robots.hung import hung
 from go1exp.recording import VECTORS
 from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
-from go1exp.sim_robot.server import TRUTH, Network, Server
+from go1exp.sim_robot.server import TRUTH, Network, Server, Truth
 from go1exp.train import run_folder, trainer
 from tests.lockstep import BEGIN, Spoil, lockstep
 from tests.small_run import SMALL
@@ -277,6 +277,29 @@ def test_a_network_delays_and_loses() -> None:
     assert way.lost == pytest.approx(1000, abs=100)
 
 
+def test_jitter_delays_each_datagram_by_its_own_and_lets_one_overtake_another() -> None:
+    way = Network(0.004, 0.0, np.random.default_rng(0), jitter=0.005)
+    arrived: dict[int, float] = {}
+    for tick in range(4010):
+        if tick < 4000:
+            way.put(TICK * tick, str(tick).encode())
+        arrived |= dict.fromkeys(map(int, way.take(TICK * tick)), TICK * tick)
+    late = np.array([arrived[k] - TICK * k for k in range(4000)])
+    assert (late.min(), late.max()) == pytest.approx((0.006, 0.010))  # 4 to 9 ms, seen at the next tick
+    assert late.mean() == pytest.approx(0.4 * 0.006 + 0.4 * 0.008 + 0.2 * 0.010, abs=2e-4)
+    order = np.array(list(arrived))
+    assert (np.diff(order) < 0).mean() > 0.1
+
+
+def test_of_the_truth_the_newest_is_kept_and_memory_does_not_grow() -> None:
+    truth = Truth(2, kept=25.0)
+    for k in range(40_000):
+        truth.add(TICK * k, np.array([k, -k]))
+    rows = truth.rows()
+    assert 25.0 <= TICK * len(rows) <= 45.0
+    np.testing.assert_array_equal(rows[:, 1], np.arange(40_000 - len(rows), 40_000))
+
+
 def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) -> None:
     config = sim_config({"protocol": "exact"})
     server = Server(Robot(bundle_task(file, {}), config), config)
@@ -407,6 +430,13 @@ def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> N
     # The drives brake at the end, and nobody says otherwise after that.
     assert done.world.robot.braking
     assert done.world.obeyed[max(done.world.obeyed)].damping
+
+
+def test_jitter_reorders_and_the_walk_goes_on(file: str, tmp_path: Path) -> None:
+    done = play(file, tmp_path, job={"sim": {"jitter": 0.005, "loss": 0.01, "protocol": "go1"}})
+    assert done.status == 0
+    assert done.account["link"]["late"] > 20  # overtaken by newer ones, and left out
+    assert (np.diff(done.recording.t) > 0).all()
 
 
 def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(file: str, tmp_path: Path) -> None:

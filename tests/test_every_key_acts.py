@@ -119,6 +119,7 @@ EXEMPT = {
     **{f"report.yaml:{key}": "tests/test_report.py shows what it does" for key in REPORT},
     **{f"train.yaml:{key}": "tests/test_beside.py shows what it does" for key in ("eval", "video", "stop")},
     **{f"play.yaml:{key}": "tests/test_viewer_browser.py, tests/test_viewer.py" for key in ("host", "port", "log")},
+    **{f"sim.yaml:{key}": "of its page: tests/test_sim_viewer.py" for key in ("viewer", "host", "port")},
     **{f"gap.yaml:{key}": "of the stage view: tests/test_viewer.py" for key in ("host", "port")},
     "play.yaml:bundle": "in place of run, as of eval: tests/test_viewer.py",
     **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},

@@ -145,6 +145,8 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     # what is seen and asked for in a browser; the sessions behind it know none
     "viewer/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.train", "go1exp.bench", "go1exp.cli"),
     "viewer/session.py": ("mujoco", "hydra", "omegaconf", "go1exp.cli"),
+    "viewer/sim_probe.py": ("mujoco", "hydra", "omegaconf", "go1exp.cli"),
+    "viewer/sim_process.py": ("mujoco", "hydra", "omegaconf", "go1exp.cli"),
     "viewer/replay.py": ("mujoco", "torch", "hydra", "omegaconf", "go1exp.cli"),
     "viewer/requests.py": (*FOREIGN, "torch", "numpy", "go1exp"),
     "viewer/history.py": (*FOREIGN, "torch", "go1exp"),
@@ -275,7 +277,8 @@ def test_sb3_stays_at_its_border_and_in_the_learner() -> None:
     assert {n for n in importers("stable_baselines3") if not n.startswith("train/")} <= allowed
 
 
-BROWSER = {f"viewer/{n}.py" for n in ("web", "window", "drive_window", "curve_plots", "replay_show", "replay_window")}
+STUDIO = ("web", "window", "drive_window", "curve_plots", "replay_show", "replay_window", "sim_window")
+BROWSER = {f"viewer/{name}.py" for name in STUDIO}
 """Files that build on MuJoCo Studio, or draw shapes of MuJoCo in its window."""
 
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from go1exp.robot import RobotConfig
     from go1exp.schema.backends import BackendConfig
     from go1exp.schema.registry import Term
+    from go1exp.sim_robot.machine import Body
+    from go1exp.sim_robot.settings import SimConfig
     from go1exp.terrain import TerrainConfig
     from go1exp.viewer.conditions import Ground
 
@@ -170,6 +172,48 @@ def _acts(term: Term) -> bool:
 
     nulls = {p.name: p.null for p in params_of(term)}
     return any(v != nulls[name] for name, value in term.parameters.items() for v in numbers(value))
+
+
+def sim(
+    body: Body,
+    groups: dict[str, Any],
+    config: SimConfig,
+    robot_at: tuple[str, int],
+    seconds: float | None,
+    where: tuple[str, int],
+) -> None:
+    """Show the simulated robot that a client drives, until Ctrl-C.
+
+    Args:
+        body: what is simulated.
+        groups: the configuration that it is made of, as plain data.
+        config: how it is set up.
+        robot_at: where it listens for its client, host and port.
+        seconds: how long it lives, s; None until Ctrl-C.
+        where: to serve the page, host and port.
+    """
+    require_studio()
+    from go1exp.sim_robot.alone import greeting
+    from go1exp.tensors.threads import one_thread
+
+    with one_thread():
+        from go1exp.viewer import web
+        from go1exp.viewer.sim_process import RobotProcess
+        from go1exp.viewer.sim_show import SimShow
+        from go1exp.viewer.sim_window import SimWindow
+
+        process = RobotProcess(groups, body.tile, config, robot_at, seconds, printed)
+        try:
+            print(greeting(config.start, process.address), flush=True)
+            show = SimShow(process, body)
+            web.run(show, [SimWindow()], title="go1exp sim", host=where[0], port=where[1])
+        finally:
+            process.close()
+
+
+def printed(line: str) -> None:
+    """Print a line of the robot, which lives in another process."""
+    print(line, flush=True)
 
 
 def log(file: Path, where: tuple[str, int]) -> None:

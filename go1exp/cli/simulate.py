@@ -17,26 +17,29 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.parts import parse_with_groups
     from go1exp.deploy.address import parsed_address
     from go1exp.effects.rules import drive_problems
+    from go1exp.sim_robot.machine import Body, Robot
     from go1exp.sim_robot.settings import SimConfig, SimSettings
 
     settings, parts = parse_with_groups(SimSettings, container, BODY)
     if problems := drive_problems(parts["actuator"], parts["effect"], robot.JOINTS):
         raise ConfigError(problems)
-    host, port = parsed_address(settings.address, HERE)
+    where = parsed_address(settings.address, HERE)
+    body, config = Body(**parts, tile=settings.tile), subset(SimConfig, settings)
+    if settings.viewer == "web":
+        from go1exp.cli.play_web import address, sim
+
+        groups = {name: container[name] for name in BODY}
+        sim(body, groups, config, where, settings.seconds, address(settings.host, settings.port))
+        return 0
 
     import torch
 
-    from go1exp.sim_robot.alone import serve
-    from go1exp.sim_robot.machine import Body, Robot
+    from go1exp.sim_robot.alone import greeting, serve
     from go1exp.sim_robot.server import Server
 
     torch.set_num_threads(1)
-    config = subset(SimConfig, settings)
-    server = Server(Robot(Body(**parts, tile=settings.tile), config), config, port, host)
-    host, port = server.address
-    print(f"a Go1 ({settings.start}) listens at {host}:{port}; Ctrl-C ends it", flush=True)
-    if host != HERE[0]:
-        print("note: anybody in the network can command it", flush=True)
+    server = Server(Robot(body, config), config, where[1], where[0])
+    print(greeting(settings.start, server.address), flush=True)
     try:
         serve(server, lambda: True, lambda line: print(line, flush=True), settings.seconds)
     finally:

@@ -66,6 +66,7 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     sim.add_argument("--start", choices=("standing", "lying", "hung"), default="standing")
     sim.add_argument("--noise", type=float, default=1.0, help="times that of the paper's Table II")
     sim.add_argument("--delay", type=float, default=0.0, help="of datagrams, each way, s")
+    sim.add_argument("--jitter", type=float, default=0.0, help="largest further delay of each datagram, s")
     sim.add_argument("--loss", type=float, default=0.0, help="share of datagrams that get lost, each way")
     sim.add_argument("--seed", type=int, default=0)
     sim.add_argument("--protocol", choices=("go1", "exact"), default="go1", help="also with --robot PORT")
@@ -102,7 +103,8 @@ def _walk(options: argparse.Namespace) -> int:
             stale=options.stale,
             spin=options.spin,
         )
-        sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "loss", "seed", "protocol")}
+        sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "jitter", "loss", "seed")}
+        sim["protocol"] = options.protocol
         if options.check:
             return _check(options)
         where = options.bundle, options.robot, plan, options.out, sim

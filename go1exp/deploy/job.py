@@ -85,7 +85,7 @@ def _reached(job: Job, bundle: Bundle, say: Say) -> Iterator[_Robot]:
             yield _Robot(link, simulated=False)
         elif job.robot == "sim":
             say("starting the simulated robot")
-            process = stack.enter_context(SimulatedRobot(job.bundle, job.sim, job.other))
+            process = stack.enter_context(SimulatedRobot(job.bundle, job.sim, job.other, keep=job.plan.keep))
             yield _Robot(stack.enter_context(closing(simulated(job, process.port))), True, process)
         else:
             if not (job.robot.isascii() and job.robot.isdigit() and 0 < int(job.robot) < 2**16):

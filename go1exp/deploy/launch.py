@@ -39,6 +39,10 @@ class RefusedError(RobotError):
         self.problems = problems
 
 
+SPARE, SPARE_S = 1.5, 30.0
+"""The robot keeps more than the log: lost states make the log reach further back, and it lives on after the walk."""
+
+
 class SimulatedRobot:
     """A simulated Go1 in a process of its own that listens at a port of this machine.
 
@@ -49,7 +53,9 @@ class SimulatedRobot:
         obeyed: what was in force, after ``close``: rows of clock, s, whether a command was, and its targets, rad.
     """
 
-    def __init__(self, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], port: int = 0) -> None:
+    def __init__(
+        self, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], port: int = 0, keep: float = 120.0
+    ) -> None:
         """Start it and wait until it listens.
 
         Args:
@@ -57,6 +63,7 @@ class SimulatedRobot:
             sim: how it is set up (``go1exp.sim_robot.machine.SimConfig``).
             other: other choices of ``actuator`` and ``effect``; None keeps those of training.
             port: where to listen; any that is free if 0.
+            keep: newest seconds of the walk's log, for which the truth and what was in force are kept too.
 
         Raises:
             RefusedError: if its settings are wrong.
@@ -75,6 +82,7 @@ class SimulatedRobot:
         self.truth: dict[str, np.ndarray] = {}
         self.obeyed: np.ndarray | None = None
         given = {"bundle": bundle, "sim": dict(sim), "robot": dict(other), "port": port, "truth": str(self._truth)}
+        given["kept"] = SPARE * keep + SPARE_S
         assert self._process.stdin is not None
         try:
             self._process.stdin.write((json.dumps(given) + "\n").encode())

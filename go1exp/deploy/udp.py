@@ -70,7 +70,7 @@ class Datagrams:
         try:
             self._socket.setblocking(False)
             self._socket.connect((host, port))  # the kernel then drops datagrams of other senders
-            _ask_for_stamps(self._socket)
+            ask_for_stamps(self._socket)
         except OSError:
             self._socket.close()
             raise
@@ -262,7 +262,7 @@ class Go1Link:
         self._datagrams.close()
 
 
-def _ask_for_stamps(opened: socket.socket) -> None:
+def ask_for_stamps(opened: socket.socket) -> None:
     """Ask the kernel for times of arrival; not every system has them."""
     with contextlib.suppress(OSError):
         opened.setsockopt(socket.SOL_SOCKET, _STAMP, 1)

@@ -27,7 +27,7 @@ from go1exp.errors import Expected
 from go1exp.robot import JOINTS
 from go1exp.schema.registry import ConfigError, as_json, explain
 from go1exp.sim_robot.machine import Robot
-from go1exp.sim_robot.server import TRUTH, Server
+from go1exp.sim_robot.server import KEPT_S, TRUTH, Server
 from go1exp.sim_robot.settings import SimConfig
 
 WITHOUT_POLICY: dict[str, Any] = {
@@ -91,7 +91,7 @@ def main() -> int:
     try:
         config = sim_config(given.get("sim", {}))
         task = bundle_task(given["bundle"], given.get("robot", {}))
-        server = Server(Robot(task, config), config, given.get("port", 0))
+        server = Server(Robot(task, config), config, given.get("port", 0), kept=given.get("kept", KEPT_S))
     except (ConfigError, Expected, OSError) as error:
         lines = error.problems if isinstance(error, ConfigError) else []
         _say("refused", message=str(error), problems=lines)

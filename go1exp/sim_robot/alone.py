@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from go1exp.deploy.udp import HOST
 from go1exp.sim_robot.machine import TICK
 from go1exp.sim_robot.server import Server
 
@@ -15,6 +16,13 @@ Say = Callable[[str], None]
 
 REPORT_S = 1.0
 """Period of the lines while somebody speaks, s."""
+
+
+def greeting(start: str, address: tuple[str, int]) -> str:
+    """Return the line that says where a robot listens, host and port, and a second one if others can reach it."""
+    host, port = address
+    line = f"a Go1 ({start}) listens at {host}:{port}; Ctrl-C ends it"
+    return line if host == HOST else f"{line}\nnote: anybody in the network can command it"
 
 
 @dataclass

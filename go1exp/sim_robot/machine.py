@@ -17,7 +17,7 @@ from go1exp.effects.base import Measured
 from go1exp.effects.rules import has_gains
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model
+from go1exp.physics.scene import HELD_HEIGHT, build_model
 from go1exp.robot import RobotConfig
 from go1exp.schema.contact import ContactConfig
 from go1exp.schema.registry import ConfigError, Term
@@ -91,7 +91,7 @@ class Robot:
         terrain = build_terrain(task.terrain if isinstance(task, Body) else TerrainConfig())
         self._origin = _origin(terrain, task.tile if isinstance(task, Body) else (0, 0))
         model, blocks = build_model(task.robot, terrain, TICK, contact=task.contact, imu=True, held=held)
-        backend = MujocoCpu(model, blocks, 1, threads=1)
+        self._backend = backend = MujocoCpu(model, blocks, 1, threads=1)
         random = EnvRandom(config.seed, 1, device=backend.qpos.device)
         self._plant = Plant(backend, drive_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
         self._plant.startup()
@@ -101,6 +101,18 @@ class Robot:
         self._commanded, self._in_force = -np.inf, 0
         self._measured = self.clock, self._in_force
         self._fed: torch.Tensor | None = None  # from the first feed-forward torque on
+        self._place()
+
+    @property
+    def backend(self) -> MujocoCpu:
+        """What computes its motion."""
+        return self._backend
+
+    def restart(self) -> None:
+        """Put the robot back into its first state, where no command is in force; its clock goes on."""
+        self._commanded, self.braking = -np.inf, False
+        if self._fed is not None:
+            self._fed = torch.zeros_like(self._fed)
         self._place()
 
     def _place(self) -> None:
@@ -195,6 +207,17 @@ class Robot:
     def commanded(self) -> bool:
         """Whether any command has come that asked for something."""
         return bool(np.isfinite(self._commanded))
+
+    @property
+    def readings(self) -> Mapping[str, np.ndarray]:
+        """Readings without noise at the instant at which the last step began, by name: ``tau_est`` (12,), N m, ..."""
+        return self._now
+
+    def pose(self) -> np.ndarray:
+        """Return position, attitude and joint angles (19,) after the last step; a robot that hangs has its place."""
+        qpos: np.ndarray = self.backend.qpos[0].numpy().copy()
+        held = (0.0, 0.0, HELD_HEIGHT, 1.0, 0.0, 0.0, 0.0)
+        return qpos if len(qpos) > robot.NUM_JOINTS else np.concatenate([held, qpos])
 
     def sense_truth(self) -> np.ndarray:
         """Return the truth (13,) at the instant at which the last step began (``sense``)."""

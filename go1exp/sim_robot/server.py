@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 import socket
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.deploy.loop import MonotonicClock, Timing, run
-from go1exp.deploy.udp import HOST
+from go1exp.deploy.udp import HOST, arrival, ask_for_stamps
 from go1exp.sim_robot.machine import TICK, Robot
 from go1exp.sim_robot.protocols import OLD, language
 from go1exp.sim_robot.settings import SimConfig
@@ -36,16 +37,21 @@ OBEYED = ("obeying", *(f"q_target_{k}" for k in range(12)))
 """Columns of what was in force: whether a command was, and its targets."""
 
 CHUNK = 5000
+"""Rows of a block: 10 s."""
+
+KEPT_S = 60.0
+"""How much is kept of the truth and of what was in force unless told otherwise, s: nobody reads it of a robot alone."""
+
 ASK_EVERY = 20
 """Calls between two checks whether to continue."""
 
 
 class Network:
-    """Delays datagrams, and loses each of them with the same probability, independently."""
+    """Delays datagrams, each by a time of its own, and loses each with the same probability, independently."""
 
-    def __init__(self, delay: float, loss: float, rng: np.random.Generator) -> None:
-        """Delay by ``delay`` s and lose a share ``loss``."""
-        self._delay, self._loss, self._rng = delay, loss, rng
+    def __init__(self, delay: float, loss: float, rng: np.random.Generator, jitter: float = 0.0) -> None:
+        """Delay by ``delay`` s and up to ``jitter`` s more, evenly distributed, and lose a share ``loss``."""
+        self._delay, self._loss, self._rng, self._jitter = delay, loss, rng, jitter
         self._way: list[tuple[float, int, bytes]] = []
         self._count = 0
         self.lost = 0
@@ -56,7 +62,8 @@ class Network:
             self.lost += 1
             return
         self._count += 1
-        heapq.heappush(self._way, (now + self._delay, self._count, data))
+        further = self._jitter * self._rng.random() if self._jitter else 0.0
+        heapq.heappush(self._way, (now + self._delay + further, self._count, data))
 
     def take(self, now: float) -> list[bytes]:
         """Return the datagrams that have arrived by ``now``, in the order of arrival."""
@@ -67,10 +74,12 @@ class Network:
 
 
 class Truth:
-    """Rows of numbers by the robot's clock, kept in blocks so that no array is ever copied to grow."""
+    """The newest rows of numbers by the robot's clock, kept in blocks so that no array is ever copied to grow."""
 
-    def __init__(self, width: int = len(TRUTH)) -> None:
-        self._pieces = [np.zeros((CHUNK, 1 + width))]
+    def __init__(self, width: int = len(TRUTH), kept: float = KEPT_S) -> None:
+        """Keep at least the rows of the last ``kept`` s."""
+        blocks = math.ceil(kept / (CHUNK * TICK)) + 1
+        self._pieces = deque([np.zeros((CHUNK, 1 + width))], maxlen=blocks)
         self._rows = 0
 
     def add(self, clock: float, values: np.ndarray) -> None:
@@ -83,8 +92,9 @@ class Truth:
         self._rows += 1
 
     def rows(self) -> np.ndarray:
-        """Return everything: clock, and the columns, (T, 1 + width)."""
-        return np.concatenate([*self._pieces[:-1], self._pieces[-1][: self._rows]])
+        """Return what is kept: clock, and the columns, (T, 1 + width)."""
+        *whole, last = self._pieces
+        return np.concatenate([*whole, last[: self._rows]])
 
 
 @dataclass
@@ -126,30 +136,36 @@ class Server:
         address: where it listens.
         counts: what has happened.
         peer: who it listens to; None before anybody has spoken.
-        truth: the trunk's true motion.
-        obeyed: what was in force, in the columns of ``OBEYED``.
+        truth: the trunk's true motion, the newest of it.
+        obeyed: what was in force, in the columns of ``OBEYED``, the newest of it.
+        on_heard: called for each datagram of ``peer``, with its time of arrival, s on ``time.perf_counter``'s clock.
+        on_tick: called after each tick.
     """
 
-    def __init__(self, robot: Robot, config: SimConfig, port: int = 0, host: str = HOST) -> None:
-        """Listen at ``port``, or at any that is free if 0.
+    on_heard: Callable[[float], None] | None = None
+    on_tick: Callable[[], None] | None = None
+
+    def __init__(self, robot: Robot, config: SimConfig, port: int = 0, host: str = HOST, kept: float = KEPT_S) -> None:
+        """Listen at ``port``, or at any that is free if 0; keep the newest ``kept`` s of truth and commands.
 
         Raises:
             OSError: if the port is taken, or the host is not this machine's.
         """
         self.robot, self._language = robot, language(config)
         rng = np.random.default_rng([config.seed, 1])
-        self._uplink, self._downlink = (Network(config.delay, config.loss, rng) for _ in range(2))
+        self._uplink, self._downlink = (Network(config.delay, config.loss, rng, config.jitter) for _ in range(2))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
             self._socket.bind((host, port))
+            ask_for_stamps(self._socket)
         except OSError:
             self._socket.close()
             raise
         self.address: tuple[str, int] = self._socket.getsockname()
         self.peer: tuple[str, int] | None = None
         self._heard = -math.inf
-        self.counts, self.truth, self.obeyed = Counts(), Truth(), Truth(len(OBEYED))
+        self.counts, self.truth, self.obeyed = Counts(), Truth(kept=kept), Truth(len(OBEYED), kept)
 
     @property
     def port(self) -> int:
@@ -198,11 +214,13 @@ class Server:
                 self._send(late)
         self.counts.ticks += 1
         self.counts.lost = self._uplink.lost + self._downlink.lost
+        if self.on_tick is not None:
+            self.on_tick()
 
     def _listen(self, now: float) -> None:
         while True:
             try:
-                data, sender = self._socket.recvfrom(self._language.size + 1)
+                data, extra, _, sender = self._socket.recvmsg(self._language.size + 1, 64)
             except BlockingIOError:
                 return
             except ConnectionRefusedError:
@@ -214,6 +232,8 @@ class Server:
             else:
                 self.peer, self._heard = sender, now
                 self.counts.heard += 1
+                if self.on_heard is not None:
+                    self.on_heard(arrival(extra))
                 self._uplink.put(now, data)
 
     def _refuse(self, why: str) -> None:

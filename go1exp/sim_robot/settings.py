@@ -19,6 +19,7 @@ class SimConfig:
         start: standing in the nominal stance, lying on its belly, or hung up so that no foot reaches the ground.
         noise: noise of its sensors, as a multiple of the paper's Table II.
         delay: delay of datagrams, each way, s.
+        jitter: largest further delay, drawn for each datagram from 0 to this, s; so one may overtake another.
         loss: share of the datagrams that are lost, each way.
         protocol: go1 for the robot's own packets, with their rounding; exact for double precision, with the number of
             the command in force.
@@ -32,6 +33,7 @@ class SimConfig:
     start: Literal["standing", "lying", "hung"] = "standing"
     noise: NonNegative = 1.0
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     loss: Annotated[Fraction, Field(lt=1)] = 0.0
     protocol: Literal["go1", "exact"] = "go1"
     feet: Literal["newton", "raw"] = "newton"
@@ -46,8 +48,14 @@ class SimSettings(SimConfig):
         address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to the network, to anybody in it.
         tile: row and column of the tile of terrain=rough on which it begins; rows grow harder.
         seconds: how long it lives, s; null until Ctrl-C.
+        viewer: web shows it in the browser, with the timing of whoever drives it; null prints lines alone.
+        host: interface on which viewer=web serves its page; another one than 127.0.0.1 opens it to the network.
+        port: of that page; 0 takes the first free one from 8080 on.
     """
 
     address: str = "127.0.0.1:8007"
     tile: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (0, 0)
     seconds: Positive | None = None
+    viewer: Literal["web"] | None = None
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 0

@@ -9,7 +9,7 @@ from mujoco.studio.implot import implot
 
 from go1exp import robot
 from go1exp.viewer.history import SPAN
-from go1exp.viewer.walk import Reward, WalkView
+from go1exp.viewer.walk import Reward, Timed, WalkView
 from go1exp.viewer.window import Vec2, section
 
 VELOCITIES = (("x", "m/s"), ("y", "m/s"), ("yaw", "rad/s"))
@@ -37,12 +37,12 @@ class Curves:
         if section("Velocity: commanded, true, estimated"):
             self._velocity(view)
         if section("Contacts"):
-            self._contacts(view)
+            self.contacts(view)
         if section("Trunk height"):
-            self._plot("##height", "m", view, [("height", view.height)], (0.0, 0.5))
+            self.plot("##height", "m", view, [("height", view.height)], (0.0, 0.5))
         if section("Torque over its limit"):
             lines = list(zip(robot.JOINTS, view.torque, strict=False))
-            self._plot("##torque", "-", view, lines, (0.0, 1.05), TALL)
+            self.plot("##torque", "-", view, lines, (0.0, 1.05), TALL)
         if section(f"Rewards: {len(view.rewards)} terms, {view.total:+.2f} per s"):
             self._rewards(view.rewards)
 
@@ -51,13 +51,13 @@ class Curves:
             lines: list[Line] = [("estimated", view.estimated[axis])] if view.estimated else []
             lines += [("commanded", view.command_curves[axis]), ("true", view.true[axis])]  # the last one lies on top
             low, high = view.limits[axis]
-            self._plot(f"##{name}", f"{name}  {unit}", view, lines, (low, high))
+            self.plot(f"##{name}", f"{name}  {unit}", view, lines, (low, high))
 
-    def _plot(
+    def plot(
         self,
         label: str,
         unit: str,
-        view: WalkView,
+        view: Timed,
         lines: Sequence[Line],
         reach: tuple[float, float],
         height: float = HEIGHT,
@@ -76,7 +76,7 @@ class Curves:
             implot.TagX(t, PUSHED, "push")
         implot.EndPlot()
 
-    def _contacts(self, view: WalkView) -> None:
+    def contacts(self, view: Timed) -> None:
         """Draw a bar for each time that a foot bore force."""
         imgui.BeginGroup()
         for leg in robot.LEGS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
@@ -55,6 +55,35 @@ VELOCITIES = ("exact", "estimated")
 HELP = ("arrows: forward, back, turn", "comma, full stop: left, right", "0 stand, P push, space pause")
 
 
+class PushPanel:
+    """Impulse, direction and button of a push.
+
+    Attributes:
+        places: where its button is on the page, left, top, right, bottom, pixels.
+    """
+
+    def __init__(self, send: Callable[[ask.Push], None]) -> None:
+        """Send pushes by ``send``."""
+        self._send, self._impulse, self._direction = send, 20.0, 90.0
+        self.places: dict[str, tuple[float, float, float, float]] = {}
+
+    def push(self) -> None:
+        """Push as the sliders say."""
+        self._send(ask.Push(self._impulse, math.radians(self._direction)))
+
+    def draw(self) -> None:
+        """Draw sliders and button."""
+        imgui.SetNextItemWidth(-85.0)
+        _, self._impulse = imgui.SliderFloat("N s", self._impulse, 0.0, 60.0, "%.0f")
+        imgui.SetNextItemWidth(-85.0)
+        _, self._direction = imgui.SliderFloat("deg", self._direction, -180.0, 180.0, "%.0f")
+        imgui.SetItemTooltip("where to, from the robot's heading: 0 forward, 90 to its left")
+        if imgui.Button("Push (P)", Vec2(-1.0, 0.0)):
+            self.push()
+        low, high = imgui.GetItemRectMin(), imgui.GetItemRectMax()
+        self.places["push"] = (low.x, low.y, high.x, high.y)
+
+
 class DriveWindow(Window):
     """Panels for a robot that walks.
 
@@ -65,10 +94,10 @@ class DriveWindow(Window):
     def __init__(self) -> None:
         super().__init__("Robot", "Curves")
         self._command, self._sticks = [0.0, 0.0, 0.0], False
-        self._impulse, self._direction = 20.0, 90.0
+        self._push = PushPanel(self.ask)
         self._plots = curve_plots.Curves()
         self._draft: dict[str, float] = {}
-        self.places: dict[str, tuple[float, float, float, float]] = {}
+        self.places = self._push.places
 
     # ------------------------------------------------------------------ keys and gamepad
 
@@ -88,7 +117,7 @@ class DriveWindow(Window):
         if imgui.IsKeyPressed(imgui.Key.Space, False):
             self.ask(ask.Pace(not view.pace.paused, view.pace.speed))
         if imgui.IsKeyPressed(PUSH_KEY, False) or imgui.IsKeyPressed(PUSH_BUTTON, False):
-            self._push()
+            self._push.push()
         if imgui.IsKeyPressed(imgui.Key.Backspace, False):
             self.ask(ask.Reset())
 
@@ -111,9 +140,6 @@ class DriveWindow(Window):
         x, y, yaw = self._command
         self.ask(ask.Steer((x, y, yaw)))
 
-    def _push(self) -> None:
-        self.ask(ask.Push(self._impulse, math.radians(self._direction)))
-
     # ------------------------------------------------------------------ panels
 
     def left(self) -> None:
@@ -123,7 +149,7 @@ class DriveWindow(Window):
         if section("Command"):
             self._command_panel(view)
         if section("Push"):
-            self._push_panel()
+            self._push.draw()
         if section("Who walks"):
             self._drivers_panel(view)
         if section("Ground"):
@@ -199,16 +225,6 @@ class DriveWindow(Window):
         for label in view.labels:
             if imgui.RadioButton(label, label == view.label):
                 self.ask(ask.Hand(label))
-
-    def _push_panel(self) -> None:
-        imgui.SetNextItemWidth(-85.0)
-        _, self._impulse = imgui.SliderFloat("N s", self._impulse, 0.0, 60.0, "%.0f")
-        imgui.SetNextItemWidth(-85.0)
-        _, self._direction = imgui.SliderFloat("deg", self._direction, -180.0, 180.0, "%.0f")
-        imgui.SetItemTooltip("where to, from the robot's heading: 0 forward, 90 to its left")
-        if imgui.Button("Push (P)", Vec2(-1.0, 0.0)):
-            self._push()
-        self._note("push")
 
     def _ground_panel(self, view: WalkView) -> None:
         setup, names = view.setup, list(view.grounds)

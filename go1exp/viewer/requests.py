@@ -102,4 +102,8 @@ class Reset:
     """Put the robot back to the start."""
 
 
+class Ended(Exception):
+    """What is shown is over."""
+
+
 Request = Steer | Push | Hand | Effects | Walk | Conditions | Pace | Step | Reset

@@ -124,7 +124,7 @@ class Session:
         require_agreement(task)
         core = Go1Core(task, 1, setup.seed, noise=setup.noise, imu=True)
         pilot = driver.begin(core, setup.trunk_velocity, setup.seed)
-        self._kicker = Kicker(core.backend, task.sim.physics_dt, _one_push(math.nan, 0.0, 0.0))
+        self._kicker = Kicker(core.backend, task.sim.physics_dt, one_push(math.nan, 0.0, 0.0))
         try:
             self._estimate: Estimate | None = Estimate(core, setup.seed)
         except EstimatorError:
@@ -223,7 +223,7 @@ class Session:
         self.message = ""
 
     def _push(self, impulse: float, direction: float) -> None:
-        self._kicker.use(_one_push(self._kicker.time, impulse, direction))
+        self._kicker.use(one_push(self._kicker.time, impulse, direction))
         angle = float(heading(self.core.backend.qpos[:, 3:7])[0]) + direction
         self.push = PushMade(self.time, impulse, angle)
 
@@ -301,7 +301,7 @@ class Session:
         return np.asarray(self.history.last("true", seconds).mean(0))
 
 
-def _one_push(start: float, impulse: float, direction: float) -> Impulses:
+def one_push(start: float, impulse: float, direction: float) -> Impulses:
     """Return one push on one robot; a start that is NaN is none."""
     begins, size, angle = (np.full((1, 1), v) for v in (start, impulse, direction))
     return Impulses(begins, size, angle, duration=PUSH_S)

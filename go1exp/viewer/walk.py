@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,22 @@ class Arrow:
     start: Vector
     end: Vector
     rgb: tuple[float, float, float]
+
+
+class Timed(Protocol):
+    """What every plot over the last seconds needs."""
+
+    @property
+    def t(self) -> list[float]:
+        """Times of the curves, 0 for now, s."""
+
+    @property
+    def contacts(self) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """Of each leg, from when to when it bore force, s."""
+
+    @property
+    def pushes(self) -> list[float]:
+        """Times of pushes, s."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +215,7 @@ class WalkShow:
             estimated=curves["estimated"] if np.isfinite(h.last("estimated", 0.0)).all() else [],
             height=h.series("height")[:, 0].tolist(),
             torque=curves["torque"],
-            contacts=tuple(_runs(t, column, h.dt) for column in h.series("contact").T),
+            contacts=tuple(runs_of(t, column, h.dt) for column in h.series("contact").T),
             pushes=[t[k] for k in begins],
             rewards=self._rewards(),
             total=float(np.nan_to_num(h.last("reward", 1.0)).sum(1).mean()) if h.filled else 0.0,
@@ -240,9 +256,14 @@ class WalkShow:
                 base = start + np.array([0.0, 0.0, height])
                 arrows.append(Arrow(base, base + ARROW_SCALE * np.array([*speed, 0.0]), rgb))
         if s.time - s.push.time < PUSH_SHOWN_S:
-            reach = PUSH_SCALE * s.push.impulse * np.array([math.cos(s.push.angle), math.sin(s.push.angle), 0.0])
-            arrows.append(Arrow(start - reach, start, PUSH_RGB))
+            arrows.append(push_arrow(start, s.push.impulse, s.push.angle))
         return tuple(arrows)
+
+
+def push_arrow(at: Vector, impulse: float, angle: float) -> Arrow:
+    """Return the arrow of a push on a trunk at ``at``, (3,) m, with a force at ``angle`` in the world, rad."""
+    reach = PUSH_SCALE * impulse * np.array([math.cos(angle), math.sin(angle), 0.0])
+    return Arrow(at - reach, at, PUSH_RGB)
 
 
 class _EffectTexts:
@@ -267,7 +288,7 @@ def _about(term: Any) -> str:
     return f"{term.entry.target.title}; at size 1: {values}"
 
 
-def _runs(t: list[float], column: Vector, dt: float) -> tuple[tuple[float, float], ...]:
+def runs_of(t: list[float], column: Vector, dt: float) -> tuple[tuple[float, float], ...]:
     """Return from when to when a column of zeros and ones is one, s."""
     on = np.concatenate([[0.0], np.nan_to_num(column), [0.0]]) > 0.5
     edges = np.flatnonzero(on[1:] != on[:-1]).reshape(-1, 2)

@@ -20,6 +20,7 @@ import mujoco
 
 from go1exp.errors import Expected
 from go1exp.viewer.gate import Gate, listening, words
+from go1exp.viewer.requests import Ended
 
 try:
     from mujoco.studio import launch_thread, messages, plugin, viewer_handle, viewer_protocol, web_viewer
@@ -62,7 +63,7 @@ class Show(Protocol):
         """Do what a user asks for."""
 
     def tick(self) -> float:
-        """Let a moment pass, and return how long it is in real time, s."""
+        """Let a moment pass, and return how long it is in real time, s; raises ``Ended`` when all is over."""
 
     def view(self) -> Any | None:
         """Return what the window shall draw; None if nothing has changed."""
@@ -199,8 +200,8 @@ def run(
             _refuses_strangers(bound, host)
             on_open(words(host, bound, gate.token))
             _loop(handle, show)
-    except KeyboardInterrupt:
-        pass  # the way to end it
+    except (KeyboardInterrupt, Ended):
+        pass  # the way to end it, or its time is over
 
 
 def _loop(handle: viewer_handle.ViewerHandle, show: Show) -> None:
