@@ -480,7 +480,7 @@ def test_commands_in_the_documentation_compose_and_parse(command: str, beside: C
     runs = [choices_from_files(cli._by_name(verb, overrides), verb)]
     if overrides[:1] == ["-m"]:
         runs = jobs(overrides[1:])
-        assert len(runs) > 1 or runs[0][0].startswith("study=")  # a study's file has its own values: tests/test_sweeps.py
+        assert len(runs) > 1 or runs[0][0].startswith("study=")  # values in the file
     for run in (runs[0], runs[-1]):
         parse(verb, compose(verb, run))
 
