@@ -15,6 +15,7 @@ BODY = ("robot", "actuator", "effect", "contact", "terrain")
 def _task(container: dict[str, Any]) -> int:
     from go1exp import robot
     from go1exp.cli.parts import parse_with_groups
+    from go1exp.cli.play_web import address
     from go1exp.deploy.address import parsed_address
     from go1exp.effects.rules import drive_problems
     from go1exp.sim_robot.machine import Body, Robot
@@ -23,13 +24,13 @@ def _task(container: dict[str, Any]) -> int:
     settings, parts = parse_with_groups(SimSettings, container, BODY)
     if problems := drive_problems(parts["actuator"], parts["effect"], robot.JOINTS):
         raise ConfigError(problems)
-    where = parsed_address(settings.address, HERE)
+    where, page = parsed_address(settings.address, HERE), address(settings.host, settings.port)
     body, config = Body(**parts, tile=settings.tile), subset(SimConfig, settings)
     if settings.viewer == "web":
-        from go1exp.cli.play_web import address, sim
+        from go1exp.cli.play_web import sim
 
         groups = {name: container[name] for name in BODY}
-        sim(body, groups, config, where, settings.seconds, address(settings.host, settings.port))
+        sim(body, groups, config, where, settings.seconds, page)
         return 0
 
     import torch
