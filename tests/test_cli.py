@@ -300,7 +300,7 @@ def test_the_examples_of_the_help_are_commands_that_exist(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for file in map(Path, re.findall(r"=([\w/]+\.yaml)", example)):
-        file.parent.mkdir(parents=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("coulomb: {bound: 0.3}")
     _, verb, *overrides = shlex.split(re.split(r" {3,}", example)[0])
     assert verb in VERBS
@@ -345,6 +345,7 @@ def test_the_value_of_an_option_is_no_setting(tmp_path: Path) -> None:
     expected = {
         "source": "go2_in_air",
         "path": "logs",
+        "columns": None,
         "options": {"rate_hz": 100.0},
         "out": "recordings",
         "plugins": [],
