@@ -342,7 +342,7 @@ def test_a_path_by_position_may_hold_anything(tmp_path: Path) -> None:
 def test_the_value_of_an_option_is_no_setting(tmp_path: Path) -> None:
     done = cli(tmp_path, "record", "import", "--cfg", "job", "go2_in_air", "logs", "options={rate_hz: 100.0}")
     assert done.returncode == 0, done.stderr
-    expected = {
+    expected: dict[str, Any] = {
         "source": "go2_in_air",
         "path": "logs",
         "columns": None,
