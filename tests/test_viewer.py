@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from go1exp import robot
-from go1exp.cli.play_web import _drivers, _effects, _grounds
+from go1exp.cli.play_web import _drivers, _grounds
 from go1exp.cli.subjects import driver, named
 from go1exp.compose import compose
 from go1exp.config import parse_parts
@@ -20,7 +20,8 @@ from go1exp.gap.result import GapResult, Overlay
 from go1exp.recording import Meta, Recording, RecordingError, joint_channels
 from go1exp.schema.registry import ConfigError
 from go1exp.viewer import requests as wish
-from go1exp.viewer.conditions import Setup, resized
+from go1exp.viewer.conditions import Setup
+from go1exp.viewer.effects import catalogue, resized
 from go1exp.viewer.gate import Gate, listening, words
 from go1exp.viewer.history import SPAN, History
 from go1exp.viewer.replay import Choose, Magnify, Motion, Piece, Play, Player, Seek, Story, of_recording, of_result
@@ -38,7 +39,7 @@ def robots() -> Robots:
     """Everything that ``go1exp play policy=trot viewer=web`` offers."""
     subject = named(None, "trot", None, None, "play.mp4")
     first = driver(subject, {})
-    return Robots(_drivers(subject, first, {}), _grounds(None)[1], _effects(first.task, False)[0])
+    return Robots(_drivers(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
 
 
 @pytest.fixture
@@ -401,11 +402,11 @@ def test_a_time_beyond_the_ends_is_an_end() -> None:
 def test_own_effects_of_a_run_that_do_nothing_are_off(robots: Robots) -> None:
     subject = named(None, "paper", None, None, "play.mp4")
     task = driver(subject, {}).task
-    _, sizes = _effects(task, False)
+    _, sizes = catalogue(task.effect, False)
     assert [name for name, size in sizes.items() if size] == []
     own = {term.key for term in task.effect}
     assert own
-    spread = _effects(task, True)
+    spread = catalogue(task.effect, True)
     assert {name for name, size in spread[1].items() if size} == own
     assert all(spread[0][name].slots["spread"] for name in own)
 

@@ -67,7 +67,7 @@ def shown() -> Iterator[Told]:
     process = subprocess.Popen(command, env=ENVIRONMENT, cwd=data_root(), stdout=subprocess.PIPE, text=True)
     try:
         told = Told(process)
-        wait_until(lambda: "places" in told.last or process.poll() is not None, PATIENCE, "address")
+        wait_until(lambda: "address" in told.last or process.poll() is not None, PATIENCE, "address")
         yield told
         process.send_signal(signal.SIGINT)
         assert process.wait(30.0) == 0
@@ -85,7 +85,7 @@ def test_a_robot_is_seen_and_driven_in_chromium() -> None:
     """A small picture: without a graphics card each one takes a core a third of a second."""
     with shown() as told, Browser(1280, 800, scale=0.25) as browser:
         browser.go(told["address"])
-        wait_until(lambda: bool(told["places"]), PATIENCE, "panel")
+        wait_until(lambda: bool(told.last.get("places")), PATIENCE, "panel")
         wait_until(lambda: browser.screenshot().std() > 15.0, PATIENCE, "picture in the canvas")
         picture = browser.screenshot().astype(float)
         height, width = picture.shape[:2]
@@ -115,11 +115,35 @@ def test_a_robot_is_seen_and_driven_in_chromium() -> None:
         browser.hold_key("0", "Digit0", 48, until=lambda: told["command"] == [0.0, 0.0, 0.0], seconds=PATIENCE)
 
 
+PAD = """
+window.pad = {index: 0, connected: true, mapping: "standard", axes: [0, 0, 0, 0],
+              buttons: Array.from({length: 17}, () => ({pressed: false}))};
+navigator.getGamepads = () => [null, window.pad];
+"""
+"""A gamepad that a test moves; Chromium without a display has no other."""
+
+
+@pytest.mark.slow(*PARTS)
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+def test_a_gamepad_drives_the_robot() -> None:
+    with shown() as told, Browser(1280, 800, scale=0.1) as browser:
+        browser.call("Page.addScriptToEvaluateOnNewDocument", source=PAD)
+        browser.go(told["address"])
+        wait_until(lambda: bool(told.last.get("places")), PATIENCE, "panel")
+        assert told["command"] == [0.0, 0.0, 0.0]
+        browser.evaluate("pad.axes[1] = -1, pad.axes[2] = 0.6")
+        wait_until(lambda: told["command"][0] > 0.5 and told["command"][2] < -0.2, PATIENCE, "answer to the sticks")
+        browser.evaluate("pad.buttons[1].pressed = true")
+        wait_until(lambda: told["pushed"] is not None, PATIENCE, "push")
+        browser.evaluate("pad.axes[1] = 0.05, pad.axes[2] = 0")  # let go, and a little worn
+        wait_until(lambda: told["command"] == [0.0, 0.0, 0.0], PATIENCE, "stand")
+
+
 @pytest.mark.slow(*PARTS)
 def test_strangers_are_refused_and_the_page_is_served() -> None:
     with shown() as told:
         here = told["address"].split("/")[2]
-        for path in ("/", "/model", "/web_client.js", "/?token=guess", "/assets/ibl.ktx"):
+        for path in ("/", "/model", "/web_client.js", "/?token=guess", "/assets/ibl.ktx", "/gamepad?axes=0,-1,0,0"):
             with pytest.raises(urllib.error.HTTPError) as refused:
                 urllib.request.urlopen(f"http://{here}{path}", timeout=10)
             with refused.value:

@@ -1,56 +1,93 @@
 """The robot of ``policy=trot`` on a page, in a process of its own, which says what it does in lines of JSON.
 
+The page's process says in the same way what its window draws.
+
 MuJoCo Studio has one window in a process, and shuts it down when the garbage collector comes to it.
 """
 
 from __future__ import annotations
 
 import json
+import signal
+import sys
 import time
+from collections.abc import Callable
+from typing import Any
 
 import torch
 
-from go1exp.cli.play_web import _drivers, _effects, _grounds
+from go1exp.cli.play_web import _drivers, _grounds
 from go1exp.cli.subjects import driver, named
 from go1exp.viewer import web
 from go1exp.viewer.conditions import Setup
 from go1exp.viewer.drive_window import DriveWindow
+from go1exp.viewer.effects import catalogue
+from go1exp.viewer.gamepad import Gamepad
 from go1exp.viewer.session import Robots, Session
 from go1exp.viewer.walk import WalkShow
 
 EVERY_S = 0.1
 
 
+class Sayer:
+    """Says something in a line of JSON, not too often."""
+
+    def __init__(self) -> None:
+        self._said = 0.0
+
+    def __call__(self, told: Callable[[], dict[str, Any]]) -> None:
+        if time.monotonic() - self._said > EVERY_S:
+            self._said = time.monotonic()
+            sys.stdout.write(json.dumps(told()) + "\n")  # one call, so that lines of the two processes do not mix
+            sys.stdout.flush()
+
+
 class Telling(WalkShow):
     """A show that says how it goes."""
 
-    def __init__(self, session: Session, window: DriveWindow) -> None:
+    def __init__(self, session: Session) -> None:
         super().__init__(session)
-        self._window, self._said = window, 0.0
+        self._say = Sayer()
 
     def tick(self) -> float:
         moment = super().tick()
-        if time.monotonic() - self._said > EVERY_S:
-            self._said = time.monotonic()
-            s = self.session
-            told = {"time": s.time, "command": s.command, "x": s.qpos()[0], "velocity": s.velocity(1.0).tolist()}
-            sideways = s.history.last("true", min(s.time - s.push.time, 5.0))[:, 1] if s.push.impulse else [0.0]
-            told |= {"pushed": s.push.time if s.push.impulse else None, "sideways": max(sideways)}
-            seen = len(self._window.view.pushes) if self._window.view is not None else 0
-            told |= {"marked": float(s.history.series("push").max()), "seen": seen, "places": self._window.places}
-            print(json.dumps(told), flush=True)
+        self._say(self._told)
         return moment
+
+    def _told(self) -> dict[str, Any]:
+        s = self.session
+        told = {"time": s.time, "command": s.command, "x": s.qpos()[0], "velocity": s.velocity(1.0).tolist()}
+        sideways = s.history.last("true", min(s.time - s.push.time, 5.0))[:, 1] if s.push.impulse else [0.0]
+        told |= {"pushed": s.push.time if s.push.impulse else None, "sideways": max(sideways)}
+        told |= {"marked": float(s.history.series("push").max()), "robot_cpu_s": time.process_time()}
+        return told
+
+
+class TellingWindow(DriveWindow):
+    """A window that says, from the page's process, what it draws and where."""
+
+    def __init__(self, pad: Gamepad) -> None:
+        super().__init__(pad)
+        self._say = Sayer()
+
+    def right(self) -> None:
+        super().right()
+        seen = len(self.view.pushes)
+        self._say(lambda: {"seen": seen, "places": self.places, "page_cpu_s": time.process_time()})
 
 
 def main() -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where pytest runs in a shell's background
     torch.set_num_threads(1)
     first = driver(named(None, "trot", None, None, "play.mp4"), {})
     subject = named(None, "trot", None, None, "play.mp4")
-    robots = Robots(_drivers(subject, first, {}), _grounds(None)[1], _effects(first.task, False)[0])
-    session, window = Session(robots, "trot", Setup(), (0.0, 0.0, 0.0)), DriveWindow()
+    robots = Robots(_drivers(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
+    session = Session(robots, "trot", Setup(), (0.0, 0.0, 0.0))
+    pad = Gamepad()
     web.run(
-        Telling(session, window),
-        [window],
+        Telling(session),
+        [TellingWindow(pad)],
+        pad=pad,
         title="test",
         host="127.0.0.1",
         port=0,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,12 +16,10 @@ from go1exp.schema.registry import ConfigError
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb, PlaySettings
     from go1exp.cli.subjects import Named
-    from go1exp.config import TaskConfig
     from go1exp.evaluate.drivers import Driver
     from go1exp.gap.robots.protocol import Robot
     from go1exp.robot import RobotConfig
     from go1exp.schema.backends import BackendConfig
-    from go1exp.schema.registry import Term
     from go1exp.sim_robot.machine import Body
     from go1exp.sim_robot.settings import SimConfig
     from go1exp.terrain import TerrainConfig
@@ -89,12 +86,14 @@ def walk(
         from go1exp.viewer import web
         from go1exp.viewer.conditions import Setup
         from go1exp.viewer.drive_window import DriveWindow
+        from go1exp.viewer.effects import catalogue
+        from go1exp.viewer.gamepad import Gamepad
         from go1exp.viewer.session import Robots, Session
         from go1exp.viewer.walk import WalkShow
 
         first = driver(subject, other)
         name, grounds = _grounds(ground or (first.task.terrain if settings.train_ground else None))
-        effects, sizes = _effects(first.task, settings.randomize)
+        effects, sizes = catalogue(first.task.effect, settings.randomize)
         setup = Setup(
             ground=name,
             level=grounds[name].hardest / 2,
@@ -108,8 +107,8 @@ def walk(
         )
         robots = Robots(_drivers(subject, first, other), grounds, effects)
         session = Session(robots, subject.label, setup, settings.velocity)
-        title = f"go1exp: {subject.label}"
-        web.run(WalkShow(session), [DriveWindow()], title=title, host=where[0], port=where[1])
+        title, pad = f"go1exp: {subject.label}", Gamepad()
+        web.run(WalkShow(session), [DriveWindow(pad)], title=title, host=where[0], port=where[1], pad=pad)
     print(f"\nclosed after {session.time:.0f} s of walking, {session.falls} falls")
 
 
@@ -144,34 +143,6 @@ def _grounds(wanted: TerrainConfig | None) -> tuple[str, dict[str, Ground]]:
         known[GIVEN] = wanted
     name = next(name for name, config in known.items() if config == wanted)
     return name, grounds(known)
-
-
-def _effects(task: TaskConfig, randomize: bool) -> tuple[dict[str, Term], dict[str, float]]:
-    """Return every effect by name at size 1, and the sizes of those that the robot has.
-
-    One of the robot's own that does nothing, since only its spread did in training, is as its choice has it, and off.
-    """
-    from go1exp.config import parse_parts
-
-    known: dict[str, Term] = {}
-    for file in choice_files("effect", [config_folder()]).values():
-        parts, problems = parse_parts({"effect": load(file)}, ("effect",))
-        if not problems:
-            known |= {term.key: term for term in parts["effect"]}
-    sizes = dict.fromkeys(known, 0.0)
-    for term in task.effect:
-        spread = randomize and any(term.slots.get("spread", {}).values())
-        if spread or _acts(term):
-            known[term.key], sizes[term.key] = term if spread else replace(term, slots={"spread": {}}), 1.0
-    return dict(sorted(known.items())), sizes
-
-
-def _acts(term: Term) -> bool:
-    from go1exp.schema.joint_values import numbers
-    from go1exp.viewer.conditions import params_of
-
-    nulls = {p.name: p.null for p in params_of(term)}
-    return any(v != nulls[name] for name, value in term.parameters.items() for v in numbers(value))
 
 
 def sim(
@@ -229,8 +200,9 @@ def log(file: Path, where: tuple[str, int]) -> None:
     from go1exp.viewer.replay_window import ReplayWindow
 
     parts, _ = parse_parts({"robot": load(config_folder() / "robot" / "go1.yaml")}, ("robot",))
-    show = ReplayShow(of_recording(recording), parts["robot"])
-    web.run(show, [ReplayWindow()], title=f"go1exp: {file.name}", host=where[0], port=where[1])
+    story = of_recording(recording)
+    show = ReplayShow(story, parts["robot"])
+    web.run(show, [ReplayWindow(story)], title=f"go1exp: {file.name}", host=where[0], port=where[1])
 
 
 def gap(settings: GapVerb, robot: Robot, config: RobotConfig, where: tuple[str, int]) -> None:
@@ -260,4 +232,4 @@ def gap(settings: GapVerb, robot: Robot, config: RobotConfig, where: tuple[str, 
         raise Expected(f"{folder / files.RESULT}: is about joints that the robot has not ({strange}); say model=...")
     model = None if set(robot.joints) == set(JOINTS) else model_of(robot)
     show = ReplayShow(story, config, model)
-    web.run(show, [ReplayWindow()], title=f"go1exp gap: {folder}", host=where[0], port=where[1])
+    web.run(show, [ReplayWindow(story)], title=f"go1exp gap: {folder}", host=where[0], port=where[1])

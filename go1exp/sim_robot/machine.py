@@ -115,6 +115,21 @@ class Robot:
             self._fed = torch.zeros_like(self._fed)
         self._place()
 
+    def take_over(self, old: Robot) -> None:
+        """Go on from where ``old`` is: its pose, speeds, clock, noise and command; drives and effects begin anew."""
+        self.clock, self.braking, self._rng = old.clock, old.braking, old._rng
+        self._commanded, self._in_force, self._measured = old._commanded, old._in_force, old._measured
+        self._target: torch.Tensor = old._target.clone()
+        self._now: dict[str, np.ndarray] = old._now
+        self._true: np.ndarray = old._true
+        self._fed = None if old._fed is None else old._fed.clone()
+        plant, everyone = self._plant, torch.ones(1, dtype=torch.bool)
+        plant.backend.reset(everyone, old.backend.qpos.clone(), old.backend.qvel.clone())
+        plant.reset(everyone, self._target)
+        kp, kd = old._gains
+        self._set_gains(kp, kd)
+        plant.effects.reset(everyone)
+
     def _place(self) -> None:
         """Put the robot into its first state and let it come to rest; default gains hold it until a command comes."""
         plant, start = self._plant, self._config.start

@@ -12,8 +12,8 @@ from go1exp.schema.settings import settings
 
 
 @dataclass(frozen=True)
-class SimConfig:
-    """How the simulated robot is set up.
+class SimBasics:
+    """How the simulated robot is set up, whatever it speaks.
 
     Attributes:
         start: standing in the nominal stance, lying on its belly, or hung up so that no foot reaches the ground.
@@ -21,10 +21,8 @@ class SimConfig:
         delay: delay of datagrams, each way, s.
         jitter: largest further delay, drawn for each datagram from 0 to this, s; so one may overtake another.
         loss: share of the datagrams that are lost, each way.
-        protocol: go1 for the robot's own packets, with their rounding; exact for double precision, with the number of
-            the command in force.
-        feet: what the foot sensors say with protocol=go1, newton, or raw counts with zeros and scales of their own, as
-            the robot's.
+        feet: what the foot sensors say in the robot's own packets, newton, or raw counts with zeros and scales of their
+            own (by seed), as the robot's.
         seed: seed of noise, loss and random effects.
     """
 
@@ -35,13 +33,24 @@ class SimConfig:
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     loss: Annotated[Fraction, Field(lt=1)] = 0.0
-    protocol: Literal["go1", "exact"] = "go1"
     feet: Literal["newton", "raw"] = "newton"
     seed: Annotated[int, Field(ge=0)] = 0
 
 
+@dataclass(frozen=True)
+class SimConfig(SimBasics):
+    """How the simulated robot of ``go1exp deploy`` is set up.
+
+    Attributes:
+        protocol: go1 for the robot's own packets, with their rounding; exact for double precision, with the number of
+            the command in force (for tests).
+    """
+
+    protocol: Literal["go1", "exact"] = "go1"
+
+
 @settings
-class SimSettings(SimConfig):
+class SimSettings(SimBasics):
     """``conf/sim.yaml`` without the groups.
 
     Attributes:

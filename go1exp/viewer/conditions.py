@@ -6,20 +6,17 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
-from go1exp import robot
 from go1exp.config import TaskConfig
-from go1exp.effects.base import Param
-from go1exp.effects.rules import drive_problems
 from go1exp.evaluate.delay_margin import delayed
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.protocol.ground import UNITS, GroundName, Lanes
 from go1exp.protocol.stage import delay_of_effects
 from go1exp.schema.backends import BackendConfig
-from go1exp.schema.joint_values import JointValues
 from go1exp.schema.registry import ConfigError, Term
 from go1exp.terrain import TerrainConfig
+from go1exp.viewer.effects import acting
 
 HARDEST: dict[GroundName, float] = {
     "slope_up": 30.0,
@@ -34,9 +31,6 @@ HARDEST: dict[GroundName, float] = {
 policies)."""
 
 FLAT = "flat"
-
-LARGEST = 3.0
-"""Where the slider of an effect's size ends, in sizes of its choice."""
 
 FOREVER = 1e7
 """Time limit of an episode, s."""
@@ -81,35 +75,6 @@ def grounds(files: Mapping[str, TerrainConfig]) -> dict[str, Ground]:
             known[name] = Ground(config, hardest=config.rows - 1.0, tiles=kinds)
     lanes: tuple[GroundName, ...] = get_args(GroundName)
     return known | {lane: Ground(None, lane, HARDEST[lane], UNITS[lane]) for lane in lanes}
-
-
-def resized(term: Term, size: float) -> Term:
-    """Return an effect whose parameters are ``size`` times as far from null, within their limits, alike in all robots.
-
-    A parameter per joint keeps its joints; one of which every value is null, a shape, stays.
-    """
-    parameters = dict(term.parameters)
-    for p in params_of(term):
-        if p.name in parameters:
-            parameters[p.name] = _scaled(parameters[p.name], p, size)
-    return dataclasses.replace(term, parameters=parameters, slots={**term.slots, "spread": {}})
-
-
-def params_of(term: Term) -> tuple[Param, ...]:
-    """Return the declarations of an effect's parameters."""
-    declared: tuple[Param, ...] = vars(term.entry.target)["params"]
-    return declared
-
-
-def _scaled(value: JointValues, param: Param, size: float) -> Any:
-    def one(v: float) -> float:
-        return min(max(param.null + size * (v - param.null), param.low), param.high)
-
-    if isinstance(value, Mapping):
-        return {joint: one(v) for joint, v in value.items()}
-    if isinstance(value, tuple | list):
-        return tuple(one(v) for v in value)
-    return one(float(value))
 
 
 @dataclass(frozen=True)
@@ -159,8 +124,6 @@ def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effe
     """
     if setup.ground not in known:
         raise ConfigError([f"ground = {setup.ground!r}: known are {', '.join(known)}"])
-    if strange := [name for name in setup.sizes if name not in effects]:
-        raise ConfigError([f"effect {strange[0]!r}: known are {', '.join(effects)}"])
     period = task.sim.policy_dt
     step = setup.physics_dt or task.sim.physics_dt
     config = EvalConfig(
@@ -177,10 +140,6 @@ def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effe
         physics_dt=period / math.ceil(period / step - 1e-6),
         engine=setup.engine,
     )
-    sizes = {name: size for name, size in setup.sizes.items() if size > 0.0}
-    acting = tuple(effects[name] if size == 1.0 else resized(effects[name], size) for name, size in sizes.items())
-    if problems := drive_problems(task.actuator, acting, robot.JOINTS):
-        raise ConfigError(problems)
-    ground = known[setup.ground].built(setup.level)
-    made = dataclasses.replace(evaluation_task(task, config), terrain=ground, effect=acting)
+    ground, effect = known[setup.ground].built(setup.level), acting(setup.sizes, effects, task.actuator)
+    made = dataclasses.replace(evaluation_task(task, config), terrain=ground, effect=effect)
     return delayed(made, setup.delay + delay_of_effects(made)) if setup.delay > 0.0 else made

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
@@ -11,7 +10,8 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from go1exp.evaluate.video import steer
 from go1exp.viewer import curve_plots
 from go1exp.viewer import requests as ask
-from go1exp.viewer.conditions import LARGEST
+from go1exp.viewer.gamepad import PUSH, STAND, Gamepad, steered
+from go1exp.viewer.panels import EffectsPanel, PushPanel, ReleasedSlider
 from go1exp.viewer.walk import WalkView
 from go1exp.viewer.window import Vec2, Window, arrow_shape, paragraph, section
 
@@ -28,17 +28,7 @@ KEYS = {
 }
 """Key -> what it is called in ``evaluate.video.STEERING``; 0 stands still, as the space bar does in the live window."""
 
-STICKS = (
-    (imgui.Key.GamepadLStickUp, imgui.Key.GamepadLStickDown),
-    (imgui.Key.GamepadLStickLeft, imgui.Key.GamepadLStickRight),
-    (imgui.Key.GamepadRStickLeft, imgui.Key.GamepadRStickRight),
-)
-"""Of each axis of the command, what moves it up and down on a gamepad."""
-
-STICK_RATE = 1.5
-"""How fast a held stick changes the command, and how fast it falls back, (m/s or rad/s) per s."""
-
-PUSH_KEY, PUSH_BUTTON, ZERO_BUTTON = imgui.Key.P, imgui.Key.GamepadFaceRight, imgui.Key.GamepadFaceDown
+PUSH_KEY = imgui.Key.P
 
 AXES = ("forward m/s", "left m/s", "turn rad/s")
 
@@ -55,35 +45,6 @@ VELOCITIES = ("exact", "estimated")
 HELP = ("arrows: forward, back, turn", "comma, full stop: left, right", "0 stand, P push, space pause")
 
 
-class PushPanel:
-    """Impulse, direction and button of a push.
-
-    Attributes:
-        places: where its button is on the page, left, top, right, bottom, pixels.
-    """
-
-    def __init__(self, send: Callable[[ask.Push], None]) -> None:
-        """Send pushes by ``send``."""
-        self._send, self._impulse, self._direction = send, 20.0, 90.0
-        self.places: dict[str, tuple[float, float, float, float]] = {}
-
-    def push(self) -> None:
-        """Push as the sliders say."""
-        self._send(ask.Push(self._impulse, math.radians(self._direction)))
-
-    def draw(self) -> None:
-        """Draw sliders and button."""
-        imgui.SetNextItemWidth(-85.0)
-        _, self._impulse = imgui.SliderFloat("N s", self._impulse, 0.0, 60.0, "%.0f")
-        imgui.SetNextItemWidth(-85.0)
-        _, self._direction = imgui.SliderFloat("deg", self._direction, -180.0, 180.0, "%.0f")
-        imgui.SetItemTooltip("where to, from the robot's heading: 0 forward, 90 to its left")
-        if imgui.Button("Push (P)", Vec2(-1.0, 0.0)):
-            self.push()
-        low, high = imgui.GetItemRectMin(), imgui.GetItemRectMax()
-        self.places["push"] = (low.x, low.y, high.x, high.y)
-
-
 class DriveWindow(Window):
     """Panels for a robot that walks.
 
@@ -91,47 +52,47 @@ class DriveWindow(Window):
         places: where controls are on the page, left, top, right, bottom, pixels.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pad: Gamepad) -> None:
+        """Steer by panels, keys and ``pad``."""
         super().__init__("Robot", "Curves")
-        self._command, self._sticks = [0.0, 0.0, 0.0], False
+        self._command, self._pad, self._sticks = [0.0, 0.0, 0.0], pad, False
         self._push = PushPanel(self.ask)
         self._plots = curve_plots.Curves()
-        self._draft: dict[str, float] = {}
+        self._effects, self._slider = EffectsPanel(self.ask), ReleasedSlider()
         self.places = self._push.places
 
     # ------------------------------------------------------------------ keys and gamepad
 
     def keys(self) -> None:
-        """Answer keys and gamepad."""
+        """Answer keys."""
         view: WalkView = self.view
         before = list(self._command)
         for key, code in KEYS.items():
             if imgui.IsKeyPressed(key):
                 steer(self._command, code)
-        if imgui.IsKeyPressed(ZERO_BUTTON, False):
-            self._command = [0.0, 0.0, 0.0]
-        self._stick(view)
         self._bounded(view)
         if self._command != before:
             self._steer()
         if imgui.IsKeyPressed(imgui.Key.Space, False):
             self.ask(ask.Pace(not view.pace.paused, view.pace.speed))
-        if imgui.IsKeyPressed(PUSH_KEY, False) or imgui.IsKeyPressed(PUSH_BUTTON, False):
+        if imgui.IsKeyPressed(PUSH_KEY, False):
             self._push.push()
         if imgui.IsKeyPressed(imgui.Key.Backspace, False):
             self.ask(ask.Reset())
 
-    def _stick(self, view: WalkView) -> None:
-        """Move the command as long as a stick is held, and back to zero when all are let go."""
-        change = STICK_RATE * imgui.GetIO().DeltaTime
-        held = [imgui.IsKeyDown(up) - imgui.IsKeyDown(down) for up, down in STICKS]
-        self._sticks = self._sticks or any(held)
-        if not self._sticks:
-            return
-        for axis, sign in enumerate(held):
-            value = self._command[axis]
-            self._command[axis] = value + sign * change if sign else math.copysign(max(0.0, abs(value) - change), value)
-        self._sticks = any(held) or any(self._command)
+    def gamepad(self) -> None:
+        """Answer the gamepad: sticks ask for their share of the sliders, and for zero when they are let go."""
+        before, pushed = list(self._command), self._pad.sticks()
+        if pushed is not None:
+            self._command = steered(pushed, self.view.limits)
+        presses = self._pad.presses()
+        if (pushed is None and self._sticks) or STAND in presses:
+            self._command = [0.0, 0.0, 0.0]
+        self._sticks = pushed is not None
+        if self._command != before:
+            self._steer()
+        for _ in range(presses.count(PUSH)):
+            self._push.push()
 
     def _bounded(self, view: WalkView) -> None:
         self._command = [min(max(v, a), b) for v, (a, b) in zip(self._command, view.limits, strict=True)]
@@ -145,6 +106,7 @@ class DriveWindow(Window):
     def left(self) -> None:
         """Draw the panels."""
         view: WalkView = self.view
+        self.gamepad()
         self._time(view)
         if section("Command"):
             self._command_panel(view)
@@ -157,7 +119,7 @@ class DriveWindow(Window):
         if section("Sensors, delay, physics"):
             self._conditions_panel(view)
         if section("Effects", is_open=False):
-            self._effects_panel(view)
+            self._effects.draw(view.setup.sizes, view.effects)
 
     def right(self) -> None:
         """Draw the curves."""
@@ -241,7 +203,7 @@ class DriveWindow(Window):
                 self.ask(ask.Walk(setup.ground, setup.level, ground.tiles[index]))
         if ground.hardest:
             shown = "%.0f" if ground.tiles else "%.2f"
-            level = self._released(f"level {ground.unit}", setup.level, ground.hardest, shown)
+            level = self._slider.draw(f"level {ground.unit}", setup.level, ground.hardest, shown)
             if level is not None:
                 self.ask(ask.Walk(setup.ground, level, setup.tile))
 
@@ -251,7 +213,7 @@ class DriveWindow(Window):
         changed, noise = imgui.Checkbox("sensor noise", now.noise)
         if changed:
             wanted["noise"] = noise
-        delay = self._released("delay ms", 1e3 * now.delay, 60.0, "%.0f")
+        delay = self._slider.draw("delay ms", 1e3 * now.delay, 60.0, "%.0f")
         if delay is not None:
             wanted["delay"] = 1e-3 * delay
         imgui.SetNextItemWidth(-85.0)
@@ -268,32 +230,6 @@ class DriveWindow(Window):
             wanted["trunk_velocity"] = VELOCITIES[index]
         if wanted:
             self.ask(ask.Conditions(**{**now.__dict__, **wanted}))
-
-    def _effects_panel(self, view: WalkView) -> None:
-        sizes = dict(view.setup.sizes)
-        for name, text in view.effects.items():
-            changed, on = imgui.Checkbox(f"##{name}", sizes.get(name, 0.0) > 0.0)
-            if changed:
-                self.ask(ask.Effects({**sizes, name: 1.0 if on else 0.0}))
-            imgui.SameLine()
-            imgui.BeginDisabled(not sizes.get(name, 0.0) > 0.0)
-            size = self._released(name, sizes.get(name, 0.0), LARGEST, "%.2f", -130.0)
-            imgui.EndDisabled()
-            imgui.SetItemTooltip(text)
-            if size is not None:
-                self.ask(ask.Effects({**sizes, name: size}))
-
-    def _released(self, label: str, now: float, high: float, shown: str, width: float = -85.0) -> float | None:
-        """Draw a slider from 0; return its value when it is let go after a change."""
-        imgui.SetNextItemWidth(width)
-        changed, value = imgui.SliderFloat(label, self._draft.get(label, now), 0.0, high, shown)
-        if changed:
-            self._draft[label] = value
-        if imgui.IsItemDeactivatedAfterEdit():
-            return self._draft.pop(label, value)
-        if not imgui.IsItemActive():
-            self._draft.pop(label, None)
-        return None
 
 
 def _nearest(values: tuple[float, ...], value: float) -> int:

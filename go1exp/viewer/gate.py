@@ -9,7 +9,7 @@ import http
 import secrets
 import socket
 import urllib.parse
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
@@ -52,7 +52,7 @@ class Gate:
         """Value of ``Set-Cookie``: of this site's own requests alone, and not for the page's scripts."""
         return f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
-    def guarded(self, process: Callable[..., Awaitable[Any] | Any]) -> Callable[..., Awaitable[Any]]:
+    def guarded(self, process: Callable[..., Awaitable[Any] | Any]) -> Callable[..., Coroutine[Any, Any, Any]]:
         """Return a ``process_request`` of a server of the package ``websockets`` that answers 403 to the others."""
 
         async def process_request(connection: Any, request: Any) -> Any:

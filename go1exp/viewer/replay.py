@@ -234,10 +234,13 @@ def _window(overlay: Overlay) -> Piece:
         for joint in joints:
             channel = f"{quantity}_{joint}"
             if channel in overlay.measured:
-                curves.setdefault(quantity, {})[joint] = {name: values[channel] for name, values in sources.items()}
-                noise.setdefault(quantity, {})[joint] = overlay.noise[channel]
-    motions = tuple(
-        Motion(name, np.stack([values[f"q_{joint}"] for joint in joints], axis=1)) for name, values in sources.items()
+                shown = {name: values[channel] for name, values in sources.items() if channel in values}
+                curves.setdefault(quantity, {})[joint] = shown
+                if channel in overlay.noise:
+                    noise.setdefault(quantity, {})[joint] = overlay.noise[channel]
+    motions = tuple(  # joints that are not compared, of legs on the ground, are as measured
+        Motion(name, np.stack([values.get(f"q_{j}", overlay.measured[f"q_{j}"]) for j in joints], axis=1))
+        for name, values in sources.items()
     )
     return Piece(f"{overlay.episode}, {overlay.t[0]:.2f} s", overlay.t, motions, curves, noise)
 

@@ -39,10 +39,9 @@ class Ghost:
 
 @dataclass(frozen=True)
 class ReplayView:
-    """What the panels draw.
+    """What the panels draw of the story, which they have themselves: it is long, and this is sent often.
 
     Attributes:
-        story: what is told.
         number: of the piece.
         time: s from its beginning.
         row: number of the sample.
@@ -52,7 +51,6 @@ class ReplayView:
         ghosts: robots beside the model's own, which is the first motion shown.
     """
 
-    story: Story
     number: int
     time: float
     row: int
@@ -135,7 +133,7 @@ class ReplayShow:
     def view(self) -> ReplayView:
         """Return what is to be drawn."""
         p = self.player
-        return ReplayView(p.story, p.number, p.time, p.row, p.running, p.speed, p.magnify, self._ghosts())
+        return ReplayView(p.number, p.time, p.row, p.running, p.speed, p.magnify, self._ghosts())
 
 
 def model_of(robot: Any) -> mujoco.MjModel:

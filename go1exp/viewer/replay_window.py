@@ -10,7 +10,7 @@ import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
-from go1exp.viewer.replay import MODELS, MOST, UNITS, Choose, Magnify, Piece, Play, Seek, thinned
+from go1exp.viewer.replay import MODELS, MOST, UNITS, Choose, Magnify, Piece, Play, Seek, Story, thinned
 from go1exp.viewer.replay_show import Ghost, ReplayView
 from go1exp.viewer.window import Vec2, Window, paragraph, section
 
@@ -34,8 +34,10 @@ NOW = imgui.Vec4(1.0, 1.0, 1.0, 0.6)
 class ReplayWindow(Window):
     """Panels for a recording or an answer."""
 
-    def __init__(self) -> None:
+    def __init__(self, story: Story) -> None:
+        """Tell a story."""
         super().__init__("Recording", "Curves")
+        self._story = story
         self._joint = 0
         self._ghosts_shown = True
         self._scenes: list[tuple[mujoco.MjvScene, mujoco.MjData]] = []
@@ -86,7 +88,7 @@ class ReplayWindow(Window):
         view: ReplayView = self.view
         if imgui.IsKeyPressed(imgui.Key.Space, False):
             self.ask(Play(not view.running, view.speed))
-        step = 0.01 * view.story.pieces[view.number].duration
+        step = 0.01 * self._story.pieces[view.number].duration
         for key, sign in ((imgui.Key.LeftArrow, -1.0), (imgui.Key.RightArrow, 1.0)):
             if imgui.IsKeyPressed(key):
                 self.ask(Seek(view.time + sign * step))
@@ -97,14 +99,14 @@ class ReplayWindow(Window):
     def left(self) -> None:
         """Draw time line, pieces and joints."""
         view: ReplayView = self.view
-        piece = view.story.pieces[view.number]
-        paragraph(view.story.about)
+        piece = self._story.pieces[view.number]
+        paragraph(self._story.about)
         if section("Time"):
             self._time(view, piece)
-        if view.story.kind == "gap" and section("Shown"):
+        if self._story.kind == "gap" and section("Shown"):
             self._shown(view)
-        if len(view.story.pieces) > 1 and section("Held-out windows"):
-            for k, other in enumerate(view.story.pieces):
+        if len(self._story.pieces) > 1 and section("Held-out windows"):
+            for k, other in enumerate(self._story.pieces):
                 if imgui.RadioButton(f"{other.title}##{k}", k == view.number):
                     self.ask(Choose(k))
         if section("Joint: error of the angle, mrad"):
@@ -159,7 +161,7 @@ class ReplayWindow(Window):
     def right(self) -> None:
         """Draw the curves of the chosen joint."""
         view: ReplayView = self.view
-        piece = view.story.pieces[view.number]
+        piece = self._story.pieces[view.number]
         joint = piece.joints[min(self._joint, len(piece.joints) - 1)]
         key = (view.number, joint)
         if key != self._key:
@@ -177,6 +179,8 @@ class ReplayWindow(Window):
         flags = int(implot.Flags.NoMenus) | int(implot.Flags.NoTitle) | int(implot.Flags.NoMouseText)
         if not implot.BeginPlot(label, Vec2(-1.0, HEIGHT), flags):
             return
+        margin = Vec2(0.0, 0.1)  # or a constant error lies on the frame, unseen
+        implot.PushStyleVar(int(implot.StyleVar.FitPadding), margin)
         fit = int(implot.AxisFlags.AutoFit)
         implot.SetupAxes("", unit, 0, fit)
         implot.SetupAxisLimits(int(implot.Axis.X1), 0.0, piece.duration, int(implot.Cond.Once))
@@ -186,6 +190,7 @@ class ReplayWindow(Window):
             implot.PlotLine(name, t, values)
         implot.TagX(now, NOW, f"{now:.3f}")
         implot.EndPlot()
+        implot.PopStyleVar()
 
 
 def _lines(piece: Piece, joint: str) -> dict[str, Any]:

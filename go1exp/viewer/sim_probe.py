@@ -6,20 +6,25 @@ It answers when it is asked and never waits, so that the page cannot hold up the
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from go1exp import robot
+from go1exp.errors import Expected
 from go1exp.protocol.disturbances import Kicker, heading
+from go1exp.schema.registry import ConfigError
 from go1exp.sim_robot.alone import Account
-from go1exp.sim_robot.machine import TICK
+from go1exp.sim_robot.machine import TICK, Body, Robot
 from go1exp.sim_robot.server import GONE_S, Server
+from go1exp.sim_robot.settings import SimConfig
 from go1exp.viewer import requests as ask
+from go1exp.viewer.effects import acting, catalogue
 from go1exp.viewer.session import PushMade, one_push
 
 Array = NDArray[np.float64]
@@ -59,6 +64,7 @@ class Frame:
         posture: what the robot does, in words.
         push: the last one, by the robot's clock.
         message: for the user.
+        sizes: of the effects that act, by name.
     """
 
     now: float
@@ -76,6 +82,7 @@ class Frame:
     posture: str
     push: PushMade
     message: str
+    sizes: dict[str, float]
 
 
 class Probe:
@@ -85,18 +92,24 @@ class Probe:
         server: whose robot it is.
     """
 
-    def __init__(self, server: Server) -> None:
-        """Begin to listen to the server."""
-        self.server = server
+    def __init__(self, server: Server, body: Body, config: SimConfig) -> None:
+        """Begin to listen to the server.
+
+        Args:
+            server: whose robot it is.
+            body: what its robot is made of.
+            config: how it is set up.
+        """
+        self.server, self._body, self._config = server, body, config
+        self._effects, self._sizes = catalogue(body.effect, randomize=True)
+        self._builder: _Builder | None = None
         kept = round(KEPT_S / ROW_S)
         self._rows: deque[NDArray[np.float32]] = deque(maxlen=kept)
         self._packets: deque[tuple[float, float]] = deque(maxlen=round(KEPT_S / TICK))
         self._count, self._peer, self._heard = 0, server.peer, math.nan
         self._message, self._push = "", PushMade(-math.inf, 0.0, 0.0)
         self._account = Account(server, lambda line: None)
-        engine = server.robot.backend
-        floats = engine.qpos.shape[1] > robot.NUM_JOINTS
-        self._kicker = Kicker(engine, TICK, one_push(math.nan, 0.0, 0.0)) if floats else None
+        self._kicker = _kicker(server.robot)
         server.on_heard, server.on_tick = self._hear, self._tick
 
     def _hear(self, arrived: float) -> None:
@@ -107,6 +120,9 @@ class Probe:
         self._peer, self._heard = self.server.peer, arrived
 
     def _tick(self) -> None:
+        if self._builder is not None and self._builder.ready.is_set():
+            self._exchange(self._builder)
+            self._builder = None
         if self.server.counts.ticks % EVERY:
             return
         now = self.server.robot.readings
@@ -137,10 +153,11 @@ class Probe:
             posture=self._account.posture(),
             push=self._push,
             message=self._message,
+            sizes={name: size for name, size in self._sizes.items() if size > 0.0},
         )
 
     def fulfil(self, requests: Iterable[ask.Request]) -> None:
-        """Push the robot or put it back; other requests are the client's affair and ignored."""
+        """Push the robot, put it back or change its effects; other requests are the client's affair and ignored."""
         for request in requests:
             match request:
                 case ask.Push(impulse, direction):
@@ -148,6 +165,8 @@ class Probe:
                 case ask.Reset():
                     self.server.robot.restart()
                     self._message = ""
+                case ask.Effects(sizes):
+                    self._begin_exchange(dict(sizes))
 
     def _pushed(self, impulse: float, direction: float) -> None:
         if self._kicker is None:
@@ -156,3 +175,54 @@ class Probe:
         self._kicker.use(one_push(self._kicker.time, impulse, direction))
         angle = float(heading(self.server.robot.backend.qpos[:, 3:7])[0]) + direction
         self._push = PushMade(self.server.robot.clock, impulse, angle)
+
+    def _begin_exchange(self, sizes: dict[str, float]) -> None:
+        """Build a robot with other effects beside the one that walks; it takes over when it is ready."""
+        try:
+            effect = acting(sizes, self._effects, self._body.actuator)
+        except ConfigError as error:
+            self._message = " ".join(str(error).split())
+            return
+        self._message = "another robot is being built ..."
+        self._builder = _Builder(replace(self._body, effect=effect), self._config, sizes)
+
+    def _exchange(self, built: _Builder) -> None:
+        """Let a robot that is ready go on from where the present one is, between two ticks."""
+        if built.robot is None:
+            self._message = built.problem
+            return
+        built.robot.take_over(self.server.robot)
+        self.server.robot, self._kicker = built.robot, _kicker(built.robot)
+        self._sizes, self._message = built.sizes, ""
+
+
+class _Builder:
+    """Builds a robot in a thread, since that takes tens of ticks.
+
+    Attributes:
+        robot: that was built; None where it cannot be.
+        problem: why it cannot.
+        sizes: of its effects.
+        ready: set when it is known.
+    """
+
+    def __init__(self, body: Body, config: SimConfig, sizes: dict[str, float]) -> None:
+        """Begin."""
+        self.robot: Robot | None = None
+        self.problem, self.sizes, self.ready = "", sizes, threading.Event()
+        threading.Thread(target=self._build, args=(body, config), daemon=True).start()
+
+    def _build(self, body: Body, config: SimConfig) -> None:
+        try:
+            self.robot = Robot(body, config)
+        except (ConfigError, Expected) as error:
+            self.problem = " ".join(str(error).split())
+        finally:
+            self.ready.set()
+
+
+def _kicker(made: Robot) -> Kicker | None:
+    """Return what pushes a robot; None for one that hangs."""
+    engine = made.backend
+    floats = engine.qpos.shape[1] > robot.NUM_JOINTS
+    return Kicker(engine, TICK, one_push(math.nan, 0.0, 0.0)) if floats else None

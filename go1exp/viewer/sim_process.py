@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -17,6 +18,9 @@ from go1exp.sim_robot.machine import Body, Robot
 from go1exp.sim_robot.settings import SimConfig
 from go1exp.viewer import requests as ask
 from go1exp.viewer.sim_probe import EVERY, Frame, Probe
+
+SWITCH_S = 1e-4
+"""Longest time for which a thread that builds another robot may hold up the ticks of 2 ms, s; Python's own is 5 ms."""
 
 ENDS_S = 5.0
 """How long the robot may take to end, s."""
@@ -142,11 +146,13 @@ def _live(
     from go1exp.sim_robot.server import Server
 
     torch.set_num_threads(1)
+    sys.setswitchinterval(SWITCH_S)
     try:
         parts, problems = parse_parts(groups, tuple(groups))
         if problems:
             raise ConfigError(problems)
-        server = Server(Robot(Body(**parts, tile=tile), config), config, address[1], address[0])
+        body = Body(**parts, tile=tile)
+        server = Server(Robot(body, config), config, address[1], address[0])
     except ConfigError as error:
         pipe.send(Refused(tuple(error.problems), settings=True))
         return
@@ -154,7 +160,7 @@ def _live(
         pipe.send(Refused((f"address = {address[0]}:{address[1]}: {error}",), settings=False))
         return
     pipe.send(Listening(server.address))
-    answering = Answering(Probe(server), pipe)
+    answering = Answering(Probe(server, body, config), pipe)
     try:
         serve(server, lambda: answering.going, say, seconds)
     finally:

@@ -18,6 +18,7 @@ from go1exp.sim_robot.machine import TICK, Body
 from go1exp.sim_robot.server import TRUTH
 from go1exp.terrain import build_terrain
 from go1exp.viewer import requests as ask
+from go1exp.viewer.effects import catalogue, lines
 from go1exp.viewer.history import SPAN, History
 from go1exp.viewer.session import PUSH_SHOWN_S, PushMade
 from go1exp.viewer.sim_probe import FORCE, ROW_S, TORQUE, Frame
@@ -84,6 +85,8 @@ class SimView:
         slipped: time by which it fell behind real time, s.
         posture: what it does, in words.
         effects: names of those that act.
+        sizes: theirs, by name.
+        known: what each effect is that there is, by name.
         message: for the user.
     """
 
@@ -99,6 +102,8 @@ class SimView:
     slipped: float
     posture: str
     effects: tuple[str, ...]
+    sizes: dict[str, float]
+    known: dict[str, str]
     message: str
 
 
@@ -126,6 +131,7 @@ class SimShow:
         self._packets: deque[tuple[float, float]] = deque()
         self._pushes: deque[PushMade] = deque(maxlen=20)
         self._sent: deque[tuple[float, int]] = deque(maxlen=round(1.0 / LOOK_S))
+        self._known = lines(catalogue(body.effect, randomize=True)[0])
         self._frame: Frame | None = None
         self._fresh = False
 
@@ -194,7 +200,9 @@ class SimShow:
             time=frame.clock,
             slipped=frame.slipped,
             posture=frame.posture,
-            effects=tuple(term.key for term in self._body.effect),
+            effects=tuple(frame.sizes),
+            sizes=frame.sizes,
+            known=self._known,
             message=frame.message,
         )
 

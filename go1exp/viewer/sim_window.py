@@ -12,8 +12,9 @@ from mujoco.studio.implot import implot
 from go1exp import robot
 from go1exp.viewer import requests as ask
 from go1exp.viewer.curve_plots import PLAIN, TALL, Curves
-from go1exp.viewer.drive_window import PUSH_KEY, SLOW, PushPanel
+from go1exp.viewer.drive_window import PUSH_KEY, SLOW
 from go1exp.viewer.history import SPAN
+from go1exp.viewer.panels import EffectsPanel, PushPanel
 from go1exp.viewer.sim_show import SimView
 from go1exp.viewer.window import Vec2, Window, arrow_shape, paragraph, section
 
@@ -36,7 +37,7 @@ class SimWindow(Window):
 
     def __init__(self) -> None:
         super().__init__("Robot", "Curves")
-        self._push = PushPanel(self.ask)
+        self._push, self._effects = PushPanel(self.ask), EffectsPanel(self.ask)
         self._plots = Curves()
 
     @property
@@ -75,7 +76,7 @@ class SimWindow(Window):
         if section("Push"):
             self._push.draw()
         if section("Effects", is_open=False):
-            paragraph(", ".join(view.effects) or "none: go1exp sim effect=...")
+            self._effects.draw(view.sizes, view.known)
 
     def _speaker(self, view: SimView) -> None:
         p = view.packets

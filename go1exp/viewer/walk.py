@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from go1exp.evaluate.camera import ARROW_SCALE, COMMAND_RGB, LEAST_DRAWN, MEASURED_RGB, VELOCITY_TIME, Stage
 from go1exp.viewer import requests as ask
-from go1exp.viewer.conditions import Ground, Setup, params_of
+from go1exp.viewer.conditions import Ground, Setup
+from go1exp.viewer.effects import lines
 from go1exp.viewer.session import PUSH_SHOWN_S, Session
 
 VIEWS_PER_S = 25.0
@@ -30,6 +31,9 @@ FALLBACK = ((-1.5, 2.0), (-1.0, 1.0), (-1.5, 1.5))
 
 RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """Parameters of a command term that are ranges of velocity."""
+
+CURVE_POINTS = 250
+"""Points of a curve: it is drawn on about as many pixels, and each point is drawn anew in every picture."""
 
 SPARK_POINTS = 100
 """Points of a reward's small curve."""
@@ -147,6 +151,7 @@ class WalkShow:
     def __init__(self, session: Session) -> None:
         """Build the scene."""
         self.session = session
+        self._effects = lines(session.robots.effects)
         self._core: Any = None
         self._speed = np.zeros(2)
         self._clock, self._then, self._achieved = time.perf_counter(), session.time, 1.0
@@ -191,7 +196,9 @@ class WalkShow:
             return None
         self._shown = now
         s, h = self.session, self.session.history
-        curves = {name: h.series(name).T.tolist() for name in ("command", "true", "estimated", "torque")}
+        every = max(1, math.ceil(h.filled / CURVE_POINTS))
+        drawn = ("command", "true", "estimated", "torque", "height")
+        curves = {name: h.series(name, every).T.tolist() for name in drawn}
         t = h.times().tolist()
         pushed = h.series("push")[:, 0] > 0.0
         begins = np.flatnonzero(np.diff(pushed, prepend=False) & pushed)
@@ -200,7 +207,7 @@ class WalkShow:
             labels=tuple(s.robots.drivers),
             setup=s.setup,
             grounds=s.robots.grounds,
-            effects=EFFECT_TEXTS.lines(s.robots.effects),
+            effects=self._effects,
             command=s.command,
             limits=self._limits(),
             pace=ask.Pace(s.paused, s.speed),
@@ -209,11 +216,11 @@ class WalkShow:
             falls=s.falls,
             message=s.message,
             physics_dt=s.core.task.sim.physics_dt,
-            t=t,
+            t=h.times(every).tolist(),
             command_curves=curves["command"],
             true=curves["true"],
             estimated=curves["estimated"] if np.isfinite(h.last("estimated", 0.0)).all() else [],
-            height=h.series("height")[:, 0].tolist(),
+            height=curves["height"][0],
             torque=curves["torque"],
             contacts=tuple(runs_of(t, column, h.dt) for column in h.series("contact").T),
             pushes=[t[k] for k in begins],
@@ -264,28 +271,6 @@ def push_arrow(at: Vector, impulse: float, angle: float) -> Arrow:
     """Return the arrow of a push on a trunk at ``at``, (3,) m, with a force at ``angle`` in the world, rad."""
     reach = PUSH_SCALE * impulse * np.array([math.cos(angle), math.sin(angle), 0.0])
     return Arrow(at - reach, at, PUSH_RGB)
-
-
-class _EffectTexts:
-    """What each effect of a catalogue is, made once."""
-
-    def __init__(self) -> None:
-        self._texts: dict[int, dict[str, str]] = {}
-
-    def lines(self, effects: Mapping[str, Any]) -> dict[str, str]:
-        """Return a line for each effect: its words, and its values at size 1."""
-        if id(effects) not in self._texts:
-            self._texts = {id(effects): {name: _about(term) for name, term in effects.items()}}
-        return self._texts[id(effects)]
-
-
-EFFECT_TEXTS = _EffectTexts()
-
-
-def _about(term: Any) -> str:
-    units = {p.name: "" if p.unit == "-" else f" {p.unit}" for p in params_of(term)}
-    values = ", ".join(f"{name} {value}{units.get(name, '')}" for name, value in term.parameters.items())
-    return f"{term.entry.target.title}; at size 1: {values}"
 
 
 def runs_of(t: list[float], column: Vector, dt: float) -> tuple[tuple[float, float], ...]:

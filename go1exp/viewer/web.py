@@ -1,7 +1,7 @@
 """MuJoCo Studio's web viewer behind a token, on one interface, with windows of our own.
 
-Only this module knows how Studio starts. The loop that moves the robot runs in the calling thread, the window's in
-another; they exchange messages (``Ask`` and ``Shown``), as Studio's own plugins do.
+Only this module knows how Studio starts. The loop that moves the robot runs in the calling process, the page in
+another (``page_process``); they exchange messages (``Ask`` and ``Shown``), as Studio's own plugins do.
 """
 
 from __future__ import annotations
@@ -19,13 +19,17 @@ from typing import Any, Protocol
 import mujoco
 
 from go1exp.errors import Expected
+from go1exp.viewer.gamepad import Gamepad
 from go1exp.viewer.gate import Gate, listening, words
+from go1exp.viewer.picture_rate import FRAME_S, PictureRate
 from go1exp.viewer.requests import Ended
 
 try:
-    from mujoco.studio import launch_thread, messages, plugin, viewer_handle, viewer_protocol, web_viewer
+    from mujoco.studio import messages, plugin, viewer_handle, viewer_protocol, web_viewer
     from mujoco.studio.web import web_server
     from websockets.exceptions import ConnectionClosed
+
+    from go1exp.viewer import page_process
 except ImportError as error:
     raise Expected(
         f"viewer=web needs MuJoCo Studio, which comes with the package mujoco and not with mujoco-core ({error}): "
@@ -53,6 +57,13 @@ class Shown(messages.Snapshot):
     view: Any
 
 
+@dataclass(frozen=True)
+class Draw(messages.Event):
+    """From the loop to the page: the least time from picture to picture, s."""
+
+    every: float
+
+
 class Show(Protocol):
     """Something that passes time and is seen: ``session.Session`` with its scene, or a recording."""
 
@@ -70,7 +81,16 @@ class Show(Protocol):
 
 
 class _Viewer(web_viewer.WebViewer):
-    """Studio's viewer, which takes no models from the browser and says nothing on the terminal."""
+    """Studio's viewer, which takes no models from the browser, is silent on the terminal, and draws not too often."""
+
+    _due, _every = 0.0, FRAME_S
+
+    def prepare_next_frame(self) -> bool:
+        """Wait until another picture is due, then for the browser; return whether there is one to draw for."""
+        time.sleep(max(0.0, self._due - time.monotonic()))
+        wanted = super().prepare_next_frame()
+        self._due = time.monotonic() + self._every
+        return bool(wanted)
 
     def get_drop_file(self) -> str:
         """Return no file: what is dropped onto the page would replace the robot."""
@@ -82,13 +102,17 @@ class _Viewer(web_viewer.WebViewer):
     def _on_post_model(self, event: messages.PostModelEvent) -> None:
         self._update_model()
 
+    @messages.handler
+    def _on_draw(self, event: Draw) -> None:
+        self._every = event.every
+
 
 _opening = threading.Lock()
 
 
 @contextmanager
-def _behind(gate: Gate, sock: Any) -> Iterator[None]:
-    """Let the server that is made inside use ``sock`` and ask ``gate``.
+def _behind(gate: Gate, pad: Gamepad, sock: Any) -> Iterator[None]:
+    """Let the server that is made inside use ``sock``, ask ``gate``, and hear ``pad``.
 
     Studio has settings for neither yet. ``_refuses_strangers`` sees to it that the gate is in force in what runs.
     """
@@ -97,7 +121,8 @@ def _behind(gate: Gate, sock: Any) -> Iterator[None]:
 
     def serve(handler: Any, **options: Any) -> Any:
         started.set()
-        return usual[0](handler, **{**options, "process_request": gate.guarded(options["process_request"])})
+        guarded = gate.guarded(pad.served(options["process_request"]))
+        return usual[0](handler, **{**options, "process_request": guarded})
 
     with _opening:
         web_server.serve = serve
@@ -132,18 +157,18 @@ def _not_a_browser_that_left(record: logging.LogRecord) -> bool:
 
 
 def _opened(
-    title: str, gate: Gate, sock: Any, windows: list[plugin.ViewerPlugin], show: Show
+    title: str, gate: Gate, pad: Gamepad, sock: Any, windows: list[plugin.ViewerPlugin], show: Show
 ) -> viewer_handle.ViewerHandle:
-    """Start Studio's viewer in a thread of its own."""
+    """Start Studio's viewer in a process of its own."""
     logging.getLogger("WebServer").setLevel(logging.WARNING)
     logging.getLogger("asyncio").addFilter(_not_a_browser_that_left)
 
     def target(endpoint: Any) -> None:
-        with _behind(gate, sock):
+        with _behind(gate, pad, sock):
             viewer = _Viewer(viewer_protocol.ViewerConfig(title=title, gfx="web"), endpoint, plugins=windows)
         viewer_protocol.run_viewer_loop(viewer)
 
-    return launch_thread.launch_thread(target, sim_plugins=[_Messenger(show)])
+    return page_process.launch(target, [_Messenger(show)])
 
 
 def _refuses_strangers(port: int, host: str) -> None:
@@ -175,6 +200,7 @@ def run(
     title: str,
     host: str,
     port: int,
+    pad: Gamepad | None = None,
     on_open: Callable[[str], None] = print,
 ) -> None:
     """Show something in the browser until Ctrl-C.
@@ -185,6 +211,7 @@ def run(
         title: of the page.
         host: interface to listen on.
         port: to listen on; 0 takes the first free one.
+        pad: hears of the gamepad at the browser; the windows have it too.
         on_open: called with the text that says where to look.
 
     Raises:
@@ -193,7 +220,8 @@ def run(
     sock = listening(host, port)
     bound = sock.getsockname()[1]
     gate = Gate(bound)
-    handle = _opened(title, gate, sock, windows, show)
+    handle = _opened(title, gate, pad or Gamepad(), sock, windows, show)
+    sock.close()  # the page's process has it now
     try:
         with handle:
             handle.set_model(show.model, data=show.data)
@@ -207,8 +235,14 @@ def run(
 def _loop(handle: viewer_handle.ViewerHandle, show: Show) -> None:
     """Let time pass, in step with the clock."""
     due = time.perf_counter()
+    rate = PictureRate(due)
     while handle.is_running():
-        due = max(due + show.tick(), time.perf_counter() - LAG_S)
+        due += show.tick()
+        now = time.perf_counter()
+        lost = max(0.0, now - LAG_S - due)
+        due += lost
+        if rate.note(now, lost):
+            handle.send_to_viewer(Draw(rate.every))
         if show.model is not handle.model:
             handle.set_model(show.model, data=show.data)
         view = show.view()

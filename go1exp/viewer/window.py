@@ -51,7 +51,7 @@ class Window(plugin.ViewerPlugin):
         raise NotImplementedError
 
     def keys(self) -> None:
-        """Answer keys and gamepad."""
+        """Answer keys."""
 
     def scene(self) -> Iterable[Any]:
         """Return shapes (``MjvGeom``) beside the model's own."""

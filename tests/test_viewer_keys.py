@@ -1,0 +1,115 @@
+"""Keys of the page: where it listens, and what it shows, of ``play``, ``sim`` and ``gap view``, without a browser."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco.studio")
+
+from go1exp.cli import gap, play, simulate
+from go1exp.compose import compose
+from go1exp.config import parse_train
+from go1exp.export.build import build
+from go1exp.gap import files
+from go1exp.recording import write
+from go1exp.train import run_folder, trainer
+from go1exp.viewer import requests as ask
+from go1exp.viewer import sim_process, web
+from go1exp.viewer.gate import FIRST_PORT, listening
+from go1exp.viewer.replay_show import ReplayShow
+from go1exp.viewer.sim_show import SimShow
+from go1exp.viewer.walk import WalkShow
+from tests.small_run import SMALL
+from tests.test_viewer import answer, recording
+
+ELSEWHERE = "127.0.0.2"
+"""Another address of this machine alone."""
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[str, int], Any]]:
+    """Where pages were opened, and what they show; each takes its port, and is closed at once."""
+    pages: list[tuple[tuple[str, int], Any]] = []
+
+    def run(show: Any, windows: list[Any], *, title: str, host: str, port: int, pad: Any = None) -> None:
+        assert title.startswith("go1exp")
+        assert len(windows) == 1
+        with closing(listening(host, port)) as sock:
+            pages.append((sock.getsockname()[:2], show))
+
+    monkeypatch.setattr(web, "run", run)
+    return pages
+
+
+def free_port() -> int:
+    with closing(socket.socket()) as sock:
+        sock.bind((ELSEWHERE, 0))
+        return int(sock.getsockname()[1])
+
+
+def page(verb: Any, name: str, overrides: list[str], opened: list[tuple[tuple[str, int], Any]]) -> Any:
+    """Open a page where ``host`` and ``port`` say, and where they do not; return what the first one shows."""
+    port = free_port()
+    verb._task(compose(name, [*overrides, f"host={ELSEWHERE}", f"port={port}"]))
+    verb._task(compose(name, overrides))
+    (chosen, show), (usual, _) = opened
+    assert chosen == (ELSEWHERE, port)
+    assert usual[0] == "127.0.0.1"
+    assert FIRST_PORT <= usual[1] < FIRST_PORT + 20
+    return show
+
+
+def test_gap_view_listens_where_it_is_told_and_shows_the_answer(tmp_path: Path, opened: list[Any]) -> None:
+    files.save(answer(), tmp_path / "gap")
+    show = page(gap, "gap", ["stage=view", f"out={tmp_path / 'gap'}"], opened)
+    assert isinstance(show, ReplayShow)
+    assert [piece.title for piece in show.player.story.pieces] == ["a, 2.00 s", "b, 2.00 s"]
+
+
+def test_a_recording_is_shown_where_it_is_told(tmp_path: Path, opened: list[Any]) -> None:
+    file = tmp_path / "walk.parquet"
+    write(file, recording())
+    show = page(play, "play", [f"log={file}"], opened)
+    assert isinstance(show, ReplayShow)
+    assert show.player.story.kind == "log"
+
+
+def test_sim_listens_for_the_page_where_it_is_told(monkeypatch: pytest.MonkeyPatch, opened: list[Any]) -> None:
+    def process(groups: Any, tile: Any, config: Any, address: tuple[str, int], *rest: Any) -> Any:
+        return SimpleNamespace(address=address, close=lambda: None, send=lambda wish: None, look=lambda: None)
+
+    monkeypatch.setattr(sim_process, "RobotProcess", process)
+    show = page(simulate, "sim", ["viewer=web"], opened)
+    assert isinstance(show, SimShow)
+
+
+def test_a_bundle_walks_on_the_page_and_hands_over(
+    tmp_path: Path, opened: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    container = compose("train", [*SMALL, "terrain=flat"])
+    run_folder.write(tmp_path / "run", container)
+    trainer.train(parse_train(container), container, tmp_path / "run")
+    (tmp_path / "mine.zip").write_bytes(build(tmp_path / "run", seconds=0.1))
+    show = page(play, "play", ["bundle=mine.zip", "viewer=web", "velocity=[0.3,0,0]"], opened)
+    assert isinstance(show, WalkShow)
+    session = show.session
+    assert session.label == "mine"
+    assert session.command == (0.3, 0.0, 0.0)
+    before = session.qpos().copy()
+    for _ in range(5):
+        show.tick()
+    assert session.time == pytest.approx(5 * session.dt)
+    assert np.isfinite(session.qpos()).all()
+    assert not np.array_equal(session.qpos(), before)
+    for label in ("trot", "mine"):  # to a policy of the package and back, while it walks
+        show.ask(ask.Hand(label))
+        assert (session.label, session.message) == (label, "")
+        show.tick()
