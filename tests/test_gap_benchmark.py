@@ -34,7 +34,7 @@ def test_a_sealed_case(kind: str, index: int, tmp_path: Path) -> None:
     found = score.judge({case.name: case.answer}, results)
     failures = {name: lines for name, lines in found.failures.items() if lines}
     if kind == "single":
-        assert found.figures["top1_exact"][0] == found.figures["truth_in_set"][0] == 1.0, failures
+        assert found.figures["first_exact"][0] == found.figures["in_set"][0] == 1.0, failures
         assert results[case.name]["verdict"] in ("explained", "partly explained")
         assert results[case.name]["closed"] > 0.9
     elif kind == "null":

@@ -27,7 +27,15 @@ from go1exp.schema.registry import bind
 
 QUIET = [f"sensors.{name}={{noise: 0.0, step: 0.0}}" for name in ("q", "qd", "tau_est", "gyro", "acc", "attitude")]
 SIGNED = ("base_tilt", "encoder_offset", "link_com", "cogging", "parallel_stiffness")
-SHAPED = ("asymmetric_friction", "torque_speed_limit", "command_delay", "load_friction", "armature", "stribeck")
+SHAPED = (
+    "asymmetric_friction",
+    "torque_speed_limit",
+    "command_delay",
+    "load_friction",
+    "armature",
+    "stribeck",
+    "point_load",
+)
 
 
 def library(names: tuple[str, ...], values: dict[str, cases.Values], episode: Episode) -> np.ndarray:

@@ -420,7 +420,7 @@ def test_the_command_seals_writes_and_continues(
     ("words", "message"),
     [
         (["seed=1"], "usage"),
-        (["out=x", "seed=1", "kinds=nil"], "must be one of null, single"),
+        (["out=x", "seed=1", "kinds=nil"], "must be one of null, near_null, single"),
         (["out=x", "seed=1.5"], "not a number"),
         (["out=x", "seed=1", "effects=stiction"], "must be one of armature"),
         (["out=x", "seed=1", "answers=x/a.json"], "must not lie beside the cases"),

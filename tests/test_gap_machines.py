@@ -107,6 +107,20 @@ def test_the_double_pendulums_are_the_textbooks(
         np.testing.assert_allclose(inertia, expected, atol=1e-7)
 
 
+def test_a_servo_is_a_motor_at_a_voltage_if_its_model_says_so() -> None:
+    """Torque and speed of its limits are the ends of the motor's line; gains are still asked for."""
+    motor = machine("xl330_pendulum", drive="voltage", kd=0.0)
+    _, setup = motor.build(1, 0.001, LEVEL, 1)
+    drive: Any = motor.drive()(setup)
+    drive.kp.fill_(3.0)
+    drive.kd.zero_()
+    one = torch.ones(1, 1, dtype=torch.float64)
+    for error, speed, torque in ((0.1, 0.0, 0.3), (9.0, 0.0, 0.77), (9.0, 16.0, 0.0), (0.1, 8.0, 0.3 - 0.385)):
+        assert float(drive.torque(error * one, 0.0 * one, speed * one)) == pytest.approx(torque, abs=1e-12)
+    with pytest.raises(NotComparable, match="says no gains"):
+        prepare([servo()], machine("xl330_pendulum", drive="voltage", firmware=None, kp=None, kd=None), GapSettings())
+
+
 def test_a_straight_leg_of_the_go2_hangs_like_a_plumb_line() -> None:
     """About the thigh's axis only what lies before it pulls; about the hip's, what lies beside it."""
     torque, _ = still("go2", np.zeros(12))
@@ -141,7 +155,7 @@ def test_the_arm_is_held_up_by_its_servos() -> None:
         ({"torque_limit": {"elbow": 3.0}}, "model.torque_limit: gives shoulder no value"),
         ({"torque_limit": 0.0}, "model.torque_limit = 0.0: every value must be at least"),
         ({"kp": 3.0}, "model.drive = 'torque': takes no kp, kd or firmware"),
-        ({"drive": "voltage"}, "model.drive = 'voltage': "),
+        ({"drive": "current"}, "model.drive = 'current': "),
         ({"masss": 1.0}, "model.masss: unknown key 'masss'"),
         ({"tolerances": {"colomb": {"bound": 1.0}}}, "model.tolerances.colomb: unknown effect 'colomb'; did you mean"),
         ({"tolerances": {"coulomb": {"bond": 1.0}}}, "model.tolerances.coulomb.bond: unknown parameter 'bond'"),

@@ -20,7 +20,7 @@ from go1exp.robot import JOINTS
 
 LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(4))
 MACHINE: Any = SimpleNamespace(
-    joints=JOINTS, groups=LEGS, base_probe=(), tolerances=DECLARED, effort=(23.7, 23.7, 35.55) * 4
+    joints=JOINTS, groups=LEGS, base_probe=(), on_ground=False, tolerances=DECLARED, effort=(23.7, 23.7, 35.55) * 4
 )
 
 
@@ -133,6 +133,25 @@ def test_what_shares_a_value_moves_only_where_it_is() -> None:
     np.testing.assert_allclose((limits.low, limits.high), ([-0.5], [0.3]))
     nowhere = tolerances.probes(MACHINE, [key], {})[0]
     assert np.all(nowhere.delta != 0.0)
+
+
+def test_a_shape_moves_only_where_its_effect_leaves_its_tolerance() -> None:
+    """The place of a load of 5 g, of which 10 g are tolerated, means next to nothing and would go anywhere."""
+    mass = np.zeros(12)
+    mass[[2, 5]] = 0.1, 0.005
+    theta = {("point_load", "mass"): mass}
+    columns = tolerances.probes(MACHINE, [("point_load", "mass"), ("point_load", "z")], theta)
+    layout = Layout.from_probes(MACHINE, columns)
+    limits = tolerances.bounds(layout, columns, theta, Freedom(DECLARED).also("point_load"))
+    by_key = {
+        name: {
+            int(layout.joint[i]): (limits.low[i], limits.high[i]) for i in range(layout.size) if layout.probe[i] in at
+        }
+        for name, at in (("mass", (0, 1, 2)), ("z", (3, 4, 5)))
+    }
+    assert by_key["z"][2] == pytest.approx((-0.187, 0.613))
+    assert all(by_key["z"][j] == (0.0, 0.0) for j in range(12) if j != 2)
+    assert all(high > 0.5 for _, high in by_key["mass"].values())
 
 
 def test_a_spring_is_looked_for_at_rest_angles_of_the_whole_range() -> None:

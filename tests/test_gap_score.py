@@ -68,20 +68,20 @@ def test_single_effects() -> None:
         "small": result("no gap"),
     }
     found = score.judge(answers, results)
-    assert value(found, "top1") == pytest.approx(3 / 5)  # right, alias, and ranked first though not named
-    assert value(found, "top1_exact") == pytest.approx(2 / 5)
-    assert value(found, "truth_in_set") == pytest.approx(2 / 5)
-    assert value(found, "mean_set_size") == pytest.approx(5 / 3)
+    assert value(found, "first") == pytest.approx(3 / 5)  # right, alias, and ranked first though not named
+    assert value(found, "first_exact") == pytest.approx(2 / 5)
+    assert value(found, "in_set") == pytest.approx(2 / 5)
+    assert value(found, "set_size") == pytest.approx(5 / 3)
     assert value(found, "small_not_wrong") == 1.0
     assert value(found, "wrong_explained_library") == pytest.approx(1 / 5)
-    assert value(found, "param_error_median") == pytest.approx(0.1)  # 0.02 / 0.2 and 0.03 / 0.3
+    assert value(found, "param_error") == pytest.approx(0.1)  # 0.02 / 0.2 and 0.03 / 0.3
     assert value(found, "coverage") == pytest.approx(1 / 2)
     assert value(found, "closed_median") == pytest.approx(0.9)
     assert value(found, "seconds_per_case") == 1.0
     assert value(found, "missing") == 1.0
     assert found.confusion["viscous", "kd_scale"] == 1
     assert found.confusion["armature", "-"] == 1
-    assert any(line.startswith("wrong: single, lag x5 on 2 joints -> explained") for line in found.failures["top1"])
+    assert any(line.startswith("wrong: single, lag x5 on 2 joints -> explained") for line in found.failures["first"])
     assert "viscous: kd_scale 1" in score.table(found)
 
 
@@ -91,7 +91,7 @@ def test_visible_effects_are_counted_apart() -> None:
         "hidden": answer("single", effect("base_tilt", 2.0, [], roll=0.02), signal=0.4),
     }
     found = score.judge(answers, {"seen": result("explained", named("coulomb")), "hidden": result("no gap")})
-    assert (value(found, "top1"), value(found, "top1_visible")) == (0.5, 1.0)
+    assert (value(found, "first"), value(found, "first_visible")) == (0.5, 1.0)
 
 
 def test_null_cases() -> None:
@@ -110,7 +110,27 @@ def test_null_cases() -> None:
     found = score.judge(answers, results)
     assert (value(found, "false_names"), value(found, "nulls")) == (2.0, 4.0)
     assert found.figures["false_name_rate"][0] == 0.5
+    near = {"right": answer("near_null", beyond="viscous"), "wrong": answer("near_null", beyond="viscous")}
+    found = score.judge(
+        answers | near,
+        results | {"right": result("explained", named("kd_scale")), "wrong": result("explained", named("coulomb"))},
+    )
+    assert (value(found, "false_names"), value(found, "nulls")) == (2.0, 6.0)
+    assert value(found, "false_names_beyond") == pytest.approx(1 / 3)
     assert value(found, "nulls_no_gap") == pytest.approx(1 / 3)
+
+
+def test_joints_are_right_if_they_are_all_and_no_others() -> None:
+    at = ["FR_hip", "FR_thigh"]
+    hidden = answer("single", effect("coulomb", joints=at, bound=[0.3, 0.3]))
+    answers = dict.fromkeys(("right", "more", "less", "other"), hidden)
+    results = {
+        "right": result("explained", named("coulomb", joints=at[::-1])),
+        "more": result("explained", named("coulomb", joints=[*at, "FL_hip"])),
+        "less": result("explained", named("coulomb", joints=at[:1])),
+        "other": result("explained", named("stribeck", joints=at)),  # counted by ``first``
+    }
+    assert score.judge(answers, results).figures["joints_exact"][::3] == (1 / 3, 3)
 
 
 def test_effects_beyond_the_library() -> None:
@@ -136,7 +156,7 @@ def test_pairs() -> None:
         "worse": result("explained", named("coulomb"), named("payload")),
     }
     found = score.judge(answers, results)
-    assert value(found, "pair_recall") == pytest.approx(1 / 3)
+    assert value(found, "pairs_both") == pytest.approx(1 / 3)
     assert value(found, "pair_precision") == pytest.approx(4 / 5)
 
 
@@ -144,9 +164,9 @@ def test_friction_of_two_directions_is_its_mean_and_a_constant() -> None:
     answers = {"a": answer("single", effect("asymmetric_friction", forward=[0.2, 0.2], backward=[0.0, 0.0]))}
     both = result("explained", named("coulomb"), named("encoder_offset"))
     found = score.judge(answers, {"a": both})
-    assert (value(found, "top1"), value(found, "truth_in_set"), value(found, "top1_exact")) == (1.0, 1.0, 0.0)
+    assert (value(found, "first"), value(found, "in_set"), value(found, "first_exact")) == (1.0, 1.0, 0.0)
     found = score.judge(answers, {"a": result("explained", named("coulomb"))})
-    assert (value(found, "top1"), value(found, "truth_in_set")) == (1.0, 0.0)
+    assert (value(found, "first"), value(found, "in_set")) == (1.0, 0.0)
 
 
 def test_silent_and_damaged_logs() -> None:
@@ -181,7 +201,7 @@ def test_numbers_and_lists_are_parameters_too() -> None:
         "scale": result("explained", named("strength", **scale)),
     }
     found = score.judge(answers, results)
-    assert found.figures["param_error_median"] == pytest.approx((0.1, 0.05, 0.25, 3), abs=0.06)  # 5 %, 10 %, 25 %
+    assert found.figures["param_error"] == pytest.approx((0.1, 0.05, 0.25, 3), abs=0.06)  # 5 %, 10 %, 25 %
     assert value(found, "coverage") == pytest.approx(2 / 3)
 
 
@@ -205,7 +225,7 @@ def test_the_command_checks_the_seal_and_writes_flat_results(
     score.main(words)
     assert "false_names" in capsys.readouterr().out
     flat = json.loads((tmp_path / "results.json").read_text())
-    assert (flat["false_names"], flat["nulls"], flat["top1"]) == (1.0, 2.0, None)
+    assert (flat["false_names"], flat["nulls"], flat["first"]) == (1.0, 2.0, None)
     assert set(score.BARS) | {"nulls"} <= set(flat)
     assert all(x is None or isinstance(x, int | float) for x in flat.values())
     seal.write_text("0" * 64 + "  answers.json\n")

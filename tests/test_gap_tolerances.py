@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from go1exp.compose import compose
 from go1exp.config import parse_parts
 from go1exp.effects.tolerances import DECLARED, Tolerances, declared, sizes
 from go1exp.gap import files
+from go1exp.gap.answer import why_withdrawn
 from go1exp.gap.report import tables, text, write_report
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.choice import robot_of
@@ -53,6 +55,25 @@ def answer(**changes: Any) -> GapResult:
 
 
 # ---------------------------------------------------------------------- what counts
+
+
+@pytest.mark.parametrize(
+    ("interval", "strained", "withdrawn"),
+    [
+        ({JOINT: (0.003, 0.005)}, True, False),  # a tolerance of rotor inertia is 0.001 kg m2
+        ({JOINT: (0.0008, 0.003)}, True, True),
+        ({JOINT: (0.0008, 0.003), "FR_hip": (-0.004, -0.002)}, True, False),
+        ({JOINT: (0.0008, 0.003)}, False, False),
+    ],
+)
+def test_where_the_tolerances_suffice_an_interval_must_lie_beyond_them(
+    interval: dict[str, tuple[float, float]], strained: bool, withdrawn: bool
+) -> None:
+    assert DECLARED.param(ADDED).tolerance == 0.001
+    (named,) = answer().named
+    search: Any = SimpleNamespace(strained=strained, settings=GapSettings(), state=SimpleNamespace(tolerances=DECLARED))
+    why = why_withdrawn(search, [replace(named, interval={"added": interval})], first=0.05)
+    assert bool(why) == withdrawn
 
 
 def test_what_no_robot_replaces_is_as_declared() -> None:

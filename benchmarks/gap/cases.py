@@ -17,7 +17,7 @@ from benchmarks.gap.simulate import Episode
 from benchmarks.gap.truth import Truth, apply, differences
 from go1exp import robot
 
-KINDS = ("null", "single", "pair", "outside", "not_excited", "damaged")
+KINDS = ("null", "near_null", "single", "pair", "outside", "not_excited", "damaged")
 SIZES = (1.0, 2.0, 5.0)
 """Sizes of single effects, in tolerances."""
 
@@ -27,6 +27,9 @@ PITCHES = (0.0, 0.3)
 
 OUTSIDE_SHARE = 0.2
 """Share of cases with one background error at 1.5 times its tolerance."""
+
+SPREAD = 1.15
+"""Largest of the values of an effect over the size that it is drawn for."""
 
 EVERYTHING = ("chirp", "steps", "ramps", "gait", "swings", "chirp", "steps")
 NOT_EXCITED: dict[str, tuple[str, ...]] = {
@@ -95,18 +98,21 @@ def draw_values(effect: str, size: float, joints: np.ndarray, rng: np.random.Gen
     tolerance, n = known.TOLERANCES[effect], len(joints)
 
     def much(name: str) -> np.ndarray:
-        return tolerance[name] * size * rng.uniform(1.0, 1.15, n)
+        return tolerance[name] * size * rng.uniform(1.0, SPREAD, n)
 
     sign = float(rng.choice((-1.0, 1.0)))
     if effect == "base_tilt":
-        angle, course = tolerance["roll"] * size * rng.uniform(1.0, 1.15), rng.uniform(0, 2 * np.pi)
+        angle, course = tolerance["roll"] * size * rng.uniform(1.0, SPREAD), rng.uniform(0, 2 * np.pi)
         return {"roll": float(angle * np.cos(course)), "pitch": float(angle * np.sin(course))}
     if effect == "payload":
         return {"mass": float(much("mass")[0])}
     if effect == "joint_stop":
-        return {"time_constant": known.null(effect, "time_constant") + much("time_constant")}
+        way = str(rng.choice(("time_constant", "upper")))  # motions reach the upper stops of the calves at most
+        return {way: (-1.0 if way == "upper" else 1.0) * much(way) + known.null(effect, way)}
     if effect == "link_com":
-        return {"along": sign * much("along")}
+        # A hip turns about x, so that a shift along it shows nowhere in a robot that hangs.
+        way = str(rng.choice(("along", "left") if np.any(joints % 3 == 0) else ("along", "forward", "left")))
+        return {way: sign * much(way)}
     if effect in ("strength", "kp_scale", "kd_scale", "link_mass", "link_inertia"):
         change = much("scale")
         return {"scale": 1.0 + (1.0 if change.max() > 0.5 else sign) * change}  # a half is the least that makes sense
@@ -123,6 +129,8 @@ def draw_values(effect: str, size: float, joints: np.ndarray, rng: np.random.Gen
         shape = {"speed": np.full(n, rng.uniform(0.1, 0.5))}
     elif effect == "cogging":
         shape = {"count": np.full(n, float(rng.integers(20, 60))), "phase": rng.uniform(-np.pi, np.pi, n)}
+    elif effect == "point_load":
+        shape = {"x": np.zeros(n), "y": np.zeros(n), "z": rng.uniform(-0.213, -0.1, n)}  # down to where a shank ends
     elif effect == "parallel_stiffness":
         shape = {"rest": robot.NOMINAL_STANCE[joints] + rng.uniform(-0.2, 0.2, n)}
     return {main: much(main), **shape}
@@ -141,15 +149,15 @@ def effect_answer(effect: str, size: float, joints: np.ndarray, values: Values) 
         "joints": [] if per_robot else [robot.JOINTS[j] for j in joints],
         "drawn": drawn,
         "params": dict(drawn),
-        "sizes": list(known.TOLERANCES[effect]),
+        "sizes": [name for name in known.TOLERANCES[effect] if name in values],
     }
 
 
 # ---------------------------------------------------------------------- the background
 
 
-def background(truth: Truth, rng: np.random.Generator, beyond: str | None) -> None:
-    """Spoil a robot a little everywhere, within the tolerances; ``beyond`` names one error at 1.5 times its own.
+def background(truth: Truth, rng: np.random.Generator, beyond: str | None, most: float = 1.5) -> None:
+    """Spoil a robot a little everywhere, within the tolerances; ``beyond`` names one error, up to ``most`` times it.
 
     Inside: masses 2 %, COM 1 mm, friction 0 to 0.03 N m and 0 to 0.01 N m s/rad, armature 10 %, strength 1.5 %,
     encoders 1 mrad, tilt 0.15 deg.
@@ -171,7 +179,7 @@ def background(truth: Truth, rng: np.random.Generator, beyond: str | None) -> No
     truth.tilt += both(np.radians(0.15), 2) / np.sqrt(2.0)
     truth.bristle = float(np.exp(rng.uniform(np.log(600.0), np.log(3000.0))))
     if beyond is not None:
-        values = draw_values(beyond, 1.5 / 1.15, everything, rng)
+        values = draw_values(beyond, most / SPREAD, everything, rng)
         apply(truth, beyond, values, everything)
 
 
@@ -235,8 +243,10 @@ def make(
     effects: list[dict[str, Any]] = []
     clean = kind == "null" and index % 4 == 0
     beyond = str(rng.choice(BEYOND)) if not clean and kind != "damaged" and rng.random() < OUTSIDE_SHARE else None
+    if kind == "near_null":
+        beyond = _cycle(BEYOND, index)
     if not clean:
-        background(truth, rng, beyond)
+        background(truth, rng, beyond, rng.uniform(SPREAD, 1.5) if kind == "near_null" else 1.5)
 
     without = copy.deepcopy(truth)
 
@@ -267,7 +277,7 @@ def make(
     elif kind == "damaged":
         damage = _cycle(DAMAGES, index)
         detail["damage"] = damage
-    elif kind != "null":
+    elif kind not in ("null", "near_null"):
         raise ValueError(f"no kind {kind!r}; there are {', '.join(KINDS)}")
     for effect in effects:
         at = np.array([robot.JOINTS.index(name) for name in effect["joints"]], dtype=int)

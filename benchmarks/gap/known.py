@@ -6,6 +6,7 @@ benchmark must not change when the library does.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from go1exp import robot
@@ -19,22 +20,24 @@ TOLERANCES: dict[str, dict[str, float]] = {
     "com_offset": {"x": 0.005, "y": 0.005, "z": 0.005},
     "command_delay": {"delay": 0.001},
     "coulomb": {"bound": 0.05},
+    "dead_band": {"band": 0.001},
     "encoder_offset": {"offset": 0.003},
     "external_wrench": {"x": 1.0, "y": 1.0, "z": 1.0, "roll": 0.2, "pitch": 0.2, "yaw": 0.2},
     "fixed_point": {"steps": 1.0},
     "flexibility": {"compliance": 5e-4},
     "foot_friction": {"scale": 0.1},
     "ground_compliance": {"time_constant": 0.003},
-    "joint_stop": {"time_constant": 0.003},
+    "joint_stop": {"time_constant": 0.003, "restitution": 0.1, "lower": 0.02, "upper": 0.02},
     "kd_scale": {"scale": 0.15},
     "kp_scale": {"scale": 0.1},
     "lag": {"time": 0.001},
-    "link_com": {"along": 0.002},
+    "link_com": {"along": 0.002, "forward": 0.002, "left": 0.002},
     "link_inertia": {"scale": 0.1},
     "link_mass": {"scale": 0.05},
     "load_friction": {"coefficient": 0.01},
     "parallel_stiffness": {"stiffness": 0.1},
     "payload": {"mass": 0.2},
+    "point_load": {"mass": 0.01},
     "quadratic_drag": {"drag": 0.002},
     "strength": {"scale": 0.05},
     "strength_drift": {"rate": 0.0025},
@@ -46,8 +49,8 @@ TOLERANCES: dict[str, dict[str, float]] = {
 """Effect -> parameter -> deviation from its null value that a user does not care about.
 
 Units: friction, cogging N m; viscous N m s/rad; drag N m s2/rad2; delays and lag s; angles rad; ``link_*`` shares of
-a link's own; ``payload`` kg on the trunk; armature kg m2; shift m; stiffness N m/rad; compliance
-rad/(N m); rate 1/s; steps over those of a Go1's packets.
+a link's own; ``payload`` kg on the trunk, ``point_load`` kg on a link; armature kg m2; shift m; stiffness N m/rad;
+compliance rad/(N m); rate 1/s; steps over those of a Go1's packets.
 """
 
 LIBRARY = tuple(TOLERANCES)
@@ -87,7 +90,7 @@ def null(effect: str, parameter: str) -> float:
     """Return the value of a parameter at which the effect is absent."""
     if effect == "torque_speed_limit" and parameter == "peak":
         return 1.0
-    return {"scale": 1.0, "time_constant": 0.02}.get(parameter, 0.0)
+    return {"scale": 1.0, "time_constant": 0.02, "restitution": math.exp(-2.0)}.get(parameter, 0.0)
 
 
 def family(effect: str) -> frozenset[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,9 +54,15 @@ def draw(rng: np.random.Generator) -> Logger:
 
 
 def log(
-    logger: Logger, samples: Samples, k: int, target: np.ndarray, on: np.ndarray, rng: np.random.Generator
+    logger: Logger,
+    samples: Samples,
+    k: int,
+    target: np.ndarray,
+    on: np.ndarray,
+    rng: np.random.Generator,
+    beside: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return the channels of robot ``k``."""
+    """Return the channels of robot ``k``; ``beside`` are others (T,), with their noise."""
     rows = len(target)
     late = np.clip(logger.jitter * rng.standard_normal(rows), -0.4 / RATE, 0.4 / RATE)
     t = float(rng.uniform(1.0, 60.0)) + np.arange(rows) / RATE * (1.0 + logger.skew) + late
@@ -73,6 +80,7 @@ def log(
         channels |= dict(zip(joint_channels("tau_est", robot.JOINTS), torque.T, strict=True))
     if not on.all():
         channels["torque_enable"] = on
+    channels |= beside or {}
     kept = rng.random(rows) >= logger.dropped
     kept[0] = True
     return {name: np.ascontiguousarray(values[kept]) for name, values in channels.items()}
@@ -81,18 +89,31 @@ def log(
 def meta(episode: Episode) -> Meta:
     """Describe an episode as a real robot's logger would; nothing in it tells what the robot hides."""
     w, x, y, z = attitude(episode.hang).as_quat(scalar_first=True)
+    hung = (float(w), float(x), float(y), float(z))
+    return described(episode.name, episode.excitation, (episode.kp, episode.kd), hung, episode.repeat_of)
+
+
+def described(
+    name: str,
+    excitation: str,
+    gains: tuple[float, float],
+    hung: tuple[float, float, float, float] | None,
+    repeat_of: str | None = None,
+) -> Meta:
+    """Describe a recording at gains kp and kd, N m/rad and N m s/rad; ``hung`` is the attitude of a held trunk."""
+    kp, kd = gains
     return Meta(
         robot="go1",
         joints=robot.JOINTS,
         rate_hz=RATE,
-        base="fixed",
-        base_quat=(float(w), float(x), float(y), float(z)),
-        kp=(episode.kp,) * robot.NUM_JOINTS,
-        kd=(episode.kd,) * robot.NUM_JOINTS,
+        base="floating" if hung is None else "fixed",
+        base_quat=hung,
+        kp=(kp,) * robot.NUM_JOINTS,
+        kd=(kd,) * robot.NUM_JOINTS,
         tau_limit=tuple(float(v) for v in robot.per_joint(robot.EFFORT_LIMIT)),
-        excitation=episode.excitation,
-        episode=episode.name,
-        repeat_of=episode.repeat_of,
+        excitation=excitation,
+        episode=name,
+        repeat_of=repeat_of,
         source="measured",
         tool="logger",
         versions={},

@@ -60,13 +60,23 @@ def build(truth: Truth, dt: float) -> mujoco.MjModel:
     """Compile the hung robot: joints only, friction and damping none, since they are computed outside."""
     spec = mujoco.MjSpec.from_file(str(data_root() / "assets/go1/go1.xml"))
     spec.delete(spec.joint("root"))
-    for key in list(spec.keys):
-        spec.delete(key)
     for geom in list(spec.geoms):
         spec.delete(geom)
+    return compiled(spec, truth, dt)
+
+
+def compiled(spec: mujoco.MjSpec, truth: Truth, dt: float) -> mujoco.MjModel:
+    """Compile a Go1 with the hidden robot's masses, stops and inertias; friction and damping are computed outside."""
+    for key in list(spec.keys):
+        spec.delete(key)
     spec.option.timestep = dt
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    for j in np.flatnonzero(truth.carried).tolist():
+        link = spec.joint(robot.JOINTS[j]).parent
+        load = link.add_body(name=f"{robot.JOINTS[j]}_load", pos=truth.carried_at[j])
+        load.explicitinertial, load.ipos = True, [0.0] * 3
+        load.mass, load.inertia = truth.carried[j], [1e-12] * 3
     model = spec.compile()
     for j, name in enumerate(robot.JOINTS):
         joint = model.joint(name)
@@ -74,6 +84,7 @@ def build(truth: Truth, dt: float) -> mujoco.MjModel:
         model.body_mass[body] *= truth.mass[j]
         model.body_inertia[body] *= truth.mass[j] * truth.inertia[j]
         model.jnt_solref[joint.id, 0] = truth.stop[j]
+        model.jnt_range[joint.id] += truth.stop_shift[j]
         model.body_ipos[body] += truth.com[j]
         model.dof_armature[joint.dofadr[0]] = 0.0 if truth.yielding[j] else truth.armature[j]
     mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -105,7 +116,8 @@ def simulate(truth: Truth, episodes: Sequence[Episode], dt: float, rng: np.rando
     powered = np.stack([e.on for e in episodes], axis=1)[:, :, None]
     qpos[:] = target[0] - truth.offset
     batch.forward()
-    drive = _Drive(truth, episodes, dt, rng, on)
+    kp, kd = (np.array([[getattr(e, gain)] for e in episodes]) for gain in ("kp", "kd"))
+    drive = Drive(truth, kp, kd, dt, rng, on)
     forces = batch.bind("xfrc_applied") if "wind" in truth.outside else None
     calves = [mujoco.mj_name2id(batch.get_model(0), mujoco.mjtObj.mjOBJ_BODY, f"{leg}_calf") for leg in robot.LEGS]
     everyone = np.ones((n, 1), dtype=bool)
@@ -131,16 +143,31 @@ def simulate(truth: Truth, episodes: Sequence[Episode], dt: float, rng: np.rando
     return samples
 
 
-class _Drive:
-    """Motors, their electronics, gears and friction of N robots."""
+class Drive:
+    """Motors, their electronics, gears and friction of N robots.
+
+    Attributes:
+        angle: (N, J) what the encoders read in the last step, rad.
+        speed: (N, J) the speed that the drives know, rad/s.
+        made: (N, J) the motors' torque, N m.
+    """
 
     def __init__(
-        self, truth: Truth, episodes: Sequence[Episode], dt: float, rng: np.random.Generator, on: np.ndarray
+        self, truth: Truth, kp: np.ndarray, kd: np.ndarray, dt: float, rng: np.random.Generator, on: np.ndarray
     ) -> None:
-        n, j = len(episodes), robot.NUM_JOINTS
+        """Switch on.
+
+        Args:
+            truth: the robot.
+            kp: (N, 1) N m/rad, as commanded.
+            kd: (N, 1) N m s/rad.
+            dt: step, s.
+            rng: of what is random in the world.
+            on: (J,) joints on which effects beyond the library act.
+        """
+        n, j = len(kp), robot.NUM_JOINTS
         self.truth, self.dt = truth, dt
-        self.kp = np.array([[e.kp] for e in episodes]) * truth.kp
-        self.kd = np.array([[e.kd] for e in episodes]) * truth.kd
+        self.kp, self.kd = kp * truth.kp, kd * truth.kd
         self.effort, self.top = robot.per_joint(robot.EFFORT_LIMIT), robot.per_joint(robot.VELOCITY_LIMIT)
         scene = outside.Scene(n, dt, on.astype(float), rng)
         self.outside = [outside.EFFECTS[name](scene, **values) for name, values in truth.outside.items()]
@@ -165,6 +192,7 @@ class _Drive:
             effect.reset()
 
     def rotor_speed(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the speed (N, J) that encoders see, rad/s, for joints at ``q`` that turn at ``v``."""
         return v if self.gears is None else self.gears.at(q, v)[1]
 
     def step(self, t: float, target: np.ndarray, powered: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -175,6 +203,7 @@ class _Drive:
         self.angle, self.speed = angle + truth.offset, speed.copy()
         asked = target if self.command is None else self.command.step(target)
         error = asked - self.angle
+        error = error * (np.abs(error) > truth.band)
         for effect in self.outside:
             if type(effect).position is not outside.Outside.position:
                 error = effect.position(t, asked, self.angle)

@@ -10,6 +10,8 @@ import numpy as np
 from go1exp import robot
 
 J = robot.NUM_JOINTS
+CENTRE = {"along": (2, -1.0), "forward": (0, 1.0), "left": (1, 1.0)}
+"""Ways in which a link's centre of mass is shifted: axis of the link's frame, and sign."""
 
 
 def _zeros() -> np.ndarray:
@@ -28,7 +30,10 @@ class Truth:
         mass: factor on each link's mass and inertia.
         inertia: factor on each link's inertia beyond that.
         stop: time constant of the stops, s.
+        stop_shift: shift of the lower and the upper stop (J, 2), rad.
         com: shift of each link's centre of mass (J, 3), m, link frame.
+        carried: point mass on each link, kg.
+        carried_at: its place (J, 3), m, link frame.
         armature: reflected rotor inertia, kg m2.
         tilt: roll and pitch of the trunk beyond what the log says, rad.
         payload: mass on the trunk, kg (a trunk that is held does not feel it).
@@ -47,6 +52,7 @@ class Truth:
         phase: rad.
         kp: factor on the position gain.
         kd: factor on the speed gain.
+        band: error that the drive leaves alone, rad.
         offset: reading of the encoder at true zero, rad.
         command_delay: s.
         torque_delay: s.
@@ -64,7 +70,10 @@ class Truth:
     mass: np.ndarray = field(default_factory=_ones)
     inertia: np.ndarray = field(default_factory=_ones)
     stop: np.ndarray = field(default_factory=lambda: np.full(J, 0.02))
+    stop_shift: np.ndarray = field(default_factory=lambda: np.zeros((J, 2)))
     com: np.ndarray = field(default_factory=lambda: np.zeros((J, 3)))
+    carried: np.ndarray = field(default_factory=_zeros)
+    carried_at: np.ndarray = field(default_factory=lambda: np.zeros((J, 3)))
     armature: np.ndarray = field(default_factory=lambda: robot.per_joint(robot.ROTOR_ARMATURE))
     tilt: np.ndarray = field(default_factory=lambda: np.zeros(2))
     payload: float = 0.0
@@ -83,6 +92,7 @@ class Truth:
     phase: np.ndarray = field(default_factory=_zeros)
     kp: np.ndarray = field(default_factory=_ones)
     kd: np.ndarray = field(default_factory=_ones)
+    band: np.ndarray = field(default_factory=_zeros)
     offset: np.ndarray = field(default_factory=_zeros)
     command_delay: np.ndarray = field(default_factory=_zeros)
     torque_delay: np.ndarray = field(default_factory=_zeros)
@@ -124,6 +134,7 @@ def apply(truth: Truth, effect: str, values: Mapping[str, np.ndarray | float], j
         "parallel_stiffness": {"stiffness": ("stiffness",)},
         "cogging": {"amplitude": ("cogging",)},
         "encoder_offset": {"offset": ("offset",)},
+        "dead_band": {"band": ("band",)},
         "armature": {"added": ("armature",)},
         "command_delay": {"delay": ("command_delay",)},
         "torque_delay": {"delay": ("torque_delay",)},
@@ -146,9 +157,15 @@ def apply(truth: Truth, effect: str, values: Mapping[str, np.ndarray | float], j
     elif effect == "payload":
         truth.payload += float(values["mass"])
     elif effect == "link_com":
-        truth.com[joints, 2] -= values["along"]
+        for name, (axis, sign) in CENTRE.items():
+            truth.com[joints, axis] += sign * values.get(name, 0.0)
+    elif effect == "point_load":
+        truth.carried[joints] = values["mass"]
+        truth.carried_at[joints] = np.stack([values[axis] for axis in "xyz"], axis=-1)
     elif effect == "joint_stop":
-        truth.stop[joints] = values["time_constant"]
+        truth.stop[joints] = values.get("time_constant", truth.stop[joints])
+        for end, name in enumerate(("lower", "upper")):
+            truth.stop_shift[joints, end] += values.get(name, 0.0)
     elif effect in scaled:
         getattr(truth, scaled[effect])[joints] *= values["scale"]
     else:
@@ -178,6 +195,6 @@ def differences(truth: Truth, effect: str, joints: np.ndarray) -> dict[str, np.n
         "encoder_offset": {"offset": truth.offset},
         "strength": {"scale": truth.strength},
         "link_mass": {"scale": truth.mass},
-        "link_com": {"along": -truth.com[:, 2]},
+        "link_com": {name: sign * truth.com[:, axis] for name, (axis, sign) in CENTRE.items()},
     }.get(effect, {})
     return {name: values[joints] for name, values in by_parameter.items()}

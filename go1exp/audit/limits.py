@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+from go1exp.deploy.go1_fields import TORQUE_STEP
+
 # ---------------------------------------------------------------------- clock
 
 RATE = (0.02, 0.10)
@@ -57,7 +59,7 @@ KNOWN_STEPS = {
     "16 bits over 25 rad (T-Motor AK series, CAN)": 25 / 65535,
     "12 bits over 24 N m (T-Motor AK80-6, CAN)": 24 / 4095,
     "12 bits over 45 rad/s (T-Motor AK80-6, CAN)": 45 / 4095,
-    "1/256 N m (Unitree Go1, low-level packets)": 1 / 256,
+    "1/256 N m (Unitree Go1, low-level packets)": TORQUE_STEP,
 }
 """Steps of encoders and messages in use; a step within ``KNOWN`` of one is called by its name."""
 KNOWN = 2e-3

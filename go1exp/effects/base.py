@@ -98,8 +98,8 @@ class Effect(Memory):
     needs and no others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
-    ``on_target`` and ``on_feedforward``, ``on_encoder``, the actuator, ``on_drive``, ``on_transmission``, ``on_gears``,
-    then ``on_joint``, ``on_friction`` and ``on_base`` beside it.
+    ``on_target`` and ``on_feedforward``, ``on_encoder``, ``on_error``, the actuator, ``on_drive``, ``on_transmission``,
+    ``on_gears``, then ``on_joint``, ``on_friction`` and ``on_base`` beside it.
     """
 
     title: ClassVar[str] = ""
@@ -150,6 +150,10 @@ class Effect(Memory):
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the angle and speed that the drive's encoder reads. Called more than once a step: changes nothing."""
         return q, qd
+
+    def on_error(self, target: Tensor, q: Tensor) -> Tensor:
+        """Return the target as the drive compares it with ``q``, the angle that its encoder reads."""
+        return target
 
     def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gains that the drive really has."""

@@ -21,8 +21,10 @@ class FixedPoint(Effect):
 
     A Go1's packets carry kp in steps of 1/32 N m/rad, kd of 1/16 N m s/rad, torque of 1/256 N m
     (``deploy/go1_wire.py``, read off the vendor's client), so that kd = 0.3 becomes 0.25 and kd = 0.5 stays. Targets
-    are floats and stay as they are. The packets' range is never reached by a Go1. It changes nothing but gains and
-    torques that are fed forward, so recordings at one gain cannot tell it from ``kp_scale``, ``kd_scale``, ``viscous``.
+    are floats and stay as they are. Only what is commanded is cut: the torque that a drive reports is not (that of
+    ``deploy`` is, by the packets themselves; its step is 1.1 mN m of noise). The packets' range is never reached by a
+    Go1. It changes nothing but gains and torques that are fed forward, so recordings at one gain cannot tell it from
+    ``kp_scale``, ``kd_scale``, ``viscous``.
     """
 
     title = "fixed-point numbers in the commands"

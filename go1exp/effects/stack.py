@@ -16,8 +16,8 @@ from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term
 
 HOOKS = (
-    *("on_target", "on_feedforward", "on_encoder", "on_gains", "on_drive", "on_transmission", "on_gears"),
-    *("on_joint", "on_friction", "on_base"),
+    *("on_target", "on_feedforward", "on_encoder", "on_error", "on_gains", "on_drive"),
+    *("on_transmission", "on_gears", "on_joint", "on_friction", "on_base"),
 )
 
 
@@ -125,6 +125,12 @@ class EffectStack:
         for effect in self._acting["on_encoder"]:
             q, qd = effect.on_encoder(q, qd)
         return q, qd
+
+    def on_error(self, target: Tensor, q: Tensor) -> Tensor:
+        """Return the targets as the drives compare them with the encoders' angles."""
+        for effect in self._acting["on_error"]:
+            target = effect.on_error(target, q)
+        return target
 
     def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque that the motors make."""

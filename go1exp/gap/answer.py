@@ -21,6 +21,7 @@ from go1exp.gap.search import significance, tolerances
 from go1exp.gap.search.evidence import deviation, inaudible
 from go1exp.gap.search.fit import fit, residuals
 from go1exp.gap.search.ledger import LastCheck
+from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.stepwise import SILENT, Search
 from go1exp.schema.registry import members
 
@@ -104,10 +105,10 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
     first, final = search.first, search.steps[-1][1]
     theta, drawn = resampled_values(search)
     named = name_terms(search, theta, drawn, final <= settings.adequate, check)
-    if named and first <= settings.adequate and not any(n.status == "certified" for n in named):
+    if named and (why := why_withdrawn(search, named, first)):
         doubtful = ", ".join(n.effect for n in named)
-        warnings.append(f"Withdrawn, since the tolerances explain these logs and nothing else is sure: {doubtful}.")
-        search.withdraw("the tolerances suffice, and resamples of the logs do not agree on it")
+        warnings.append(f"Withdrawn, since the tolerances explain these logs and {why}: {doubtful}.")
+        search.withdraw(f"the tolerances suffice, and {why}")
         final, theta, named = search.first, search.state.theta, ()
     within = share_accepted(search)
     verdict = decide(search, first, final, within >= MOST_WINDOWS)
@@ -122,6 +123,18 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
     certain = {key: value for key, value in theta.items() if key[0] not in unsure}
     reached["written"] = excess(search.state.held_out(certain, search.splits.judged))
     return Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan, within)
+
+
+def why_withdrawn(search: Search, named: Sequence[NamedEffect], first: float) -> str:
+    """Return why nothing is to be named after all, where the tolerances suffice; empty if something is.
+
+    One effect of which that is sure keeps those that were fitted beside it.
+    """
+    if search.strained and not any(beyond_doubt(n, search.state.tolerances) for n in named):
+        return "no interval lies beyond its tolerance"
+    if first <= search.settings.adequate and not any(n.status == "certified" for n in named):
+        return "resamples of the logs do not agree on it"
+    return ""
 
 
 def share_accepted(search: Search) -> float:
@@ -217,6 +230,16 @@ def _joints_beyond(
     return tuple(j for j, b in zip(joints, beyond, strict=True) if b)
 
 
+def beyond_doubt(effect: NamedEffect, known: Tolerances) -> bool:
+    """Return whether all of one of an effect's 95 % intervals lies beyond its tolerance."""
+    params = {key[1]: known.param(key) for key in sizes(effect.effect)}
+    return any(
+        low > p.null + p.tolerance or high < p.null - p.tolerance
+        for name, p in params.items()
+        for low, high in effect.interval.get(name, {}).values()
+    )
+
+
 def _strongest(keys: Sequence[Key], theta: Theta, joints: Sequence[str], known: Tolerances) -> str:
     """Return the joint that is furthest from null, in tolerances."""
     away = [np.broadcast_to(deviation(theta, key, known), len(joints)) for key in keys]
@@ -272,7 +295,10 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggesti
     """
     everyone = search.state.scorer.windows.joints
     first, final = 1.0 + answer.excess["box"], 1.0 + answer.excess["final"]
-    parts = [_opening(answer.verdict, first, search), *(_lacking(effect, everyone) for effect in answer.named)]
+    parts = [
+        _opening(answer.verdict, first, search),
+        *(_lacking(effect, everyone, search.state.tolerances) for effect in answer.named),
+    ]
     if answer.named:
         parts.append(
             f"With that the held-out error falls from {first:.3g} to {final:.3g} times the noise floor (floor 1)."
@@ -313,17 +339,20 @@ def _nearest(search: Search) -> str:
     return f"of which {title} takes {share:.0%} away and yet is not named: {near.reason}."
 
 
-def _lacking(effect: NamedEffect, everyone: Sequence[str]) -> str:
-    """Return the sentence about one effect that the model lacks."""
+def _lacking(effect: NamedEffect, everyone: Sequence[str], known: Tolerances) -> str:
+    """Return the sentence about one effect that the model lacks: what leaves its tolerance, and its shapes."""
+    names = [name for _, name in sizes(effect.effect) if effect.params.get(name)]
+    values_of = {name: np.array(list(effect.params[name].values())) for name in names}
+    size = {name: deviation({(effect.effect, name): v}, (effect.effect, name), known) for name, v in values_of.items()}
+    telling = [name for name in names if np.max(size[name]) > 1.0] or names
     texts = []
-    for _, name in sizes(effect.effect):
-        values = np.array(list(effect.params.get(name, {}).values()))
-        if len(values):
-            p = declared((effect.effect, name))
-            half = np.mean([0.5 * (b - a) for a, b in effect.interval[name].values()])
-            spread = f", {values.min():.3g} to {values.max():.3g}" if len(values) > 1 else ""
-            unit = "" if p.unit == "-" else f" {p.unit}"
-            texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}")
+    for name in [*telling, *(shape for _, shape in free_shapes(effect.effect) if effect.params.get(shape))]:
+        values = np.array(list(effect.params[name].values()))
+        p = declared((effect.effect, name))
+        half = np.mean([0.5 * (b - a) for a, b in effect.interval[name].values()])
+        spread = f", {values.min():.3g} to {values.max():.3g}" if len(values) > 1 else ""
+        unit = "" if p.unit == "-" else f" {p.unit}"
+        texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}")
     at = f" at {where(effect.joints, everyone)}" if effect.joints else ""
     doubted = "" if effect.status == "certified" else f" (compensating, not certified: {effect.reason})"
     title = f"{effect_class(effect.effect).title} ({effect.effect})"

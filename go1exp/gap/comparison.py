@@ -104,7 +104,7 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
     Raises:
         NotComparable: if too many of them cannot.
     """
-    robot = robot.suited(recordings)
+    robot = robot.suited(recordings, settings.phase)
     reports = [audit(r) for r in recordings]
     flaws = [robot.flaws(r, report) for r, report in zip(recordings, reports, strict=True)]
     good = [k for k, lines in enumerate(flaws) if not lines]

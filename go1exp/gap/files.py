@@ -10,9 +10,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from go1exp.files import write_json
-from go1exp.gap.result import EXIT_CODES, AngleErrors, Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay
+from go1exp.gap.result import (
+    EXIT_CODES,
+    AngleErrors,
+    Candidate,
+    Floors,
+    GapResult,
+    GapSettings,
+    Localisation,
+    NamedEffect,
+    Overlay,
+)
 from go1exp.schema.registry import Expected
 
 RESULT = "verdict.json"
@@ -69,6 +80,20 @@ def from_dict(plain: Mapping[str, Any]) -> GapResult:
     for name in ("advice", "warnings"):
         values[name] = tuple(plain[name])
     return GapResult(**values)
+
+
+def search_of(result: GapResult) -> GapSettings:
+    """Return the settings of the search that found a result.
+
+    Raises:
+        GapFileError: if it does not say, or says what this version does not know.
+    """
+    try:
+        kept = TypeAdapter(GapSettings).validate_json(json.dumps(result.provenance["settings"]))
+    except (KeyError, ValidationError) as error:
+        why = "does not say them" if isinstance(error, KeyError) else str(error).splitlines()[0]
+        raise GapFileError(f"{RESULT}: settings of its search: {why}; run go1exp gap explain again") from None
+    return kept
 
 
 def _number(value: float | None) -> float:

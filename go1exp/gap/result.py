@@ -28,6 +28,9 @@ EXIT_CODES: dict[str, int] = {
 }
 """Verdict -> exit code of the command."""
 
+Phase = Literal["auto", "whole", "swing"]
+"""What of a robot that walks is compared: everything, or the legs that are in the air."""
+
 Share = Annotated[float, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(ge=1)]
 
@@ -60,6 +63,9 @@ class GapSettings:
         physics_dt: longest physics step, s; the one used divides the logger's period.
         clock_s: standard deviation of the time by which readings may be stamped early or late against commands, window
             by window; a hundredth of a control step, which nothing in training would notice.
+        phase: what of robots on their feet is compared: ``whole``, the whole robot; ``swing``, legs while they are in
+            the air, which show what joints lack; ``auto``, legs in the air first, and the whole robot if those agree
+            with the model or hardly swing.
         torque: also score the torque that the drives report, where it was logged.
         calibrate: whether nominal parameters may move within their tolerances first; without, small errors of the model
             are taken for effects (for comparison).
@@ -91,6 +97,7 @@ class GapSettings:
     stride_s: Positive = 0.4
     physics_dt: Annotated[float, Field(gt=0, le=0.002)] = 0.001
     clock_s: NonNegative = 0.00015
+    phase: Phase = "auto"
     torque: bool = False
     calibrate: bool = True
     judge: Literal["max_t", "gain", "bic"] = "max_t"
@@ -213,7 +220,7 @@ class Overlay:
         episode: where it is from.
         t: (T,) time in the episode, s.
         measured: (T,) by channel.
-        before: (T,) of the model within its tolerances.
+        before: (T,) of the model within its tolerances; only channels that are compared in this window.
         after: (T,) with what was named.
         noise: standard deviation of the noise, by channel.
     """

@@ -20,6 +20,9 @@ Direction = Literal["lower", "higher"]
 RESAMPLES = 20_000
 """Permutations of a test; where there are fewer, all of them."""
 
+LEAST_RANDOM_P = 2.0 / (RESAMPLES + 1)
+"""Smallest two-sided p of random permutations, of which what came counts as one."""
+
 ALPHA = 1.0 - LEVEL
 
 
@@ -112,15 +115,23 @@ def _mean_difference(*ranks: NDArray[np.float64], axis: int = -1) -> NDArray[np.
 
 
 def least_p(n: int, m: int, paired: bool = False) -> float:
-    """Return the smallest two-sided p that a permutation test of n and m runs can give."""
+    """Return the smallest two-sided p that ``permutation_p`` of n and m runs can give.
+
+    Where not all ways are made, the one that came counts as a permutation of its own, so that p never is zero.
+    """
     if min(n, m) < 2:
         return math.nan
     ways = 2**n if paired else math.comb(n + m, n)
-    return min(1.0, 2.0 / ways)
+    return min(1.0, max(2.0 / ways, LEAST_RANDOM_P))
 
 
-def runs_that_can_tell(paired: bool = False, figures: int = 1, alpha: float = ALPHA) -> int:
-    """Return the least number of runs in each group with which one of ``figures`` can be told apart at all."""
+def runs_that_can_tell(paired: bool = False, figures: int = 1, alpha: float = ALPHA) -> int | None:
+    """Return the least number of runs in each group with which one of ``figures`` can be told apart at all.
+
+    None where no number can: so many figures are more than random permutations can tell.
+    """
+    if LEAST_RANDOM_P * figures > alpha:
+        return None
     n = 2
     while least_p(n, n, paired) * figures > alpha:
         n += 1
@@ -184,7 +195,7 @@ def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0.8, alpha: float = ALPHA) -> int | None:
-    """Return how many runs in each group would tell a difference like the one seen; None if there is none.
+    """Return how many runs in each group would tell a difference like the one seen; None if no number would.
 
     The normal approximation for two groups, with a quarter of the squared quantile for Student's: n = (z_alpha +
     z_power)^2 (s_a^2 + s_b^2) / d^2 + z_alpha^2 / 4.
@@ -196,7 +207,8 @@ def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0
     z_alpha, z_power = float(stats.norm.ppf(1.0 - 0.5 * alpha)), float(stats.norm.ppf(power))
     ratio = (a.var(ddof=1) + b.var(ddof=1)) / (a.mean() - b.mean()) ** 2
     needed = (z_alpha + z_power) ** 2 * ratio + 0.25 * z_alpha**2
-    return max(runs_that_can_tell(alpha=alpha), math.ceil(needed)) if needed < 1e6 else None
+    least = runs_that_can_tell(alpha=alpha)
+    return max(least, math.ceil(needed)) if least is not None and needed < 1e6 else None
 
 
 def worded(estimate: float, p: float, better: Direction, alpha: float = ALPHA) -> Word:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -122,6 +122,27 @@ def bridged(t: np.ndarray, target: np.ndarray, period: float) -> tuple[np.ndarra
 
 
 @dataclass(frozen=True)
+class Place:
+    """Where a window may be, by the clock of its recording.
+
+    Attributes:
+        first: earliest time at which it may begin, s.
+        last: latest time, s.
+        end: time after which nothing is compared, s.
+        joints: which are compared; all if None.
+    """
+
+    first: float
+    last: float
+    end: float = np.inf
+    joints: tuple[int, ...] | None = None
+
+    def compared(self, count: int) -> np.ndarray:
+        """Return which of ``count`` joints are compared, (J,) bool."""
+        return np.ones(count, dtype=bool) if self.joints is None else np.isin(np.arange(count), self.joints)
+
+
+@dataclass(frozen=True)
 class _Track:
     """One recording as it is cut: its clock and readings, its commands, and where its holes are."""
 
@@ -165,29 +186,38 @@ class _Cutter:
         """Time of a window, with what is replayed before it, s."""
         return self.settings.burn_s + self.settings.window_s
 
-    def windows(self, track: _Track) -> Iterator[dict[str, Any]]:
+    def windows(self, track: _Track, places: Iterable[Place]) -> Iterator[dict[str, Any]]:
         """Cut one recording; every window as the fields of :class:`Windows` without the first axis."""
+        for place in places:
+            begin, state, misfit = self._smoothest(track, place)
+            if np.isfinite(misfit) and track.whole(begin, self.length):
+                yield self._window(track, begin, place, state)
+
+    def evenly(self, track: _Track) -> Iterator[Place]:
+        """Yield places one stride apart, each a third of a stride wide."""
         at = track.t[0] + PAST_S
         while at + self.settings.stride_s / 3 + self.length < track.t[-1]:
-            begin, state, misfit = self._smoothest(track, at)
+            yield Place(at, at + self.settings.stride_s / 3)
             at += self.settings.stride_s
-            if np.isfinite(misfit) and track.whole(begin, self.length):
-                yield self._window(track, begin, state)
 
-    def _smoothest(self, track: _Track, at: float) -> tuple[float, tuple[np.ndarray, ...], float]:
-        """Return where the initial state is known best within a third of a stride, the state there, and its misfit."""
-        tries = at + np.linspace(0.0, self.settings.stride_s / 3, 9)
+    def _smoothest(self, track: _Track, place: Place) -> tuple[float, tuple[np.ndarray, ...], float]:
+        """Return where at a place the initial state is known best, the state there, and its misfit."""
+        tries = place.first + np.linspace(0.0, place.last - place.first, 9)
         tries = track.t[np.searchsorted(track.t, tries)]
         q, qd = track.y[:, 0], track.y[:, 1]
         states = [_start(track.t, q, qd, float(s), self.sd, self.half) for s in tries]
-        misfits = [f[3].max() + self.doubt(track.number, float(s)) for f, s in zip(states, tries, strict=True)]
+        compared = place.compared(q.shape[1])
+        misfits = [
+            f[3][compared].max() + self.doubt(track.number, float(s)) for f, s in zip(states, tries, strict=True)
+        ]
         best = int(np.argmin(misfits))
         return float(tries[best]), states[best], misfits[best]
 
-    def _window(self, track: _Track, begin: float, state: tuple[np.ndarray, ...]) -> dict[str, Any]:
-        """Return the window that begins at ``begin``, s, in ``state``."""
+    def _window(self, track: _Track, begin: float, place: Place, state: tuple[np.ndarray, ...]) -> dict[str, Any]:
+        """Return the window at ``place`` that begins at ``begin``, s, in ``state``."""
         t, first, end = track.t, begin - PAST_S, begin + self.length
-        inside = np.flatnonzero((t >= begin + self.settings.burn_s - 1e-9) & (t <= end + 1e-9))[: self.samples]
+        shown = (t >= begin + self.settings.burn_s - 1e-9) & (t <= min(end, place.end) + 1e-9)
+        inside = np.flatnonzero(shown)[: self.samples]
         q, qd, qdd, misfit = state
         return {
             "episode": track.number,
@@ -203,6 +233,7 @@ class _Cutter:
             "t": _padded(t[inside] - begin, self.samples),
             "y": _padded(track.y[inside], self.samples),
             "valid": _padded(np.ones(len(inside), dtype=bool), self.samples),
+            "scale": np.where(place.compared(self.sd.shape[1]), self.sd, np.inf),
             "edges": _since(begin, _changes(track.stamps, track.targets, first, end)),
             "switches": _since(begin, _changes(t, track.enabled, first, end)),
         }
@@ -212,6 +243,7 @@ def cut(
     recordings: Sequence[Recording],
     settings: GapSettings,
     doubt: Callable[[int, float], float] = lambda number, at: 0.0,
+    places: Sequence[Sequence[Place]] | None = None,
 ) -> Windows:
     """Cut recordings of one robot into windows.
 
@@ -223,6 +255,7 @@ def cut(
         settings: lengths of windows.
         doubt: what to add to the misfit of an initial state of recording ``number`` at time ``at``, s; where it is
             infinite, no window begins.
+        places: of the windows of each recording; one stride apart if None.
 
     Raises:
         RecordingError: if not one window fits.
@@ -237,7 +270,11 @@ def cut(
         _Track.from_recording(k, r, t, quantities, period)
         for k, (r, t) in enumerate(zip(recordings, clocks, strict=True))
     )
-    rows = [window for track in tracks for window in cutter.windows(track)]
+    rows = [
+        window
+        for track in tracks
+        for window in cutter.windows(track, cutter.evenly(track) if places is None else places[track.number])
+    ]
     if not rows:
         raise RecordingError(
             f"no window of {settings.burn_s:g} + {settings.window_s:g} s fits into these recordings; record longer ones"
@@ -247,7 +284,6 @@ def cut(
         joints=recordings[0].meta.joints,
         quantities=quantities,
         period=period,
-        scale=np.broadcast_to(sd, (len(rows), *sd.shape)).copy(),
         edges=tuple(row["edges"] for row in rows),
         switches=tuple(row["switches"] for row in rows),
         length=cutter.length + 1e-9,

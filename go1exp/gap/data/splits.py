@@ -77,6 +77,8 @@ def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.r
         confirm: share for the last check; of fewer than four episodes none whole, and none of short ones.
         rng: of what goes where.
     """
+    shown, episode = np.unique(episode, return_inverse=True)  # one without any window can neither judge nor be fitted
+    metas = [metas[k] for k in shown]
     units = list(dict.fromkeys(m.repeat_of or m.episode for m in metas))
     unit = np.array([units.index(m.repeat_of or m.episode) for m in metas])[episode]
     about = {m.repeat_of or m.episode: m for m in reversed(metas)}

@@ -73,6 +73,11 @@ class Windows:
         return len(self.quantities)
 
     @property
+    def compared(self) -> np.ndarray:
+        """(W, J) bool, which joints are: some of their quantities have a noise that is finite."""
+        return np.asarray(np.isfinite(self.scale[:, : self.of_joints]).any(axis=1))
+
+    @property
     def base_sd(self) -> np.ndarray:
         """(W, B) standard deviations of a free base's initial state; B is 0 for one that is held."""
         return np.empty((len(self), 0))

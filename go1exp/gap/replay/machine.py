@@ -28,7 +28,14 @@ class Machine(Protocol):
 
     @property
     def base_probe(self) -> tuple[float, ...]:
-        """Changes of a free base's initial state by which its influence is measured; empty for one that is held."""
+        """Changes of a free base's initial state by which its influence is measured; empty for one that is held.
+
+        Of a base that is moved as an IMU says, errors of that IMU.
+        """
+
+    @property
+    def on_ground(self) -> bool:
+        """Whether it stands on its feet, so that it feels what acts on its trunk and on the ground."""
 
     @property
     def effort(self) -> tuple[float, ...]:
@@ -47,6 +54,15 @@ class Machine(Protocol):
 
 def pd() -> Term:
     """Return the ideal PD law."""
-    term = bind("actuator", "pd", {}, "pd")[0]
+    return _plain("pd")
+
+
+def voltage() -> Term:
+    """Return a motor at a voltage, whose line goes from the robot's peak torque to its top speed."""
+    return _plain("voltage")
+
+
+def _plain(actuator: str) -> Term:
+    term = bind("actuator", actuator, {}, actuator)[0]
     assert term is not None
     return term

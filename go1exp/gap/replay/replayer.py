@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -117,6 +118,10 @@ class Replayer:
         """Return what records more than the joints, or None."""
         return None
 
+    def _carrier(self, plant: Plant, rows: Rows, dt: float, steps: int) -> Callable[[int], None] | None:
+        """Return what is called before each step to move a base that is neither held nor free, or None."""
+        return None
+
     def _signals(self, dt: float) -> tuple[Tensor, Tensor]:
         """Return targets (K, W, J) and whether drives are on (K, W) at every step, the past included."""
         if dt not in self._inputs:
@@ -144,6 +149,7 @@ class Replayer:
         q, qd, torque = np.empty(shape), np.empty(shape), np.empty(shape) if "tau_est" in w.quantities else None
         senses = plant.effects.senses
         recorder = self._recorder(kept, len(index))
+        carry = self._carrier(plant, rows, dt, steps)
         for k in range(steps):
             if k >= first:
                 sensed = Measured(plant.q, plant.speed())
@@ -154,6 +160,8 @@ class Replayer:
                     recorder.record(k - first, plant)
             if not always:
                 plant.enabled = enabled[past + k]
+            if carry is not None:
+                carry(k)
             plant.step(targets[past + k])
             if torque is not None and k >= first:
                 torque[k - first] = plant.torque.numpy()

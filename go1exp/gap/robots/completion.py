@@ -32,7 +32,7 @@ def flaws_of(recording: Recording, report: AuditReport, config: ModelConfig) -> 
         flaws.append(f"{name}: the base is free; only robots with a fixed base can be compared")
     command = "tau_cmd" if config.drive == "torque" else "q_target"
     flaws += [f"{name}: no {quantity}" for quantity in ("q", command) if not recording.has(quantity)]
-    if config.drive == "position" and gains_of(recording, config) is None:
+    if config.drive != "torque" and gains_of(recording, config) is None:
         flaws.append(f"{name}: says no gains (kp, kd), and the model has none")
     needed = {"t", "all", *joint_channels("q", meta.joints), *joint_channels(command, meta.joints)}
     for flaw in report.flaws:

@@ -69,7 +69,8 @@ class ModelConfig:
         base: body that is bolted down.
         joints: driven hinges, in the order of the MuJoCo file; all others are held at zero.
         groups: joints that feel each other, equally many in each group; all in one if null.
-        drive: ``position``: torque = kp (target - q) - kd qd, clipped; ``torque``: ``tau_cmd`` played open loop.
+        drive: ``position``: torque = kp (target - q) - kd qd, clipped; ``voltage``: that clipped, then less the back
+            EMF (torque_limit / speed_limit) qd, as in servos; ``torque``: ``tau_cmd`` played open loop.
         kp: position gain of recordings that say none, N m/rad.
         kd: speed gain of recordings that say none, N m s/rad.
         firmware: how to read the position gain from a recording's notes instead; null for not at all.
@@ -91,7 +92,7 @@ class ModelConfig:
     torque_limit: Limit
     speed_limit: Limit
     groups: tuple[Annotated[tuple[Name, ...], Field(min_length=1)], ...] | None = None
-    drive: Literal["position", "torque"] = "position"
+    drive: Literal["position", "voltage", "torque"] = "position"
     kp: Gain | None = None
     kd: Gain | None = None
     firmware: Firmware | None = None

@@ -19,9 +19,9 @@ from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import NEEDLESS, pd
+from go1exp.gap.replay.machine import NEEDLESS, pd, voltage
 from go1exp.gap.replay.replayer import Replayer
-from go1exp.gap.result import GapSettings
+from go1exp.gap.result import GapSettings, Phase
 from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, gain_warnings, wrong_speeds
 from go1exp.gap.robots.description import ModelConfig
 from go1exp.physics.fixed_base import NO_SENSORS, FixedBaseError, build_fixed_base, feel_each_other
@@ -58,6 +58,8 @@ class FixedBase:
         effort: peak torque (J,), N m.
         top_speed: (J,) rad/s.
         tolerances: of nominal parameters.
+        base_probe: none.
+        on_ground: no.
     """
 
     config: ModelConfig
@@ -67,6 +69,7 @@ class FixedBase:
     top_speed: tuple[float, ...]
     tolerances: Tolerances = DECLARED
     base_probe: tuple[float, ...] = ()
+    on_ground: bool = False
 
     @staticmethod
     def from_config(config: ModelConfig, path: str = "model") -> FixedBase:
@@ -90,6 +93,12 @@ class FixedBase:
                     names = f"{config.joints[b]} and {config.joints[a]}"
                     raise ConfigError([f"{path}.groups: {names} must be in one group, since one carries the other"])
         return machine
+
+    @property
+    def angle_range(self) -> np.ndarray:
+        """Lowest and highest angle (J, 2), rad; NaN where the MuJoCo file has no stops."""
+        model = self.model(0.001, (1.0, 0.0, 0.0, 0.0))
+        return np.where(model.jnt_limited[:, None], model.jnt_range, np.nan)
 
     def model(self, physics_dt: float, base_quat: Sequence[float]) -> Any:
         """Return the compiled MuJoCo model."""
@@ -122,9 +131,9 @@ class FixedBase:
         """Return what turns commands into torques."""
         if self.config.drive == "torque":
             return Term("torque", Entry("actuator", "torque", TorqueDrive), {})
-        return pd()
+        return voltage() if self.config.drive == "voltage" else pd()
 
-    def suited(self, recordings: Sequence[Recording]) -> FixedBase:
+    def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> FixedBase:
         """Return itself: its base is always fixed."""
         return self
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from go1exp import robot
 from go1exp.audit import AuditReport
 from go1exp.gap.data.prepare import TELLING
 from go1exp.gap.data.standing import missing
 from go1exp.recording import Recording
 
 GO1 = "go1"
+ONE_GROUP = (tuple(range(robot.NUM_JOINTS)),)
+"""Legs feel each other through a trunk that is free: all joints are one group."""
+
 NEEDED = ("t", "q", "qd", "q_target")
 """Channels, or quantities, without which nothing can be replayed."""
 

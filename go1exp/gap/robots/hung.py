@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,17 +16,18 @@ from go1exp.env.plant import drive_setup
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import NEEDLESS, pd
+from go1exp.gap.replay.machine import NEEDLESS
 from go1exp.gap.replay.replayer import Replayer
-from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.go1_logs import go1_flaws
+from go1exp.gap.result import GapSettings, Phase
+from go1exp.gap.robots.go1 import Go1
+from go1exp.gap.robots.go1_logs import ONE_GROUP
 from go1exp.gap.robots.protocol import Robot
-from go1exp.gap.robots.standing import ONE_GROUP, StandingGo1
+from go1exp.gap.robots.standing import StandingGo1
+from go1exp.gap.robots.swinging import SwingingGo1
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
-from go1exp.schema.registry import Term
 from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import TerrainConfig, build_terrain
 
@@ -34,7 +35,7 @@ LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS)
 
 
 @dataclass(frozen=True)
-class HungGo1:
+class HungGo1(Go1):
     """A Go1 whose trunk is held, so that its legs do not feel each other.
 
     Attributes:
@@ -42,19 +43,28 @@ class HungGo1:
         joints: names.
         groups: the legs.
         base_probe: none, as the trunk is held.
+        on_ground: no.
         tolerances: of nominal parameters.
+        free_trunk: no.
     """
 
     config: RobotConfig
     joints: tuple[str, ...] = robot.JOINTS
     groups: tuple[tuple[int, ...], ...] = LEGS
     base_probe: tuple[float, ...] = ()
+    on_ground: bool = False
     tolerances: Tolerances = DECLARED
+    free_trunk: ClassVar[bool] = False
 
     @property
-    def effort(self) -> tuple[float, ...]:
-        """Peak torque (J,), N m."""
-        return tuple(float(v) for v in robot.per_joint(self.config.effort_limit))
+    def top_speed(self) -> tuple[float, ...]:
+        """Speed without load (J,), rad/s."""
+        return tuple(float(v) for v in robot.per_joint(self.config.velocity_limit))
+
+    @property
+    def angle_range(self) -> np.ndarray:
+        """Lowest and highest angle (J, 2), rad."""
+        return robot.JOINT_POS_LIMITS.copy()
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
@@ -65,19 +75,13 @@ class HungGo1:
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
-    def drive(self) -> Term:
-        """Return the ideal PD law."""
-        return pd()
-
-    def suited(self, recordings: Sequence[Recording]) -> Robot:
-        """Return the Go1 on its feet if it is so in one of the recordings, else this one."""
+    def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
+        """Return the Go1 on its feet, or its legs in the air, if its trunk is free in a recording, else this one."""
         if not any(r.meta.base == "floating" for r in recordings):
             return self
+        if phase == "swing":
+            return SwingingGo1(self.config, tolerances=self.tolerances)
         return StandingGo1(self.config, replace(self, groups=ONE_GROUP), tolerances=self.tolerances)
-
-    def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
-        """Return why a recording cannot be compared, a line each."""
-        return go1_flaws(recording, report, self.joints, free=False)
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are."""

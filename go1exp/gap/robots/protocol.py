@@ -12,15 +12,15 @@ from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.replayer import Replayer
-from go1exp.gap.result import GapSettings
+from go1exp.gap.result import GapSettings, Phase
 from go1exp.recording import Recording
 
 
 class Robot(Machine, Protocol):
     """A robot that can be replayed, and that knows which recordings can be compared with it, and how."""
 
-    def suited(self, recordings: Sequence[Recording]) -> Robot:
-        """Return the robot as it is in these recordings: hung, or on its feet."""
+    def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
+        """Return the robot as it is in these recordings: hung, on its feet, or its legs while they are in the air."""
 
     def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
         """Return why a recording cannot be compared with this robot, a line each."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -16,16 +16,16 @@ from go1exp.env.plant import drive_setup
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import Machine, pd
+from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.standing import StandingReplayer
-from go1exp.gap.result import GapSettings
-from go1exp.gap.robots.go1_logs import go1_flaws
+from go1exp.gap.result import GapSettings, Phase
+from go1exp.gap.robots.go1 import Go1
+from go1exp.gap.robots.go1_logs import ONE_GROUP
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
-from go1exp.schema.registry import Term
 from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import TerrainConfig, build_terrain
 
@@ -35,12 +35,9 @@ NO_SENSORS = 1 << 13
 BASE_PROBE = (5.0e-4, 1.0e-3, 1.0e-3, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
 """Changes of a base's initial height, roll, pitch, velocity and rate by which their influence is measured."""
 
-ONE_GROUP = (tuple(range(robot.NUM_JOINTS)),)
-"""Legs feel each other through a trunk that is free: all joints are one group."""
-
 
 @dataclass(frozen=True)
-class StandingGo1:
+class StandingGo1(Go1):
     """A Go1 that stands or moves on flat ground, its trunk free.
 
     Attributes:
@@ -49,7 +46,9 @@ class StandingGo1:
         joints: names.
         groups: all joints in one.
         base_probe: as for :class:`~go1exp.gap.replay.machine.Machine`.
+        on_ground: yes.
         tolerances: of nominal parameters.
+        free_trunk: yes.
     """
 
     config: RobotConfig
@@ -57,12 +56,9 @@ class StandingGo1:
     joints: tuple[str, ...] = robot.JOINTS
     groups: tuple[tuple[int, ...], ...] = ONE_GROUP
     base_probe: tuple[float, ...] = BASE_PROBE
+    on_ground: bool = True
     tolerances: Tolerances = DECLARED
-
-    @property
-    def effort(self) -> tuple[float, ...]:
-        """Peak torque (J,), N m."""
-        return tuple(float(v) for v in robot.per_joint(self.config.effort_limit))
+    free_trunk: ClassVar[bool] = True
 
     def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
@@ -71,17 +67,9 @@ class StandingGo1:
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
-    def drive(self) -> Term:
-        """Return the ideal PD law."""
-        return pd()
-
-    def suited(self, recordings: Sequence[Recording]) -> StandingGo1:
+    def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> StandingGo1:
         """Return itself: it can be compared with recordings of a held trunk too."""
         return self
-
-    def flaws(self, recording: Recording, report: AuditReport) -> list[str]:
-        """Return why a recording cannot be compared, a line each."""
-        return go1_flaws(recording, report, self.joints, free=True)
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are, with windows that suit contact."""

@@ -21,7 +21,7 @@ def unexplained(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np
 
 
 def of_angles(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np.ndarray:
-    """Return the root mean square error of each joint's angle in each window (V, J), rad."""
+    """Return the root mean square error of each joint's angle in each window (V, J), rad; NaN if it is not compared."""
     w = scorer.windows
     left = unexplained(scorer, residual, windows)[:, :, :, 0]  # V G n K
     square = np.empty((len(windows), len(w.joints)))
@@ -29,13 +29,14 @@ def of_angles(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np.n
     for g, joints in enumerate(scorer.replayer.machine.groups):
         total = (left[:, g : g + 1] ** 2 * valid).sum(axis=(1, 2))
         square[:, list(joints)] = total / np.maximum(w.valid[windows].sum(1), 1)[:, None]
-    return np.asarray(np.sqrt(square) * scorer.scale[windows][:, 0])
+    scale = scorer.scale[windows][:, 0]
+    return np.asarray(np.sqrt(square) * np.where(np.isfinite(scale), scale, np.nan))
 
 
 def within(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, accept: float) -> float:
     """Return the share of the windows (V,) in which no joint is further off than ``accept`` rad beside the noise."""
     allowed = np.hypot(accept, scorer.scale[windows][:, 0])
-    return float(np.mean((of_angles(scorer, residual, windows) <= allowed).all(axis=1)))
+    return float(np.mean(~(of_angles(scorer, residual, windows) > allowed).any(axis=1)))  # not of what is not compared
 
 
 def angle_errors(
@@ -52,12 +53,13 @@ def angle_errors(
     not decide.
     """
     pair = np.stack([of_angles(scorer, residual, windows) for residual in (before, after)])  # 2 V J
-    whole = np.sqrt((pair**2).mean(axis=2))
+    whole = np.sqrt(np.nanmean(pair**2, axis=2))
     episode = scorer.windows.episode[windows]
     gone = 1.0 - whole[1] / np.maximum(whole[0], 1e-300)
 
     def medians(errors: np.ndarray) -> tuple[float, float]:
-        first, second = np.median(errors, axis=1)
+        known = errors[:, ~np.isnan(errors[0])]
+        first, second = np.median(known, axis=1) if known.size else (np.nan, np.nan)
         return float(first), float(second)
 
     return AngleErrors(

@@ -9,7 +9,7 @@ import numpy as np
 
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Theta, variants
-from go1exp.gap.score.initial_state import settled
+from go1exp.gap.score.initial_state import settled, stepped
 from go1exp.gap.score.likelihood import Scorer, scorer
 from go1exp.recording import Recording
 
@@ -23,10 +23,15 @@ def measured(replayer: Replayer, dt: float, coarse: float, clock_s: float) -> tu
         coarse: step, s, at which the influence of the initial states of a held robot is measured.
         clock_s: standard deviation of the time between stamps of commands and of readings, s.
     """
-    if replayer.machine.base_probe:  # initial states of a free trunk matter so much that they are fitted first
+    if replayer.machine.on_ground:  # initial states of a free trunk matter so much that they are fitted first
         return settled(replayer, dt, clock_s)
 
     def at(theta: Theta) -> tuple[Scorer, dict[str, float]]:
+        if replayer.machine.base_probe:  # legs in the air: most of that error is as one of the initial speeds
+            plain = scorer(replayer, theta, replayer.windows.scale, dt, clock_s)
+            rows = variants(replayer.machine, theta, np.arange(len(replayer.windows)), [])
+            score, numerical = stepped(plain, rows, dt)
+            return replace(score, renewed=lambda values: at(values)[0]), numerical
         scale, numerical = numerical_scale(replayer, dt, theta)
         score = scorer(replayer, theta, scale, coarse, clock_s)
         return replace(score, renewed=lambda values: at(values)[0]), numerical
@@ -46,7 +51,7 @@ def numerical_scale(replayer: Replayer, dt: float, theta: Theta | None = None) -
     coarse, fine = (replayer.run(rows, step) for step in (dt, 0.5 * dt))
     weight = w.valid[..., None, None] / np.maximum(w.valid.sum(1), 1)[:, None, None, None]
     error = 2.0 * np.sqrt(np.sum((coarse - fine) ** 2 * weight, axis=1))  # W C J
-    return np.hypot(w.scale, error), {n: float(np.median(error[:, c])) for c, n in enumerate(w.quantities)}
+    return np.hypot(w.scale, error), w.by_quantity(error)
 
 
 def repeatability(recordings: Sequence[Recording]) -> dict[str, float] | None:

@@ -90,7 +90,7 @@ def settled(
     rough = np.hypot(replayer.windows.scale, 2.0 * np.sqrt(np.mean(fine**2, axis=1)))
     score = _fitted(scorer(replayer, theta, rough, dt, clock_s), rows, theta, dt)
     score = _rescaled(score, score.windows.scale / np.where(np.isfinite(rough), rough, 1.0))
-    score, numerical = _stepped(score, rows, dt)
+    score, numerical = stepped(score, rows, dt)
     score = _bent(score, rows, dt)
     score = dataclasses.replace(score, expected=replayer.windows)
     return dataclasses.replace(score, renewed=lambda values: settled(replayer, dt, clock_s, values)[0]), numerical
@@ -134,7 +134,7 @@ def _fitted(score: Scorer, rows: Rows, theta: Theta, dt: float) -> Scorer:
     return score
 
 
-def _stepped(score: Scorer, rows: Rows, dt: float) -> tuple[Scorer, dict[str, float]]:
+def stepped(score: Scorer, rows: Rows, dt: float) -> tuple[Scorer, dict[str, float]]:
     """Add to the noise twice what half the step changes and no initial state could; return also that, by quantity."""
     everything, windows = np.arange(len(score.windows)), score.windows
     change = score.replayer.run(rows, dt) - score.replayer.run(rows, 0.5 * dt)

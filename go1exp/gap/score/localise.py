@@ -49,7 +49,8 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
         jump = np.abs(np.diff(values, axis=0, prepend=values[:1])) > EDGE
         since = t[row][:, None] - when
         edge[row] = np.einsum("te,ej->tj", ((since >= 0) & (since < 0.06)).astype(int), jump.astype(int)) > 0
-    demand = np.abs(w.demanded(windows))
+    compared = w.compared[windows][:, None]
+    demand = np.abs(w.demanded(windows)) * compared
     span = max(int(TURN_S / w.period), 1)
     turn = np.zeros(q.shape, dtype=bool)
     turn[:, span:-span] = qd[:, : -2 * span] * qd[:, 2 * span :] < 0
@@ -69,7 +70,7 @@ def regimes(scorer: Scorer, windows: np.ndarray) -> np.ndarray:
         long = max(round(IMPACT_S / w.period), 1)
         impact = np.stack([touched[:, max(k - long, 0) : k + 1].any(1) for k in range(stance.shape[1])], axis=1)
         masks += [stance, ~stance, impact]
-    return np.stack(masks) & w.valid[windows][None, ..., None]
+    return np.stack(masks) & w.valid[windows][None, ..., None] & compared
 
 
 def localise(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, rng: np.random.Generator) -> Localisation:

@@ -46,6 +46,14 @@ def count(effect: str, theta: Theta, machine: Machine) -> int:
     return max(beyond_it, 1)
 
 
+def parameters(model: Model) -> int:
+    """Return how many parameters a fitted model uses, at least 1: shapes, and those that leave their tolerance."""
+    known = model.may.tolerances
+    used = [key for key in model.keys if not math.isfinite(known.param(key).tolerance)]
+    used += [key for key in sizes(model.name) if float(np.max(deviation(model.theta, key, known))) > 1.0]
+    return max(len(used), 1)
+
+
 def candidate(model: Model, joints: Sequence[str], **judged: object) -> Candidate:
     """Write a fitted model down; ``judged`` are the other fields of :class:`~go1exp.gap.result.Candidate`."""
     tolerances = model.may.tolerances

@@ -6,7 +6,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import norm
 
+from go1exp.effects.tolerances import sizes
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.score.robust import excess, removed
@@ -26,7 +28,8 @@ def eliminate(search: Ledger) -> None:
         gain = significance.gains(without, search.select_chi2[None])
         needed = removed(excess(without), excess(search.select_chi2)) > search.settings.min_share
         search.returned[name] = removed(search.first, search.first + excess(search.select_chi2) - excess(without))
-        if not needed or significance.max_t(gain, search.rng)[0] >= search.settings.alpha:
+        p = significance.max_t(gain, search.rng, len(search.state.machine.groups))[0]
+        if not needed or p >= search.settings.alpha:
             search.state, search.select_chi2 = rest, without
             search.steps.append((f"without {name}", excess(without)))
 
@@ -37,7 +40,7 @@ def simplify(search: Ledger) -> None:
         simpler = tolerances.identification(name).simpler
         if not simpler or simpler in search.state.terms:
             continue
-        rest = search.state.without(name, simpler).settled(2)
+        rest = instead_of(search.state, name).settled(2)
         before, after = search.state.held_out(search.nominal), search.state.held_out()
         gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
         large = evidence.size(simpler, rest.theta, rest.tolerances) > 1.0
@@ -73,12 +76,27 @@ def symmetrical(search: Ledger) -> None:
         theta, joints = search.state.theta, search.state.machine.joints
         outside = evidence.beyond(name, theta, joints, search.state.tolerances)
         differences = np.stack([draw[first] - draw[second] for draw in resampled(search)])
-        low, high = np.quantile(differences, (0.025, 0.975), axis=0)
-        if not np.all(((low <= 0.0) & (high >= 0.0))[outside]):
+        # 95 % for all joints together: of twelve intervals of 95 % one would often miss zero by chance.
+        wide = norm.ppf(1.0 - 0.025 / max(int(outside.sum()), 1)) * differences.std(axis=0)
+        if not np.all((np.abs(differences.mean(axis=0)) <= wide)[outside]):
             continue
-        rest = search.state.without(name, how.simpler).settled(2)
+        rest = instead_of(search.state, name).settled(2)
         if evidence.size(how.simpler, rest.theta, rest.tolerances) > 1.0:
             replaced(search, name, how.simpler, rest)
+
+
+def instead_of(state: State, name: str) -> State:
+    """Return the state with the simpler effect in the place of a term, not fitted.
+
+    It begins half-way between two parameters of the term that are equal where it is that effect: friction that is the
+    same both ways is far from the tolerance at which plain friction was left.
+    """
+    how = tolerances.identification(name)
+    rest = state.without(name, how.simpler)
+    if not how.simpler_if_equal:
+        return rest
+    one, other = (state.theta[name, parameter] for parameter in how.simpler_if_equal)
+    return replace(rest, theta={**rest.theta, sizes(how.simpler)[0]: 0.5 * (one + other)})
 
 
 def resampled(search: Ledger) -> list[Theta]:

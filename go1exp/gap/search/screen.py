@@ -104,10 +104,10 @@ class Motion:
 def motion(windows: Windows, effort: Sequence[float]) -> Motion:
     """Return what joints did in the windows; ``effort`` (J,) are their peak torques, N m."""
     which = np.arange(len(windows))
-    q, valid = windows.y[:, :, 0], windows.valid[..., None]
+    q, valid = windows.y[:, :, 0], windows.valid[..., None] & windows.compared[:, None]
     asked = np.abs(windows.demanded(which)) * valid
     least, largest = (np.where(valid, q, other).reshape(-1, q.shape[-1]) for other in (np.inf, -np.inf))
-    mean = (q * valid).sum((0, 1)) / np.maximum(valid.sum(), 1)
+    mean = (q * valid).sum((0, 1)) / np.maximum(valid.sum((0, 1)), 1)
     return Motion(mean, least.min(0), largest.max(0), asked.max((0, 1)) / np.asarray(effort))
 
 

@@ -31,18 +31,29 @@ def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.asarray(log_chi2(before) - log_chi2(after)).reshape(len(after), -1)
 
 
-def max_t(gain: np.ndarray, rng: np.random.Generator, flips: int = FLIPS) -> np.ndarray:
-    """Return a p-value (M,) for each of M models' mean gain (M, V), right for all of them together.
+def max_t(gain: np.ndarray, rng: np.random.Generator, groups: int = 1, flips: int = FLIPS) -> np.ndarray:
+    """Return a p-value (M,) for each of M models' mean gain (M, V G), right for all of them together.
 
     Under the hypothesis that a model gains nothing, a window's gain is as likely negative. All models' signs are
-    flipped together, window by window, and each is compared with the largest statistic of all.
+    flipped together, window by window, and each is compared with the largest statistic of all. Beside the mean over
+    all, each group of joints is looked at by itself: what one joint of one leg lacks, the other legs' noise would hide.
+
+    Args:
+        gain: of every window and group, the groups of a window side by side.
+        rng: of the flips.
+        groups: G.
+        flips: of signs.
     """
-    count = gain.shape[1]
-    scale = np.sqrt(np.mean(gain**2, axis=1)) / np.sqrt(count) + 1e-12
-    signs = rng.choice([-1.0, 1.0], size=(flips, count))
-    largest = ((signs @ gain.T) / count / scale).max(axis=1)
-    observed = gain.mean(axis=1) / scale
-    return np.asarray([(1 + np.sum(largest >= s - 1e-12)) / (flips + 1) for s in observed])
+    signs = rng.choice([-1.0, 1.0], size=(flips, gain.shape[1]))
+    parts = [slice(None), *(slice(g, None, groups) for g in range(groups if groups > 1 else 0))]
+    largest, observed = [], []
+    for part in parts:
+        gains_there = gain[:, part]
+        scale = np.sqrt(np.mean(gains_there**2, axis=1)) / np.sqrt(gains_there.shape[1]) + 1e-12
+        largest.append(((signs[:, part] @ gains_there.T) / gains_there.shape[1] / scale).max(axis=1))
+        observed.append(gains_there.mean(axis=1) / scale)
+    of_all = np.max(largest, axis=0)
+    return np.asarray([(1 + np.sum(of_all >= s - 1e-12)) / (flips + 1) for s in np.max(observed, axis=0)])
 
 
 def same(gain: float) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from go1exp.effects.tolerances import sizes
+from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.robust import excess
 from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, tolerances
 from go1exp.gap.search.fit import Model, fit, misfit
@@ -29,6 +30,12 @@ LOOSENED = 3
 """Most effects that join the tolerance box because the data ask for some of them, within their tolerances."""
 
 
+def _confounded(one: str, other: str) -> bool:
+    """Return whether an effect is easily taken for another; for none (""), it is not."""
+    how = tolerances.identification
+    return bool(other) and (other in how(one).confounded or one in how(other).confounded)
+
+
 @dataclass
 class Search(Ledger):
     """A search in progress, and its result (``gap/search/ledger.py``)."""
@@ -37,7 +44,7 @@ class Search(Ledger):
 
     def run(self) -> None:
         """Search."""
-        cause = self.single_cause() if self.state.machine.base_probe else None
+        cause = self.single_cause() if self.state.machine.on_ground else None
         self._fit_nominal()
         if cause is not None:
             self.progress(f"fitting the model with {cause.name}", 0.2)
@@ -78,12 +85,7 @@ class Search(Ledger):
         """Look for one more term, or one more effect to move within its tolerance; return whether to go on."""
         term = len(self.state.terms) + 1
         share = 0.15 + 0.7 * (term - 1) / self.settings.max_terms
-        level = excess(self.select_chi2)
-        if level < 0.0:  # below the floor there is nothing to explain
-            if not self.signal:
-                self._note_signals(self._screened())
-            return False
-        small = level < self.settings.material
+        small = excess(self.select_chi2) < self.settings.material
         fitted = self._proposals(term, share, small)
         accepted, inside = self._judged(fitted, self.state, self.state.train_chi2, self.select_chi2, small)
         if accepted is not None:
@@ -103,17 +105,17 @@ class Search(Ledger):
             self.progress(f"screening for term {term}", share)
             screened = self._screened()
             self._note_signals(screened)
-        straining = None
+        straining: list[str] = []
         if small:
             relief = strain.relief(self.state.scorer, self.state.table, self.state.may)
             values = strain.values(self.state.scorer, self.state.table)
             straining = strain.straining(relief, values, [*self.state.terms, *self._unasked()])
             screened = outside(screened, tolerances.nominal(self.state.machine))
-            if straining is None and not screened:
+            if not straining and not screened:
                 self._note_absorbed(relief)
                 return []
         self.progress(f"fitting candidates for term {term}", share + 0.06)
-        return self._fitted(screened) if straining is None else self._freed(straining)
+        return [self._given_back(effect, self.state.theta) for effect in straining] or self._fitted(screened)
 
     def _accept(self, model: Model) -> bool:
         """Make a candidate a term, unless the model is worse with all else fitted again; return whether it is one."""
@@ -134,12 +136,14 @@ class Search(Ledger):
         # What the box had taken on in place of the effect it gives back: it starts from the nominal values.
         theta = {key: value for key, value in model.theta.items() if key[0] in (*terms, *loosened)}
         state = replace(self.state, terms=terms, loosened=loosened, theta=theta)
-        renews = state.scorer.renewed is not None
-        if renews and model.name == self.single:
+        renews, held = state.scorer.renewed is not None, not state.machine.on_ground
+        if renews and (held or model.name == self.single):
+            # A loaded link answers its initial state otherwise: by the plain model's answer the truth has twice the
+            # floor's chi2, and a fit spreads the load over its neighbours and the drives.
             state = state.renewed()
         state = state.settled(4)
         if renews:
-            state = state.renewed().settled(1)
+            state = state.renewed().settled(2 if held else 1)
         chi2, plain = state.held_out(), state.held_out(model.theta)
         # With little data, what was fitted from scratch can be a poorer optimum.
         if excess(plain) < excess(chi2) - significance.SAME:
@@ -188,17 +192,33 @@ class Search(Ledger):
         wanted = self.settings.effects
         return [e for e in tolerances.nominal(self.state.machine) if wanted and e not in wanted]
 
-    def _freed(self, effect: str) -> list[Model]:
+    def _freed(self, effect: str) -> Model:
         """Return the model in which an effect of the tolerance box may leave its tolerance, fitted."""
         model = Model(effect, self.state.theta, self.state.may.also(effect), sizes(effect))
-        return fit(self.state.scorer, [model], self.state.table, self.settings.iterations, self.dt)
+        return fit(self.state.scorer, [model], self.state.table, self.settings.iterations, self.dt)[0]
+
+    def _given_back(self, effect: str, theta: Theta) -> Model:
+        """Return the model in which an effect may leave its tolerance, and the others begin at their nominal values.
+
+        Several effects within their tolerances make up for it together, at next to no cost: from there a fit of few
+        steps hardly comes away.
+
+        Args:
+            effect: the candidate.
+            theta: values of which those of the candidate and of the terms are kept.
+        """
+        terms = (*self.state.terms, effect)
+        kept = {key: value for key, value in theta.items() if key[0] in (*terms, *self.state.loosened)}
+        state = replace(self.state, terms=terms, theta=kept).settled(2)
+        return Model(effect, state.theta, state.may, sizes(effect), state.train_chi2, state.table.residual)
 
     def _fitted(self, screened: Sequence[Screened]) -> list[Model]:
         """Return models of the best candidates, fitted.
 
         They start from what screening made of a few windows, and what looks hopeless after a step is given up. Where
         the model is near the data both may mislead: effects of the tolerance box are also fitted each on its own, from
-        where they are, and the better fit counts.
+        where they are, and the better fit counts. So may it where the best candidate is one that another is easily
+        taken for: that one is fitted from nominal values of all else, too.
         """
         chosen: dict[str, Screened] = {}
         for s in screened:
@@ -209,8 +229,12 @@ class Search(Ledger):
         fitted = fit(self.state.scorer, models, self.state.table, self.settings.iterations, self.dt) if models else []
         near = excess(self.select_chi2) <= self.settings.adequate
         movable = {key[0] for key in self.state.keys} if near else set()
-        again = [self._freed(m.name)[0] if m.name in movable else m for m in fitted]
-        return [min(pair, key=misfit) for pair in zip(fitted, again, strict=True)]
+        again = [self._freed(m.name) if m.name in movable else m for m in fitted]
+        better = [min(pair, key=misfit) for pair in zip(fitted, again, strict=True)]
+        best = min(better, key=misfit).name if better else ""
+        return [
+            min(m, self._given_back(m.name, m.theta), key=misfit) if _confounded(m.name, best) else m for m in better
+        ]
 
     # ------------------------------------------------------------------ judgement
 

@@ -39,7 +39,7 @@ def identification(effect: str) -> Identification:
 
 def felt(machine: Machine) -> tuple[str, ...]:
     """Return the registered effects that a robot can feel; one whose trunk is held has no use for ground."""
-    return tuple(name for name in members("effect") if machine.base_probe or not identification(name).needs_ground)
+    return tuple(name for name in members("effect") if machine.on_ground or not identification(name).needs_ground)
 
 
 def nominal(machine: Machine) -> tuple[str, ...]:
@@ -128,6 +128,19 @@ class Freedom:
         return 0.0 if self.rigid else tolerance
 
 
+def _beyond_tolerance(effect: str, theta: Mapping[Key, np.ndarray], joint: int, tolerances: Tolerances) -> bool:
+    """Return whether an effect leaves its tolerance at a joint: where it does not, its shape hardly matters.
+
+    A place of next to no mass would wander through all of its bounds, and take the length of every step with it.
+    """
+    for key in sizes(effect):
+        p = tolerances.param(key)
+        value = np.ravel(theta.get(key, np.array([p.null])))
+        if abs(float(value[joint if value.size > 1 else 0]) - p.null) > p.tolerance:
+            return True
+    return False
+
+
 def bounds(
     layout: Layout, columns: Sequence[Probe], theta: Mapping[Key, np.ndarray], may: Freedom, back: bool = False
 ) -> Bounds:
@@ -139,6 +152,8 @@ def bounds(
         theta: present values.
         may: what may leave its tolerance.
         back: whether what is outside must come back inside, and not only no further.
+
+    A shape stays as it is where its effect is within tolerance.
     """
     low, high, centre, weight = (np.zeros(layout.size) for _ in range(4))
     for i in range(layout.size):
@@ -158,6 +173,8 @@ def bounds(
         centre[i] = p.null - value
         scale = p.tolerance if math.isfinite(p.tolerance) else p.high - p.low
         weight[i] = 1.0 / ((WIDE if wide else PRIOR) * scale) ** 2
+        if not math.isfinite(p.tolerance) and not _beyond_tolerance(probe.key[0], theta, j, may.tolerances):
+            low[i] = high[i] = 0.0
     if not back:
         low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
     return Bounds(low, high, centre, weight)

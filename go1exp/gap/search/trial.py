@@ -116,7 +116,8 @@ def tried(
     """
     chi2 = scores(scorer, [m.theta for m in fitted], windows, dt)
     gain = significance.gains(now, chi2)
-    p = significance.max_t(gain, rng) if settings.judge == "max_t" else np.zeros(len(fitted))
+    groups = len(scorer.replayer.machine.groups)
+    p = significance.max_t(gain, rng, groups) if settings.judge == "max_t" else np.zeros(len(fitted))
     if settings.judge == "bic":
         p = (_bic(scorer, fitted, train) >= 0).astype(float)
     before, after = excess(now), [excess(one) for one in chi2]
@@ -126,7 +127,8 @@ def tried(
     sizes = np.array([evidence.size(m.name, m.theta, m.may.tolerances) for m in fitted])
     helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
     outside = helps & (sizes > (CLEAR if small else 1.0))
-    numbers = np.array([(evidence.count(m.name, m.theta, scorer.replayer.machine), len(m.keys)) for m in fitted])
+    machine = scorer.replayer.machine
+    numbers = np.array([(evidence.count(m.name, m.theta, machine), evidence.parameters(m)) for m in fitted])
     chosen, alias, aside = _choice(gain, outside, helps & (sizes <= 1.0), numbers, rng)
     names = [m.name for m in fitted]
     return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, aside, chosen)
@@ -141,7 +143,7 @@ def _choice(
         gain: (M, V G) fall of log chi2 of each candidate.
         outside: (M,) which help and leave their tolerances.
         inside: (M,) which help within their tolerances.
-        numbers: (M, 2) how many values of each leave their tolerance, and how many parameters it has.
+        numbers: (M, 2) how many values of each leave their tolerance, and how many parameters it uses.
         rng: of the tests.
     """
     none = np.zeros(len(gain), dtype=bool)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -259,6 +259,8 @@ def prove(
         NotComparable: if the recordings do not suit the robot.
     """
     robot = robot_from(robot)
+    phase = result.provenance.get("settings", {}).get("phase", "whole")  # what auto came to
+    settings = replace(settings, phase=phase)
     _same_search(recordings, settings, result, robot.tolerances)
     with one_thread():
         comparison = compare(recordings, robot, settings, physics_dt=physics_dt, fewest=1)

@@ -99,7 +99,7 @@ def check(
             parts = comparison.split(rng)
             search = Search(score, parts, comparison.settings, comparison.dt, rng, lambda what, share: None)
             search.measure_signals()
-            silent = not_excited(search.signal, held=not comparison.robot.base_probe)
+            silent = not_excited(search.signal, held=not comparison.robot.on_ground)
     on_progress("done", 1.0)
     error_of_all = excess(score.chi2(plain, everything))
     return CheckResult((), comparison.floors(), len(everything), error_of_all, where, silent, comparison.ready.warnings)

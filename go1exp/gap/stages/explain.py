@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from go1exp import __version__
 from go1exp.effects.tolerances import declared
 from go1exp.gap.answer import Answer, advice, concluded, evidence, not_excited, sentence
-from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from
+from go1exp.gap.comparison import FEWEST_WINDOWS, Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.result import AngleErrors, GapResult, GapSettings, NamedEffect, Overlay
@@ -28,6 +28,13 @@ from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.tensors.threads import one_thread
 
+FEWEST_SWINGS = 24
+"""Windows of legs in the air below which nothing is judged: each shows some of the legs only."""
+
+SWING_ALONE = (
+    "Only legs in the air were compared, so trunk, feet and ground were not judged; search.phase=whole compares all."
+)
+
 
 def explain(
     recordings: Sequence[Recording],
@@ -37,18 +44,42 @@ def explain(
 ) -> GapResult:
     """Compare recordings of a robot with its model, and name what is missing.
 
+    Of a robot that walks, the legs in the air come first: they show what joints lack whatever the ground does. Only if
+    the model agrees with them, or they hardly swing, is the robot on its feet compared (``settings.phase``).
+
     Args:
         recordings: of one robot.
         robot: the nominal Go1, or another :class:`~go1exp.gap.robots.protocol.Robot`.
         settings: how; the defaults if None.
         on_progress: called with what is being done, and which share of the work is finished.
     """
-    start = time.perf_counter()
     settings, robot = settings or GapSettings(), robot_from(robot)
+    if settings.phase != "auto":
+        return _explained(recordings, robot, settings, on_progress)
+    whole, notes, seconds = replace(settings, phase="whole"), tuple[str, ...](), 0.0
+    if all(r.meta.base == "floating" for r in recordings):
+        swing = replace(settings, phase="swing")
+        legs = _explained(recordings, robot, swing, lambda what, share: on_progress(what, 0.5 * share))
+        if legs.verdict not in ("bad log", "no gap", "not excited"):
+            on_progress("done", 1.0)
+            return replace(legs, warnings=(*legs.warnings, SWING_ALONE))
+        if legs.excess:
+            notes = (f"Legs in the air agree with the model: error {1 + legs.excess['box']:.3g} times the floor.",)
+        seconds = legs.seconds
+    result = _explained(recordings, robot, whole, lambda what, share: on_progress(what, 0.5 * (1.0 + share)))
+    return replace(result, warnings=(*notes, *result.warnings), seconds=seconds + result.seconds)
+
+
+def _explained(
+    recordings: Sequence[Recording], robot: Robot, settings: GapSettings, on_progress: Progress
+) -> GapResult:
+    """Compare recordings in one way: legs in the air, or the whole robot."""
+    start = time.perf_counter()
     rng, warnings = np.random.default_rng(settings.seed), list[str]()
     with one_thread():
         try:
-            comparison = compare(recordings, robot, settings, on_progress)
+            fewest = FEWEST_SWINGS if settings.phase == "swing" else FEWEST_WINDOWS
+            comparison = compare(recordings, robot, settings, on_progress, fewest=fewest)
         except NotComparable as error:
             seconds = time.perf_counter() - start
             return GapResult("bad log", str(error), warnings=error.warnings, seconds=seconds)
@@ -106,7 +137,7 @@ def written(
     score, parts, settings, dt = search.state.scorer, search.splits, search.settings, search.dt
     shown = np.sort(np.concatenate([parts.select, parts.confirm]))
     before, after = residuals(score, [{}, search.state.theta], shown, dt)
-    silent = not_excited(search.signal, held=not comparison.robot.base_probe)
+    silent = not_excited(search.signal, held=not comparison.robot.on_ground)
     suggestions = advice({n.effect: n.alias_set for n in answer.named})
     named = {n.effect: n for n in answer.named}
     return GapResult(
@@ -172,20 +203,23 @@ def overlays(
     picked = order[np.unique(np.linspace(0, len(order) // 2, count).astype(int))]
     after = score.replayer.run(variants(machine, theta, windows[picked], []), dt)
     drawn = []
-    compared = [at for at in w.channels if np.isfinite(w.scale[windows[0]][at[1:]])]
+    known = [at for at in w.channels if np.isfinite(w.scale[windows][:, *at[1:]]).any()]
     for row, k in enumerate(picked):
         window = windows[k]
         valid = w.valid[window]
+        compared = [at for at in known if np.isfinite(w.scale[window][at[1:]])]
 
-        def curves(y: np.ndarray, valid: np.ndarray = valid) -> dict[str, np.ndarray]:
-            return {name: y[valid, c, i] for name, c, i in compared}
+        def curves(
+            y: np.ndarray, channels: Sequence[tuple[str, int, int]] = compared, valid: np.ndarray = valid
+        ) -> dict[str, np.ndarray]:
+            return {name: y[valid, c, i] for name, c, i in channels}
 
         noise = {name: float(w.scale[window, c, i]) for name, c, i in compared}
         drawn.append(
             Overlay(
                 recordings[w.episode[window]].meta.episode,
                 w.begin[window] + w.t[window, valid],
-                curves(w.y[window]),
+                curves(w.y[window], known),
                 curves(before[k]),
                 curves(after[row]),
                 noise,

@@ -163,7 +163,7 @@ def replay(
         on_progress: called with what is being done, and which share of the work is finished.
     """
     robot = robot_from(robot)
-    settings = dataclasses.replace(settings, torque=False, physics_dt=physics_dt)
+    settings = dataclasses.replace(settings, torque=False, physics_dt=physics_dt, phase="whole")
     kinds = [[r for r in recordings if (r.meta.base == "floating") == free] for free in (False, True)]
     comparisons = []
     parts: list[Part] = []

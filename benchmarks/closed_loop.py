@@ -1,0 +1,479 @@
+"""The loop closed on a policy: hidden robots are recorded, the gap is named, the policy is fine-tuned and walks again.
+
+    python -m benchmarks.closed_loop out=DIR [size=full|small|tiny] [robots=friction,late] [seed=0] [threads=2]
+
+For each hidden robot (``benchmarks/gap/hidden.py``, physics that is not the library's) ``go1exp gap`` writes an
+``effect.yaml`` from its recordings, hung, or on its feet where those give no effect. Then the policy is fine-tuned
+with it, and with equally many steps on the plain model and with an actuator net fitted to hung recordings.
+All four policies walk on the hidden robot with the same seeds. Writes ``robots.json``, ``robots.csv`` and
+``closed_loop.json``. What is done already is not done again, so an interrupted run goes on.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.gap import hidden, logger
+from benchmarks.gap.walking import Ground, Policy
+from benchmarks.results import write_results
+from go1exp.config import parse_train
+from go1exp.evaluate.policy import load_network
+from go1exp.export.graph import DeployedPolicy
+from go1exp.statistics.intervals import Interval, bootstrap_interval, mean_interval, share_interval
+from go1exp.train import run_folder
+
+Command = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is done.
+
+    Attributes:
+        robots: names of ``hidden.SECRETS``.
+        task: overrides of all trainings.
+        first: further ones of the training from nothing; it may take coarser physics than all that follow.
+        walker: further ones of the training after it, which makes the policy that all others start from.
+        tuned: further ones of every fine-tuning, the number of its iterations among them.
+        physics_dt: step of fine-tuning, s.
+        ground: that the robots walk on, where they hide none.
+        recordings: hung ones of each robot, and squats.
+        seconds: of each recording.
+        search: further settings of ``go1exp gap``.
+        for_net: further hung ones, which the actuator net alone is fitted to, and their seconds.
+        net: further settings of ``go1exp fit-actuator``.
+        commands: of the walks that are judged, m/s, m/s, rad/s.
+        walks: with each command.
+        walk_s: of each walk, s.
+    """
+
+    robots: tuple[str, ...]
+    task: tuple[str, ...]
+    first: tuple[str, ...]
+    walker: tuple[str, ...]
+    tuned: tuple[str, ...]
+    physics_dt: float
+    ground: Ground
+    recordings: int
+    seconds: float
+    search: tuple[str, ...]
+    for_net: tuple[int, float]
+    net: tuple[str, ...]
+    commands: tuple[Command, ...]
+    walks: int
+    walk_s: float
+
+
+SLOW = ((0.5, 0.0, 0.0), (-0.4, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, -0.3, 0.0), (0.0, 0.0, 0.8), (0.4, 0.2, -0.5))
+FAST = ((1.5, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 0.3, 0.5), (0.0, 0.0, 1.5))
+NET = ("target=joint_torque", "smoothing=0.02", "history=8", "period=0.004", "half_net=false", "plots=false")
+
+SIZES = {
+    "full": Size(
+        robots=tuple(hidden.SECRETS),
+        # A policy that has seen ideal drives on nominal robots only.
+        task=("experiment=trot", "actuator=pd", "~actuator.command", "effect=none", "rand=none"),
+        first=(),
+        walker=("ppo.iterations=50",),
+        tuned=("ppo.iterations=150",),
+        physics_dt=0.002,
+        ground=Ground(time_constant=0.005),
+        recordings=8,
+        seconds=5.0,
+        search=(),
+        for_net=(20, 5.0),
+        net=(*NET, "epochs=60"),
+        commands=(*SLOW, *FAST),
+        walks=20,
+        walk_s=10.0,
+    ),
+    "small": Size(
+        robots=("friction", "late"),  # those on their feet take minutes more
+        task=("experiment=five_minutes",),
+        first=(),
+        walker=("sim.physics_dt=0.005", "ppo.iterations=30"),
+        tuned=("sim.physics_dt=0.005", "ppo.iterations=25"),
+        physics_dt=0.005,
+        ground=Ground(),
+        recordings=6,
+        seconds=3.0,
+        search=("search.max_terms=2", "search.shortlist=3", "search.iterations=2", "search.bootstraps=12"),
+        for_net=(13, 4.0),
+        net=(*NET, "epochs=20"),
+        commands=SLOW,
+        walks=8,
+        walk_s=6.0,
+    ),
+    "tiny": Size(  # for a test: nothing is learnt in it
+        robots=("friction",),
+        task=("experiment=five_minutes", "ppo.num_envs=32", "ppo.iterations=1"),
+        first=(),
+        walker=("sim.physics_dt=0.005",),
+        tuned=("sim.physics_dt=0.005",),
+        physics_dt=0.005,
+        ground=Ground(),
+        recordings=6,
+        seconds=1.2,
+        search=("search.max_terms=1", "search.shortlist=1", "search.iterations=1", "search.bootstraps=4"),
+        for_net=(3, 1.0),
+        net=(*NET, "epochs=1"),
+        commands=SLOW[:2],
+        walks=2,
+        walk_s=1.5,
+    ),
+}
+
+POLICIES = ("before", "plain", "net", "effects")
+"""As trained; fine-tuned on the plain model, with the actuator net, and with the named effects."""
+
+VERDICTS = (0, 10, 11, 12, 13, 15)
+"""Exit statuses of ``go1exp gap`` that tell something of the robot, not of the logs."""
+
+DONE = "done.json"
+"""In the folder of a step that is finished."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a run of this benchmark keeps its files, its size, seed and threads."""
+
+    out: Path
+    size: Size
+    seed: int
+    threads: int
+
+    def named(self, *parts: str) -> Path:
+        """Return a folder of it."""
+        return self.out.joinpath(*parts)
+
+
+def go1exp(*words: str, allowed: Sequence[int] = (0,)) -> int:
+    """Run a command as a user would and return its exit status.
+
+    Raises:
+        SystemExit: if that is not one of ``allowed``.
+    """
+    print("$ go1exp", *words, flush=True)
+    status = subprocess.run([sys.executable, "-m", "go1exp.cli", *words]).returncode
+    if status not in allowed:
+        raise SystemExit(f"go1exp {' '.join(words)}: exit status {status}")
+    return status
+
+
+def finished(folder: Path) -> bool:
+    """Return whether the step of this folder was done before."""
+    return (folder / DONE).is_file()
+
+
+def finish(folder: Path, **content: Any) -> None:
+    """Note that a step is done, and what came of it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = folder / f".{DONE}"
+    partial.write_text(json.dumps(content, indent=1) + "\n")
+    partial.rename(folder / DONE)
+
+
+# ---------------------------------------------------------------------- what the user of the robot does
+
+
+def trained(place: Place, run: Path, *words: str) -> Path:
+    """Train into a run folder, or go on with what is there; return it."""
+    if not finished(run):
+        if list((run / "checkpoints").glob("*.pt")):
+            go1exp("train", f"resume={run}")
+        else:
+            go1exp("train", *place.size.task, *words, f"seed={place.seed}", f"hydra.run.dir={run}")
+        finish(run)
+    return run
+
+
+def walker(place: Place) -> Path:
+    """Return the run of the policy that all others start from: trained on the nominal robot."""
+    first = trained(place, place.named("first"), *place.size.first)
+    return trained(place, place.named("walker"), f"start_from={first}", *place.size.walker)
+
+
+def tuned(place: Place, run: Path, *words: str) -> Path:
+    """Return the run of a fine-tuned policy."""
+    return trained(place, run, f"start_from={place.named('walker')}", *place.size.tuned, *words)
+
+
+def named_effects(place: Place, name: str) -> dict[str, Any]:
+    """Return what ``go1exp gap`` says of a robot: by its hung logs, or by those on its feet if they give no effect.
+
+    ``file`` is the ``effect.yaml``, which has what is certified; where nothing is, it is empty.
+    """
+    verdict: dict[str, Any] = {}
+    for support in ("hung", "ground"):
+        logs, out = place.named(name, support), place.named(name, f"gap_{support}")
+        if support == "ground":
+            record(place, name, logs)
+        if not finished(out):
+            begun = time.monotonic()
+            where = (f"logs={logs}", f"out={out}", f"train_dt={place.size.physics_dt}")
+            search = ("search.overlays=0", f"search.threads={place.threads}", *place.size.search)
+            status = go1exp("gap", *where, *search, allowed=VERDICTS)
+            answer = json.loads((out / "verdict.json").read_text())
+            names = [f"{n['effect']} ({n['status']})" for n in answer["named"]]
+            certain = any(n["status"] == "certified" for n in answer["named"])
+            about = {"verdict": answer["verdict"], "named": names, "certain": certain, "exit": status}
+            finish(out, logs=support, **about, seconds=round(time.monotonic() - begun, 1))
+        verdict = json.loads((out / DONE).read_text()) | {"file": str(out / "effect.yaml")}
+        if verdict["certain"]:
+            break
+    return verdict
+
+
+def fitted_net(place: Place, name: str) -> Path:
+    """Return the actuator net fitted to hung recordings of a robot at the gains of its policy."""
+    out, logs = place.named(name, "net_fit"), place.named(name, "hung_for_net")
+    if not finished(out):
+        record(place, name, logs)
+        go1exp("fit-actuator", f"recordings={logs}", f"out={out}", *place.size.net)
+        finish(out)
+    return out / "net.npz"
+
+
+# ---------------------------------------------------------------------- what the robot does
+
+
+def deployed(run: Path) -> Policy:
+    """Return the newest policy of a run as a bundle would hold it: readings in, joint targets and action out."""
+    config = parse_train(run_folder.read_config(run))
+    network, _ = load_network(run, config.ppo)
+    module = DeployedPolicy(network, config.task.observation, config.task.action)
+
+    def policy(readings: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        with torch.no_grad():
+            target, _, action = module(*(torch.from_numpy(readings[port.name]) for port in module.inputs))
+        return {"joint_target": target.numpy().astype(float), "action": action.numpy().astype(float)}
+
+    return policy
+
+
+def record(place: Place, name: str, folder: Path) -> None:
+    """Write the recordings of a hidden robot, unless they are there; the folder's name says of which kind."""
+    if finished(folder):
+        return
+    size, robot = place.size, hidden.make(name, place.seed, place.size.ground)
+    if folder.name == "hung":
+        made = hidden.record_hung(robot, name, place.seed, size.recordings, size.seconds)
+    elif folder.name == "hung_for_net":
+        made = hidden.record_for_net(robot, name, place.seed, *size.for_net)
+    else:
+        policy, told = deployed(place.named("walker")), np.array(size.commands[:2])
+        made = hidden.record_ground(robot, name, place.seed, size.recordings, size.seconds, policy, told)
+    logger.save(folder, made)
+    finish(folder, episodes=len(made))
+
+
+def judge(place: Place, robot: hidden.Hidden, run: Path, file: Path) -> None:
+    """Write the errors of a policy's walks on a robot, m/s, and its falls, unless they are there."""
+    if not file.is_file():
+        size = place.size
+        errors, fell = hidden.judged(robot, deployed(run), size.commands, size.walks, size.walk_s, place.seed)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps({"errors": errors.round(6).tolist(), "fell": fell.tolist()}) + "\n")
+
+
+# ---------------------------------------------------------------------- figures
+
+
+@dataclass(frozen=True)
+class Walks:
+    """Walks of one policy on one robot: errors (n,) m/s, and falls (n,) bool; the k-th has the k-th seed."""
+
+    errors: np.ndarray
+    fell: np.ndarray
+
+    @classmethod
+    def read(cls, file: Path) -> Walks:
+        """Read what ``judge`` wrote."""
+        plain = json.loads(file.read_text())
+        return cls(np.array(plain["errors"]), np.array(plain["fell"], dtype=bool))
+
+
+def won_back(nominal: np.ndarray, before: np.ndarray, after: np.ndarray) -> Interval:
+    """Return the share of what a robot adds to the mean (over the nominal one) that fine-tuning takes away again.
+
+    (before - after) / (before - nominal) of the means, with the bootstrap over walks (n,), which belong together by
+    their seeds. NaN where the robot adds nothing: where the interval of what it adds holds zero.
+    """
+
+    def added(walks: np.ndarray) -> float:
+        return float(before[walks].mean() - nominal[walks].mean())
+
+    if not bootstrap_interval(added, len(before)).low > 0:
+        return Interval(float("nan"), float("nan"), float("nan"), len(before))
+    return bootstrap_interval(lambda k: float(before[k].mean() - after[k].mean()) / added(k), len(before))
+
+
+def median_over(robots: Sequence[float]) -> Interval:
+    """Return the median over robots, NaNs left out, with the bootstrap over robots."""
+    each = np.array([value for value in robots if np.isfinite(value)])
+    return bootstrap_interval(lambda k: float(np.median(each[k])), len(each), draws=4000)
+
+
+def falls_won_back(nominal: Walks, robots: Sequence[Mapping[str, Walks]], policy: str) -> Interval:
+    """Return the share of the falls added by all robots that fine-tuning takes away, with the bootstrap over robots."""
+
+    def share(k: np.ndarray) -> float:
+        before, after = (sum(robots[i][which].fell.mean() for i in k) for which in ("before", policy))
+        added = before - len(k) * nominal.fell.mean()
+        return float((before - after) / added) if added > 0 else float("nan")
+
+    return bootstrap_interval(share, len(robots), draws=4000)
+
+
+def row_of(name: str, verdict: Mapping[str, Any], nominal: Walks, walks: Mapping[str, Walks]) -> dict[str, Any]:
+    """Return a robot's row of the table: errors with 95 % intervals, falls, shares won back."""
+    row: dict[str, Any] = {"robot": name, "hides": hidden.SECRETS[name].about, "walks": len(nominal.errors)}
+    row |= {"logs": verdict["logs"], "verdict": verdict["verdict"], "named": ", ".join(verdict["named"])}
+    for policy, each in {"nominal": nominal, **walks}.items():
+        error = mean_interval(each.errors)
+        falls = share_interval(int(each.fell.sum()), len(each.fell))
+        row |= {f"{policy}_error": error.estimate, f"{policy}_error_low": error.low, f"{policy}_error_high": error.high}
+        row |= {f"{policy}_falls": int(each.fell.sum()), f"{policy}_falls_low": falls.low}
+        row |= {f"{policy}_falls_high": falls.high}
+    for policy in POLICIES[1:]:
+        share = won_back(nominal.errors, walks["before"].errors, walks[policy].errors)
+        row |= {f"won_back_{policy}": share.estimate, f"won_back_{policy}_low": share.low}
+        row |= {f"won_back_{policy}_high": share.high}
+    return {key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()}
+
+
+def figures_of(
+    rows: Sequence[Mapping[str, Any]], nominal: Walks, walks: Sequence[Mapping[str, Walks]]
+) -> dict[str, float | int | str | None]:
+    """Return the figures of all robots: the median share of the error won back, and the share of the falls."""
+    figures: dict[str, float | int | str | None] = {"closed_loop_robots": len(rows)}
+    figures["closed_loop_walks"] = len(nominal.errors)
+    for policy, end in (("effects", ""), ("plain", "_plain"), ("net", "_net")):
+        shares = median_over([row[f"won_back_{policy}"] for row in rows])
+        falls = falls_won_back(nominal, walks, policy)
+        figures["closed_loop_robots_hurt"] = shares.n
+        for key, figure in ((f"won_back{end}", shares), (f"falls_won_back{end}", falls)):
+            parts = {"": figure.estimate, "_low": figure.low, "_high": figure.high}
+            figures |= {f"closed_loop_{key}{k}": round(v, 4) if np.isfinite(v) else None for k, v in parts.items()}
+    return figures
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the rows as lines for people."""
+    lines = [f"{'robot':14} {'nominal':>8}" + "".join(f"{p:>16}" for p in POLICIES) + "  won back (95 %), named"]
+    for row in rows:
+        cells = "".join(f"{row[f'{p}_error']:8.3f} ({row[f'{p}_falls']:2d} fell)" for p in POLICIES)
+        shares = "; ".join(
+            f"{p} {row[f'won_back_{p}']:.0%} ({row[f'won_back_{p}_low']:.0%} to {row[f'won_back_{p}_high']:.0%})"
+            for p in POLICIES[1:]
+        )
+        lines.append(
+            f"{row['robot']:14} {row['nominal_error']:8.3f}{cells}  {shares}; {row['named'] or 'nothing named'}"
+        )
+    return "\n".join(lines)
+
+
+def write_table(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write the rows as ``robots.json`` and ``robots.csv``; what is not defined is null, or empty."""
+    plain = [{k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()} for row in rows]
+    (out / "robots.json").write_text(json.dumps(plain, indent=1) + "\n")
+    with open(out / "robots.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(plain[0]))
+        writer.writeheader()
+        writer.writerows(plain)
+
+
+# ---------------------------------------------------------------------- the whole
+
+
+def robot_of(place: Place, name: str) -> tuple[dict[str, Any], dict[str, Walks]]:
+    """Record a robot, name its gap, fine-tune, and let all four policies walk on it."""
+    record(place, name, place.named(name, "hung"))
+    verdict = named_effects(place, name)
+    net = fitted_net(place, name)
+    runs = {
+        "before": place.named("walker"),
+        "plain": place.named("plain"),
+        "net": tuned(
+            place, place.named(name, "net"), "actuator=net", f"actuator.file={net}", "actuator.period=resample"
+        ),
+        "effects": tuned(place, place.named(name, "effects"), f"effect={verdict['file']}"),
+    }
+    robot = hidden.make(name, place.seed, place.size.ground)
+    for policy, run in runs.items():
+        judge(place, robot, run, place.named(name, f"walks_{policy}.json"))
+    return verdict, {policy: Walks.read(place.named(name, f"walks_{policy}.json")) for policy in runs}
+
+
+def settled(given: Mapping[str, str]) -> tuple[Place, tuple[str, ...]]:
+    """Read the arguments; return the place of the run, and its robots.
+
+    Raises:
+        SystemExit: if one is wrong, or the folder holds a run of another size or seed.
+    """
+    usage = (
+        f"usage: python -m benchmarks.closed_loop out=DIR [size={'|'.join(SIZES)}] [robots=NAME,NAME] [seed=0] "
+        f"[threads=INT]\nrobots: {', '.join(hidden.SECRETS)}"
+    )
+    if not {"out"} <= set(given) <= {"out", "size", "robots", "seed", "threads"}:
+        raise SystemExit(usage)
+    name = given.get("size", "full")
+    if name not in SIZES:
+        raise SystemExit(f"size={name}: must be one of {', '.join(SIZES)}\n{usage}")
+    try:
+        seed, threads = int(given.get("seed", 0)), int(given.get("threads", os.cpu_count() or 1))
+    except ValueError as error:
+        raise SystemExit(f"seed and threads must be whole numbers: {error}\n{usage}") from None
+    robots = tuple(given["robots"].split(",")) if "robots" in given else SIZES[name].robots
+    for robot in robots:
+        if robot not in hidden.SECRETS:
+            raise SystemExit(f"robots: {robot!r} must be one of {', '.join(hidden.SECRETS)}\n{usage}")
+    place = Place(Path(given["out"]).resolve(), SIZES[name], seed, threads)
+    settings = json.loads(json.dumps({**asdict(place.size), "seed": seed}))
+    del settings["robots"]  # others may be added
+    file = place.named("settings.json")
+    if file.is_file() and json.loads(file.read_text()) != settings:
+        raise SystemExit(f"{place.out}: holds a run with another size or seed; take another folder")
+    place.out.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(settings, indent=1) + "\n")
+    return place, robots
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Close the loop on every robot, print the table and write the figures."""
+    given = dict(a.split("=", 1) for a in arguments if "=" in a)
+    place, robots = settled(given if len(given) == len(arguments) else {})
+    torch.set_num_threads(1)
+    begun = time.monotonic()
+    run = walker(place)
+    tuned(place, place.named("plain"))
+    judge(place, hidden.nominal(place.size.ground), run, place.named("walks_nominal.json"))
+    nominal = Walks.read(place.named("walks_nominal.json"))
+    rows, walks = [], []
+    for count, name in enumerate(robots, start=1):
+        verdict, of_robot = robot_of(place, name)
+        walks.append(of_robot)
+        rows.append(row_of(name, verdict, nominal, of_robot))
+        print(f"robot {count}/{len(robots)}, {(time.monotonic() - begun) / 60:.1f} min\n{table(rows)}\n", flush=True)
+    write_table(place.out, rows)
+    command = f"python -m benchmarks.closed_loop size={given.get('size', 'full')} seed={place.seed} "
+    write_results(
+        place.named("closed_loop.json"), f"{command}robots={','.join(robots)}", figures_of(rows, nominal, walks)
+    )
+    print(f"written to {place.out}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

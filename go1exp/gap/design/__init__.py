@@ -1,0 +1,1 @@
+"""The next recording: which motion tells apart what the recordings at hand cannot."""

@@ -1,0 +1,146 @@
+"""Recordings that could be made: motion, size, gains, attitude of the base; a library, and neighbours of one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+import go1exp.excitations  # noqa: F401  (registers every excitation)
+from go1exp.excitations import ExcitationError, Motion
+from go1exp.gap.design.limits import Limits
+from go1exp.schema.registry import Term, bind, members
+
+SIZES = ("amplitude", "large", "stride", "lift", "sway")
+"""Parameters of excitations that say how far the joints go."""
+
+MOTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("chirp", {"band": (0.1, 4.0)}),
+    ("chirp", {"band": (0.5, 10.0)}),
+    ("multisine", {"band": (0.15, 8.0)}),
+    ("multisine", {"band": (0.5, 15.0)}),
+    ("steps", {}),
+    ("slow_ramps", {}),
+    ("slow_ramps", {"speed": 0.8, "hold": 0.3}),
+    ("torque_off", {}),
+    ("gait", {}),
+)
+"""Kinds of motion in the library."""
+
+SCALES = (1.0, 0.5)
+"""Sizes of motion in the library, as shares of what the excitation does by itself."""
+
+CARRIED = 0.3
+"""Highest frequency of a band over the rate of commands."""
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """How a base is held: ``roll`` and ``pitch``, rad, None for as it was; ``quat`` w-x-y-z."""
+
+    roll: float | None
+    pitch: float | None
+    quat: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Design:
+    """A recording that could be made.
+
+    Attributes:
+        excitation: kind of motion.
+        parameters: of the excitation.
+        scale: size of the motion, 1 is the excitation's own.
+        gains: factors on kp and kd of the recordings at hand.
+        attitude: of the base.
+        seed: of the motion.
+    """
+
+    excitation: str
+    parameters: Mapping[str, Any]
+    scale: float
+    gains: tuple[float, float]
+    attitude: Attitude
+    seed: int
+
+    def term(self, rate_hz: float) -> Term:
+        """Return the excitation, its size and band as they are played at a rate of commands, Hz."""
+        defaults = {name: p.default for name, p in members("excitation")[self.excitation].parameters.items()}
+        given = dict(self.parameters)
+        for name in SIZES:
+            if name in defaults:
+                value = given.get(name, defaults[name])
+                scaled = [float(f"{self.scale * v:.4g}") for v in np.atleast_1d(value)]
+                given[name] = scaled if np.ndim(value) else scaled[0]
+        if "band" in defaults:
+            low, high = given.get("band", defaults["band"])
+            high = min(high, CARRIED * rate_hz)
+            given["band"] = [float(f"{min(low, 0.5 * high):.4g}"), float(f"{high:.4g}")]
+        term, problems = bind("excitation", self.excitation, given, self.excitation)
+        assert term is not None, problems  # of this file's own tables
+        return term
+
+    def motion(self, seconds: float, period: float, limits: Limits) -> Motion | None:
+        """Return the motion, commanded every ``period`` s; None if the excitation cannot be made for this robot."""
+        t = np.arange(round(seconds / period)) * period
+        try:
+            made: Motion = self.term(1.0 / period)(t, limits.centre, limits.angle, np.random.default_rng(self.seed))
+        except ExcitationError:
+            return None
+        # Seen from the drive there is no difference between this and the file that it is written to.
+        return replace(made, target=made.target.round(5).clip(limits.angle[:, 0], limits.angle[:, 1]), soft_start=0.0)
+
+    def about(self, rate_hz: float) -> dict[str, Any]:
+        """Return what it is, as JSON can hold it."""
+        plain = json.loads(json.dumps(dict(self.term(rate_hz).parameters)))
+        return {"motion": self.excitation, "parameters": plain, "gain_factors": self.gains, "seed": self.seed} | {
+            "attitude": asdict(self.attitude)
+        }
+
+
+def library(
+    count: int, gains: Sequence[tuple[float, float]], attitudes: Sequence[Attitude], rng: np.random.Generator
+) -> list[Design]:
+    """Return up to ``count`` designs, drawn evenly from all combinations, in the order of attitudes."""
+    seed = int(rng.integers(1 << 16))
+    every = [
+        Design(name, parameters, scale, pair, attitude, seed)
+        for attitude in attitudes
+        for name, parameters in MOTIONS
+        for scale in SCALES
+        for pair in gains
+    ]
+    if len(every) <= count:
+        return every
+    return [every[k] for k in np.sort(rng.permutation(len(every))[:count])]
+
+
+def neighbours(
+    best: Design,
+    count: int,
+    gains: Sequence[tuple[float, float]],
+    attitudes: Sequence[Attitude],
+    rng: np.random.Generator,
+) -> list[Design]:
+    """Return designs near one: another size, band, gain (between those allowed), attitude or seed."""
+    designs = []
+    factors = np.array(gains)
+    low, high = factors.min(axis=0), factors.max(axis=0)
+    for _ in range(count):
+        tried = replace(best, scale=float(np.clip(best.scale * rng.uniform(0.7, 1.5), 0.1, 2.0)))
+        if "band" in best.parameters:
+            stretch = np.exp(rng.uniform(-0.5, 0.5, 2))
+            band = np.sort(np.array(best.parameters["band"]) * stretch)
+            tried = replace(tried, parameters={**best.parameters, "band": tuple(float(v) for v in band)})
+        if rng.uniform() < 0.5:
+            pair = (np.array(best.gains) * np.exp(rng.uniform(-0.3, 0.3, 2))).clip(low, high)
+            tried = replace(tried, gains=(float(pair[0]), float(pair[1])))
+        if rng.uniform() < 0.3:
+            tried = replace(tried, attitude=attitudes[int(rng.integers(len(attitudes)))])
+        if rng.uniform() < 0.5:
+            tried = replace(tried, seed=int(rng.integers(1 << 16)))
+        designs.append(tried)
+    return designs

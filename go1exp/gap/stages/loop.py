@@ -1,0 +1,164 @@
+"""The stage ``loop``: record, search, design, and again, on a simulated robot, until one name is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from go1exp.gap.comparison import Progress
+from go1exp.gap.design.limits import DesignError
+from go1exp.gap.design.settings import DesignSettings
+from go1exp.gap.result import GapResult, GapSettings
+from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.stages.explain import explain
+from go1exp.gap.stages.next import NextResult, design
+from go1exp.record.plan import Episode
+from go1exp.record.sensors import SensorConfig
+from go1exp.record.simulate import Rig, play
+from go1exp.recording import Recording
+
+
+@dataclass(frozen=True)
+class Round:
+    """One turn of the loop.
+
+    Attributes:
+        number: from 0, the recordings that it begins with.
+        recordings: how many there are.
+        robot_seconds: of all recordings so far.
+        verdict: of the search.
+        names: effects that are named, each with the rivals that are not settled behind it.
+        power: least chance to tell a name from a rival, by the recordings so far; 1 if no rival is left.
+        next: what was designed, in words; empty if the loop ends here.
+        ended: why it ends here; empty if it goes on.
+    """
+
+    number: int
+    recordings: int
+    robot_seconds: float
+    verdict: str
+    names: tuple[tuple[str, ...], ...]
+    power: float
+    next: str
+    ended: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What a round leaves beside its row: the recordings so far, the answer, and the design if there was one."""
+
+    row: Round
+    recordings: tuple[Recording, ...]
+    result: GapResult
+    design: NextResult | None
+
+
+def names_left(result: GapResult, planned: NextResult | None) -> tuple[tuple[str, ...], ...]:
+    """Return each named effect, and behind it the rivals that are not settled."""
+    pairs = planned.pairs if planned else ()
+    return tuple((n.effect, *(p.rival for p in pairs if p.truth == n.effect and p.rival)) for n in result.named)
+
+
+def as_episode(planned: NextResult, number: int, seed: int) -> Episode:
+    """Return a design as an episode to record on a Go1."""
+    best = planned.best
+    assert best is not None
+    attitude = best.design.attitude
+    assert attitude.roll is not None  # a Go1's
+    assert attitude.pitch is not None
+    hang = (attitude.roll, attitude.pitch)
+    name = f"next_{number}_{best.design.excitation}"
+    return Episode(name, best.design.excitation, best.motion, best.kp[0], best.kd[0], hang, None, seed)
+
+
+def loop(
+    rig: Rig,
+    episodes: Sequence[Episode],
+    sensors: SensorConfig,
+    robot: Robot,
+    search: GapSettings,
+    settings: DesignSettings,
+    rounds: int,
+    on_round: Callable[[Turn], None],
+    on_progress: Progress = lambda what, share: None,
+) -> list[Round]:
+    """Close the circle: no one is asked anything in between.
+
+    Args:
+        rig: the hidden robot.
+        episodes: to begin with.
+        sensors: the logger.
+        robot: the model that it is compared with.
+        search: settings of the searches.
+        settings: of the designs.
+        rounds: designed recordings, at most.
+        on_round: called after each search and design.
+        on_progress: as for ``explain``.
+
+    Returns:
+        A row for each round; the last one says why it ended.
+    """
+    recordings = play(rig, episodes, sensors, settings.seed, lambda done, total: None)
+    rows: list[Round] = []
+    for number in range(rounds + 1):
+        result = explain(recordings, robot, search, on_progress)
+        planned, ended = _designed(result, recordings, robot, search, settings, on_progress)
+        if not ended and number == rounds:
+            ended = "rounds are used up"
+        rows.append(_row(number, recordings, result, planned, ended))
+        on_round(Turn(rows[-1], tuple(recordings), result, planned))
+        if ended:
+            break
+        assert planned is not None
+        new = as_episode(planned, number + 1, settings.seed + number + 1)
+        recordings = [*recordings, *play(rig, [new], sensors, settings.seed, lambda done, total: None)]
+    return rows
+
+
+def _designed(
+    result: GapResult,
+    recordings: Sequence[Recording],
+    robot: Robot,
+    search: GapSettings,
+    settings: DesignSettings,
+    on_progress: Progress,
+) -> tuple[NextResult | None, str]:
+    """Return the design for a result, and why the loop ends with it; empty if it goes on."""
+    if not result.named:
+        return None, f"nothing is named: {result.verdict}"
+    try:
+        planned = design(result, recordings, robot, search, settings, on_progress, names_only=True)
+    except DesignError as error:
+        return None, str(error)
+    ends = {"nothing left": "one name is left", "not separable": "not separable"}
+    return planned, ends.get(planned.verdict, "")
+
+
+def _row(
+    number: int, recordings: Sequence[Recording], result: GapResult, planned: NextResult | None, ended: str
+) -> Round:
+    seconds = round(sum(float(r.t[-1] - r.t[0]) for r in recordings), 3)
+    pairs = planned.pairs if planned else ()
+    power = min((p.before.power for p in pairs), default=1.0 if result.named else 0.0)
+    best = planned.best if planned else None
+    words = ""
+    if best and not ended:
+        attitude = best.design.attitude
+        words = f"{best.design.excitation}, kp {best.kp[0]:g}, kd {best.kd[0]:g}"
+        words += f", roll {attitude.roll:g}, pitch {attitude.pitch:g}"
+    return Round(number, len(recordings), seconds, result.verdict, names_left(result, planned), power, words, ended)
+
+
+def table(rows: Sequence[Round]) -> str:
+    """Return rounds as lines for people."""
+    lines = [f"{'round':>5} {'robot s':>8} {'power':>6}  names left"]
+    for row in rows:
+        names = "; ".join(" or ".join(each) for each in row.names) or "none"
+        lines.append(f"{row.number:5d} {row.robot_seconds:8.1f} {row.power:6.0%}  {names} ({row.verdict})")
+        lines.append(" " * 23 + (f"ended: {row.ended}" if row.ended else f"next: {row.next}"))
+    return "\n".join(lines)

@@ -1,0 +1,312 @@
+"""The stage ``next``: from an answer to the recording that tells apart what it leaves open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from go1exp.effects.tolerances import sizes
+from go1exp.gap.comparison import Comparison, Progress, compare, robot_from
+from go1exp.gap.data.fingerprint import fingerprint
+from go1exp.gap.design.choice import COARSE, ENOUGH, Choice, choose
+from go1exp.gap.design.limits import DesignError, limits_of
+from go1exp.gap.design.plan import Attitude
+from go1exp.gap.design.power import Judge, Pair, Worth
+from go1exp.gap.design.rehearsal import Rehearsal, Stage
+from go1exp.gap.design.settings import DesignSettings
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.result import Candidate, GapResult, GapSettings, NamedEffect
+from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.search import significance, tolerances
+from go1exp.gap.search.screen import PROBE
+from go1exp.gap.stages.apply import composed, terms_of, theta_of
+from go1exp.record.simulate import held_quat
+from go1exp.recording import Recording
+from go1exp.robot import JOINTS, RobotConfig
+from go1exp.tensors.threads import one_thread
+
+INTERVAL_SD = 2.0 * 1.96
+"""Width of a 95 % interval in standard deviations."""
+
+WIDEST = 0.5
+"""Largest relative standard deviation of a size that is believed; an interval across null would have any."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What becomes of a pair.
+
+    Attributes:
+        truth: effect of the answer, or one that the recordings did not excite.
+        rival: effect that could be there in its place; empty for none.
+        before: what the recordings at hand say.
+        after: what they say with the designed one.
+        reason: why it is not separable; empty if it is.
+    """
+
+    truth: str
+    rival: str
+    before: Worth
+    after: Worth
+    reason: str
+
+    @property
+    def text(self) -> str:
+        """In a line."""
+        what = f"{self.truth} from {self.rival}" if self.rival else f"whether there is {self.truth}"
+        line = f"{what}: {self.before.power:.0%} with the logs at hand"
+        return f"{line}; not separable: {self.reason}" if self.reason else f"{line}, {self.after.power:.0%} with this"
+
+
+@dataclass(frozen=True)
+class NextResult:
+    """The next recording.
+
+    Attributes:
+        verdict: ``designed``, ``nothing left``, or ``not separable``.
+        pairs: what is told apart and what is not.
+        settled: pairs that the recordings at hand tell apart already, in words.
+        best: the design; None if there is none.
+        rate_hz: of its commands, Hz.
+        joints: their names.
+        tried: designs that were looked at.
+        beyond: designs that went beyond a limit.
+    """
+
+    verdict: str
+    pairs: tuple[Verdict, ...]
+    settled: tuple[str, ...]
+    best: Rehearsal | None
+    rate_hz: float
+    joints: tuple[str, ...]
+    tried: int = 0
+    beyond: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """Length of the design, s; NaN without one."""
+        return round(len(self.best.q) / self.rate_hz, 6) if self.best else math.nan
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values that JSON can hold."""
+        design: dict[str, Any] | None = None
+        if self.best:
+            gains = {"kp": self.best.kp.tolist(), "kd": self.best.kd.tolist()}
+            design = {**self.best.design.about(self.rate_hz), **gains, "used_of_limits": asdict(self.best.used)}
+            design["seconds"] = self.seconds
+        pairs = [{**asdict(p), "separable": not p.reason} for p in self.pairs]
+        about = {"rate_hz": self.rate_hz, "joints": list(self.joints), "tried": self.tried, "beyond": self.beyond}
+        return {"verdict": self.verdict, "design": design, "pairs": pairs, "settled": list(self.settled), **about}
+
+
+def model_of(result: GapResult, robot: Robot) -> Theta:
+    """Return the values that an answer comes to: what it names, and the rest within tolerance."""
+    named = {n.effect: _as_file(n.params) for n in result.named}
+    return theta_of(terms_of(composed({e: _as_file(p) for e, p in result.box.items()}, named)), robot.joints)
+
+
+def _as_file(params: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Return values as an effect file has them: a number for one of the robot."""
+    return {name: places["robot"] if set(places) == {"robot"} else dict(places) for name, places in params.items()}
+
+
+def rivals(named: NamedEffect, terms: Sequence[str], robot: Robot) -> list[str]:
+    """Return what could be there in the place of a named effect: its equals, then what is known to look like it."""
+    felt = tolerances.felt(robot)
+    known = tolerances.identification(named.effect).confounded
+    others = [name for name in felt if named.effect in tolerances.identification(name).confounded]
+    every = dict.fromkeys(chain(named.alias_set, known, others))
+    return [name for name in every if name in felt and name not in terms]
+
+
+def pairs_of(result: GapResult, robot: Robot) -> list[Pair]:
+    """Return each named effect of a result with each rival.
+
+    Raises:
+        DesignError: if the result names nothing for a reason that a recording cannot mend.
+    """
+    if result.verdict in ("bad log", "unexplained"):
+        raise DesignError(
+            f"the result is {result.verdict!r}: it names nothing that could be told from something else; "
+            "mend the logs, or record more kinds of motion"
+        )
+    theta = model_of(result, robot)
+    terms = [n.effect for n in result.named]
+    listed = []
+    for named in result.named:
+        without = tolerances.without(theta, named.effect, robot.tolerances)
+        others = tuple(t for t in terms if t != named.effect)
+        spread = _spread(named, robot)
+        same = significance.same(max((c.log_gain for c in result.candidates if c.effect == named.effect), default=0.0))
+        for rival in rivals(named, terms, robot):
+            start = without | _fitted(rival, result.candidates, robot)
+            listed.append(Pair(named.effect, rival, theta, start, (*others, rival), spread, same))
+    return listed
+
+
+def unseen(result: GapResult, robot: Robot) -> list[Pair]:
+    """Return what the recordings did not excite, each against nothing."""
+    theta, terms = model_of(result, robot), tuple(n.effect for n in result.named)
+    return [
+        Pair(effect, "", _probed(effect, theta, robot), theta, terms, 0.0, significance.SAME)
+        for effect in result.not_excited
+        if effect in tolerances.felt(robot)
+    ]
+
+
+def _spread(named: NamedEffect, robot: Robot) -> float:
+    """Return the relative standard deviation of an effect's size, from its intervals: results keep no draws."""
+    shares = []
+    for name, places in named.interval.items():
+        null = robot.tolerances.param((named.effect, name)).null
+        for place, (low, high) in places.items():
+            size = abs(named.params[name][place] - null)
+            if size > 0.0 and math.isfinite(high - low):
+                shares.append((high - low) / INTERVAL_SD / size)
+    return min(float(np.median(shares)), WIDEST) if shares else 0.0
+
+
+def _fitted(effect: str, candidates: Sequence[Candidate], robot: Robot) -> Theta:
+    """Return what a search fitted of an effect as a candidate; nothing if it did not, or said no joints."""
+    candidate_fits = [c for c in candidates if c.effect == effect and c.params]
+    theta: Theta = {}
+    for name, given in candidate_fits[0].params.items() if candidate_fits else ():
+        p = robot.tolerances.param((effect, name))
+        value = np.full(len(robot.joints), p.null) if p.per == "joint" else np.array([p.null])
+        at = [robot.joints.index(j) for j in candidate_fits[0].joints if j in robot.joints] if p.per == "joint" else [0]
+        if len(np.atleast_1d(given)) == len(at):
+            value[at] = given
+            theta[effect, name] = value
+    return theta
+
+
+def _probed(effect: str, theta: Theta, robot: Robot) -> Theta:
+    """Return values with an effect at all joints, as large as what must not go unseen: twice its tolerance."""
+    changed = dict(theta)
+    for key in sizes(effect)[:1]:
+        p = robot.tolerances.param(key)
+        wide = len(robot.joints) if p.per == "joint" else 1
+        changed[key] = np.full(wide, p.null + tolerances.step(p, None, PROBE))
+    return changed
+
+
+def attitudes(robot: Robot, comparison: Comparison, settings: DesignSettings) -> list[Attitude]:
+    """Return how the base may be held: a Go1 as the settings say, another robot as it was in the recordings."""
+    if robot.joints == JOINTS:
+        return [Attitude(roll, pitch, held_quat((roll, pitch))) for roll, pitch in settings.hang]
+    quats = dict.fromkeys(r.meta.base_quat for r in comparison.recordings)
+    return [Attitude(None, None, quat) for quat in quats if quat is not None]
+
+
+def reason(judge: Judge, reached: Worth, choice_beyond: int, settings: DesignSettings) -> str:
+    """Return why no design tells a pair apart."""
+    best = f"no design reaches more than {reached.power:.0%}"
+    if judge.pair.rival:
+        share = f"all but {1.0 - reached.imitated:.1g}"
+        why = f"{judge.pair.rival} imitates {share} of what {judge.pair.truth} does in the best one"
+    else:
+        why = f"twice its tolerance changes chi2 by {reached.gain:.2g} per value there"
+    fixed = [name for name, kept in (("gains", settings.gains), ("hang", settings.hang)) if len(kept) == 1]
+    hints = [f"{' and '.join(fixed)} may not change"] if fixed else []
+    hints += [f"{choice_beyond} designs went beyond a limit"] if choice_beyond else []
+    return "; ".join([best, why, *hints])
+
+
+def design(
+    result: GapResult,
+    recordings: Sequence[Recording],
+    robot: RobotConfig | Robot,
+    search: GapSettings,
+    settings: DesignSettings,
+    on_progress: Progress = lambda what, share: None,
+    names_only: bool = False,
+) -> NextResult:
+    """Design the recording that best tells apart what a result leaves open.
+
+    Args:
+        result: of a search.
+        recordings: in which it searched.
+        robot: that was compared.
+        search: settings of that search.
+        settings: of the design.
+        on_progress: called with what is being done, and which share of the work is finished.
+        names_only: whether to leave out what the recordings did not excite.
+
+    Raises:
+        DesignError: if there is nothing that a recording could tell apart, or none is within the limits.
+        NotComparable: if the recordings do not suit the robot.
+    """
+    robot = robot_from(robot).suited(recordings)
+    _same_logs(result, recordings)
+    lots = [pairs_of(result, robot), [] if names_only else unseen(result, robot)]
+    rate = recordings[0].meta.rate_hz
+    if not any(lots):
+        return NextResult("nothing left", (), (), None, rate, robot.joints)
+    with one_thread():
+        comparison = compare(recordings, robot, search, on_progress)
+        targets = [r.joint("q_target") for r in comparison.recordings]
+        limits = limits_of(robot, comparison.windows, targets, settings.limits)
+        if not comparison.windows.kp.any():
+            raise DesignError("gap next designs motions of drives that follow angles; these are commanded torques")
+        on_progress("what the recordings at hand tell apart", 0.1)
+        settled: list[str] = []
+        for pairs in lots:  # names first: what was not excited waits until they are settled
+            judges, before = _left(pairs, comparison, result, settled)
+            if judges:
+                break
+        else:
+            return NextResult("nothing left", (), tuple(settled), None, rate, robot.joints)
+        stage = Stage(comparison, limits, model_of(result, robot), settings.seconds)
+        rate = 1.0 / stage.period
+        choice = choose(stage, judges, attitudes(robot, comparison, settings), settings, on_progress)
+    on_progress("done", 1.0)
+    verdicts = _verdicts(judges, before, choice, settings)
+    verdict = "designed" if choice.best else "not separable"
+    return NextResult(verdict, verdicts, tuple(settled), choice.best, rate, robot.joints, choice.tried, choice.beyond)
+
+
+def _left(
+    pairs: Sequence[Pair], comparison: Comparison, result: GapResult, settled: list[str]
+) -> tuple[list[Judge], list[Worth]]:
+    """Return the pairs that the recordings at hand leave open, and what they say of each; note the ``settled`` ones."""
+    judges, before = list[Judge](), list[Worth]()
+    for pair in pairs:
+        judge = Judge(pair, comparison.scorer, comparison.settings, COARSE * comparison.dt)
+        worth = judge.worth(judge.at_hand)
+        if worth.power < ENOUGH or _equal(pair, result):
+            judges.append(judge)
+            before.append(worth)
+        else:
+            settled.append(f"{pair.name}: {worth.power:.0%}")
+    return judges, before
+
+
+def _equal(pair: Pair, result: GapResult) -> bool:
+    """Return whether the search itself took the two for equals."""
+    return any(n.effect == pair.truth and pair.rival in n.alias_set for n in result.named)
+
+
+def _verdicts(
+    judges: Sequence[Judge], before: Sequence[Worth], choice: Choice, settings: DesignSettings
+) -> tuple[Verdict, ...]:
+    listed = []
+    for judge, at_hand, after, reached in zip(judges, before, choice.worths, choice.reach, strict=True):
+        why = "" if after.power >= ENOUGH else reason(judge, reached, choice.beyond, settings)
+        if why and reached.power >= ENOUGH:
+            why = f"another recording would with {reached.power:.0%}; run gap next again after this one"
+        listed.append(Verdict(judge.pair.truth, judge.pair.rival, at_hand, after, why))
+    return tuple(listed)
+
+
+def _same_logs(result: GapResult, recordings: Sequence[Recording]) -> None:
+    """Raise a ``DesignError`` unless a result is of these recordings."""
+    logs = result.provenance.get("logs")
+    if logs and logs != {r.meta.episode: fingerprint(r) for r in recordings}:
+        missing = sorted(set(logs) - {r.meta.episode for r in recordings})
+        what = f"{', '.join(missing[:3])} missing" if missing else "others, or changed"
+        raise DesignError(f"logs: not those of the search ({what}); give the recordings that the result is of")
