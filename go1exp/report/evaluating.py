@@ -1,16 +1,21 @@
-"""Evaluates runs that have no evaluation yet, all alike, on the grid of commands."""
+"""Evaluates runs that have no evaluation yet, all alike: on the grid of commands, and by protocols."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from go1exp.evaluate.drivers import PolicyDriver
 from go1exp.evaluate.files import FILE, write
 from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
-from go1exp.report.evaluations import GRID, names
+from go1exp.protocol.base import Chosen
+from go1exp.protocol.playing import Rates, play
+from go1exp.protocol.report.writing import write as write_protocol
+from go1exp.report.evaluations import GRID, PROTOCOLS, names
 from go1exp.report.runs import Run
 from go1exp.report.settings import Evaluation
 from go1exp.schema.registry import bind_list
@@ -19,16 +24,57 @@ BEST = "best.pt"
 """The checkpoint that evaluation during training found best, in a run folder."""
 
 
-def missing(runs: Sequence[Run]) -> list[Run]:
-    """Return the runs that have no rows of the grid but have a checkpoint."""
-    return [run for run in runs if GRID not in names(run) and any((run.folder / "checkpoints").glob("*.pt"))]
+Progress = Callable[[int, int], None]
 
 
-def evaluate_run(run: Path, settings: Evaluation, on_step: Callable[[int, int], None]) -> dict[str, Any]:
-    """Evaluate the policy of a run folder as asked for; return the report of ``evaluate``."""
+@dataclass(frozen=True)
+class Wanted:
+    """One evaluation of one run: by a protocol, or on the grid for None."""
+
+    run: Run
+    protocol: Chosen | None
+
+    @property
+    def label(self) -> str:
+        """Its name in what is shown."""
+        return f"{self.run.label}, {self.protocol.key if self.protocol else GRID}"
+
+
+def missing(runs: Sequence[Run], protocols: Sequence[Chosen | None] = (None,)) -> list[Wanted]:
+    """Return which of these evaluations (None: the grid) the runs lack that have a checkpoint."""
+    return [
+        Wanted(run, protocol)
+        for run in runs
+        for protocol in protocols
+        if (protocol.key if protocol else GRID) not in names(run) and any((run.folder / "checkpoints").glob("*.pt"))
+    ]
+
+
+def _checkpoint(run: Path, settings: Evaluation) -> Path | None:
+    """Return the checkpoint that is judged; None for the newest."""
     best = run / BEST
-    checkpoint = best if settings.checkpoint == "best" and best.is_file() else None
-    config, policy, about = load_run(run, checkpoint)
+    return best if settings.checkpoint == "best" and best.is_file() else None
+
+
+def play_protocol(run: Run, protocol: Chosen, settings: Evaluation, on_step: Progress) -> None:
+    """Play a protocol with the policy of a run, as ``go1exp eval`` does, and write its files into the run's folder.
+
+    Raises:
+        ValueError: if the policy cannot be played so.
+    """
+    config, policy, about = load_run(run.folder, _checkpoint(run.folder, settings))
+    driver = PolicyDriver(run.label, config.task, policy, about)
+    velocities = protocol.protocol.policy_velocities().items()
+    problems = [p for key, v in velocities for p in driver.problems(v, f"protocol.{protocol.key}.{key}")]
+    if problems:
+        raise ValueError("; ".join(problems))
+    result = play(protocol, driver, Rates(settings.seed), {"robot": {}}, on_step)
+    write_protocol(result, run.folder / PROTOCOLS)
+
+
+def evaluate_run(run: Path, settings: Evaluation, on_step: Progress) -> dict[str, Any]:
+    """Evaluate the policy of a run folder on the grid, as asked for; return the report of ``evaluate``."""
+    config, policy, about = load_run(run, _checkpoint(run, settings))
     commands = grid(settings.x, settings.y, settings.yaw, False)
     unlike = ("commands", "train_ground", "policy_dt", "physics_dt", "trunk_velocity", "engine")
     shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(EvalConfig) if f.name not in unlike}
@@ -38,21 +84,24 @@ def evaluate_run(run: Path, settings: Evaluation, on_step: Callable[[int, int], 
 
 
 def evaluate_missing(
-    runs: Sequence[Run], settings: Evaluation, on_run: Callable[[int, int, str], Callable[[int, int], None]]
+    wanted: Sequence[Wanted], settings: Evaluation, on_run: Callable[[int, int, str], Progress]
 ) -> list[str]:
     """Evaluate runs one after the other and write what came of them into their folders; return remarks.
 
     Args:
-        runs: what to evaluate.
+        wanted: what to evaluate, and by what.
         settings: how.
-        on_run: called with the number of the run, how many there are and its label; returns what shows its progress.
+        on_run: called with the number of the evaluation, how many there are and its label; returns what shows its
+            progress.
     """
     notes = []
-    for number, run in enumerate(runs, 1):
+    for number, each in enumerate(wanted, 1):
+        show = on_run(number, len(wanted), each.label)
         try:
-            report = evaluate_run(run.folder, settings, on_run(number, len(runs), run.label))
+            if each.protocol is None:
+                write(evaluate_run(each.run.folder, settings, show), each.run.folder / FILE)
+            else:
+                play_protocol(each.run, each.protocol, settings, show)
         except (OSError, RuntimeError, ValueError) as error:
-            notes.append(f"{run.label}: could not be evaluated ({' '.join(str(error).split())[:160]})")
-            continue
-        write(report, run.folder / FILE)
+            notes.append(f"{each.label}: could not be evaluated ({' '.join(str(error).split())[:160]})")
     return notes

@@ -89,7 +89,7 @@ def evaluations(study: Study) -> list[Judged]:
 
 
 def _advice(name: str) -> str:
-    return "; eval=true makes it" if name == GRID else f"; go1exp eval run=... protocol={name} makes it"
+    return "; eval=true makes it" if name == GRID else f"; eval=true protocol={name} makes it"
 
 
 def _listed(labels: Sequence[str]) -> str:

@@ -108,12 +108,17 @@ def _once(runs: list[Run], study: Study) -> list[Run]:
 
 
 def _names(made: Sequence[Group]) -> list[str]:
-    """Return a name for each group: the settings that are its own, or its job's name where those are many."""
+    """Return a name for each group: its job's where sweeps name all of them apart, else the settings that are its own.
+
+    Where those are many, the job's name stands for them alone.
+    """
     if len(made) == 1:
         return ["all runs"]
+    by_jobs = [_by_job(group.runs) for group in made]
+    if all(by_jobs) and len(set(by_jobs)) == len(made):
+        return by_jobs
     usual = {key: Counter(_as_text(g.settings[key]) for g in made).most_common(1)[0][0] for key in made[0].settings}
     by_keys = [_by_keys(group.settings, usual, len(made), flat(group.runs[0].config)) for group in made]
-    by_jobs = [_by_job(group.runs) for group in made]
     names = []
     for number, (keys, job) in enumerate(zip(by_keys, by_jobs, strict=True), 1):
         if len(keys) <= LONGEST and by_keys.count(keys) == 1:
@@ -146,8 +151,14 @@ def _missing(key: str, known: Flat) -> str:
 
 def _by_job(runs: Sequence[Run]) -> str:
     """Return the job name that runs of a sweep have in common, without their seeds."""
-    names = {" ".join(o for o in run.job.split(" ") if not o.startswith("seed=")) for run in runs}
+    names = {" ".join(_short(o) for o in run.job.split(" ") if not o.startswith("seed=")) for run in runs}
     return names.pop() if len(names) == 1 else ""
+
+
+def _short(override: str) -> str:
+    """Return an override without Hydra's plus and the folders of its group: ``ablation=none``."""
+    key, equals, value = override.lstrip("+").partition("=")
+    return f"{key.rpartition('/')[2]}{equals}{value}"
 
 
 def _notes(made: Sequence[Group]) -> list[str]:
@@ -173,7 +184,7 @@ def baseline(made: Sequence[Group], wanted: str | None) -> Group:
     meant = exact or [g for g in made if wanted in g.name or _has(g, wanted)]
     if len(meant) != 1:
         those = "no group" if not meant else f"{len(meant)} groups"
-        raise ConfigError([f"baseline = {wanted!r}: {those} of {', '.join(repr(g.name) for g in meant or made)}"])
+        raise ConfigError([f"baseline = {wanted!r}: {those} of these:", *(repr(g.name) for g in meant or made)])
     return meant[0]
 
 

@@ -87,59 +87,66 @@ def study(folders: Sequence[str], unfinished: bool) -> Study:
     if missing := [f"folders: {str(f)!r}: there is no such folder" for f in given if not f.is_dir()]:
         raise ConfigError(missing)
     jobs: dict[Path, _Job] = {}
+    notes: list[str] = []
     places: dict[Path, Path] = {}  # resolved -> as the user would name it
     empty = []
     for folder in given:
-        below = list(_below(folder, jobs))
+        below = list(_below(folder, jobs, notes))
         places |= {place.resolve(): place for place in below if place.resolve() not in places}
         if not below and not any(job.folder.is_relative_to(folder.resolve()) for job in jobs.values()):
             empty.append(f"folders: {str(folder)!r}: there is no run in it (no folder with config.yaml)")
     if empty:
         raise ConfigError(empty)
-    return _counted(_read(places, jobs), jobs, places, unfinished)
+    runs, damaged = _read(places, jobs)
+    counted = _counted(runs, damaged, jobs, places, unfinished)
+    counted.notes += dict.fromkeys(notes)  # folders that were given may cover each other
+    return counted
 
 
-def _below(folder: Path, jobs: dict[Path, _Job]) -> Iterator[Path]:
-    """Yield the run folders in and below a folder; note the jobs of sweeps on the way."""
+def _below(folder: Path, jobs: dict[Path, _Job], notes: list[str]) -> Iterator[Path]:
+    """Yield the run folders in and below a folder; note the jobs of sweeps on the way, and indices that are damaged."""
     for place, below, files in os.walk(folder):
         path = Path(place)
         if SWEEP in files:
-            jobs.update({job.folder: job for job in _jobs(path)})
+            jobs.update({job.folder: job for job in _jobs(path, notes)})
         if "config.yaml" in files:
             yield path
             below.clear()
         below[:] = sorted(name for name in below if not name.startswith("."))
 
 
-def _jobs(sweep: Path) -> Iterator[_Job]:
-    """Yield the jobs of a sweep's index; nothing of one that cannot be read."""
+def _jobs(sweep: Path, notes: list[str]) -> Iterator[_Job]:
+    """Yield the jobs of a sweep's index; of one that cannot be read those before the damage, and note it."""
     try:
         for job in json.loads((sweep / SWEEP).read_text())["jobs"]:
             yield _Job(
                 str(job["name"]), str(job["state"]), str(job.get("cause", "")), (sweep / job["run_folder"]).resolve()
             )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError([f"{sweep / SWEEP}: cannot be read ({type(error).__name__}: {error})"]) from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
+        notes.append(
+            f"{sweep / SWEEP}: is damaged ({reason}); names of jobs, and those that have not begun, are not known"
+        )
 
 
-def _read(places: dict[Path, Path], jobs: dict[Path, _Job]) -> list[Run]:
+def _read(places: dict[Path, Path], jobs: dict[Path, _Job]) -> tuple[list[Run], list[Absent]]:
+    """Return the runs in these folders, and those whose configuration is damaged."""
     labels = _labels(list(places.values()))
-    problems, runs = [], []
+    damaged, runs = [], []
     for place, shown in places.items():
         try:
             config = yaml.load((place / "config.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
             seed = int(config["seed"])
         except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError):
-            problems.append(f"{shown / 'config.yaml'}: is not the configuration of a run")
+            cause = f"{shown / 'config.yaml'} is not the configuration of a run"
+            damaged.append(Absent(labels[place], "damaged", cause))
             continue
         known, job = run_state.read(place), jobs.get(place)
         state: str = known.state
         if state == "not started" and (place / "metrics.csv").is_file():
             state = "done" if job is None else job.state  # of a version that kept no state
         runs.append(Run(place, labels[place], config, seed, state, known.cause, job.name if job else ""))
-    if problems:
-        raise ConfigError(problems)
-    return runs
+    return runs, damaged
 
 
 def _labels(places: Sequence[Path]) -> dict[Path, str]:
@@ -156,7 +163,9 @@ def _labels(places: Sequence[Path]) -> dict[Path, str]:
     return labels
 
 
-def _counted(runs: list[Run], jobs: dict[Path, _Job], places: dict[Path, Path], unfinished: bool) -> Study:
+def _counted(
+    runs: list[Run], damaged: list[Absent], jobs: dict[Path, _Job], places: dict[Path, Path], unfinished: bool
+) -> Study:
     """Return the runs that count, and the others with their reasons."""
     kept: list[Run] = []
     absent = [
@@ -164,6 +173,7 @@ def _counted(runs: list[Run], jobs: dict[Path, _Job], places: dict[Path, Path], 
         for job in jobs.values()
         if job.folder not in places
     ]
+    absent += damaged
     for run in runs:
         begun = (run.folder / "metrics.csv").is_file() or any((run.folder / "checkpoints").glob("*.pt"))
         if not begun:

@@ -17,6 +17,8 @@ Count = Annotated[int, Field(ge=1)]
 class Evaluation:
     """How runs without an evaluation are evaluated: on the grid of commands of ``go1exp eval``.
 
+    Of these settings, seed and checkpoint are those of other protocols too.
+
     Attributes:
         x: forward velocities, m/s.
         y: velocities to the left, m/s.
@@ -65,7 +67,7 @@ class ReportSettings:
         correction: holm makes at most one study in twenty with any false word; none words each figure by itself.
         paired: pair runs by their seed in comparisons; needs six pairs to tell anything.
         unfinished: count running, stopped and failed runs as well, as far as they came.
-        eval: evaluate runs that have no evaluation (protocol=grid), as ``evaluation`` says.
+        eval: evaluate runs that lack an evaluation, by ``protocol``: the grid as ``evaluation`` says.
         evaluation: how.
         points: times at which a learning curve is drawn.
         wandb: Weights & Biases to log the tables to, offline or online; null for none.

@@ -11,7 +11,7 @@ from go1exp.protocol.report.words import condition_text, number
 from go1exp.report.drawings import label
 from go1exp.report.figures import Figure, Verdict
 from go1exp.report.made import Outcome, Report
-from go1exp.statistics.compare import runs_that_can_tell
+from go1exp.statistics.compare import RESAMPLES, runs_that_can_tell
 from go1exp.statistics.intervals import Interval
 
 ORDER = ("better", "worse", "not told apart")
@@ -67,8 +67,13 @@ def _verdicts(outcome: Outcome, baseline: str) -> Table:
         least = runs_that_can_tell(figures=len(outcome.verdicts))
         note += (
             f" {len(hopeless)} of {len(outcome.verdicts)} comparisons could not have been told whatever came out: too"
-            f" few runs for so many comparisons; {least} runs in each group could tell, or more of the baseline."
         )
+        if least is None:
+            note += f" many comparisons for {RESAMPLES:,} permutations; name fewer with figures=."
+        else:
+            note += (
+                f" few runs for so many comparisons; {least} runs in each group could tell, or more of the baseline."
+            )
     return {"title": f"{outcome.judged.name}: against the baseline", "note": note, "header": header, "rows": rows}
 
 

@@ -109,13 +109,13 @@ class TuneSettings:
         overrides: settings of every trial, such as ["experiment=five_minutes"].
         trials: trainings of the whole search, those of earlier commands and of other machines counted.
         workers: trainings at once on this machine, its cores shared out.
-        metric: column of metrics.csv that says how good a training is.
+        metric: column of metrics.csv that says how good a training is, or eval/score and others of eval.every.
         direction: whether more of it is better.
-        average: newest iterations that the metric is averaged over.
+        average: newest rows that the metric is averaged over.
         warmup: iterations before a training may be ended early.
         prune: end a training whose metric is below the median of the others at the same iteration.
         storage: where trials are kept, as Optuna names databases; null is a SQLite file in out.
-        seed: of the draws.
+        seed: of the draws; with one worker the same search from nothing draws the same.
         out: folder of the search: a run folder for each trial, and an index as sweeps have.
     """
 

@@ -20,16 +20,15 @@ from typing import Any
 
 from go1exp.errors import Expected
 from go1exp.files import write_json
-from go1exp.sweep import index
+from go1exp.schema.beside import ROWS
+from go1exp.sweep import index, trials
 from go1exp.sweep.command import CORES, PARENT, Command, Ended, Running
 from go1exp.sweep.local import shares
 from go1exp.sweep.settings import TuneSettings
+from go1exp.sweep.trials import FOLDER, LOOK_S
 
-LOOK_S = 0.5
-"""Time between two looks at the metrics of a trial, s."""
-
-FOLDER = "folder"
-"""Attribute of a trial that was stopped, and of the one that goes on with it: its run folder."""
+EVALUATED = "eval/"
+"""Begin of metrics that are columns of ``evals.csv``, as trainings log them."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +91,11 @@ class Search:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         study = self._study()
+        trials.put_back(study, self.folder)
         cores = sorted(os.sched_getaffinity(0))
         free = shares(cores, self.settings.workers)
-        with ThreadPoolExecutor(self.settings.workers) as pool:
-            workers = [pool.submit(self._work, study, share) for share in free]
+        with trials.alive(self.folder) as name, ThreadPoolExecutor(self.settings.workers) as pool:
+            workers = [pool.submit(self._work, study, share, name) for share in free]
             try:
                 for worker in workers:
                     worker.result()
@@ -108,7 +108,7 @@ class Search:
         return study.best_trial if finished else None
 
     def _study(self) -> Any:
-        """Open Optuna's study, and put trials that were stopped in front."""
+        """Open Optuna's study."""
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -119,7 +119,6 @@ class Search:
             study = optuna.create_study(
                 study_name=self.folder.name,
                 storage=storage,
-                sampler=optuna.samplers.TPESampler(seed=settings.seed, constant_liar=settings.workers > 1),
                 pruner=pruner if settings.prune else optuna.pruners.NopPruner(),
                 direction=settings.direction,
                 load_if_exists=True,
@@ -134,14 +133,16 @@ class Search:
             study.set_user_attr(key, value)
         return study
 
-    def _work(self, study: Any, share: tuple[int, ...]) -> None:
-        """Run one trial after the other on some cores."""
+    def _work(self, study: Any, share: tuple[int, ...], search: str) -> None:
+        """Run one trial after the other on the cores of ``share``; ``search`` is the name of this search."""
         while not self._stopping:
             with self._lock:
                 counted = [t for t in study.get_trials(deepcopy=False) if t.state.name not in ("FAIL", "WAITING")]
                 if len(counted) >= self.settings.trials:
                     return
                 trial = study.ask()
+                trial.set_user_attr(trials.SEARCH, search)
+                study.sampler = trials.sampler(self.settings.seed, trial.number, self.settings.workers > 1)
                 drawn = {key: drawn_from.draw(trial, key) for key, drawn_from in self.ranges.items()}
             self._try(study, trial, drawn, share)
 
@@ -151,8 +152,12 @@ class Search:
         run = self.folder / trial.user_attrs.get(FOLDER, f"trial-{trial.number:04}")
         trial.set_user_attr(FOLDER, run.name)
         overrides = [*self.settings.overrides, *(f"{key}={value}" for key, value in drawn.items())]
-        with self._lock:  # composing is not made for threads
-            self.plan(overrides, run)
+        try:
+            with self._lock:  # composing is not made for threads
+                self.plan(overrides, run)
+        except BaseException:
+            study.tell(trial, state=optuna.trial.TrialState.FAIL)
+            raise
         how, values, hopeless = self._train(trial, run, share)
         if self._stopping:
             study.tell(trial, state=optuna.trial.TrialState.FAIL)
@@ -166,7 +171,7 @@ class Search:
             result = f"{values[-1][1]:.5g}"
         else:
             study.tell(trial, state=optuna.trial.TrialState.FAIL)
-            result = f"failed ({how.cause or f'metrics.csv has no {self.settings.metric}'})"
+            result = f"failed ({how.cause or f'{self._column[0]} has no {self.settings.metric}'})"
         with self._lock:
             self._write(study)
             words = " ".join(f"{key}={value}" for key, value in drawn.items())
@@ -198,9 +203,16 @@ class Search:
         self._running.pop(trial.number, None)
         return ended[0], self._values(run), hopeless
 
+    @property
+    def _column(self) -> tuple[str, str]:
+        """Return the file of a run folder that has the metric, and the metric's column."""
+        metric = self.settings.metric
+        return (ROWS, metric.removeprefix(EVALUATED)) if metric.startswith(EVALUATED) else ("metrics.csv", metric)
+
     def _values(self, run: Path) -> list[tuple[int, float]]:
         """Return iteration and averaged metric, at each row that has the metric."""
-        rows = list(_rows(run / "metrics.csv", self.settings.metric))
+        file, column = self._column
+        rows = list(_rows(run / file, column))
         newest = self.settings.average
         return [
             (iteration, sum(v for _, v in rows[max(0, k + 1 - newest) : k + 1]) / min(k + 1, newest))
@@ -217,15 +229,15 @@ class Search:
 
     def _write(self, study: Any) -> None:
         """Write the trials as the index of a sweep, and the best one's settings."""
-        trials = [t for t in study.get_trials(deepcopy=False) if FOLDER in t.user_attrs and t.params]
-        newest = {t.user_attrs[FOLDER]: t for t in trials}  # one that went on has its folder from an older one
+        begun = [t for t in study.get_trials(deepcopy=False) if FOLDER in t.user_attrs and t.params]
+        newest = {t.user_attrs[FOLDER]: t for t in begun}  # one that went on has its folder from an older one
         jobs = []
         for number, (name, trial) in enumerate(newest.items()):
             drawn = tuple(f"{key}={value}" for key, value in trial.params.items())
             state, cause = STATES[trial.state.name]
             jobs.append(index.Job(number, " ".join(drawn), (*self.settings.overrides, *drawn), name, state, cause))
         index.write(self.folder, index.Index(tuple(jobs), {"name": "tune"}, os.getcwd()))
-        best = [t for t in trials if t.state.name == "COMPLETE"]
+        best = [t for t in begun if t.state.name == "COMPLETE"]
         if best:
             best_trial = study.best_trial
             write_json(self.folder / "best.json", {"value": best_trial.value, "overrides": best_trial.params})

@@ -1,0 +1,105 @@
+"""Optuna's trials of several searches: what each is drawn with, and which of them nobody runs any more.
+
+A search that was killed could not say what became of its trials, and Optuna counts them as running for ever. So each
+search holds a lock in the folder while it lives, and its trials name it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+import uuid
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from go1exp.train import run_lock
+
+FOLDER = "folder"
+"""Attribute of a trial that was stopped, and of the one that goes on with it: its run folder."""
+
+SEARCH = "search"
+"""Attribute of a trial: the name of the search that runs it."""
+
+SEARCHES = ".searches"
+"""In the folder of trials: a folder for each search that has not ended by itself, locked while that lives."""
+
+NAMELESS = timedelta(minutes=1)
+"""Longest time between a trial's start and the name of its search."""
+
+LOOK_S = 0.5
+"""Time between two looks at a run folder that is in use, s."""
+
+
+@contextlib.contextmanager
+def alive(folder: Path) -> Iterator[str]:
+    """Be a search that others can see to be alive; give its name."""
+    name = uuid.uuid4().hex
+    with run_lock.locked(folder / SEARCHES / name):
+        yield name
+    shutil.rmtree(folder / SEARCHES / name, ignore_errors=True)  # after an exception it tells that its trials are free
+
+
+def sampler(seed: int, number: int, parallel: bool) -> Any:
+    """Return what draws the settings of one trial.
+
+    A sampler that lived as long as its process would draw the same again in every process that goes on, and on every
+    machine that joins. The number of a trial is its own on all of them.
+
+    Args:
+        seed: of the search.
+        number: of the trial.
+        parallel: other trials run meanwhile; do not draw close to them.
+    """
+    import numpy as np
+    import optuna
+
+    (word,) = np.random.SeedSequence([seed, number]).generate_state(1)
+    return optuna.samplers.TPESampler(seed=int(word), constant_liar=parallel)
+
+
+def put_back(study: Any, folder: Path) -> None:
+    """Put the trials of searches that were killed in front, so that they go on in their run folders.
+
+    Args:
+        study: Optuna's.
+        folder: of the trials.
+    """
+    from optuna.trial import TrialState
+
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        if _is_run(trial, folder):
+            continue
+        run = trial.user_attrs.get(FOLDER)
+        if run:
+            _outwait(folder / run)
+        try:
+            study.tell(trial.number, state=TrialState.FAIL)
+        except (ValueError, RuntimeError):  # another search was quicker
+            continue
+        if run:
+            study.enqueue_trial(trial.params, user_attrs={FOLDER: run})
+        print(
+            f"trial {trial.number}: its search was killed; {'goes on now' if run else 'counts as failed'}", flush=True
+        )
+
+
+def _is_run(trial: Any, folder: Path) -> bool:
+    """Whether a search runs the trial; also where that cannot be known from here."""
+    search, run = trial.user_attrs.get(SEARCH), trial.user_attrs.get(FOLDER)
+    if search:
+        place = folder / SEARCHES / search
+        return not place.is_dir() or run_lock.in_use(place)  # without it: of a machine with a folder of its own
+    if run:  # of a version that named no search
+        return not (folder / run).is_dir() or run_lock.in_use(folder / run)
+    return bool(datetime.now() - trial.datetime_start < NAMELESS)
+
+
+def _outwait(run: Path) -> None:
+    """Wait for the training that a killed search left: it ends with a checkpoint after its iteration."""
+    if run_lock.in_use(run):
+        print(f"{run}: waiting for its training to save a checkpoint", flush=True)
+    while run_lock.in_use(run):
+        time.sleep(LOOK_S)
