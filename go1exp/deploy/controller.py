@@ -14,7 +14,7 @@ import numpy as np
 
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.messages import Link, LowCmd, LowState
-from go1exp.deploy.past import PastActions
+from go1exp.deploy.past import PolicyMemory
 from go1exp.deploy.safety import Safety
 
 PHASES = ("waiting", "standing_up", "walking", "lying_down", "damping")
@@ -164,7 +164,7 @@ class Controller:
         self._begin: float | None = None
         self._mover = mover
         self._readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
-        self._past = PastActions[np.ndarray](about.policy_dt, about.policy_dt if rate is None else 1.0 / rate)
+        self._memory = PolicyMemory(about, about.policy_dt if rate is None else 1.0 / rate)
         self._target = self._nominal.copy()
         self._state: LowState | None = None
         self._early: list[LowState] = []  # received before their cycle; of these so many are in the estimate
@@ -298,8 +298,6 @@ class Controller:
                 return None
         if self._mover:
             return self._mover.step(self._velocity, state, self._base)
-        outputs = self._policy(self._readings)
-        if "previous_action" in self._readings:
-            self._readings["previous_action"][:] = self._past.after(outputs["action"])
+        outputs = self._memory(self._policy, self._readings)
         self._observation = outputs["observation"][0]
         return LowCmd(outputs["joint_target"][0].astype(float), self._kp, self._kd)

@@ -10,15 +10,36 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from go1exp.deploy import go1_wire
 from go1exp.deploy.messages import LowState
 from go1exp.deploy.safety import SafetyConfig, lean
-from go1exp.deploy.udp import Go1Link
+from go1exp.deploy.udp import Traffic
 from go1exp.estimation import FilterConfig
 from go1exp.estimation.feet import FootCalibration, calibrated, forces_by_torque, kinematics, vertical
+
+
+class Looked(Protocol):
+    """A link to a Go1 before the first command, through which only packets go that ask for no torque."""
+
+    @property
+    def traffic(self) -> Traffic:
+        """Counts of its datagrams."""
+
+    @property
+    def tick(self) -> int | None:
+        """The tick of the newest state; None before the first."""
+
+    @property
+    def health(self) -> go1_wire.Health | None:
+        """What the newest state has beside the readings; None before the first."""
+
+    def receive(self) -> Sequence[LowState]:
+        """Return the states that have arrived since the last call, oldest first."""
+
 
 SECONDS = 2.0
 """How long to listen, s."""
@@ -89,7 +110,7 @@ class Heard:
 
 
 def listen(
-    link: Go1Link,
+    link: Looked,
     seconds: float,
     now: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
@@ -100,10 +121,10 @@ def listen(
         states = link.receive()
         if states:
             heard.states.extend(states)
-            heard.ticks.append((go1_wire.tick_of(link.newest), states[-1].t))
+            heard.ticks.append((link.tick or 0, states[-1].t))
         sleep(go1_wire.PERIOD)
     heard.seconds = now() - begin
-    heard.health = go1_wire.unpack_health(link.newest) if link.newest else None
+    heard.health = link.health
     return heard
 
 
@@ -127,7 +148,7 @@ class Report:
 
 
 def judged(
-    heard: Heard, link: Go1Link, joints: Sequence[str], stops: np.ndarray, config: FilterConfig, bounds: Bounds
+    heard: Heard, link: Looked, joints: Sequence[str], stops: np.ndarray, config: FilterConfig, bounds: Bounds
 ) -> Report:
     """Return the findings.
 
@@ -160,14 +181,15 @@ def judged(
     return Report(tuple(lines), tuple(problems), heard.tick_s, counts, force)
 
 
-def _packets(heard: Heard, link: Go1Link) -> list[str]:
+def _packets(heard: Heard, link: Looked) -> list[str]:
     gaps, traffic = 1e3 * heard.intervals, link.traffic
     p50, p99 = np.percentile(gaps, [50, 99])
     unit = f"{heard.tick_s:g} s" if math.isfinite(heard.tick_s) else "not known; times of arrival are used"
     refused = ", ".join(f"{count} x {why}" for why, count in traffic.refused_because.items()) or "none"
+    counted = f"refused: {refused}; late or doubled {traffic.late}"
     return [
         f"packets: {_rate(heard):.0f} a second; between two p50 {p50:.2f}, p99 {p99:.2f}, worst {gaps.max():.2f} ms",
-        f"  refused: {refused}; late or doubled {traffic.late}; unit of the tick: {unit}",
+        f"  {counted if traffic.complete else 'the SDK does not tell what it refuses'}; unit of the tick: {unit}",
     ]
 
 
@@ -175,7 +197,7 @@ def _rate(heard: Heard) -> float:
     return (len(heard.states) - 1) / max(heard.states[-1].t - heard.states[0].t, 1e-9)
 
 
-def _packet_problems(heard: Heard, link: Go1Link, bounds: Bounds) -> list[str]:
+def _packet_problems(heard: Heard, link: Looked, bounds: Bounds) -> list[str]:
     problems = []
     if _rate(heard) < bounds.rate:
         problems.append(f"packets: {_rate(heard):.0f} a second; at least {bounds.rate:.0f} are needed")
@@ -243,18 +265,17 @@ def _trunk(heard: Heard, joints: Sequence[str], stops: np.ndarray, bounds: Bound
 
 
 def check(
-    link: Go1Link,
+    link: Looked,
     joints: Sequence[str],
     stops: np.ndarray,
     config: FilterConfig,
     say: Callable[[str], None],
     bounds: Bounds | None = None,
 ) -> Report:
-    """Listen for ``SECONDS``, say what was heard, tell the link its tick's unit, and return the findings."""
+    """Listen for ``SECONDS``, say what was heard, and return the findings."""
     report = judged(listen(link, SECONDS), link, joints, stops, config, bounds or Bounds())
     for line in report.lines:
         say(line)
-    link.tick_s = report.tick_s
     return report
 
 

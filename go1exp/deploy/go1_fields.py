@@ -29,6 +29,20 @@ TORQUE_STEP, KP_STEP, KD_STEP, ACCELERATION_STEP = 1.0 / 256.0, 1.0 / 32.0, 1.0 
 """Steps of the fixed-point numbers: N m, N m/rad, N m s/rad, rad/s2. All are cut towards zero."""
 
 
+TORQUE_NOTE = f"torques have steps of 1/{1.0 / TORQUE_STEP:g} N m"
+"""What the notes of a recording say of torques that came by the Go1's packets."""
+
+
+def in_torque_steps(torque: np.ndarray) -> bool:
+    """Return whether torques, N m, of any shape, are those of the packets: whole steps, to a tenth as in decimal text.
+
+    Fewer than ten that are not zero tell nothing, nor do torques that are not finite. Coarser steps are not these.
+    """
+    steps = torque[np.isfinite(torque) & (torque != 0.0)] / TORQUE_STEP
+    whole = np.rint(steps)
+    return len(steps) >= 10 and bool((np.abs(steps - whole) < 0.1).all() and np.gcd.reduce(whole.astype(int)) == 1)
+
+
 class Field(NamedTuple):
     """One field of a packet: NumPy's type, its unit (of the number times ``step``), and where that is known from."""
 

@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.deploy.go1_wire import JOINTS, LOW_LEVEL, PERIOD, ROBOT, ROBOT_PORT, SERVO
+from go1exp.deploy.go1_wire import JOINTS, LOW_LEVEL, PERIOD, ROBOT, ROBOT_PORT, SERVO, Health
 from go1exp.deploy.launch import RobotError
 from go1exp.deploy.messages import LowCmd, LowState
 from go1exp.deploy.safety import DEFAULT_KD
+from go1exp.deploy.udp import Traffic
 
 MODULES = ("robot_interface", "unitree_legged_sdk.robot_interface")
 """Names of the binding: as the SDK's build leaves it, and as the package unitree-legged-sdk has it."""
@@ -37,10 +38,12 @@ SILENCE = 0.05
 class SdkLink:
     """Exchanges states and commands every 2 ms in a thread of its own, at any rate of the runtime.
 
-    Only that thread calls the SDK. If the runtime stops sending commands, the drives brake.
+    Only that thread calls the SDK. Before the first command it asks for nothing, as ``udp.Go1Link`` does. If the
+    runtime stops sending commands, the drives brake.
 
     Attributes:
         sent_at: NaN: the thread sends.
+        traffic: counts of states and commands; the SDK leaves out what is damaged, late or lost, and does not tell.
     """
 
     sent_at = math.nan
@@ -59,6 +62,8 @@ class SdkLink:
         self._arrived: deque[LowState] = deque(maxlen=1000)
         self._wanted: tuple[LowCmd, float] | None = None
         self._tick: int | None = None
+        self._health: Health | None = None
+        self._begun, self.traffic = False, Traffic(complete=False)
         self._failure: BaseException | None = None
         self._going = True
         self._thread = threading.Thread(target=self._pump, name="go1", daemon=True)
@@ -77,6 +82,16 @@ class SdkLink:
             states.append(self._arrived.popleft())
         return states
 
+    @property
+    def tick(self) -> int | None:
+        """The tick of the newest state; None before the first."""
+        return self._tick
+
+    @property
+    def health(self) -> Health | None:
+        """What the newest state before the first command had beside the readings; None before the first state."""
+        return self._health
+
     def send(self, command: LowCmd) -> None:
         """Hand over a command; it goes out within 2 ms, and again every 2 ms."""
         self._wanted = (command, time.perf_counter())
@@ -88,7 +103,7 @@ class SdkLink:
         """Do nothing: the thread sends."""
 
     def close(self) -> None:
-        """End the exchange, after a last command to brake."""
+        """End the exchange; once the drives were commanded, after a last command to brake."""
         self._going = False
         self._thread.join(1.0)
 
@@ -111,13 +126,16 @@ class SdkLink:
         tick = int(self._state.tick)
         if tick != self._tick and tick != 0:  # zero until something has come
             self._tick = tick
+            if not self._begun:  # for the check, before the first command: reading it takes long
+                self._health = _health(self._state)
+            self.traffic.received += 1
             self._arrived.append(_read(self._state, now))
-        if self._tick is not None or self._wanted is not None:
-            self._fill(
-                now
-            )  # before that an empty command is sent, as in the SDK's example: the robot answers only then
+        self._begun = self._begun or self._wanted is not None
+        if self._begun:  # before that an empty command is sent, as in the SDK's example: the robot answers only then
+            self._fill(now)
         self._udp.SetSend(self._command)
         self._udp.Send()
+        self.traffic.sent += 1
 
     def _fill(self, now: float) -> None:
         """Write what is wanted into the SDK's command; braking if nothing is, or not any more."""
@@ -150,6 +168,19 @@ def _read(state: Any, now: float) -> LowState:
         imu_gyro=np.array(state.imu.gyroscope, dtype=float),
         imu_acc=np.array(state.imu.accelerometer, dtype=float),
         foot_force=np.array([float(state.footForce[k]) for k in range(4)]),
+    )
+
+
+def _health(state: Any) -> Health:
+    """Return what the SDK's state has beside the readings."""
+    motors = [state.motorState[k] for k in range(JOINTS)]
+    return Health(
+        charge=int(state.bms.SOC),
+        current=1e-3 * int(state.bms.current),
+        cell_voltage=tuple(1e-3 * float(volts) for volts in state.bms.cell_vol),  # mV: the SDK has scaled them
+        motor_temperature=tuple(int(motor.temperature) for motor in motors),
+        imu_temperature=int(state.imu.temperature),
+        acceleration=tuple(float(motor.ddq) for motor in motors),
     )
 
 

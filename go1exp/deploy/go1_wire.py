@@ -6,8 +6,10 @@ level or checksum is refused (``refusal``). No function here knows a socket.
 
 from __future__ import annotations
 
-import struct
+import math
 import zlib
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
@@ -57,8 +59,9 @@ def checksum(packet: bytes | bytearray) -> int:
     the way out.
     """
     words = (len(packet) - 4) // 4
-    reverse = np.frombuffer(packet, "<u4", words).byteswap().tobytes().translate(_REVERSED)
-    plain = zlib.crc32(reverse) ^ 0xFFFFFFFF
+    whole = array("I", bytes(packet[: 4 * words]))
+    whole.byteswap()
+    plain = zlib.crc32(whole.tobytes().translate(_REVERSED)) ^ 0xFFFFFFFF
     return int.from_bytes(plain.to_bytes(4, "little").translate(_REVERSED), "big")
 
 
@@ -69,7 +72,7 @@ class Refusal(Enum):
     HEAD = "wrong head"
     LEVEL = "not of the low level"
     CHECKSUM = "wrong checksum"
-    CONTENT = "a number that is no command"
+    CONTENT = "a number that cannot be"
 
 
 def refusal(packet: bytes, size: int) -> Refusal | None:
@@ -110,14 +113,63 @@ def _idle() -> bytes:
 IDLE = _idle()
 """The vendor's InitCmdData, byte by byte: asks for no torque at all. The robot answers to whoever sends it."""
 
-_MOTORS = struct.Struct("<" + "BffhHH12x" * JOINTS)
-"""MOTOR_COMMAND of the twelve joints: several times as fast as NumPy's records."""
 
-_PLACE, _EACH = 22, 6
-"""Offset of the first motor in a packet, and numbers per motor."""
+def _bytes_of(kind: np.dtype[Any], *paths: tuple[str, ...]) -> np.ndarray:
+    """Return where in a packet the bytes of these fields are, of the twelve motors one after the other: (bytes,).
 
-_STEPS = np.array([[1.0 / TORQUE_STEP], [1.0 / KP_STEP], [1.0 / KD_STEP]])
-_LEAST, _MOST = np.array([[-32768.0], [0.0], [0.0]]), np.array([[32767.0], [65535.0], [65535.0]])
+    Taking bytes from these places, to view them as numbers, is several times as fast as NumPy's records.
+    """
+    places = []
+    for path in paths:
+        part, offsets = kind, np.arange(kind.itemsize, dtype=np.intp).reshape(1, -1)
+        for name in path:
+            assert part.fields is not None
+            inner, offset = part.fields[name][:2]
+            part, offsets = inner.base, offsets[:, offset : offset + inner.itemsize].reshape(-1, inner.base.itemsize)
+            offsets = offsets[:JOINTS] if name == "motor" else offsets
+        places.append(offsets.ravel())
+    return np.concatenate(places)
+
+
+_U1, _F4, _I2, _U2 = (np.dtype(kind) for kind in ("u1", "<f4", "<i2", "<u2"))
+
+_REACH = {kind: (int(np.iinfo(kind).min), int(np.iinfo(kind).max)) for kind in (_I2, _U2)}
+
+
+def _whole(values: Sequence[float], step: float, kind: np.dtype[Any]) -> list[int]:
+    """Return values in whole steps, cut towards zero and to a type's range; of a dozen, lists are faster than NumPy."""
+    low, high = _REACH[kind]
+    whole = [int(value / step) for value in values]  # exact: a step is a power of two
+    return whole if low <= min(whole) and max(whole) <= high else [min(max(n, low), high) for n in whole]
+
+
+def _motors(packet: bytearray, kind: np.dtype[Any]) -> np.ndarray:
+    """Return the twelve motors in a packet, to be written."""
+    motors: np.ndarray = np.frombuffer(packet, kind)["motor"][0]
+    return motors[:JOINTS]
+
+
+def _checked(numbers: Sequence[float]) -> Sequence[float]:
+    """Return numbers of a command; raise ValueError if one is beyond any Go1."""
+    if not _within(numbers, BEYOND):
+        raise ValueError("a command has a part that is not finite, or beyond any Go1")
+    return numbers
+
+
+def _within(values: Sequence[float], bound: float) -> bool:
+    """Return whether no value is beyond ``bound`` in either direction, or NaN. Of a dozen, faster than NumPy."""
+    return max(values) <= bound and min(values) >= -bound and not math.isnan(sum(values))
+
+
+@lru_cache(maxsize=8)
+def _with_gains(kp: bytes, kd: bytes) -> bytes:
+    """Return the packet of a command with these gains, double-precision numbers, and targets of zero."""
+    packet = bytearray(IDLE)
+    motors = _motors(packet, COMMAND_TYPE)
+    motors["q"] = motors["dq"] = 0.0
+    for name, gains, step in (("kp", kp, KP_STEP), ("kd", kd, KD_STEP)):
+        motors[name] = _whole(_checked(array("d", gains).tolist()), step, _U2)
+    return bytes(packet)
 
 
 def pack_command(command: LowCmd) -> bytes:
@@ -126,21 +178,15 @@ def pack_command(command: LowCmd) -> bytes:
     Raises:
         ValueError: if a part has another size than a Go1's, or is not finite.
     """
-    parts = np.zeros((4, JOINTS))
-    try:
-        parts[0], parts[2], parts[3] = command.joint_target, command.kp, command.kd
-        if command.feedforward is not None:
-            parts[1] = command.feedforward
-    except ValueError:
-        raise ValueError(f"a command's parts have the sizes {_sizes(command)}; a Go1's have {JOINTS}") from None
-    if not abs(parts).max() < BEYOND:  # NaN too
-        raise ValueError("a command has a part that is not finite, or beyond any Go1")
-    whole = np.minimum(np.maximum(parts[1:] * _STEPS, _LEAST), _MOST).astype(np.int32).tolist()  # cuts towards zero
-    numbers: list[float] = [SERVO, 0.0, 0.0, 0, 0, 0] * JOINTS
-    numbers[1::_EACH] = parts[0].tolist()
-    numbers[3::_EACH], numbers[4::_EACH], numbers[5::_EACH] = whole
-    packet = bytearray(IDLE)
-    _MOTORS.pack_into(packet, _PLACE, *numbers)
+    given = (command.joint_target, command.kp, command.kd, command.feedforward)
+    q, kp, kd, *rest = (np.asarray(part, float) for part in given if part is not None)
+    if any(part.shape != (JOINTS,) for part in (q, kp, kd, *rest)):
+        raise ValueError(f"a command's parts have the sizes {_sizes(command)}; a Go1's have {JOINTS}")
+    packet = bytearray(_with_gains(kp.tobytes(), kd.tobytes()))  # gains seldom change
+    motors = _motors(packet, COMMAND_TYPE)
+    motors["q"] = _checked(q.tolist())
+    for tau in rest:
+        motors["tau"] = _whole(_checked(tau.tolist()), TORQUE_STEP, _I2)
     packet[-4:] = checksum(packet).to_bytes(4, "little")
     return bytes(packet)
 
@@ -188,21 +234,24 @@ def unpack_command(packet: bytes) -> MotorCommand | Refusal:
     """Return what a packet asks for, or why it is refused."""
     if wrong := refusal(packet, COMMAND_SIZE):
         return wrong
-    numbers = np.array(_MOTORS.unpack_from(packet, _PLACE), float).reshape(JOINTS, _EACH).T
-    mode, q, dq, tau, kp, kd = numbers
-    free, loose = q == _FREE, dq == _LOOSE
-    if free.any() or loose.any():
+    data = np.frombuffer(packet, _U1)
+    listed = data[_TARGETS].view(_F4).tolist()
+    floats, gains = np.array(listed), data[_GAINS].view(_U2) * _GAIN_STEPS  # NumPy's cast warns of a signalling NaN
+    q, dq, kp, kd = floats[:JOINTS], floats[JOINTS:], gains[:JOINTS], gains[JOINTS:]
+    if _FREE in listed or _LOOSE in listed:
+        free, loose = q == _FREE, dq == _LOOSE
         q[free] = kp[free] = dq[loose] = kd[loose] = 0.0
-    damping = mode == DAMPING
-    # written so that a NaN is refused
-    if not ((abs(numbers) <= _BOUNDS).all() and (damping | (mode == SERVO)).all()):
+        listed = floats.tolist()
+    modes = data[_MODES]
+    known = modes.tobytes() == _ALL_SERVO or {*modes.tolist()} <= {SERVO, DAMPING}
+    if not (known and _within(listed[:JOINTS], FARTHEST) and _within(listed[JOINTS:], FASTEST)):
         return Refusal.CONTENT
-    numbers *= _UNITS
-    return MotorCommand(q, dq, tau, kp, kd, damping)
+    return MotorCommand(q, dq, data[_TORQUES].view(_I2) * TORQUE_STEP, kp, kd, modes == DAMPING)
 
 
-_BOUNDS = np.array([[255.0], [FARTHEST], [FASTEST], [32768.0], [65535.0], [65535.0]])
-_UNITS = np.array([[1.0], [1.0], [1.0], [TORQUE_STEP], [KP_STEP], [KD_STEP]])
+_TARGETS, _TORQUES = _bytes_of(COMMAND_TYPE, ("motor", "q"), ("motor", "dq")), _bytes_of(COMMAND_TYPE, ("motor", "tau"))
+_GAINS, _GAIN_STEPS = _bytes_of(COMMAND_TYPE, ("motor", "kp"), ("motor", "kd")), np.repeat([KP_STEP, KD_STEP], JOINTS)
+_MODES, _ALL_SERVO = _bytes_of(COMMAND_TYPE, ("motor", "mode")), bytes([SERVO]) * JOINTS
 _FREE, _LOOSE = float(np.float32(POSITION_STOP)), float(np.float32(VELOCITY_STOP))
 
 
@@ -233,20 +282,24 @@ class Health:
     acceleration: tuple[float, ...] = (0.0,) * JOINTS
 
 
-_STATE_MOTORS = struct.Struct("<" + "BffhhffhbII" * JOINTS)
-_STATE_IMU = struct.Struct("<13fb")
-_STATE_BATTERY = struct.Struct("<BBBBiHbbbb10B")
-_STATE_REST = struct.Struct("<4h8xI")
-_PLACES = {name: STATE_TYPE.fields[name][1] for name in ("imu", "motor", "battery", "foot_force")}  # type: ignore[index]
-_BLANK_STATE = sealed(_blank(STATE_TYPE))
-
-
-_STATE_STEPS = np.repeat([1.0 / TORQUE_STEP, 1.0 / ACCELERATION_STEP, 1.0], [JOINTS, JOINTS, LEGS])
-
-
 @lru_cache(maxsize=8)
-def _cells(voltage: tuple[float, ...]) -> tuple[int, ...]:
-    return tuple(round(1000.0 * volts / 32.0) for volts in voltage)
+def _with_health(health: Health) -> bytes:
+    """Return the packet of a state without readings."""
+    packet = bytearray(sealed(_blank(STATE_TYPE)))
+    record, motors = np.frombuffer(packet, STATE_TYPE)[0], _motors(packet, STATE_TYPE)
+    record["imu"]["temperature"], battery = health.imu_temperature, record["battery"]
+    battery["charge"], battery["current"] = health.charge, round(1000.0 * health.current)
+    battery["cell_voltage"] = [round(1000.0 * volts / 32.0) for volts in health.cell_voltage]
+    motors["mode"], motors["temperature"] = SERVO, health.motor_temperature
+    motors["ddq"] = motors["ddq_raw"] = _whole(health.acceleration, ACCELERATION_STEP, _I2)
+    return bytes(packet)
+
+
+_READ = (("motor", "q"), ("motor", "dq"), ("imu", "quat"), ("imu", "gyro"), ("imu", "acc"))
+_READINGS = _bytes_of(STATE_TYPE, *_READ)
+_WRITTEN = _bytes_of(STATE_TYPE, *_READ, ("motor", "q_raw"), ("motor", "dq_raw"), ("imu", "rpy"))
+_STATE_WHOLE = _bytes_of(STATE_TYPE, ("motor", "tau"), ("foot_force",))
+_TICK = _bytes_of(STATE_TYPE, ("tick",))
 
 
 def pack_state(state: LowState, tick: int, health: Health, rpy: np.ndarray) -> bytes:
@@ -258,23 +311,23 @@ def pack_state(state: LowState, tick: int, health: Health, rpy: np.ndarray) -> b
         health: everything else.
         rpy: (3,) roll, pitch and yaw, rad.
     """
-    packet = bytearray(_BLANK_STATE)
-    imu = np.concatenate([state.imu_quat, state.imu_gyro, state.imu_acc, rpy]).tolist()
-    _STATE_IMU.pack_into(packet, _PLACES["imu"], *imu, health.imu_temperature)
-    fixed = np.concatenate([state.joint_torque, health.acceleration, state.foot_force]) * _STATE_STEPS
-    whole = np.minimum(np.maximum(fixed, -32768), 32767).astype(np.int32).tolist()  # cuts towards zero
-    numbers: list[float] = [SERVO, 0.0, 0.0, 0, 0, 0.0, 0.0, 0, 0, 0, 0] * JOINTS
-    numbers[1::11] = numbers[5::11] = state.joint_pos.tolist()
-    numbers[2::11] = numbers[6::11] = state.joint_vel.tolist()
-    numbers[3::11] = numbers[7::11] = whole[JOINTS : 2 * JOINTS]
-    numbers[4::11], numbers[8::11] = whole[:JOINTS], health.motor_temperature
-    _STATE_MOTORS.pack_into(packet, _PLACES["motor"], *numbers)
-    cells = _cells(health.cell_voltage)
-    battery = (0, 0, 0, health.charge, round(1000.0 * health.current), 0, 0, 0, 0, 0, *cells)
-    _STATE_BATTERY.pack_into(packet, _PLACES["battery"], *battery)
-    _STATE_REST.pack_into(packet, _PLACES["foot_force"], *whole[2 * JOINTS :], tick % NUMBERS)
+    packet = bytearray(_with_health(health))  # changes seldom
+    data, q, qd = np.frombuffer(packet, _U1), state.joint_pos, state.joint_vel
+    floats = np.concatenate([q, qd, state.imu_quat, state.imu_gyro, state.imu_acc, q, qd, rpy])
+    data[_WRITTEN] = floats.astype(_F4).view(_U1)
+    whole = _whole(state.joint_torque.tolist(), TORQUE_STEP, _I2) + _whole(state.foot_force.tolist(), 1.0, _I2)
+    data[_STATE_WHOLE] = np.array(whole, _I2).view(_U1)
+    data[_TICK] = np.frombuffer((tick % NUMBERS).to_bytes(4, "little"), _U1)
     packet[-4:] = checksum(packet).to_bytes(4, "little")
     return bytes(packet)
+
+
+def state_refusal(packet: bytes) -> Refusal | None:
+    """Return why a state's packet is refused; also one of which a reading is not finite, or beyond any Go1."""
+    if wrong := refusal(packet, STATE_SIZE):
+        return wrong
+    readings = np.frombuffer(packet, _U1)[_READINGS].view(_F4).tolist()
+    return None if _within(readings, BEYOND) else Refusal.CONTENT
 
 
 def tick_of(packet: bytes) -> int:
@@ -286,21 +339,21 @@ def unpack_state(packet: bytes, t: float, clock: float) -> LowState:
     """Return the readings in a state's packet that is not refused.
 
     Args:
-        packet: see ``refusal``.
+        packet: see ``state_refusal``.
         t: when it arrived, on the runtime's clock, s.
         clock: its tick in s; NaN if the tick's unit is not known.
     """
-    record = np.frombuffer(packet, STATE_TYPE)[0]
-    motors, imu = record["motor"][:JOINTS], record["imu"]
+    data = np.frombuffer(packet, _U1)
+    floats, whole = data[_READINGS].view(_F4).astype(float), data[_STATE_WHOLE].view(_I2)
     return LowState(
         t=t,
-        joint_pos=motors["q"].astype(float),
-        joint_vel=motors["dq"].astype(float),
-        joint_torque=motors["tau"] * TORQUE_STEP,
-        imu_quat=imu["quat"].astype(float),
-        imu_gyro=imu["gyro"].astype(float),
-        imu_acc=imu["acc"].astype(float),
-        foot_force=record["foot_force"].astype(float),
+        joint_pos=floats[:JOINTS],
+        joint_vel=floats[JOINTS : 2 * JOINTS],
+        joint_torque=whole[:JOINTS] * TORQUE_STEP,
+        imu_quat=floats[24:28],
+        imu_gyro=floats[28:31],
+        imu_acc=floats[31:],
+        foot_force=whole[JOINTS:].astype(float),
         clock=clock,
         in_force=-1,
     )

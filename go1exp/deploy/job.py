@@ -19,18 +19,19 @@ from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.commands import KEYS, make, range_array
 from go1exp.deploy.controller import Mover
 from go1exp.deploy.estimate import settings as estimator_settings
-from go1exp.deploy.go1_check import Report, calibrate, check
+from go1exp.deploy.go1_check import Looked, Report, calibrate, check
+from go1exp.deploy.go1_fields import TORQUE_NOTE
 from go1exp.deploy.go1_wire import gains_on_wire
-from go1exp.deploy.launch import RobotError, SimulatedRobot
+from go1exp.deploy.launch import RefusedError, RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
 from go1exp.deploy.udp import HOST, SIMULATED_TICK_S, Go1Link, UdpLink
 from go1exp.deploy.walk import STATUS, Outcome, Plan, account, interruptible, save, velocity_errors, walk
-from go1exp.estimation.feet import FootCalibration
+from go1exp.estimation.feet import LEGS, FootCalibration
 
 Say = Callable[[str], None]
 
-ON_WIRE = "; gains are those that the packets carried, torques have steps of 1/256 N m"
+ON_WIRE = f"; gains are those that the packets carried, {TORQUE_NOTE}"
 OTHER_MOVER = "; not moved by a policy: gains change, and torques that are fed forward are not recorded"
 
 
@@ -47,8 +48,10 @@ class Job:
         other: its ``actuator`` and ``effect``, if not those of training.
         truth: also write the simulated trunk's true motion into the recording.
         mover: walks in place of the bundle's policy.
+        motion: what the mover does to a robot that hangs; None if it walks.
+        gains: kp and kd (J,) in place of the bundle's.
         address: HOST:PORT of ``go1`` and ``go1_sdk``; that of every Go1 if None.
-        feet: file of the foot sensors' calibration, for ``go1`` and ``go1_sdk``; contact from torques alone if None.
+        feet: file of the calibration of foot sensors that count (``counting``); contact from torques alone if None.
     """
 
     bundle: str
@@ -59,9 +62,24 @@ class Job:
     other: Mapping[str, Any] = field(default_factory=dict)
     truth: bool = False
     mover: Mover | None = None
+    motion: str | None = None
+    gains: tuple[np.ndarray, np.ndarray] | None = None
     address: str | None = None
     feet: str | None = None
 
+    @property
+    def on_wire(self) -> bool:
+        """Whether robot and runtime speak by the Go1's own packets."""
+        return self.robot in REAL or self.sim.get("protocol", "go1") == "go1"
+
+    @property
+    def counting(self) -> bool:
+        """Whether the feet's sensors count, each with its own zero and scale, instead of saying newtons."""
+        return self.robot in REAL or (self.on_wire and self.sim.get("feet") == "raw")
+
+
+REAL = ("go1", "go1_sdk")
+"""Names of the robots that are not simulated."""
 
 NOTICE = "note: robot=go1 has never been run on a robot; hang it up first, and keep a hand on its switch"
 
@@ -79,7 +97,7 @@ class _Robot:
 def _reached(job: Job, bundle: Bundle, say: Say) -> Iterator[_Robot]:
     """Open the link to the robot; close it at the end."""
     with contextlib.ExitStack() as stack:
-        if job.robot in ("go1", "go1_sdk"):
+        if job.robot in REAL:
             say(NOTICE)
             link: Link = _real(job, bundle, say, stack)
             yield _Robot(link, simulated=False)
@@ -111,13 +129,25 @@ def _real(job: Job, bundle: Bundle, say: Say, stack: contextlib.ExitStack) -> Li
     if job.robot == "go1_sdk":
         from go1exp.deploy.go1_sdk import SdkLink
 
-        return stack.enter_context(closing(SdkLink(address=parsed_address(job.address))))
+        by_sdk = stack.enter_context(closing(SdkLink(address=parsed_address(job.address))))
+        _checked(by_sdk, bundle, say)
+        return by_sdk
     link = stack.enter_context(closing(Go1Link(*parsed_address(job.address))))
+    link.tick_s = _checked(link, bundle, say).tick_s
+    return link
+
+
+def _checked(link: Looked, bundle: Bundle, say: Say) -> Report:
+    """Return the findings about a robot that may walk.
+
+    Raises:
+        RobotError: if it may not.
+    """
     about = bundle.metadata
     report = check(link, about.joints, np.array(about.joint_limits), estimator_settings(about.estimator), say)
     if report.problems:
         raise RobotError("the robot does not pass its check, so no walk begins: " + "; ".join(report.problems))
-    return link
+    return report
 
 
 @dataclass(frozen=True)
@@ -169,6 +199,7 @@ def run_job(job: Job, say: Say) -> int:
         go1exp.errors.Expected: if bundle, robot, commands or estimator are not available.
         OSError: if a file cannot be read or written.
     """
+    feet = _calibration(job)
     bundle = bundles.load(job.bundle)
     about, plan = bundle.metadata, job.plan
     if about.kp is None or about.kd is None:
@@ -182,20 +213,22 @@ def run_job(job: Job, say: Say) -> int:
         say(f"note: the policy was trained at {1 / about.policy_dt:g} Hz and runs at {plan.rate:g} Hz")
     if plan.wish.command == "keyboard":
         say(KEYS)
-    feet = None if job.feet is None else FootCalibration.read(Path(job.feet))
+    if job.counting:
+        say(BY_TORQUE if feet is None else BY_BOTH.format(job.feet))
     _writable(Path(job.out))
     outcome: Outcome | None = None
     try:
         with interruptible(), _reached(job, bundle, say) as robot:
-            contact = None if robot.simulated else "torque"
-            outcome = walk(bundle, robot.link, plan, contact=contact, feet=feet, on_second=say, mover=job.mover)
+            contact = "torque" if job.counting else None
+            means: dict[str, Any] = {"contact": contact, "feet": feet, "mover": job.mover, "gains": job.gains}
+            outcome = walk(bundle, robot.link, plan, on_second=say, **means)
             traffic = getattr(robot.link, "traffic", None)
     except KeyboardInterrupt:
         if outcome is not None:
             raise
         say("stopped before the walk began: nothing was commanded")
         return STATUS["operator_stop"]
-    extra: dict[str, Any] = {"robot": job.robot, "link": None if traffic is None else vars(traffic)}
+    extra: dict[str, Any] = {"robot": job.robot, "link": None if traffic is None else traffic.counts()}
     truth: Mapping[str, np.ndarray] = {}
     if robot.process is not None:
         truth, extra["simulated_robot"] = robot.process.truth, robot.process.report
@@ -213,22 +246,44 @@ def run_job(job: Job, say: Say) -> int:
     return outcome.status
 
 
+BY_TORQUE = "contact of the feet: by the joints' torques alone; feet=FILE, a calibration, adds the foot sensors"
+BY_BOTH = "contact of the feet: by the joints' torques and by the sensors that {} calibrates"
+
+
+def _calibration(job: Job) -> FootCalibration | None:
+    """Return the calibration of the feet's sensors, if there is one.
+
+    Raises:
+        RefusedError: if the sensors need none.
+        go1exp.estimation.feet.CalibrationError: if the file is none, or has no scales yet.
+    """
+    if job.feet is None:
+        return None
+    if not job.counting:
+        problem = f"feet = {job.feet}: calibrates sensors that count; those of robot={job.robot} say newtons"
+        raise RefusedError([f"{problem}, unless sim.feet=raw (with sim.protocol=go1)"])
+    calibration = FootCalibration.read(Path(job.feet))
+    calibration.forces(np.zeros(LEGS))  # raises without scales, before anything moves
+    return calibration
+
+
 def _about(job: Job, bundle: Bundle, simulated: bool) -> About:
     """Return the origin of a walk's log."""
     about = bundle.metadata
-    on_wire = job.robot in ("go1", "go1_sdk") or job.sim.get("protocol", "go1") == "go1"
-    gains = np.array(about.kp), np.array(about.kd)
-    gains = gains_on_wire(*gains) if on_wire else gains
+    gains = job.gains or (np.array(about.kp), np.array(about.kd))
+    gains = gains_on_wire(*gains) if job.on_wire else gains
     return About(
         metadata=about,
         kp=gains[0],
         kd=gains[1],
         simulated=simulated,
-        newton=simulated and job.sim.get("feet") != "raw",
-        episode=_free(Path(job.out), time.strftime("walk_%Y-%m-%d_%H-%M-%S")),
+        newton=not job.counting,
+        episode=_free(Path(job.out), time.strftime(f"{job.motion or 'walk'}_%Y-%m-%d_%H-%M-%S")),
+        excitation=job.motion or "policy",
+        hung=job.motion is not None,
         notes="ends where the drives begin to brake"
-        + (ON_WIRE if on_wire else "")
-        + (OTHER_MOVER if job.mover else ""),
+        + (ON_WIRE if job.on_wire else "")
+        + (OTHER_MOVER if job.mover and job.motion is None else ""),
     )
 
 

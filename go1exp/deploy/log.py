@@ -80,6 +80,8 @@ class About:
         simulated: not measured on hardware.
         newton: the feet's readings are in newtons; if not, they are left out of the recording.
         episode: the recording's name.
+        excitation: what moved the robot.
+        hung: whether its trunk was held in the air; the mean of what the IMU says is its attitude then.
         notes: anything else that a reader must know.
     """
 
@@ -89,6 +91,8 @@ class About:
     simulated: bool
     newton: bool
     episode: str
+    excitation: str = "policy"
+    hung: bool = False
     notes: str = ""
 
 
@@ -160,9 +164,8 @@ class Log:
         known = obeyed is not None or (self.states.part("in_force")[kept] >= 0).all()
         notes = [about.notes, "" if known else UNKNOWN_DELAY]
         notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
-        meta = _meta(about, t[good], "; ".join(note for note in notes if note))
-        channels = {"t": t, **channels}
-        return Recording(meta, {name: np.ascontiguousarray(values[good]) for name, values in channels.items()})
+        channels = {name: np.ascontiguousarray(values[good]) for name, values in {"t": t, **channels}.items()}
+        return Recording(_meta(about, channels, "; ".join(note for note in notes if note)), channels)
 
     def _channels(self, about: About, kept: np.ndarray, targets: np.ndarray) -> dict[str, np.ndarray]:
         """Return what was measured in the states ``kept`` (S,) bool, by column, each (T,), with targets (T, J)."""
@@ -217,20 +220,20 @@ class Log:
 UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell what it obeys, and the way takes time"
 
 
-def _meta(about: About, t: np.ndarray, notes: str) -> Meta:
-    """Return the description of a recording with the times ``t`` (T,), s."""
-    from go1exp.recording import Meta
+def _meta(about: About, channels: Mapping[str, np.ndarray], notes: str) -> Meta:
+    """Return the description of a recording with these channels."""
+    from go1exp.recording import VECTORS, Meta
 
     return Meta(
         robot=about.metadata.robot,
         joints=about.metadata.joints,
-        rate_hz=float(np.round(1.0 / np.median(np.diff(t)), 3)),
-        base="floating",
-        base_quat=None,
+        rate_hz=float(np.round(1.0 / np.median(np.diff(channels["t"])), 3)),
+        base="fixed" if about.hung else "floating",
+        base_quat=_attitude(np.stack([channels[name] for name in VECTORS["imu_quat"]])) if about.hung else None,
         kp=tuple(map(float, about.kp)),
         kd=tuple(map(float, about.kd)),
         tau_limit=about.metadata.torque_limit,
-        excitation="policy",
+        excitation=about.excitation,
         episode=about.episode,
         repeat_of=None,
         source="simulated" if about.simulated else "measured",
@@ -238,6 +241,13 @@ def _meta(about: About, t: np.ndarray, notes: str) -> Meta:
         versions={"go1exp": __version__, "onnxruntime": metadata.version("onnxruntime")},
         notes=notes,
     )
+
+
+def _attitude(quat: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the mean attitude w-x-y-z of quaternions (4, T), of which q and -q are the same (Markley et al., 2007)."""
+    mean = np.linalg.eigh(quat @ quat.T)[1][:, -1]
+    w, x, y, z = np.where(mean[0] < 0.0, -mean, mean).tolist()
+    return w, x, y, z
 
 
 def _joined(truth: Mapping[str, np.ndarray], clock: np.ndarray) -> dict[str, np.ndarray]:

@@ -25,13 +25,17 @@ class Port:
 
 @dataclass(frozen=True)
 class Block:
-    """One term of the flat observation: ``size`` columns from ``start`` on; half-width of its noise in training."""
+    """One term of the flat observation: ``size`` columns from ``start`` on; half-width of its noise in training.
+
+    They are ``history`` frames of it, one training period apart, the newest first.
+    """
 
     key: str
     term: str
     start: int
     size: int
     noise: float
+    history: int = 1
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,11 @@ class Metadata:
         ends = [block.start + block.size for block in self.observation]
         if [block.start for block in self.observation] != [0, *ends[:-1]]:
             raise ValueError("observation: its terms do not follow one another")
+        if wrong := [block.key for block in self.observation if block.history < 1 or block.size % block.history]:
+            raise ValueError(f"observation: {wrong[0]} has a size that is not that of its history")
+        earlier = sum(block.size - block.size // block.history for block in self.observation)
+        if earlier != sum(port.size for port in self.inputs if port.name == "past"):
+            raise ValueError(f"inputs: past must have the {earlier} numbers of the observation's earlier frames")
         for name in ("action_scale", "action_clip", "policy_dt", "physics_dt"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: must be greater than 0")
@@ -127,13 +136,14 @@ def _built(kind: type[T], content: Any, path: str) -> T:
     if not isinstance(content, Mapping):
         raise ValueError(f"{path or 'content'}: must be a mapping")
     kinds = get_type_hints(kind)
+    optional = {field.name for field in dataclasses.fields(kind) if field.default is not dataclasses.MISSING}  # type: ignore[arg-type]
     for name in kinds:
-        if name not in content:
+        if name not in content and name not in optional:  # optional: what files of older versions do not have
             raise ValueError(f"{path}{name}: missing")
     for name in content:
         if name not in kinds:
             raise ValueError(f"{path}{name}: unknown key")
-    return kind(**{name: _value(kinds[name], content[name], f"{path}{name}") for name in kinds})
+    return kind(**{name: _value(kinds[name], content[name], f"{path}{name}") for name in kinds if name in content})
 
 
 def _value(kind: Any, given: Any, path: str) -> Any:

@@ -9,6 +9,7 @@ import struct
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from go1exp.deploy import go1_wire, wire
 from go1exp.deploy.messages import LowCmd, LowState
@@ -41,6 +42,7 @@ class Traffic:
         late: states older than one received before, or received twice; they are left out.
         lost: states missing in the robot's count (a late one counts here too).
         refused: times that the port at the other end was closed.
+        complete: whether all of this is counted; else only what was received and sent is known.
     """
 
     received: int = 0
@@ -51,6 +53,12 @@ class Traffic:
     late: int = 0
     lost: int = 0
     refused: int = 0
+    complete: bool = True
+
+    def counts(self) -> dict[str, Any]:
+        """Return what is known, by name."""
+        every = {name: value for name, value in vars(self).items() if name != "complete"}
+        return every if self.complete else {name: every[name] for name in ("received", "sent")}
 
 
 class Datagrams:
@@ -199,6 +207,16 @@ class Go1Link:
         self._clock, self._packet = 0.0, go1_wire.IDLE
         self._spoken, self.sent_at = -math.inf, math.nan
 
+    @property
+    def tick(self) -> int | None:
+        """The tick of the newest state; None before the first."""
+        return self._last
+
+    @property
+    def health(self) -> go1_wire.Health | None:
+        """What the newest state has beside the readings; None before the first."""
+        return go1_wire.unpack_health(self.newest) if self.newest else None
+
     def receive(self) -> Sequence[LowState]:
         """Return the states that have arrived since the last call, oldest first, without waiting."""
         states = []
@@ -212,7 +230,7 @@ class Go1Link:
 
     def _taken(self, data: bytes, extra: list[tuple[int, int, bytes]]) -> LowState | None:
         """Return the state of a datagram; None, and a count, if it is not accepted."""
-        wrong = go1_wire.refusal(data, go1_wire.STATE_SIZE)
+        wrong = go1_wire.state_refusal(data)
         if wrong is not None:
             self.traffic.foreign += 1
             self.traffic.refused_because[wrong.value] = self.traffic.refused_because.get(wrong.value, 0) + 1

@@ -102,8 +102,8 @@ def estimator_of(
 ) -> Estimator:
     """Return the estimator that a bundle's policy wants; with ``always`` one in any case.
 
-    ``contact`` is ``torque`` for a robot whose feet's sensors speak no newtons; None leaves the bundle's choice. With
-    their calibration, ``feet``, both are used.
+    ``contact`` is ``torque`` for a robot whose feet's sensors count instead of saying newtons; None leaves the bundle's
+    choice. With their calibration, ``feet``, both are used.
 
     Raises:
         go1exp.schema.registry.ConfigError: if the bundle's settings are not such.
@@ -128,8 +128,11 @@ def walk(
     feet: FootCalibration | None = None,
     on_second: Callable[[str], None] = lambda line: None,
     mover: Mover | None = None,
+    gains: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Outcome:
     """Walk, by the bundle's policy or by ``mover``. The link stays open; SIGINT and SIGTERM stop the robot meanwhile.
+
+    ``gains``, kp and kd (J,), are in force in place of the bundle's.
 
     Raises:
         go1exp.errors.Expected: if commands or the estimator cannot be had; nothing has been sent then.
@@ -142,7 +145,7 @@ def walk(
     stop_requests: list[str] = []
     ranges = range_array(about.command_ranges)
     with contextlib.closing(make(plan.wish, ranges, safety.stop, stop_requests.append)) as commands:
-        walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests, mover)
+        walk = _Walk(bundle, link, plan, safety, estimator, commands, stop_requests, mover, gains)
         with stopping(safety):
             clock = MonotonicClock(plan.spin, walk.rehearse, link.repeat, walk.prepare)
             timing = run(walk.cycle, walk.rate, None, clock, lambda timing: on_second(walk.status(timing)))
@@ -162,6 +165,7 @@ class _Walk:
         commands: Limited,
         stop_requests: list[str],
         mover: Mover | None,
+        gains: tuple[np.ndarray, np.ndarray] | None,
     ) -> None:
         """Join the parts of the runtime; nothing is sent yet. ``stop_requests`` fills with who asks for an end."""
         self.rate = plan.rate or 1.0 / bundle.metadata.policy_dt
@@ -178,6 +182,8 @@ class _Walk:
             stages=plan,
             on_cycle=self._note,
             mover=mover,
+            kp=gains and gains[0],
+            kd=gains and gains[1],
         )
 
     def _note(self, cycle: Cycle) -> None:

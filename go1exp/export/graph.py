@@ -23,6 +23,7 @@ from go1exp.config import ActionConfig
 from go1exp.deploy.metadata import Block, Port
 from go1exp.mdp.actions import clipped, joint_target
 from go1exp.mdp.types import Snapshot
+from go1exp.schema.history import frame_width, frames_of, width
 from go1exp.schema.registry import Expected, Term
 from go1exp.tensors.rotation import projected_gravity
 
@@ -67,6 +68,11 @@ READINGS = (
     Port("walked", 1, "s", "-", "time since walking began: a gait clock is a function of it"),
 )
 """Inputs that the robot's computer can provide. A graph has those that its terms read, in this order."""
+
+PAST = Port(
+    "past", 0, "as each term", "-", "earlier frames of the terms with a history, a training period apart, newest first"
+)
+"""Input of a graph whose observation has a history, behind the others; before there is a past, the first frame."""
 
 SOURCES = {
     "base_lin_vel_b": Source("base_lin_vel_b"),
@@ -124,8 +130,8 @@ def blocks(terms: Sequence[Term]) -> tuple[Block, ...]:
     """Return the terms with their place in the flat observation."""
     placed, start = [], 0
     for term in terms:
-        size = int(term.entry.traits["size"])
-        placed.append(Block(term.key, term.entry.name, start, size, float(term.slots.get("noise", 0.0))))
+        size, noise = width(term), float(term.slots.get("noise", 0.0))
+        placed.append(Block(term.key, term.entry.name, start, size, noise, frames_of(term)))
         start += size
     return tuple(placed)
 
@@ -166,7 +172,9 @@ class DeployedPolicy(nn.Module):
             ExportError: if a term reads what the robot does not measure.
         """
         super().__init__()
-        self.inputs = required_inputs(terms)
+        self._earlier = [width(term) - frame_width(term) for term in terms]
+        past = (dataclasses.replace(PAST, size=sum(self._earlier)),) if any(self._earlier) else ()
+        self.inputs = (*required_inputs(terms), *past)
         size = sum(block.size for block in blocks(terms))
         self.outputs = tuple(dataclasses.replace(p, size=p.size or size) for p in OUTPUTS)
         self._terms, self._action = tuple(terms), action
@@ -177,7 +185,11 @@ class DeployedPolicy(nn.Module):
     def forward(self, *readings: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return joint targets (N, 12), observation (N, O) and clipped action (N, 12) for readings (N, size)."""
         given = dict(zip([port.name for port in self.inputs], readings, strict=True))
-        observation = torch.cat([term(cast(Snapshot, Sensed(given, term.key))) for term in self._terms], dim=-1)
+        frames = [term(cast(Snapshot, Sensed(given, term.key))) for term in self._terms]
+        if any(self._earlier):
+            earlier = given["past"].split(self._earlier, dim=-1)
+            frames = [torch.cat(pair, dim=-1) for pair in zip(frames, earlier, strict=True)]
+        observation = torch.cat(frames, dim=-1)
         action = clipped(self.head(self.actor(observation)), self._action.clip)
         return joint_target(action, self.nominal, self._action.scale), observation, action
 

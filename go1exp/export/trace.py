@@ -13,6 +13,7 @@ from go1exp.deploy.metadata import Port
 from go1exp.effects.base import Measured
 from go1exp.env.core import Go1Core
 from go1exp.schema.backends import CpuBackend
+from go1exp.schema.history import history_columns
 
 
 def readings(core: Go1Core) -> dict[str, Tensor]:
@@ -72,9 +73,11 @@ def record(
     observation = core.reset()
     steps, period = max(1, round(seconds / task.sim.policy_dt)), task.sim.policy_dt
     rows: list[dict[str, np.ndarray]] = []
+    earlier = history_columns(task.observation).earlier
     for step in range(steps):
-        before = readings(core)  # before the step: what the policy is about to see
         policy_input = observation.clone()
+        # before the step: what the policy is about to see
+        before = {**readings(core), "past": policy_input[:, earlier]}
         result = core.step(policy(observation))
         core.check(result)
         if not bool(result.terminated | result.truncated):

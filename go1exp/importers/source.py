@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from go1exp import __version__
+from go1exp.deploy.go1_fields import TORQUE_NOTE, in_torque_steps
 from go1exp.recording import Meta, Recording, RecordingError, joint_channels, problems
 from go1exp.schema.registry import explain
 
@@ -124,6 +125,8 @@ def reorder(theirs: Iterable[str], ours: Iterable[str]) -> list[int]:
 def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **about: Any) -> Recording:
     """Build a recording and check it; ``about`` are fields of ``Meta``; unknown ones are left out.
 
+    The notes say it where a Go1's torques have the steps of its packets, as those of ``go1exp deploy`` do.
+
     Raises:
         RecordingError: naming ``path``, if anything breaks the format.
     """
@@ -137,6 +140,9 @@ def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **abou
         lines = explain(error, "metadata", Meta.__dataclass_fields__)
         raise RecordingError("\n".join(f"{path}: {line}" for line in lines)) from error
     result = Recording(meta, channels)
+    torques = [values for name, values in channels.items() if name.startswith("tau_est_")]
+    if meta.robot == "go1" and torques and in_torque_steps(np.concatenate(torques)):
+        result = replace(result, meta=replace(meta, notes="; ".join(filter(None, (meta.notes, TORQUE_NOTE)))))
     wrong = problems(result)
     if wrong:
         raise RecordingError("\n".join(f"{path}: {line}" for line in wrong))

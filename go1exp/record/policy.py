@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import go1exp.record.playback  # noqa: F401  (registers an excitation: what is recorded and is no motion of its own)
 from go1exp.schema.registry import excitation
 
 
