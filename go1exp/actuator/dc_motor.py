@@ -55,8 +55,7 @@ class DCMotor(Gains):
         """
         self.kp, self.kd = setup.rows(kp), setup.rows(kd)
         self._effort = setup.effort_limit
-        self._stall = _or(setup, stall, setup.effort_limit)
-        self._speed = _or(setup, speed, setup.velocity_limit)
+        self._stall, self._speed = line(setup, stall, speed)
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
         """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is in the clipped sum."""
@@ -67,6 +66,11 @@ class DCMotor(Gains):
 
     def reset(self, mask: Tensor) -> None:
         """Nothing to forget."""
+
+
+def line(setup: DriveSetup, stall: JointValues | None, speed: JointValues | None) -> tuple[Tensor, Tensor]:
+    """Return stall torques and top speeds (J,) of motors, where they are not given those of the robot's limits."""
+    return _or(setup, stall, setup.effort_limit), _or(setup, speed, setup.velocity_limit)
 
 
 def _or(setup: DriveSetup, values: JointValues | None, usual: Tensor) -> Tensor:

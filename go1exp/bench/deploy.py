@@ -22,11 +22,10 @@ from go1exp.config import parse_train
 from go1exp.deploy.bundle import Bundle, loads
 from go1exp.deploy.go1_wire import (
     JOINTS,
-    STATE_SIZE,
     Health,
     pack_command,
     pack_state,
-    refusal,
+    state_refusal,
     tick_of,
     unpack_command,
     unpack_state,
@@ -104,7 +103,7 @@ def _packets() -> float:
         start = time.perf_counter()
         unpack_command(pack_command(command))
         pack_state(state, 2, health, rpy)
-        if refusal(packet, STATE_SIZE) is None:
+        if state_refusal(packet) is None:
             tick_of(packet)
             unpack_state(packet, 0.0, 0.0)
         times.append(time.perf_counter() - start)

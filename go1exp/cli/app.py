@@ -162,6 +162,10 @@ def _composed_once(overrides: Sequence[str], folders: Sequence[Path]) -> Iterato
         Hydra.get_mode = before  # type: ignore[method-assign]
 
 
+MODES = ("--run", "-r", "--multirun", "-m", "--cfg", "-c", "--info", "-i")
+"""Options of Hydra of which one may be given."""
+
+
 def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:
     """Raise ConfigError where Hydra's parsers would print their usage or a remark on grammar."""
     problems = []
@@ -173,6 +177,9 @@ def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:
                 problems.append(f"{word}: unknown option; see {title} --help")
         elif "=" not in word and not word.startswith("~"):
             problems.append(f"{word}: not a setting, which is key=value; see {title} --help")
+    modes = [word for word in arguments if word.partition("=")[0] in MODES]
+    if len(modes) > 1:
+        problems.append(f"{' and '.join(modes)} cannot be used together: --cfg and --info show one run, without -m")
     if problems:
         raise ConfigError(problems)
 

@@ -15,6 +15,7 @@ from go1exp.schema.registry import ConfigError
 if TYPE_CHECKING:
     from go1exp.cli.settings import DeploySettings
     from go1exp.deploy.controller import Mover
+    from go1exp.record.played import PlayedMotion
 
 
 def _task(container: dict[str, Any]) -> int:
@@ -28,11 +29,11 @@ def _task(container: dict[str, Any]) -> int:
         return _check(settings)
     _refuse_misfits(settings, other, controller is not None)
     assert settings.bundle is not None  # or it would have been refused
-    rate = settings.rate
-    if controller:
-        rate = 1.0 / controller.period
-        if settings.rate is not None and abs(settings.rate - rate) > 1e-6 * rate:
-            raise ConfigError([f"rate = {settings.rate:g}: controller=mpc runs at {rate:g} Hz (controller.period)"])
+    rate, seconds = _rate(settings, controller), settings.seconds
+    motion = _motion(settings, controller is not None)
+    mover = _mover(controller) if motion is None else motion
+    if motion is not None:
+        rate, seconds = motion.rate, motion.seconds
 
     from go1exp.cli.logs import remove_empty, writable
     from go1exp.deploy.commands import Wish
@@ -43,7 +44,7 @@ def _task(container: dict[str, Any]) -> int:
     existed = Path(settings.out).exists()
     writable(settings.out)
     wish = Wish(settings.command, settings.sinusoid.amplitude, settings.sinusoid.period)
-    plan = subset(Plan, settings, wish=wish, rate=rate)
+    plan = subset(Plan, settings, wish=wish, rate=rate, seconds=seconds)
     sim = dataclasses.asdict(settings.sim)
     job = Job(
         settings.bundle,
@@ -53,7 +54,9 @@ def _task(container: dict[str, Any]) -> int:
         sim,
         other,
         truth=settings.truth,
-        mover=_mover(controller),
+        mover=mover,
+        motion=None if motion is None else motion.name,
+        gains=None if motion is None else motion.gains,
         address=settings.address,
         feet=settings.feet,
     )
@@ -75,9 +78,8 @@ def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled:
     real = settings.robot != "sim"
     if real and other:
         raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
-    for name in ("address", "feet"):
-        if not real and getattr(settings, name) is not None:
-            raise ConfigError([f"{name} = {getattr(settings, name)}: is for robot=go1 and robot=go1_sdk"])
+    if not real and settings.address is not None:
+        raise ConfigError([f"address = {settings.address}: is for robot=go1 and robot=go1_sdk"])
     if real and controlled:
         raise ConfigError(
             ["controller=mpc: is for robot=sim; it has never moved a real robot, nor has a person tried it"]
@@ -96,6 +98,16 @@ def _check(settings: DeploySettings) -> int:
     return run_check(job, lambda line: print(line, flush=True))
 
 
+def _rate(settings: DeploySettings, controller: MpcSettings | None) -> float | None:
+    """Return cycles per second, Hz; None for those of training."""
+    if controller is None:
+        return settings.rate
+    rate = 1.0 / controller.period
+    if settings.rate is not None and abs(settings.rate - rate) > 1e-6 * rate:
+        raise ConfigError([f"rate = {settings.rate:g}: controller=mpc runs at {rate:g} Hz (controller.period)"])
+    return rate
+
+
 def _mover(controller: MpcSettings | None) -> Mover | None:
     """Return what walks in place of the bundle's policy, if anything does."""
     if controller is None:
@@ -104,6 +116,21 @@ def _mover(controller: MpcSettings | None) -> Mover | None:
     from go1exp.controller.mpc import Mpc
 
     return Deployed(Mpc(controller))
+
+
+def _motion(settings: DeploySettings, controlled: bool) -> PlayedMotion | None:
+    """Return the motion of a hung robot, if one is asked for."""
+    if settings.motion is None:
+        if settings.gains is not None:
+            raise ConfigError(["gains: are of motion; a policy walks with those that it was trained with"])
+        return None
+    if controlled:
+        raise ConfigError(["controller=mpc: walks; motion moves a robot that hangs. Leave out one of them"])
+    if settings.robot == "sim" and settings.sim.start != "hung":
+        raise ConfigError([f"motion = {settings.motion!r}: is for a robot that hangs; add sim.start=hung"])
+    from go1exp.record.played import played
+
+    return played(settings.motion, settings.seconds, settings.rate, settings.gains, settings.sim.seed)
 
 
 APP = App("deploy", _task)

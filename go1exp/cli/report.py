@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from go1exp.cli.app import App, spinner
 from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
+    from go1exp.protocol.base import Chosen
     from go1exp.report.made import Report
     from go1exp.report.runs import Study
     from go1exp.report.settings import ReportSettings
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.settings import ReportSettings, parse
 
+    container = dict(container)
+    protocols = _protocols(container.pop("protocol"), bool(container.get("eval")))
     settings = parse(ReportSettings, container)
     folder = Path(settings.folder or Path(settings.folders[0]) / "report")
     if folder.exists() and not folder.is_dir():
@@ -29,8 +32,7 @@ def _task(container: dict[str, Any]) -> None:
 
     runs = study(settings.folders, settings.unfinished)
     if settings.eval:
-        _evaluate(runs, settings)
-    import go1exp.protocol.kinds  # noqa: F401  (registers them)
+        _evaluate(runs, settings, protocols)
     from go1exp.report.made import report
     from go1exp.report.writing import write
 
@@ -45,7 +47,19 @@ def _task(container: dict[str, Any]) -> None:
         log_tables(plain_rows(made), files[0], settings.project, settings.wandb, folder)
 
 
-def _evaluate(runs: Study, settings: ReportSettings) -> None:
+def _protocols(given: Any, asked: bool) -> list[Chosen | None]:
+    """Return what ``eval=true`` plays, None for the grid; raise ConfigError with every problem."""
+    import go1exp.protocol.kinds  # noqa: F401  (registers them)
+    from go1exp.protocol.base import chosen
+
+    protocols, grid = chosen(given)
+    if protocols and not asked:
+        names = ",".join(c.key for c in protocols)
+        raise ConfigError([f"protocol=[{names}]: is what eval=true plays; the report shows whatever runs have played"])
+    return [*([None] if grid else []), *protocols]
+
+
+def _evaluate(runs: Study, settings: ReportSettings, protocols: Sequence[Chosen | None]) -> None:
     """Evaluate what is missing, and say what is being done."""
     import go1exp.measures  # noqa: F401  (registers them)
     from go1exp.report.evaluating import evaluate_missing, missing
@@ -54,7 +68,7 @@ def _evaluate(runs: Study, settings: ReportSettings) -> None:
         print(f"evaluating {number}/{count}: {label}", file=sys.stderr, flush=True)
         return spinner(1, f"evaluating {number}/{count}")
 
-    runs.notes += evaluate_missing(missing(runs.runs), settings.evaluation, on_run)
+    runs.notes += evaluate_missing(missing(runs.runs, protocols), settings.evaluation, on_run)
 
 
 def lines(made: Report) -> list[str]:

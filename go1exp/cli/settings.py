@@ -7,11 +7,13 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
+from go1exp.cli.gap_settings import GapLoopSettings as GapLoopSettings
+from go1exp.cli.gap_settings import GapNextSettings as GapNextSettings
+from go1exp.cli.gap_settings import GapVerb as GapVerb
 from go1exp.cli.play_settings import PlaySettings as PlaySettings
-from go1exp.cli.play_settings import Port, RunFolder
+from go1exp.cli.play_settings import RunFolder
 from go1exp.deploy.controller import Stages
 from go1exp.fit.settings import FitSettings
-from go1exp.gap.result import Angle, GapSettings
 from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
 from go1exp.report.settings import ReportSettings
@@ -222,12 +224,15 @@ class DeploySettings(Stages):
         robot: sim, a simulated robot in another process, go1, the real one, or go1_sdk, the same by the vendor's SDK.
         address: HOST:PORT of robot=go1 and go1_sdk; null takes 192.168.123.10:8007.
         check: with robot=go1, only look at the robot and calibrate its foot sensors; no torque is ever asked for.
-        feet: calibration of robot=go1's foot sensors, which check=true writes; null takes contact from torques alone,
-            and lets check=true write feet.json in out.
+        feet: calibration of foot sensors that count, a real robot's or those of sim.feet=raw, which check=true writes;
+            null takes contact from torques alone, and lets check=true write feet.json in out.
         command: velocity as [x m/s, y m/s, yaw rad/s]; or FILE.csv, sinusoid, keyboard, gamepad.
+        motion: in place of walking, move a robot that hangs: an excitation of go1exp record, or FILE.csv of targets
+            (such as the one of go1exp gap next); its log is a recording for go1exp gap.
+        gains: kp N m/rad and kd N m s/rad of motion; null takes those of the file, or [20, 0.5].
         sinusoid: the sines of command=sinusoid.
-        rate: rate of policy and commands, Hz; null takes that of training.
-        seconds: time under the policy, s; null walks until it is stopped (Ctrl-C).
+        rate: rate of policy and commands, Hz; null takes that of training; of a motion, that of its file, or 400.
+        seconds: time under the policy, s; null walks until it is stopped (Ctrl-C). Of a motion that is no file: 20.
         keep: newest seconds of the walk that the log has room for.
         stale: time without a state after which the robot counts as lost, s.
         spin: time before each cycle for which the core is kept busy, s; quicker, and it costs that core.
@@ -243,6 +248,8 @@ class DeploySettings(Stages):
     check: bool
     feet: str | None
     command: tuple[float, float, float] | str
+    motion: Annotated[str, Field(min_length=1)] | None
+    gains: tuple[NonNegative, NonNegative] | None
     sinusoid: SinusoidSettings
     rate: Annotated[float, Field(ge=10, le=1000)] | None
     seconds: Positive | None
@@ -269,31 +276,6 @@ class FitActuatorSettings(FitSettings):
     gains: tuple[NonNegative, NonNegative] | None
     plots: bool
     out: str
-
-
-@settings
-class GapVerb:
-    """``conf/gap.yaml`` without the groups.
-
-    Attributes:
-        logs: folder of recordings, or a list of folders and files.
-        stage: check, localise, replay, explain, apply, report or view; all runs explain, apply and report.
-        out: folder for verdict.json, effect.yaml, report.html.
-        train_dt: physics step of training, s, at which the answer must hold; also that of replay.
-        host: interface on which view listens; 127.0.0.1 is this machine alone.
-        port: on which view listens; 0 takes the first free one from 8080 on.
-        accept: error of an angle that you would not care about, in rad or such as 2mrad; then it counts as right.
-        search: how the missing effect is searched for.
-    """
-
-    logs: str | tuple[str, ...]
-    stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report", "view"]
-    out: str
-    train_dt: Annotated[float, Field(gt=0, le=0.02)]
-    host: str
-    port: Port
-    accept: Angle
-    search: GapSettings
 
 
 @settings
@@ -357,6 +339,8 @@ SETTINGS: dict[str, type] = {
     "record_audit": AuditSettings,
     "record_import": ImportSettings,
     "gap": GapVerb,
+    "gap_next": GapNextSettings,
+    "gap_loop": GapLoopSettings,
     "export": ExportSettings,
     "export_check": ExportCheckSettings,
     "deploy": DeploySettings,

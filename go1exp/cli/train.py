@@ -127,6 +127,7 @@ def _task(container: dict[str, Any]) -> int | None:
     try:
         if container.get("sweep"):
             sweep.leave_to_go_on(container, overrides)
+        _refuse_one_of_a_study()
         job = resolved(container, overrides, folder)
         check(job)
     except BaseException:
@@ -135,6 +136,16 @@ def _task(container: dict[str, Any]) -> int | None:
     if job.resumed:
         discard(folder)
     return _run(job)
+
+
+def _refuse_one_of_a_study() -> None:
+    """Raise ConfigError where a study was chosen without ``-m``: Hydra composes one run, of none of its values."""
+    about = HydraConfig.get()
+    study = about.runtime.choices.get("study")
+    if study is None or about.mode == RunMode.MULTIRUN or not about.sweeper.params:
+        return
+    given = [o for o in (*about.overrides.task, *about.overrides.hydra) if not o.startswith("hydra.mode=")]
+    raise ConfigError([f"study={study}: is a sweep and needs -m: {command('train', '-m', *given)}"])
 
 
 def _go_on(run: Path, overrides: list[str]) -> int | None:

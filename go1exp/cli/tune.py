@@ -64,7 +64,7 @@ def _task(container: dict[str, Any]) -> int | None:
         raise ConfigError(["go1exp tune needs the package optuna: pip install 'go1exp[tune]'"])
 
     from go1exp.cli import train
-    from go1exp.sweep.tune import Search
+    from go1exp.sweep.tune import EVALUATED, Search
 
     def plan(overrides: Sequence[str], run: Path) -> None:
         job = train.resolved(compose_checked("train", overrides), list(overrides), run)
@@ -72,7 +72,10 @@ def _task(container: dict[str, Any]) -> int | None:
         train.plan(job)
 
     lowest = [f"{key}={drawn.example}" for key, drawn in ranges.items()]
-    train.check(train.resolved(compose_checked("train", [*settings.overrides, *lowest]), lowest, Path(settings.out)))
+    job = train.resolved(compose_checked("train", [*settings.overrides, *lowest]), lowest, Path(settings.out))
+    if settings.metric.startswith(EVALUATED) and not job.config.eval.every:
+        raise ConfigError([f"metric = {settings.metric!r}: needs evaluations; add eval.every=50 to overrides"])
+    train.check(job)
     best = Search(settings, ranges, plan).run()
     if best is None:
         return FAILED

@@ -23,7 +23,7 @@ VERBS = {
 MODULES = {"eval": "evaluate", "fit-actuator": "fit_actuator", "list": "listing", "sim": "simulate"}
 """Modules that cannot have their verb's name."""
 
-SUBVERBS = {"record": ("audit", "import"), "export": ("check",)}
+SUBVERBS = {"record": ("audit", "import"), "export": ("check",), "gap": ("next", "loop")}
 """Second words of a verb that are verbs of their own; module and configuration are called VERB_WORD."""
 
 POSITIONAL: dict[str, tuple[str, ...]] = {

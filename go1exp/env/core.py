@@ -168,7 +168,7 @@ class Go1Core:
             self.steps.copy_(self._first_step)
         self._started = True
         self._advance_world(everyone)
-        return self._observe(self.snapshot())
+        return self.terms.frames.begun(*self._frame(self.snapshot()), everyone)
 
     def reseed(self, seed: int) -> None:
         """Make the next ``reset`` the first one of an environment built with ``seed``."""
@@ -235,7 +235,7 @@ class Go1Core:
         self.episode_return += reward
         episode_return, episode_length = self.episode_return.clone(), self.steps - self._first_step
         self.task_log.add(s, (terminated, truncated & ~cut, truncated & cut), (episode_return, episode_length))
-        final_observation = self._observe(s, advance=True)
+        final_observation = self.terms.frames.ended(*self._frame(s, advance=True))
         self._last_qpos.copy_(self.backend.qpos)
         self._last_qvel.copy_(self.backend.qvel)
         if self._deferred:
@@ -245,7 +245,7 @@ class Go1Core:
         self._move_levels(ended)
         self._restarts(ended)
         self._advance_world(ended)
-        observation = self._observe(self.snapshot())
+        observation = self.terms.frames.begun(*self._frame(self.snapshot()), ended)
         return StepResult(observation, reward, terminated, truncated, final_observation, episode_return, episode_length)
 
     def _advance_physics(self, action: Tensor) -> None:
@@ -327,15 +327,15 @@ class Go1Core:
             height_scan=self._scan(state.base_pos_w.float(), quat) if self._scan else None,
         )
 
-    def _observe(self, s: Snapshot, *, advance: bool = False) -> Tensor:
-        """(N, O) the configured observation of a snapshot, with its noise if that is on; ``advance`` once a step."""
+    def _frame(self, s: Snapshot, *, advance: bool = False) -> tuple[Tensor, Tensor | None]:
+        """(N, F) each: the observed values of a snapshot, and what to make noise of; ``advance`` once a step."""
         sensed = self.plant.sense(s) if self.plant.effects.senses else s
         if advance:
             self.terms.advance(sensed, s)
-        clean = self.terms.observation(sensed, s)
-        if not self.noise:
-            return clean
-        return clean + self.terms.noise * self.random.stream("noise").uniform(self.observation_size, low=-1.0)
+        frames = self.terms.frames.size
+        return self.terms.observation(sensed, s), (
+            self.random.stream("noise").uniform(frames, low=-1.0) if self.noise else None
+        )
 
     # ------------------------------------------------------------------ what a step was made of
 

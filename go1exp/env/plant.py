@@ -63,7 +63,7 @@ class Plant:
         torque: (N, J) what the drives made in the last step, N m.
         actuator: the drives.
         effects: what else acts.
-        enabled: (N,) bool, which robots' drives are on, or None for all.
+        enabled: (N,) bool, which robots' drives are on, or None for all; one that is off asks for no torque.
         observer: called before every step with the target (N, J) that takes force in it.
     """
 
@@ -144,6 +144,7 @@ class Plant:
 
         - ``pd``: in the sum that is clipped at the peak torque.
         - ``dc_motor``: in the sum that is clipped at what the motor can make at that speed.
+        - ``voltage``: in the duty that is clipped, before the back EMF.
         - ``delay``: as late as the target, then as the drive inside says.
         - ``net``: added to what the net says or holds, and clipped at the peak torque; its history has no part of it.
 
@@ -162,13 +163,14 @@ class Plant:
         command = effects.on_target(torch.lerp(self._target, target, 0.5))
         self._target.copy_(target)
         encoder = effects.on_encoder(q, qd)
+        command = effects.on_error(command, encoder[0])
         if feedforward is None and self._fed is None:
             made = self.actuator.torque(command, *encoder)
         else:
             made = self._fed_forward(command, encoder, feedforward)
+        if self.enabled is not None:  # a demand of zero, which a lag or a delay treats as any other
+            made = made * self.enabled.unsqueeze(1)
         self.torque.copy_(effects.on_drive(made, *encoder))
-        if self.enabled is not None:
-            self.torque.mul_(self.enabled.unsqueeze(1))
         if effects.acts("on_friction"):
             self.backend.field(FRICTION)[:, self._joints] = effects.on_friction(self._bound, self.torque, qd)
         geared = effects.on_transmission(self.torque, q, qd)
@@ -187,7 +189,7 @@ class Plant:
         """Return the drives' torque for a target, with the torque that is fed forward."""
         if self._fed is None:
             if not takes_feedforward(self.actuator):
-                kind, known = type(self.actuator).__name__, "use actuator=pd, dc_motor, delay or net"
+                kind, known = type(self.actuator).__name__, "use actuator=pd, dc_motor, voltage, delay or net"
                 raise ConfigError([f"actuator: {kind} takes no feed-forward torque; {known}"])
             self._fed = torch.zeros_like(self.torque)
         given = torch.zeros_like(self._fed) if feedforward is None else feedforward

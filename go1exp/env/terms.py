@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from go1exp.config import TaskConfig
+from go1exp.env.frames import Frames
 from go1exp.mdp.foot_impacts import impossible
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.schema.backends import WarpBackend
+from go1exp.schema.history import width
 from go1exp.schema.registry import Term
 
 Call = Callable[[Snapshot], Tensor]
@@ -38,6 +40,7 @@ class StepTerms:
         observed: terms of the observation, in the order of their columns; those of the critic are the last ones.
         observation_size: O.
         policy_size: columns that are the policy's.
+        frames: noise and history of the observation.
         read: fields of the Snapshot that are computed only because an observation reads them.
     """
 
@@ -73,10 +76,9 @@ class StepTerms:
         )
         self.observed = (*task.observation, *beside)
         self.read = {name for t in self.observed for name in t.entry.traits.get("reads", ())}
-        widths = [int(t.entry.traits["size"]) for t in self.observed]
+        widths = [width(t) for t in self.observed]
         self.observation_size, self.policy_size = sum(widths), sum(widths[: len(task.observation)])
-        noise = [t.slots["noise"] for t in self.observed]
-        self.noise = torch.tensor(noise).repeat_interleave(torch.tensor(widths)).float().to(device)
+        self.frames = Frames(self.observed, setup)
 
     def terminated(self, s: Snapshot) -> Tensor:
         """(N,) bool, any termination is true."""
@@ -109,7 +111,7 @@ class StepTerms:
             term.advance(s)
 
     def observation(self, sensed: Snapshot, s: Snapshot) -> Tensor:
-        """(N, O) all observations without noise: what the sensors saw, and behind it the critic's, of the truth."""
+        """(N, F) values of all observations: what the sensors saw, and behind it the critic's, of the truth."""
         policy = [term(sensed) for term in self._observation_calls]
         return torch.cat([*policy, *(term(s) for term in self._critic_calls)], dim=-1)
 
@@ -132,5 +134,5 @@ class StepTerms:
         return None
 
     def parts(self) -> dict[str, Any]:
-        """Return the terms that remember something, by group and key."""
-        return dict(self._remembering)
+        """Return what remembers something: terms by group and key, and the frames."""
+        return {**self._remembering, **({"frames": self.frames} if self.frames.memory else {})}

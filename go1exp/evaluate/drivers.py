@@ -7,16 +7,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
+import torch
 from torch import Tensor
 
 from go1exp.config import TaskConfig
 from go1exp.controller.batch import Driven
 from go1exp.controller.types import Controller
-from go1exp.deploy.past import PastActions
+from go1exp.deploy.past import Past
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.estimated import TERM, EstimatedVelocity
 from go1exp.evaluate.observed import TrunkVelocity, columns
 from go1exp.evaluate.policy import Policy
+from go1exp.schema.history import history_columns
 
 
 class Pilot(Protocol):
@@ -87,29 +89,32 @@ class _PolicyPilot:
     def __init__(self, driver: PolicyDriver, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
         self._policy, self._core = driver.policy, core
         self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
-        # A policy that runs faster than it was trained sees its action of one training period ago.
-        self._past = PastActions[Tensor](driver.task.sim.policy_dt, core.task.sim.policy_dt)
+        # A policy that runs faster than it was trained sees its action, and frames, of one training period ago.
+        self._past = Past[tuple[Tensor, Tensor]](driver.task.sim.policy_dt, core.task.sim.policy_dt)
         self._columns = columns(core.task, "previous_action") if self._past.cycles > 1 else None
-        self._past_action: Tensor | None = None
+        self._history = history_columns(core.task.observation)
+        self._remembered: tuple[Tensor, Tensor] | None = None
 
     def __call__(self, observation: Tensor) -> Tensor:
+        if self._past.cycles == 1 and self._filter is None:
+            return self._policy(observation)
+        observation = observation.clone() if self._filter is None else self._filter.put(observation)
         if self._columns is not None:
-            observation = observation.clone()
-            observation[:, self._columns] = 0.0 if self._past_action is None else self._past_action
-        if self._filter is not None:
-            observation = self._filter.put(observation)
+            observation[:, self._columns] = 0.0 if self._remembered is None else self._remembered[0]
+        history, kept = self._history, self._remembered
+        observation[:, history.earlier] = observation[:, history.newest] if kept is None else kept[1]
         action = self._policy(observation)
-        if self._columns is not None:
-            self._past_action = self._past.after(
-                action.clamp(-self._core.task.action.clip, self._core.task.action.clip)
-            )
+        clip = self._core.task.action.clip
+        newest = action.clamp(-clip, clip), observation[:, history.carried]
+        first = torch.zeros_like(action), observation[:, history.earlier]
+        self._remembered = self._past.after(newest, first if kept is None else kept)
         return action
 
     def save(self) -> Any | None:
-        return None if self._filter else copy.deepcopy((self._past, self._past_action))
+        return None if self._filter else copy.deepcopy((self._past, self._remembered))
 
     def load(self, state: Any) -> None:
-        self._past, self._past_action = copy.deepcopy(state)
+        self._past, self._remembered = copy.deepcopy(state)
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import Literal
 
 from go1exp.config import TaskConfig
+from go1exp.schema.history import frame_width, width
 
 TrunkVelocity = Literal["exact", "estimated"]
 """Velocity of the trunk that is observed: the true one, or what the filter makes of the sensors."""
 
 
 def columns(task: TaskConfig, term: str) -> slice | None:
-    """Return the columns of a term in the observation; None if the policy does not observe it."""
+    """Return the columns of a term's newest values in the observation; None if the policy does not observe it."""
     start = 0
     for t in task.observation:
-        size = int(t.entry.traits["size"])
         if t.entry.name == term:
-            return slice(start, start + size)
-        start += size
+            return slice(start, start + frame_width(t))
+        start += width(t)
     return None

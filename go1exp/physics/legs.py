@@ -1,4 +1,4 @@
-"""Kinematics of the legs in the trunk's frame, by MuJoCo."""
+"""Kinematics of the legs in the trunk's frame, and their inverse dynamics, by MuJoCo."""
 
 from __future__ import annotations
 
@@ -47,3 +47,31 @@ class Legs:
         """Return the forces on the feet (4, 3), N, that balance joint torques (12,); a straight leg's is the least."""
         joints = np.arange(robot.NUM_JOINTS).reshape(robot.NUM_LEGS, -1)
         return np.stack([-np.linalg.lstsq(moves[k][:, joints[k]].T, torque[joints[k]])[0] for k in range(len(joints))])
+
+
+class LegDynamics:
+    """Inverse dynamics of legs in the air, on a trunk that moves, by MuJoCo."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Compile the robot with its trunk free and nothing to touch."""
+        self._model, _ = build_model(config, build_terrain(TerrainConfig(kind="flat")), 0.002)
+        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self._data = mujoco.MjData(self._model)
+
+    def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, trunk: np.ndarray) -> np.ndarray:
+        """Return the torques (12,), N m, that move the legs so.
+
+        Args:
+            q: (12,) angles, rad.
+            qd: (12,) rad/s.
+            qdd: (12,) rad/s2.
+            trunk: (9,) specific force at its origin, m/s2, angular acceleration, rad/s2, and angular velocity, rad/s,
+                in its own axes.
+        """
+        data, joints = self._data, slice(-robot.NUM_JOINTS, None)
+        data.qpos[:3], data.qpos[3:7] = 0.0, (1.0, 0.0, 0.0, 0.0)
+        data.qvel[:3], data.qvel[3:6] = 0.0, trunk[6:]
+        data.qacc[:3], data.qacc[3:6] = trunk[:3] + self._model.opt.gravity, trunk[3:6]
+        data.qpos[joints], data.qvel[joints], data.qacc[joints] = q, qd, qdd
+        mujoco.mj_inverse(self._model, data)
+        return np.array(data.qfrc_inverse[joints])

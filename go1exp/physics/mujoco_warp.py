@@ -33,7 +33,10 @@ except ImportError as error:
 
 from go1exp.physics.warp_constants import DERIVED, DerivedConstants
 from go1exp.physics.warp_contacts import ContactReadings, without_contact_sensors
+from go1exp.physics.warp_height_field import use_mujocos_law
 from go1exp.physics.warp_random import units_kernel
+
+use_mujocos_law()  # of contacts with a height field, before any kernel is built
 
 T = TypeVar("T")
 

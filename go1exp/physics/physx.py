@@ -48,7 +48,10 @@ DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "a
 RIGID = {
     "geom_solref": "PhysX's contacts are rigid; leave out rand.foot_restitution, rand.ground_stiffness and "
     "effect.ground_compliance",
-    "jnt_solref": "PhysX's joint stops are rigid; leave out effect.joint_stop",
+    **dict.fromkeys(
+        ("jnt_solref", "jnt_range"),
+        "PhysX's joint stops are rigid and where the model has them; leave out effect.joint_stop",
+    ),
 }
 """Fields that PhysX has no place for, and what asks for them."""
 

@@ -109,6 +109,14 @@ def build_model(
     return spec.compile(), sensors
 
 
+def weigh_down(model: mujoco.MjModel, heavy: float) -> None:
+    """Make a trunk so heavy that legs do not move it: a mass, kg, and moments of inertia about its origin, kg m2."""
+    trunk = model.body("trunk").id
+    model.body_mass[trunk], model.body_inertia[trunk] = heavy, heavy
+    model.body_ipos[trunk], model.body_iquat[trunk] = 0.0, (1.0, 0.0, 0.0, 0.0)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
 def _set_contact(spec: mujoco.MjSpec, contact: ContactConfig) -> None:
     """Give the feet their contact: they have priority over the ground, so that what they say holds for the pair."""
     spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{contact.cone.upper()}")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from go1exp.config import TaskConfig
 from go1exp.deploy.bundle import Bundle
-from go1exp.deploy.past import PastActions
+from go1exp.deploy.past import PolicyMemory
 from go1exp.env.core import Go1Core
 from go1exp.evaluate.drivers import Pilot
 from go1exp.evaluate.estimated import EstimatedVelocity
@@ -54,25 +54,21 @@ class _BundlePilot:
     def __init__(self, driver: BundleDriver, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
         self._bundle, self._core = driver.bundle, core
         self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
-        self._past = PastActions[np.ndarray](driver.bundle.metadata.policy_dt, core.task.sim.policy_dt)
-        self._past_action = np.zeros((core.num_envs, 12), np.float32)
+        self._memory = PolicyMemory(driver.bundle.metadata, core.task.sim.policy_dt, core.num_envs)
         self._rng = np.random.default_rng([seed, 3])
 
     def __call__(self, observation: Tensor) -> Tensor:
         now = {name: values.numpy() for name, values in readings(self._core).items()}
-        now["previous_action"] = self._past_action
         if self._core.noise:
             zeros = {"acc": np.zeros((len(observation), 3)), "foot_force": np.zeros((len(observation), 4))}
             read = noisy({short: now[name] for name, short in NOISY.items()} | zeros, 1.0, self._rng)
             now |= {name: read[short].astype(np.float32) for name, short in NOISY.items()}
         if self._filter is not None:
             now["base_lin_vel_b"] = self._filter.velocities().astype(np.float32)
-        action = self._bundle.policy(now)["action"]
-        self._past_action = self._past.after(action)
-        return torch.from_numpy(action)
+        return torch.from_numpy(self._memory(self._bundle.policy, now)["action"])
 
     def save(self) -> Any | None:
-        return None if self._filter else copy.deepcopy((self._past, self._past_action, self._rng))
+        return None if self._filter else copy.deepcopy((self._memory, self._rng))
 
     def load(self, state: Any) -> None:
-        self._past, self._past_action, self._rng = copy.deepcopy(state)
+        self._memory, self._rng = copy.deepcopy(state)

@@ -12,6 +12,9 @@ from go1exp.schema.registry import STRICT, NonNegative, Positive
 CountOrZero = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 
+ROWS = "evals.csv"
+"""File of a run folder: a row for each evaluation."""
+
 
 @dataclass(frozen=True)
 class EvalDuring:

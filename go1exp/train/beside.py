@@ -24,10 +24,11 @@ import torch
 
 from go1exp.config import TrainConfig
 from go1exp.files import opened, write_bytes, write_json, write_text
+from go1exp.schema.beside import ROWS
 from go1exp.train.checkpoint import FORMAT, SUFFIX
 from go1exp.train.ppo import AdaptivePPO
 
-FOLDER, ROWS, BEST, FILMS = "evals", "evals.csv", "best.pt", "videos"
+FOLDER, BEST, FILMS = "evals", "best.pt", "videos"
 """In the run folder: policies that wait to be evaluated, what came of them, the best one, films."""
 
 WAITING = 3

@@ -59,8 +59,9 @@ def save(ppo: AdaptivePPO, run: Path, keep: int) -> Path:
         final.parent.mkdir(parents=True, exist_ok=True)
         with opened(final) as file:
             torch.save(state, file)
-    except (OSError, RuntimeError) as error:  # torch's zip writer turns some of the system's errors into its own
-        number, reason = (error.errno, error.strerror) if isinstance(error, OSError) else (errno.EIO, str(error))
+    except (OSError, RuntimeError) as error:  # torch's zip writer covers the system's errors with its own
+        cause = error.__context__ if isinstance(error.__context__, OSError) else error
+        number, reason = (cause.errno, cause.strerror) if isinstance(cause, OSError) else (errno.EIO, str(cause))
         raise OSError(number, f"checkpoint cannot be written: {reason}", str(final)) from error
     for old in checkpoints(run)[:-keep]:
         old.unlink()

@@ -15,6 +15,7 @@ import torch
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
 from go1exp.mdp.mirror import ACTION, Mirror, side_by_side
+from go1exp.schema.history import frames_of
 from go1exp.schema.registry import Term
 
 
@@ -33,4 +34,4 @@ class SampleMirror(NamedTuple):
 
 def of_policy(observations: Iterable[Term]) -> SampleMirror:
     """Return the mirror of a policy that sees these terms one after the other; each must declare its own."""
-    return SampleMirror(side_by_side(term.entry.traits["mirror"] for term in observations))
+    return SampleMirror(side_by_side(t.entry.traits["mirror"].repeated(frames_of(t)) for t in observations))

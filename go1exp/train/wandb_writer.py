@@ -19,8 +19,9 @@ from stable_baselines3.common.logger import KVWriter
 
 from go1exp.config import LoggerConfig, WandbConfig
 from go1exp.files import write_text
+from go1exp.schema.beside import ROWS
 from go1exp.schema.registry import ConfigError, Expected
-from go1exp.train.beside import BEST, ROWS
+from go1exp.train.beside import BEST
 
 IDENTITY = "wandb_id"
 """In the run folder: the id under which a resumed run goes on."""
