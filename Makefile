@@ -13,7 +13,7 @@ LOCK_VENV := build/lock-venv
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo quick test test-all test-slurm test-ray check sanitise bench runtime image lock clean
+.PHONY: help setup demo quick test test-all test-slurm test-ray test-tune test-vendor check sanitise bench runtime image lock clean
 
 help: ## list the verbs
 	@echo "usage: make VERB"
@@ -73,13 +73,29 @@ test-slurm: setup ## sweeps on a real Slurm of this machine alone, started and e
 	@echo "test-slurm 1/2: submitit"
 	@$(PIP) install -qq "submitit>=1.5.4,<2"
 	@echo "test-slurm 2/2: pytest"
-	@GO1EXP_TEST_SLURM=1 $(BIN)/python -m pytest -q --slow=all tests/test_slurm.py
+	@GO1EXP_TEST_SLURM=1 $(BIN)/python -m pytest -q --slow=all tests/test_slurm.py tests/test_study.py tests/test_sweep_index.py
+
+test-tune: setup ## searches for settings with Optuna
+	@echo "test-tune 1/2: optuna"
+	@$(PIP) install -qq "optuna>=5,<6"
+	@echo "test-tune 2/2: pytest"
+	@GO1EXP_TEST_TUNE=1 $(BIN)/python -m pytest -q --slow=all tests/test_tune.py
 
 test-ray: setup ## sweeps on a Ray cluster of this machine, one node of which is killed; needs root
 	@echo "test-ray 1/2: ray"
 	@$(PIP) install -qq "ray>=2.60,<3"
 	@echo "test-ray 2/2: pytest"
 	@GO1EXP_TEST_RAY=1 $(BIN)/python -m pytest -q --slow=all tests/test_ray.py
+
+# A folder of its own, so that the vendor's package, whose metadata asks for much else, never enters .venv.
+VENDOR := build/vendor
+
+test-vendor: setup ## the vendor's own client of the Go1 against our simulated robot; Python 3.11 on x86-64
+	@echo "test-vendor 1/2: unitree-legged-sdk in $(VENDOR)"
+	@rm -rf $(VENDOR)
+	@$(PIP) install -qq --no-deps --only-binary :all: --target $(VENDOR) unitree-legged-sdk==3.8.20231105
+	@echo "test-vendor 2/2: pytest"
+	@GO1EXP_TEST_VENDOR=1 PYTHONPATH=$(VENDOR) $(BIN)/python -m pytest -q -s --slow=all tests/test_go1_vendor.py
 
 check: setup ## formatting, lint and types; changes nothing
 	@echo "check 1/3: ruff format"

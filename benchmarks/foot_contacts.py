@@ -111,7 +111,7 @@ def main() -> None:
     """Print the table."""
     torch.set_num_threads(1)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, default=data_root() / "assets/policies/robust")
+    parser.add_argument("--run", type=Path, default=data_root() / "assets/policies/paper")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--robots", type=int, default=4)
     given = parser.parse_args()

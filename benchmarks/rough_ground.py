@@ -2,7 +2,8 @@
 
 As many robots on each level and kind of tile as there are columns of it, the noise and randomisation of training, no
 pushes, told to walk forward at ``speed`` m/s for ``seconds``; headings are random. A robot that leaves the map counts
-as left and not as walked through. A shipped policy is ``run=assets/policies/NAME``.
+as left and not as walked through. A shipped policy is ``run=assets/policies/NAME``. ``ground`` is the run whose terrain
+it is, where that is another: policies are compared on one ground.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +24,21 @@ from go1exp.mdp.commands import FixedVelocity
 from go1exp.statistics.intervals import share_interval
 
 USAGE = (
-    "usage: python -m benchmarks.rough_ground run=FOLDER [speed=1.0] [robots=200] [seconds=12] [seed=1] [out=F.json]"
+    "usage: python -m benchmarks.rough_ground run=FOLDER [ground=FOLDER] [speed=1.0] [robots=200] [seconds=12] [seed=1]"
+    " [out=F.json]"
 )
 
 
-def walked(run: Path, speed: float, robots: int, seconds: float, seed: int) -> dict[str, Any]:
+def walked(run: Path, ground: Path, speed: float, robots: int, seconds: float, seed: int) -> dict[str, Any]:
     """Return what became of each robot: its level, kind of tile, whether it fell or left, and how far it came, m."""
     config, policy, about = load_run(run)
+    task = replace(config.task, terrain=load_run(ground)[0].task.terrain)
     command = (speed, 0.0, 0.0)
     wanted = EvalConfig(
         (command,), robots, seconds, 0.0, noise=True, randomize=True, push=False, train_ground=True,
         policy_dt=None, seed=seed,
     )  # fmt: skip
-    core = Go1Core(evaluation_task(config.task, wanted), robots, seed)
+    core = Go1Core(evaluation_task(task, wanted), robots, seed)
     assert isinstance(core.command, FixedVelocity)
     core.command.value.copy_(torch.tensor(command))
     core.reset()
@@ -54,7 +58,8 @@ def walked(run: Path, speed: float, robots: int, seconds: float, seed: int) -> d
         assert torch.equal(level, core.level)
     figures = {"level": core.level, "fell": fell.bool(), "left": left.bool(), "far_m": far}
     return {
-        "run": str(run), "checkpoint": about.get("sha256"), "speed": speed, "seconds": seconds, "seed": seed,
+        "run": str(run), "ground": str(ground), "checkpoint": about.get("sha256"), "speed": speed, "seconds": seconds,
+        "seed": seed,
         "robots": [dict(zip((*figures, "kind"), row, strict=True)) for row in zip(
             *(v.tolist() for v in figures.values()), kinds, strict=True)],
     }  # fmt: skip
@@ -78,11 +83,11 @@ def printed(rows: Sequence[dict[str, Any]], levels: int) -> str:
 def main(arguments: Sequence[str]) -> None:
     """Walk, print the table, and write each robot's row to ``out``."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
-    if not {"run"} <= set(given) <= {"run", "speed", "robots", "seconds", "seed", "out"}:
+    if not {"run"} <= set(given) <= {"run", "ground", "speed", "robots", "seconds", "seed", "out"}:
         raise SystemExit(USAGE)
     report = walked(
-        Path(given["run"]), float(given.get("speed", 1)), int(given.get("robots", 200)),
-        float(given.get("seconds", 12)), int(given.get("seed", 1)),
+        Path(given["run"]), Path(given.get("ground", given["run"])), float(given.get("speed", 1)),
+        int(given.get("robots", 200)), float(given.get("seconds", 12)), int(given.get("seed", 1)),
     )  # fmt: skip
     print(printed(report["robots"], 1 + max(row["level"] for row in report["robots"])), flush=True)
     if "out" in given:

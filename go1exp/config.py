@@ -171,10 +171,15 @@ class ObservationSlots(BaseModel):
 
     Attributes:
         noise: half-width of the uniform noise added to the term.
+        correlation_time: time in which the noise forgets, s: a first-order Gauss-Markov process of the same standard
+            deviation (noise / sqrt(3)), as an estimator's error is one. 0: drawn anew in each step.
+        history: policy steps whose values are observed, the newest first.
     """
 
     model_config = STRICT
     noise: NonNegative = 0.0
+    correlation_time: NonNegative = 0.0
+    history: Annotated[int, Field(ge=1, le=64)] = 1
 
 
 class RandomizationSlots(BaseModel):

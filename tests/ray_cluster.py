@@ -7,9 +7,11 @@ takes the machine's own address whatever it is told; in a network of its own (``
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 PORT = 26379
@@ -32,7 +34,7 @@ def main(folder: Path, command: list[str]) -> int:
         f"--port={PORT}",
         "--node-ip-address=127.0.0.1",
         "--include-dashboard=false",
-        f"--temp-dir={folder}/r",
+        f"--temp-dir={(place := tempfile.mkdtemp(prefix='r'))}",  # the path of a socket has at most 107 bytes
     )
     nodes = [start(folder, *head, "--num-cpus=0")]
     try:
@@ -47,6 +49,7 @@ def main(folder: Path, command: list[str]) -> int:
         for node in reversed(nodes):
             end(node.pid)
             node.wait()
+        shutil.rmtree(place, ignore_errors=True)
 
 
 def end(session: int) -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import signal
@@ -15,6 +16,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+import pytest
 
 DAEMONS = ("munged", "slurmctld", "slurmd")
 
@@ -65,6 +68,20 @@ def missing() -> str:
     return "" if os.getuid() == 0 else "Slurm's daemons start as root only"
 
 
+@contextmanager
+def of_a_test(folder: Path) -> Iterator[dict[str, str]]:
+    """Start a cluster for a test, which is skipped where none can be, or fails by ``make test-slurm``."""
+    lacking = missing()
+    if importlib.util.find_spec("submitit") is None:
+        lacking = lacking or "no submitit: pip install 'go1exp[slurm]'"
+    if lacking and os.environ.get("GO1EXP_TEST_SLURM"):
+        pytest.fail(lacking)
+    elif lacking:
+        pytest.skip(f"{lacking}; make test-slurm")
+    with cluster(folder) as variables:
+        yield variables
+
+
 def _program(name: str) -> str | None:
     return shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
 
@@ -106,7 +123,8 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
 
 def _free_port() -> int:
     """Return the first of two ports in a row that nobody listens on."""
-    for port in range(26817, 28000, 2):
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    for port in range(26817 + 100 * worker, 28000, 2):
         with (
             suppress(OSError),
             socket.create_server(("127.0.0.1", port)),

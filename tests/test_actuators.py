@@ -61,6 +61,41 @@ def test_a_stronger_line_has_a_corner(drives: Drives) -> None:
         assert tau[2] == pytest.approx(30.0 * (1.0 - speed / 30.0))  # the line lies below the calf's 35.55
 
 
+def test_a_motor_at_a_voltage_is_its_circuit(drives: Drives) -> None:
+    """The current of U = R i + L di/dt + k qd, integrated until it rests, times k; then the limit of the current."""
+
+    def slow(target: float, q: float, qd: float, joint: int) -> float:
+        nominal, stall, speed, supply = 12.0, 18.0 if joint == 4 else 30.0, 25.0, [1.0, 0.8, 1.2][joint % 3]
+        k = nominal / speed
+        resistance = k * nominal / stall
+        duty = max(-1.0, min(1.0, (15.0 * (target - q) - 0.3 * qd) / stall))
+        current, inductance, dt = 0.0, 1e-3, 1e-4
+        for _ in range(3000):
+            current += dt / inductance * (duty * supply * nominal - resistance * current - k * qd)
+        limit = [23.7, 23.7, 35.55][joint % 3]
+        return max(-limit, min(limit, k * current))
+
+    rng = np.random.default_rng(0)
+    make = members("actuator")["voltage"].target
+    stall = {**dict.fromkeys(robot.JOINTS, 30.0), "FL_thigh": 18.0}
+    drive: Any = make(drives(2), kp=15.0, kd=0.3, stall=stall, speed=25.0, supply=[1.0, 0.8, 1.2])
+    target, q, qd = rng.normal(size=(2, 12)), rng.normal(size=(2, 12)), rng.normal(0.0, 15.0, (2, 12))
+    got = drive.torque(*map(torch.as_tensor, (target, q, qd)))
+    for i in range(2):
+        for j in range(12):
+            assert got[i, j].item() == pytest.approx(slow(target[i, j], q[i, j], qd[i, j], j), abs=1e-9), (i, j)
+
+
+def test_a_motor_at_a_voltage_brakes_what_pushes_it_and_has_nothing_left_at_top_speed(drives: Drives) -> None:
+    make = members("actuator")["voltage"].target
+    drive: Any = make(drives(1), kp=20.0)
+    top = rows([30.1, 30.1, 20.06] * 4)
+    assert torch.allclose(drive.torque(rows(9.0), rows(0.0), top), rows(0.0), atol=1e-12)  # pd: the peak torque
+    pushed = 0.5 * top
+    power = drive.torque(rows(0.0), rows(0.0), pushed) * pushed
+    assert torch.allclose(power, -0.25 * rows([23.7, 23.7, 35.55] * 4) * top)
+
+
 def test_a_dc_motor_is_pd_within_its_line(drives: Drives) -> None:
     def slow(target: float, q: float, qd: float, joint: int, kp: float, kd: float) -> float:
         effort, speed = ([23.7, 23.7, 35.55][joint % 3], [30.1, 30.1, 20.06][joint % 3])

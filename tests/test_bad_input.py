@@ -111,6 +111,7 @@ def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypa
     ("words", "status", "said"),
     [
         ("train word", 2, "go1exp train: word: not a setting, which is key=value; see go1exp train --help"),
+        ("train -m --cfg job seed=1,2", 2, "go1exp train: -m and --cfg cannot be used together: --cfg and --info show"),
         ("eval --foo", 2, "go1exp eval: --foo: unknown option; see go1exp eval --help"),
         ("list reward rand", 2, "go1exp list: rand: not a setting, which is key=value; see go1exp list --help"),
         ("train --config-dir nowhere reward=x", 2, "no such folder"),
@@ -123,6 +124,7 @@ def test_two_files_whose_paths_differ_by_a_sign_are_two(tmp_path: Path, monkeypa
         ("gap logs=.", 1, "go1exp gap: .: no *.parquet in it"),
         ("export check .", 1, "go1exp export check: Is a directory: ."),
         ("deploy nowhere.zip", 1, "go1exp deploy: No such file or directory: nowhere.zip"),
+        ("deploy x.zip feet=f.json", 2, "feet = f.json: calibrates sensors that count; those of robot=sim say newtons"),
         ("deploy walk.zip robot=sm", 2, "go1exp deploy: robot = 'sm': input should be 'sim', 'go1' or 'go1_sdk'"),
         (
             "train reward=shrt",

@@ -60,7 +60,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("record audit ou", {"out="}),
         ("record import opt", {"options="}),
         ("record import go2", {"go2_in_air"}),
-        ("gap lo", {"localise", "logs="}),
+        ("gap lo", {"localise", "logs=", "loop"}),
         ("list re", {"reward"}),
         ("list group=rew", {"group=reward"}),
         ("list --config-dir mine we", {"weather"}),
@@ -197,4 +197,4 @@ def test_launchers_and_studies_are_completed() -> None:
         f"hydra/launcher={name}" for name in ("basic", "joblib", "ray", "slurm", "slurm_gpu")
     ]
     assert completions("go1exp train hydra/l") == ["hydra/launcher="]
-    assert completions("go1exp train study=") == ["study=ablations", "study=ablations_cpu"]
+    assert completions("go1exp train study=") == ["study=ablations", "study=ablations_cpu", "study=walking_cpu"]

@@ -68,7 +68,7 @@ ABLATIONS = [
 NEEDS = {"curriculum=terrain_level": ["terrain=rough"]}
 
 
-ELSEWHERE = ("experiment=ablation/", "effect=")
+ELSEWHERE = ("experiment=ablation/", "experiment=five_minutes_part/", "effect=")
 """Choices with tests of their own: below, and in tests/contracts/test_effects.py."""
 
 
@@ -163,6 +163,32 @@ def test_an_ablation_works_on_the_papers_setting() -> None:
         expected = ablated(name, base)
         assert flat(compose("train", [f"experiment=[paper,ablation/{name}]"])) == expected
         assert flat(compose("train", ["experiment=paper", f"+experiment/ablation={name}"])) == expected
+
+
+PROPRIOCEPTION = ["base_angular_velocity", "projected_gravity", "joint_position", "joint_velocity", "previous_action"]
+PARTS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "no_mirrored_samples": {"ppo.symmetry": False},
+    "no_clock_rewards": {"reward.load_clock.weight": 0.0, "reward.foot_clock.weight": 0.0},
+    "no_smoothness": {
+        f"reward.{term}.weight": 0.0 for term in ("action_smoothness", "joint_acceleration", "joint_velocity")
+    },
+    "no_near_kernels": {"reward.near_linear_velocity.weight": 0.0, "reward.close_angular_velocity.weight": 0.0},
+    "with_history": {f"observation.{term}.history": 5 for term in PROPRIOCEPTION},
+}
+"""What each part of ``experiment=five_minutes`` changes."""
+
+
+def test_the_walking_study_changes_one_part_of_the_five_minutes_each() -> None:
+    files = {file.stem for file in (CONF / "experiment/five_minutes_part").glob("*.yaml")}
+    study = OmegaConf.load(CONF / "study/walking_cpu.yaml")
+    swept = study.hydra.sweeper.params["+experiment/five_minutes_part"].split(",")
+    assert files == set(swept) == set(PARTS)
+    base = flat(compose("train", ["experiment=five_minutes"]))
+    for name, changes in PARTS.items():
+        container = compose("train", [f"experiment=[five_minutes,five_minutes_part/{name}]"])
+        parse_train(container)
+        assert flat(container) == {**base, **changes}
 
 
 @pytest.mark.parametrize("recipe", ["study", "study_cpu"])

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from go1exp import recording
+from go1exp.deploy.go1_fields import TORQUE_NOTE
+from go1exp.deploy.job import ON_WIRE
 from go1exp.importers import import_recordings
 from go1exp.importers.csv import UNITS
 from go1exp.recording import JOINT_QUANTITIES, VECTORS, Recording, RecordingError
@@ -64,6 +66,29 @@ def test_columns_become_channels_with_unit_sign_and_offset(tmp_path: Path) -> No
     assert "left out: volt" in meta.notes
     recording.write(tmp_path / "run_7.parquet", r)
     np.testing.assert_array_equal(recording.read(tmp_path / "run_7.parquet").t, r.t)
+
+
+@pytest.mark.parametrize(
+    ("robot", "torque", "noted"),
+    [
+        ("go1", np.round((K - 15) / 256, 4), True),
+        ("arm", (K - 15) / 256, False),
+        ("go1", 0.1 * np.sin(0.3 * K), False),
+        ("go1", 2.0 * K / 256, False),  # coarser steps are another drive's
+        ("go1", 3.0 * K / 256, False),
+        ("go1", np.where(K < 9, (K + 1) / 256, 0.0), False),  # too few
+    ],
+)
+def test_torques_of_a_go1s_packets_are_noted_as_in_recordings_of_deploy(
+    tmp_path: Path, robot: str, torque: np.ndarray, noted: bool
+) -> None:
+    path = tmp_path / "a.csv"
+    rows = zip(TABLE["stamp"], TABLE["goal"], torque.tolist(), strict=True)
+    path.write_text("\n".join(["stamp,q,tau", *(f"{t},{q},{tau}" for t, q, tau in rows)]) + "\n")
+    columns = {"t": COLUMNS["t"], "q_knee": "q", "tau_est_knee": "tau"}
+    r = imported(path, robot=robot, columns=columns)
+    assert (TORQUE_NOTE in r.meta.notes) == noted
+    assert TORQUE_NOTE in ON_WIRE
 
 
 def test_the_same_table_in_other_notations_is_the_same_recording(tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ from go1exp.deploy.commands import (
 )
 from go1exp.deploy.controller import LYING, PHASES, Cycle
 from go1exp.deploy.estimate import BLIND_S, KalmanEstimator, settings
+from go1exp.deploy.go1_wire import Health
 from go1exp.deploy.job import Job, run_job
 from go1exp.deploy.launch import RefusedError, RobotError
 from go1exp.deploy.log import About, Log, Ring
@@ -53,7 +54,10 @@ from go1exp.deploy.walk import FAULTS, STATUS, Plan
 from go1exp.estimation import from_json, go1, make_filter, sample, to_json
 from go1exp.export.build import build
 from go1exp.gap.robots.hung import hung
+from go1exp.record.plan import make_motion
+from go1exp.record.played import played
 from go1exp.recording import VECTORS
+from go1exp.schema.registry import Term, members
 from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
 from go1exp.sim_robot.server import TRUTH, Network, Server, Truth
@@ -912,8 +916,13 @@ class Sdk:
 
     def fill(self, state: Any) -> None:
         state.tick = self.tick
-        state.motorState = [SimpleNamespace(q=0.1 * k, dq=1.0, tauEst=2.0) for k in range(20)]
-        state.imu = SimpleNamespace(quaternion=[1.0, 0, 0, 0], gyroscope=[0.1, 0, 0], accelerometer=[0, 0, 9.8])
+        state.motorState = [
+            SimpleNamespace(q=0.1 * k, dq=1.0, tauEst=2.0, ddq=3, temperature=30 + k) for k in range(20)
+        ]
+        state.bms = SimpleNamespace(SOC=77, current=-1500, cell_vol=[3840] * 10)
+        state.imu = SimpleNamespace(
+            temperature=45, quaternion=[1.0, 0, 0, 0], gyroscope=[0.1, 0, 0], accelerometer=[0, 0, 9.8]
+        )
         state.footForce = [100, 101, 102, 103]
 
 
@@ -942,7 +951,9 @@ def test_the_sdk_is_spoken_to_as_its_example_does(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_allclose(state.joint_pos, 0.1 * np.arange(12))
     assert state.foot_force.tolist() == [100, 101, 102, 103]
     braking = Motor(0.0, 0.0, 0.0, 0.0, 2.0, 0x0A)
-    assert sdk.sent[-1][0] == braking
+    assert sdk.sent[-1][0] == Motor()  # before the first command nothing is asked for
+    assert (link.tick, link.traffic.counts()) == (1, {"received": 1, "sent": 3})  # the SDK does not tell the rest
+    assert link.health == Health(77, -1.5, (3.84,) * 10, tuple(range(30, 42)), 45, (3.0,) * 12)
     link._wanted = (make_command(), 1.01)
     link.exchange(1.02)
     np.testing.assert_allclose([m.q for m in sdk.sent[-1][:12]], robot.NOMINAL_STANCE)
@@ -1119,3 +1130,21 @@ def test_the_bench_measures_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None
     assert 0 < figures["command_p50_ms"] <= figures["command_p99_ms"]
     assert figures["policy_us"] > 1
     assert 20 < figures["memory_mb"] < 400
+
+
+def test_a_motion_of_a_hung_robot_becomes_a_recording_for_gap(file: str, tmp_path: Path) -> None:
+    motion = played("chirp", 1.0, 250.0, (35.0, 0.7), 3)
+    job = {"mover": motion, "motion": motion.name, "gains": motion.gains, "sim": {"start": "hung", "noise": 0.0}}
+    done = play(file, tmp_path, job=job, rate=motion.rate, seconds=motion.seconds)
+    assert done.output[-1] == f"walked for {motion.seconds:.1f} s, to the end"
+    meta = done.recording.meta
+    assert (meta.base, meta.excitation, meta.kp[0], meta.kd[0]) == ("fixed", "chirp", 35.0, 0.7)
+    assert meta.base_quat == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-6)
+    target = make_motion(Term("chirp", members("excitation")["chirp"], {}), 1.0, 250.0, 3).target
+    logged, rest = done.recording.joint("q_target"), target[0]
+    there = int(np.flatnonzero(np.abs(logged - rest).max(axis=1) < 1e-6)[0])  # it has stood up
+    moving = [int(np.argmax(np.abs(rows - rest).max(axis=1) > 1e-4)) for rows in (logged[there:], target)]
+    first = there + moving[0]
+    np.testing.assert_allclose(logged[first : first + 400 : 2], target[moving[1] :][:200], atol=1e-9)  # for two states
+    away = np.abs(done.recording.joint("q") - logged)
+    assert away[: len(away) // 2].max() < 0.3

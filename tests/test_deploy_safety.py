@@ -326,7 +326,8 @@ def controller(
     **settings: Any,
 ) -> SimpleNamespace:
     link, policy, log = FakeLink(script), FakePolicy(), list[Cycle]()
-    about = SimpleNamespace(kp=tuple(KP), kd=tuple(KD), nominal_stance=tuple(NOMINAL), policy_dt=0.04)
+    ports = {"inputs": policy.inputs, "observation": ()}
+    about = SimpleNamespace(kp=tuple(KP), kd=tuple(KD), nominal_stance=tuple(NOMINAL), policy_dt=0.04, **ports)
     bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=policy))
     usual: dict[str, Any] = {"rate": 25.0, "on_cycle": log.append}
     times = {"stand_up": 0.1, "lie_down": 0.0, "brake": 0.045}
@@ -500,7 +501,8 @@ def test_times_of_a_walk_that_cannot_be_are_refused_together() -> None:
 
 
 def test_gains_that_nobody_knows_have_to_be_given() -> None:
-    about = SimpleNamespace(kp=None, kd=None, nominal_stance=tuple(NOMINAL), policy_dt=0.02)
+    ports = {"inputs": FakePolicy().inputs, "observation": ()}
+    about = SimpleNamespace(kp=None, kd=None, nominal_stance=tuple(NOMINAL), policy_dt=0.02, **ports)
     bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=FakePolicy()))
     arguments = (FakeLink(always), lambda t: np.zeros(3), Velocity(), make_safety())
     with pytest.raises(ValueError, match="kp, kd: the bundle does not know any"):

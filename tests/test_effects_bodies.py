@@ -135,7 +135,7 @@ def expected(name: str, model: mujoco.MjModel) -> tuple[dict[str, np.ndarray], n
     elif name == "link_inertia":
         body["inertia"][links] *= 0.7
     elif name == "link_com":
-        body["com"][calves] -= [0.0, 0.0, 0.012]
+        body["com"][calves] += [0.007, -0.004, -0.012]
     elif name == "com_offset":
         body["com"][trunk] += [0.03, -0.01, 0.02]
     return body, rotor
@@ -145,7 +145,7 @@ EDITS: dict[str, dict[str, Any]] = {
     "armature": {"added": [0.002, 0.002, -0.003]},
     "link_mass": {"scale": {"calf": 1.3}},
     "link_inertia": {"scale": 0.7},
-    "link_com": {"along": {"calf": 0.012}},
+    "link_com": {"along": {"calf": 0.012}, "forward": {"calf": 0.007}, "left": {"calf": -0.004}},
     "com_offset": {"x": 0.03, "y": -0.01, "z": 0.02},
 }
 
@@ -176,13 +176,14 @@ def test_inertia_and_weight_are_those_of_the_links_written_down_anew(name: str) 
     assert changed > 1e-4
 
 
-def with_box(mass: float, at: tuple[float, float, float]) -> mujoco.MjModel:
-    """Compile a robot that carries a real body."""
+def with_bodies(loads: Mapping[str, tuple[float, tuple[float, float, float]]]) -> mujoco.MjModel:
+    """Compile a robot that carries real bodies: name of the link -> mass, kg, and place in its frame, m."""
     from go1exp.physics.model import load_robot
 
     spec = load_robot(task().robot.inertia)
-    box = spec.body("trunk").add_body(name="box", pos=list(at))
-    box.explicitinertial, box.mass, box.inertia, box.ipos = True, mass, [1e-12] * 3, [0.0] * 3
+    for link, (mass, at) in loads.items():
+        box = spec.body(link).add_body(name=f"{link}_load", pos=list(at))
+        box.explicitinertial, box.mass, box.inertia, box.ipos = True, mass, [1e-12] * 3, [0.0] * 3
     for kind, name in enumerate(robot.JOINT_KINDS):
         for leg in robot.LEGS:
             spec.joint(f"{leg}_{name}").armature = task().robot.armature[kind]
@@ -192,11 +193,26 @@ def with_box(mass: float, at: tuple[float, float, float]) -> mujoco.MjModel:
 @pytest.mark.parametrize(("mass", "at"), [(3.0, (0.1, -0.05, 0.12)), (0.4, (-0.2, 0.0, -0.1))])
 def test_a_payload_is_a_body_on_the_trunk(mass: float, at: tuple[float, float, float]) -> None:
     values = {"mass": mass, **dict(zip("xyz", at, strict=True))}
-    edited, real = engine(rig({"payload": values}, held=None)).env_model(0), with_box(mass, at)
+    edited, real = engine(rig({"payload": values}, held=None)).env_model(0), with_bodies({"trunk": (mass, at)})
     a, b = somewhere(edited), somewhere(real)
     assert edited.body_mass.sum() == pytest.approx(real.body_mass.sum(), rel=1e-12)
     assert edited.body_subtreemass[1] == pytest.approx(real.body_subtreemass[1], rel=1e-12)
     assert np.allclose(a.subtree_com[1], b.subtree_com[1], atol=1e-12)
+    assert np.allclose(mass_matrix(edited, a), mass_matrix(real, b), atol=1e-9)
+    a.qvel[:] = b.qvel[:] = np.random.default_rng(1).normal(0.0, 3.0, 18)
+    mujoco.mj_forward(edited, a)
+    mujoco.mj_forward(real, b)
+    assert np.allclose(a.qfrc_bias, b.qfrc_bias, atol=1e-7)
+
+
+@pytest.mark.parametrize(("part", "at"), [("calf", (0.01, -0.02, -0.213)), ("thigh", (0.0, 0.03, -0.1))])
+def test_a_point_load_is_a_body_on_the_link(part: str, at: tuple[float, float, float]) -> None:
+    """Mass matrix, gravity and Coriolis torques against a robot compiled with such bodies on all four legs."""
+    effect = {"mass": {part: 0.15}, **dict(zip("xyz", at, strict=True))}
+    edited = engine(rig({"point_load": effect}, held=None)).env_model(0)
+    real = with_bodies({f"{leg}_{part}": (0.15, at) for leg in robot.LEGS})
+    a, b = somewhere(edited), somewhere(real)
+    assert edited.body_subtreemass[1] == pytest.approx(real.body_subtreemass[1], rel=1e-12)
     assert np.allclose(mass_matrix(edited, a), mass_matrix(real, b), atol=1e-9)
     a.qvel[:] = b.qvel[:] = np.random.default_rng(1).normal(0.0, 3.0, 18)
     mujoco.mj_forward(edited, a)
@@ -351,6 +367,62 @@ def test_a_soft_stop_yields_with_the_square_of_its_time_constant() -> None:
     # The drive pushes less, the further the joint goes.
     force = [0.2 - hard, 0.2 - soft]
     assert torch.allclose((soft / hard) * (force[0] / force[1]), torch.full_like(hard, 4.0), rtol=0.15)
+
+
+def thrown(values: Mapping[str, Any], speed: float = 3.0, dt: float = 0.00025) -> tuple[Tensor, Tensor]:
+    """Throw weightless calves at their upper stops, all other joints blocked; return angles and speeds (K, 4)."""
+    stance = robot.NOMINAL_STANCE.copy()
+    stance[CALVES] = robot.JOINT_POS_LIMITS[2, 1] - 0.1
+    plant = rig({"joint_stop": values}, kp=0.0, kd=0.0, dt=dt, stance=stance)
+    plant.backend.field("opt.gravity").zero_()
+    armature = plant.backend.field("dof_armature")
+    armature[:, HIPS], armature[:, THIGHS] = 1e4, 1e4
+    plant.backend.derive_constants(torch.ones(1, dtype=torch.bool))
+    velocity = torch.zeros_like(plant.q)
+    velocity[:, CALVES] = speed
+    start(plant, plant.q.clone(), velocity)
+    states = []
+    for _ in range(round(0.25 / dt)):
+        plant.step(plant.q)
+        states.append(torch.stack([plant.q[0, CALVES], plant.qd[0, CALVES]]))
+    q, qd = torch.stack(states, dim=1)
+    return q, qd
+
+
+@pytest.mark.parametrize("e", [0.05, 0.3, 0.6])
+def test_a_joint_comes_back_from_its_stop_with_its_restitution(e: float) -> None:
+    _, qd = thrown({"restitution": e})
+    assert torch.allclose(-qd[-1] / 3.0, torch.full_like(qd[-1], e), atol=0.03), -qd[-1] / 3.0
+
+
+def test_no_stop_gives_back_more_than_it_got() -> None:
+    """All softnesses and rebounds, at the step of training."""
+    for time_constant in (0.004, 0.02, 0.2):
+        for e in (0.02, 0.7):
+            _, qd = thrown({"restitution": e, "time_constant": time_constant}, dt=0.002)
+            assert qd.abs().max() <= 3.0 * (1.0 + 1e-4)  # what blocks the other joints is not infinitely heavy
+            assert (-qd[-1] < 0.9 * 3.0).all()
+
+
+@pytest.mark.parametrize("shift", [-0.15, 0.12])
+def test_a_shifted_stop_is_met_where_it_is(shift: float) -> None:
+    beyond = np.array([0.0, 0.8, robot.JOINT_POS_LIMITS[2, 1] + 0.3] * 4)
+    hard = {"time_constant": 0.004, "upper": {"calf": shift}}
+    q = settle(rig({"joint_stop": hard}), beyond)[0, CALVES]
+    assert torch.allclose(q, torch.full_like(q, robot.JOINT_POS_LIMITS[2, 1] + shift), atol=0.01)
+
+
+def test_no_stop_passes_the_middle_of_its_range() -> None:
+    plant = rig({"joint_stop": {}})
+    narrow = plant.backend.model.jnt_range.copy()
+    narrow[:, 1] = narrow[:, 0] + 0.2
+    plant.backend.model.jnt_range[:] = narrow
+    effect: Any = plant.effects.effects["joint_stop"]
+    effect.lower.fill_(0.3)
+    effect.upper.fill_(-0.3)
+    plant.refresh()
+    ends = plant.backend.field("jnt_range")[0].numpy()
+    assert np.allclose(ends, narrow.mean(1)[:, None])
 
 
 # ---------------------------------------------------------------------- transmission

@@ -116,6 +116,7 @@ INSTANT: dict[str, dict[str, Slow]] = {
     },
     "kp_scale": {"on_gains": lambda e, kp, kd: e["scale"] * kp},
     "kd_scale": {"on_gains": lambda e, kp, kd: e["scale"] * kd},
+    "dead_band": {"on_error": lambda e, target, q: q if abs(target - q) <= e["band"] and e["band"] else target},
     "encoder_offset": {"on_encoder": lambda e, q, qd: q + e["offset"]},
 }
 """By effect and hook: value for one joint at one instant, from its parameters and the hook's arguments."""
@@ -149,6 +150,7 @@ def test_a_law_without_memory_agrees_with_one_reckoned_joint_by_joint(
         "on_drive": (torque, q, qd),
         "on_gains": (q.abs(), qd.abs()),
         "on_encoder": (q, qd),
+        "on_error": (q + 0.002 * qd, q),
     }
     for hook, slow in INSTANT[name].items():
         given = arguments[hook]
@@ -389,6 +391,26 @@ def test_a_delay_of_whole_steps_is_the_targets_of_these_steps_ago() -> None:
     for plant in (delayed, plain):
         plant.step(STANCE)
     assert torch.equal(swing(delayed, DT, 0.2), swing(plain, DT, 0.2, late=5))
+
+
+def test_a_drive_that_comes_on_makes_its_torque_as_late_as_ever() -> None:
+    plant = stand({"lag": {"time": 0.005}})
+    plant.enabled = torch.tensor([False])
+    for _ in range(5):
+        plant.step(STANCE + 0.1)
+        assert torch.count_nonzero(plant.torque) == 0
+    made = []
+    plant.enabled = torch.tensor([True])
+    for _ in range(5):
+        plain = stand({})
+        plain.backend.reset(torch.tensor([True]), plant.q.clone(), plant.qd.clone())
+        plain.reset(torch.tensor([True]), STANCE + 0.1)
+        plain.step(STANCE + 0.1)
+        plant.step(STANCE + 0.1)
+        made.append(float(plant.torque[0, CALF] / plain.torque[0, CALF]))
+    t = DT * np.arange(6)
+    _, risen, _ = lsim(([1.0], [0.005, 1.0]), np.minimum(t / DT, 1.0), t)
+    np.testing.assert_allclose(made, risen[1:], rtol=0, atol=0.05)  # the joint moves, so that the demand falls
 
 
 def test_an_encoder_with_an_offset_is_a_target_with_the_opposite_one() -> None:

@@ -114,14 +114,28 @@ EXEMPT = {
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("record", "record_audit", "record_import")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("fit-actuator", "gap", "export", "export_check")},
     **{f"{verb}.yaml:hydra": "Hydra's own settings" for verb in ("deploy", "sim")},
-    **{f"deploy.yaml:{key}": "of robot=go1: tests/test_go1_walk.py" for key in ("address", "check", "feet")},
+    **{f"deploy.yaml:{key}": "of a robot that hangs: tests/test_played.py" for key in ("motion", "gains")},
+    **{f"deploy.yaml:{key}": "of robot=go1: tests/test_go1_walk.py" for key in ("address", "check")},
+    "deploy.yaml:feet": "of sensors that count: tests/test_go1_walk.py",
     "logger/wandb.yaml:logger.wandb.tags": "tests/test_logging.py reads them back",
     **{f"report.yaml:{key}": "tests/test_report.py shows what it does" for key in REPORT},
     **{f"train.yaml:{key}": "tests/test_beside.py shows what it does" for key in ("eval", "video", "stop")},
-    **{f"play.yaml:{key}": "tests/test_viewer_browser.py, tests/test_viewer.py" for key in ("host", "port", "log")},
-    **{f"sim.yaml:{key}": "of its page: tests/test_sim_viewer.py" for key in ("viewer", "host", "port")},
-    **{f"gap.yaml:{key}": "of the stage view: tests/test_viewer.py" for key in ("host", "port")},
-    "play.yaml:bundle": "in place of run, as of eval: tests/test_viewer.py",
+    **{f"play.yaml:{key}": "tests/test_viewer_keys.py" for key in ("host", "port", "log")},
+    **{f"sim.yaml:{key}": "of its page: tests/test_viewer_keys.py" for key in ("viewer", "host", "port")},
+    "gap.yaml:search.phase": "of robots that walk: tests/test_gap_swings.py shows what it does",
+    **{f"gap.yaml:{key}": "of the stage view: tests/test_viewer_keys.py" for key in ("host", "port")},
+    "play.yaml:bundle": "in place of run, as of eval: tests/test_viewer_keys.py",
+    **{
+        f"gap_next.yaml:{key}": "tests/test_gap_next.py shows what it does"
+        for key in ("logs", "out", "design", "plugins", "hydra")
+    },
+    **{
+        f"gap_loop.yaml:{key}": "as of record.yaml, gap.yaml and gap_next.yaml; tests/test_gap_loop.py shows the rest"
+        for key in (
+            *("effect", "excitation", "gains", "seconds", "seeds", "repeats", "support", "hang", "physics_dt", "seed"),
+            *("rounds", "sensors", "search", "design", "out", "plugins", "hydra"),
+        )
+    },
     **{f"compare.yaml:{key}": "tests/test_protocol_commands.py shows what it does" for key in COMPARE},
     **{f"eval.yaml:{key}": "not of the grid: tests/test_protocol_commands.py" for key in ("bundle", "folder")},
     **{
@@ -161,6 +175,8 @@ NEEDS = {
     "experiment/five_minutes": ["reward=clock"],
     "experiment/ablation/no_latency": ["actuator=delay"],
     "experiment/ablation/no_adaptive_rate": ["ppo=paper"],
+    "experiment/five_minutes_part/no_mirrored_samples": ["ppo=small"],
+    "experiment/five_minutes_part/no_near_kernels": ["experiment=five_minutes"],
     "experiment/study": ["experiment=paper", "actuator=delay", "backend=cpu"],
     "experiment/study_cpu": ["experiment=study", "backend=cpu", "ppo=small"],
     "experiment/robust": ["experiment=trot", "backend=cpu"],

@@ -41,6 +41,7 @@ from go1exp.export.build import build, command_ranges, gains
 from go1exp.export.graph import DeployedPolicy, ExportError, required_inputs, to_onnx
 from go1exp.export.trace import readings
 from go1exp.mdp.types import Snapshot
+from go1exp.schema.history import history_columns, width
 from go1exp.schema.registry import Entry, Term
 from go1exp.train import run_folder, trainer
 from go1exp.train.ppo import GaussianPolicy
@@ -105,20 +106,22 @@ def scattered(core: Go1Core) -> Tensor:
     core.backend.reset(torch.ones(n, dtype=torch.bool), qpos, qvel)
     core.command.value.copy_(torch.tensor(rng.uniform(-2, 3, (n, 3))))
     core.action.copy_(torch.tensor(rng.normal(size=(n, 12)) * 4))
-    return core._observe(core.snapshot())
+    return core.terms.frames.begun(*core._frame(core.snapshot()), torch.ones(n, dtype=torch.bool))
 
 
 @pytest.mark.parametrize("choice", OBSERVATIONS)
 def test_torch_onnx_and_the_environment_agree(choice: str, make_task: Callable[..., TaskConfig]) -> None:
     task = make_task("backend.threads=1", f"observation={choice}", "action.clip=2.0")
-    policy = network(sum(t.entry.traits["size"] for t in task.observation))
+    policy = network(sum(width(t) for t in task.observation))
     module = DeployedPolicy(policy, task.observation, task.action)
     session = OnnxPolicy(to_onnx(module), module.inputs, module.outputs)
     sensing = parse_task(compose("train", ["backend.threads=1", "effect=[encoder_offset,base_tilt]"])).effect
     for effects in ((), sensing):
         core = Go1Core(dataclasses.replace(task, effect=effects), ROWS, noise=False)
         observed = scattered(core)
-        given = readings(core)
+        past = torch.randn(ROWS, len(history_columns(task.observation).earlier))
+        observed[:, history_columns(task.observation).earlier] = past
+        given = {**readings(core), "past": past}
         named = {port.name: given[port.name] for port in module.inputs}
         by_onnx = session({name: values.numpy() for name, values in named.items()})
         by_torch = dict(zip(by_onnx, module(*named.values()), strict=True))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import math
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -286,6 +288,25 @@ def test_a_save_that_fails_half_way_costs_nothing_and_can_be_made_up_for(
     assert_saved_up_to(run, 4)
     assert not list((run / "checkpoints").glob("*.partial"))
     assert (run / "metrics.csv").read_bytes() == (tmp_path / "reference/metrics.csv").read_bytes()
+
+
+def test_a_disk_that_fills_up_within_a_checkpoint_is_named_as_the_cause(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Then the error that arrives is one of torch's zip writer about positions in the file."""
+    save = torch.save
+
+    class NearlyFull(io.BytesIO):
+        def write(self, content: Any) -> int:
+            if self.tell() + len(content) > 5000:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return super().write(content)
+
+    monkeypatch.setattr(torch, "save", lambda state, file: save(state, NearlyFull()))
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        train_here(run)
+    assert caught.value.errno == errno.ENOSPC
+    assert not checkpoint.checkpoints(run)
 
 
 def row(iteration: int) -> dict[str, float]:

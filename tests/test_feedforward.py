@@ -47,6 +47,7 @@ def limp(plant: Plant) -> None:
 DRIVES = [
     (),
     ("actuator=dc_motor",),
+    ("actuator=voltage",),
     ("actuator=delay", "actuator.command=[0.006,0.006]"),
     ("effect=[command_delay,strength]", "effect.command_delay.delay=0.005", "effect.strength.scale=0.8"),
 ]

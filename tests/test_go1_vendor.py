@@ -1,14 +1,15 @@
 """The vendor's own client (unitree-legged-sdk 3.8.20231105, a compiled module) against ours, over real sockets.
 
-Skipped where the module is not installed; docs/hardware.md says how to install it.
+``make test-vendor`` installs it; without it these tests are skipped.
 """
 
 from __future__ import annotations
 
-import math
+import os
 import socket
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,9 +19,10 @@ import pytest
 
 from go1exp import recording, robot
 from go1exp.cli.runs import shipped_policies
-from go1exp.deploy import go1_sdk
+from go1exp.deploy import go1_sdk, job
 from go1exp.deploy import go1_wire as wire
 from go1exp.deploy.commands import Wish
+from go1exp.deploy.go1_check import Bounds, check
 from go1exp.deploy.job import Job, run_job
 from go1exp.deploy.launch import RobotError, SimulatedRobot
 from go1exp.deploy.messages import LowCmd, LowState
@@ -32,28 +34,37 @@ try:
 except RobotError:
     SDK = None
 
-pytestmark = [
-    pytest.mark.skipif(SDK is None, reason="the vendor's module is not installed"),
-    pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/"),
-]
+pytestmark = pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/")
 LOCAL = 8080
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _needs() -> None:
+    if SDK is None and os.environ.get("GO1EXP_TEST_VENDOR"):
+        pytest.fail("the vendor's module cannot be imported: it needs Python 3.11 on x86-64")
+    elif SDK is None:
+        pytest.skip("the vendor's module is not installed: make test-vendor")
 
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The shipped policy as a bundle."""
     path = tmp_path_factory.mktemp("vendor") / "walk.zip"
-    path.write_bytes(build(shipped_policies()["robust"], seconds=0.2))
+    path.write_bytes(build(shipped_policies()["paper"], seconds=0.2))
     return str(path)
 
 
-def test_the_vendors_client_walks_the_shipped_policy_for_ten_seconds(walk: str, tmp_path: Path) -> None:
-    """With its PositionLimit and PowerProtect, and one packet in a hundred lost each way."""
+def test_the_vendors_client_walks_the_shipped_policy_for_ten_seconds(
+    walk: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the check, with its PositionLimit and PowerProtect, and one packet in a hundred lost each way."""
+    monkeypatch.setattr(job, "check", partial(check, bounds=Bounds(rate=20.0, gap=2.0)))  # the machine may be busy
     with SimulatedRobot(walk, {"noise": 0.3, "loss": 0.01}, {}) as there:
         plan = Plan(seconds=10.0, stale=5.0, wish=Wish((0.6, 0.0, 0.2)))
         said: list[str] = []
-        job = Job(walk, "go1_sdk", plan, str(tmp_path), address=f"127.0.0.1:{there.port}")
-        assert run_job(job, said.append) == 0, said
+        given = Job(walk, "go1_sdk", plan, str(tmp_path), address=f"127.0.0.1:{there.port}")
+        assert run_job(given, said.append) == 0, said
+    assert any(line.startswith("battery: 80 %, -2.00 A, cells 3.84 to 3.84 V") for line in said), said[:12]
     print("\n".join(said[-5:]))
     print({name: value for name, value in there.report.items() if name != "timing"})
     assert said[-1] == "walked for 10.0 s, to the end"
@@ -62,15 +73,26 @@ def test_the_vendors_client_walks_the_shipped_policy_for_ten_seconds(walk: str, 
     clock, height = there.truth["clock"], there.truth["base_pos_z_w"]
     assert there.obeyed is not None
     obeying = there.obeyed[:, 1] > 0
-    before_lying = obeying & (clock < clock[obeying][-1] - 2.5)
-    assert height[before_lying].min() > 0.2
-    way = math.hypot(*(float(np.ptp(there.truth[f"base_pos_{axis}_w"])) for axis in "xy"))
-    print(f"{way:.2f} m in {clock[-1]:.1f} s of the robot's time")
-    assert way > 0.5  # on a machine that keeps real time it is 5 m
+    # It sinks while the runtime brakes first, then stands up; at the end it lies down.
+    upright = obeying & (clock > clock[obeying][0] + 3.0) & (clock < clock[obeying][-1] - 2.5)
+    assert height[upright].min() > 0.25
+    # By the robot's clock, which falls behind on a busy machine; the middle half has no standing up or lying down.
+    begin, end = np.quantile(clock[obeying], [0.25, 0.75])
+    forward = _forward_speed(there.truth)[(clock >= begin) & (clock <= end)]
+    print(f"{forward.mean():.2f} m/s forward in the middle {end - begin:.1f} s of the robot's time")
+    assert abs(forward.mean() - 0.6) < 0.2  # 0.54 and 0.47 where the robot lost 4 and 9 s of 18
     kept = recording.read(next(tmp_path.glob("*.parquet")))
     assert (kept.meta.source, "does not tell what it obeys" in kept.meta.notes) == ("measured", True)
     torque = kept.joint("tau_est") * 256
     np.testing.assert_allclose(torque, np.rint(torque), atol=1e-6)
+
+
+def _forward_speed(truth: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the trunk's speed along its heading, m/s."""
+    w, x, y, z = (truth[f"base_quat_{part}"] for part in "wxyz")
+    heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    forward: np.ndarray = truth["base_lin_vel_x_w"] * np.cos(heading) + truth["base_lin_vel_y_w"] * np.sin(heading)
+    return forward
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,16 +16,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from go1exp import recording, robot
+from go1exp.cli.runs import shipped_policies
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.deploy import go1_check, job
 from go1exp.deploy import go1_wire as wire
+from go1exp.deploy.bundle import load
 from go1exp.deploy.commands import Wish
+from go1exp.deploy.estimate import BOTH, TORQUE, KalmanEstimator, settings
 from go1exp.deploy.go1_check import Bounds, Heard, judged, listen
 from go1exp.deploy.job import CheckJob, Job, run_check, run_job
 from go1exp.deploy.launch import RobotError
+from go1exp.deploy.messages import LowState
 from go1exp.deploy.udp import Go1Link
 from go1exp.deploy.walk import Plan
 from go1exp.estimation import go1
@@ -33,7 +39,8 @@ from go1exp.export.build import build
 from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.alone import Account
 from go1exp.sim_robot.machine import SILENCE, TICK, Robot
-from go1exp.sim_robot.server import GONE_S, STRANGER, Network, Server
+from go1exp.sim_robot.protocols import FootSensors
+from go1exp.sim_robot.server import GONE_S, STRANGER, TRUTH, Network, Server
 from go1exp.train import run_folder, trainer
 from tests.lockstep import World, lockstep
 from tests.small_run import SMALL
@@ -133,6 +140,123 @@ def test_a_walk_stands_a_network_that_loses_doubles_delays_damages_and_replays(f
     r = done.recording
     assert (np.diff(r.t) > 0).all()
     assert r.block("base_pos_z_w").min() > 0.2
+
+
+# ---------------------------------------------------------------------- where contact comes from
+
+
+@pytest.fixture(scope="module")
+def walking(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The shipped policy as a bundle."""
+    path = tmp_path_factory.mktemp("paper") / "walk.zip"
+    path.write_bytes(build(shipped_policies()["paper"], seconds=0.2))
+    return str(path)
+
+
+RAW = {"feet": "raw", "seed": 5}
+
+
+def of_sensors(seed: int, folder: Path) -> str:
+    """The file of a calibration that is as wrong as a check's: zeros up to 5 N high, scales within a quarter."""
+    sensors, rng = FootSensors(sim_config({"feet": "raw", "seed": seed})), np.random.default_rng(seed)
+    zero = sensors.zero + sensors.scale * rng.uniform(0.0, 5.0, 4)
+    path = folder / "feet.json"
+    scale = sensors.scale * rng.uniform(0.75, 1.25, 4)
+    FootCalibration(tuple(map(float, zero)), tuple(map(float, scale))).write(path)  # type: ignore[arg-type]
+    return str(path)
+
+
+def errors(states: list[LowState], truth: dict[str, np.ndarray], estimator: KalmanEstimator) -> float:
+    """The RMSE of the velocity, three components together, m/s, from half a second on."""
+    velocity = np.array([estimator.update(state) for state in states])
+    k = np.searchsorted(truth["clock"], [state.clock - 1e-6 for state in states])
+    quat = np.stack([truth[f"base_quat_{part}"] for part in "wxyz"], axis=1)[k]
+    world = np.stack([truth[f"base_lin_vel_{axis}_w"] for axis in "xyz"], axis=1)[k]
+    off = velocity - Rotation.from_quat(quat, scalar_first=True).inv().apply(world)
+    return float(np.sqrt((off[250:] ** 2).sum(axis=1).mean()))
+
+
+@dataclass
+class Watched:
+    """A walk whose filter was watched."""
+
+    states: list[LowState]
+    velocity: np.ndarray
+    truth: dict[str, np.ndarray]
+    said: list[str]
+
+
+def watched(walking: str, out: Path, monkeypatch: pytest.MonkeyPatch, feet: str | None) -> Watched:
+    """Walk with the shipped policy and raw sensors for three seconds, and keep what its filter took and gave."""
+    states, velocities, said, worlds = list[LowState](), list[np.ndarray](), list[str](), list[World]()
+    update = KalmanEstimator.update
+
+    def listening(self: KalmanEstimator, state: LowState) -> np.ndarray:
+        states.append(state)
+        velocities.append(update(self, state))
+        return velocities[-1]
+
+    plan = Plan(seconds=3.0, stand_up=0.3, lie_down=0.0, brake=0.05, wish=Wish((0.8, 0.0, 0.3)))
+    with monkeypatch.context() as patch, lockstep(on_server=worlds.append) as world:
+        patch.setattr(KalmanEstimator, "update", listening)
+        assert run_job(Job(walking, "sim", plan, str(out), sim=RAW, feet=feet), said.append) == 0, said
+        assert world.server is not None
+        rows = world.server.truth.rows()
+    truth = dict(zip(("clock", *TRUTH), rows.T, strict=True))
+    return Watched(states, np.array(velocities), truth, said)
+
+
+def test_raw_sensors_with_a_calibration_and_torques_tell_contact_better_than_torques_alone_or_counts(
+    walking: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fresh filter over the same states gives the walk's own velocities, and with another source larger errors."""
+    path = of_sensors(5, tmp_path)
+    done = watched(walking, tmp_path / "both", monkeypatch, path)
+    assert f"contact of the feet: by the joints' torques and by the sensors that {path} calibrates" in done.said
+    assert min(state.foot_force.min() for state in done.states) > 60.0  # counts
+    about = load(walking).metadata.estimator
+
+    def anew(feet: FootCalibration | None, **changes: Any) -> KalmanEstimator:
+        return KalmanEstimator(settings(about, **changes), lambda *_: None, feet)
+
+    feet = FootCalibration.read(Path(path))
+    again = anew(feet, **BOTH)
+    assert np.array([again.update(state) for state in done.states]).tobytes() == done.velocity.tobytes()
+    both = errors(done.states, done.truth, anew(feet, **BOTH))
+    torques = errors(done.states, done.truth, anew(None, **TORQUE))
+    counts = errors(done.states, done.truth, anew(None))
+    assert both < 0.02  # 0.012; torques alone 0.045, counts taken for newtons 0.146
+    assert torques > 2.0 * both
+    assert counts > 5.0 * both
+
+
+def test_raw_sensors_without_a_calibration_leave_contact_to_the_torques(
+    walking: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = watched(walking, tmp_path / "torques", monkeypatch, None)
+    assert any(line.startswith("contact of the feet: by the joints' torques alone; feet=FILE") for line in done.said)
+    again = KalmanEstimator(settings(load(walking).metadata.estimator, **TORQUE), lambda *_: None)
+    assert np.array([again.update(state) for state in done.states]).tobytes() == done.velocity.tobytes()
+    assert not any(
+        name.startswith("foot_force")
+        for name in recording.read(next((tmp_path / "torques").glob("*.parquet"))).channels
+    )
+
+
+@pytest.mark.parametrize("sim", [{}, {"feet": "newton"}, {"feet": "raw", "protocol": "exact"}])
+def test_a_calibration_of_sensors_that_say_newtons_is_refused(file: str, tmp_path: Path, sim: dict[str, str]) -> None:
+    job = Job(file, "sim", Plan(seconds=1.0), str(tmp_path / "out"), sim=sim, feet=of_sensors(0, tmp_path))
+    with pytest.raises(RobotError, match=r"feet\.json: calibrates sensors that count.*unless sim\.feet=raw"):
+        run_job(job, print)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_calibration_without_scales_is_refused_before_anything_moves(file: str, tmp_path: Path) -> None:
+    FootCalibration((1.0, 2.0, 3.0, 4.0)).write(tmp_path / "feet.json")
+    job = Job(file, "sim", Plan(), str(tmp_path / "o"), sim={"feet": "raw"}, feet=str(tmp_path / "feet.json"))
+    with pytest.raises(CalibrationError, match="has no scales"):
+        run_job(job, print)
+    assert not (tmp_path / "o").exists()
 
 
 def server(file: str, **sim: Any) -> Server:

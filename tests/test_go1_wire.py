@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 import socket
 import struct
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from hypothesis import strategies as st
 from go1exp.deploy import go1_wire as wire
 from go1exp.deploy.messages import LowCmd, LowState
 from go1exp.deploy.udp import Go1Link
+from go1exp.sim_robot.machine import Robot
 from go1exp.sim_robot.protocols import Go1, roll_pitch_yaw
+from go1exp.sim_robot.server import Server
 from go1exp.sim_robot.settings import SimConfig
 
 # Bytes of unitree-legged-sdk 3.8.20231105, received on a socket: InitCmdData, then twelve motors set to
@@ -107,6 +110,49 @@ def test_every_field_has_its_offset_unit_and_source() -> None:
     assert wire.dtype_of(wire.MOTOR_STATE).itemsize == 32
     for fields in (wire.COMMAND, wire.STATE, wire.MOTOR_COMMAND, wire.MOTOR_STATE, wire.IMU, wire.BATTERY):
         assert all(field.unit and field.source for field in fields)
+
+
+BEGINNING = "2sBB2I2IH"
+LAYOUT = {
+    "command": (wire.COMMAND_TYPE, BEGINNING + 20 * "BffhHH3I" + "4B" + "40B" + "II"),
+    "state": (wire.STATE_TYPE, BEGINNING + "4f3f3f3fb" + 20 * "BffhhffhbII" + "4BiH2b2b10B" + "4h4hI" + "40B" + "II"),
+}
+"""The packets as ``struct`` writes them, after the SDK's headers and nothing of ours."""
+
+RANGES = {"B": (0, 2**8), "b": (-(2**7), 2**7), "H": (0, 2**16), "h": (-(2**15), 2**15), "I": (0, 2**32)}
+RANGES["i"] = (-(2**31), 2**31)
+
+
+def leaves(record: Any, kind: np.dtype[Any]) -> Iterator[tuple[Any, str]]:
+    """The innermost fields of a record, in order: what holds them, and their name."""
+    for name in kind.names or ():
+        inner = kind[name].base
+        if inner.names is None:
+            yield record, name
+        else:
+            for part in np.atleast_1d(record[name]):
+                yield from leaves(part, inner)
+
+
+@pytest.mark.parametrize("which", LAYOUT)
+def test_every_field_comes_there_and_back(which: str) -> None:
+    """Random values in all fields, used or not: serial, version, bandwidth, remote, reserves, the estimated forces."""
+    kind, layout = LAYOUT[which]
+    codes = "".join(
+        code * int(count or 1) for count, code in re.findall(r"(\d*)([BbHhIif])", layout.replace("2s", "", 1))
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        floats = (float(np.float32(value)) for value in rng.normal(scale=1e3, size=len(codes)))
+        values = [next(floats) if code == "f" else int(rng.integers(*RANGES[code])) for code in codes]
+        packet = struct.pack("<" + layout, b"\xfe\xef", *values)
+        there, back = np.frombuffer(packet, kind)[0], np.zeros(1, kind)
+        read = [there[name] if record is there else record[name] for record, name in leaves(there, kind)]
+        assert read[0] == b"\xfe\xef"
+        assert np.concatenate([np.ravel(value) for value in read[1:]]).tolist() == values
+        for (record, name), value in zip(leaves(back[0], kind), read, strict=True):
+            record[name] = value
+        assert back.tobytes() == packet
 
 
 def test_a_state_written_by_hand_is_read_as_the_vendors_client_read_it() -> None:
@@ -225,6 +271,7 @@ def test_stop_values_switch_feedback_off() -> None:
         (VENDOR_COMMAND[:300] + b"\1" + VENDOR_COMMAND[301:], wire.Refusal.CHECKSUM),
         (resealed(VENDOR_COMMAND, 23, struct.pack("<f", math.nan)), wire.Refusal.CONTENT),
         (resealed(VENDOR_COMMAND, 27, struct.pack("<f", math.inf)), wire.Refusal.CONTENT),
+        (resealed(VENDOR_COMMAND, 23, b"\1\0\x80\x7f"), wire.Refusal.CONTENT),  # a signalling NaN
         (resealed(VENDOR_COMMAND, 23, struct.pack("<f", 1e6)), wire.Refusal.CONTENT),
         (resealed(VENDOR_COMMAND, 22, b"\7"), wire.Refusal.CONTENT),
     ],
@@ -245,29 +292,35 @@ def test_a_state_is_refused_likewise() -> None:
     assert wire.refusal(GOOD, 807) is None
 
 
-def mutations(packet: bytes) -> st.SearchStrategy[bytes]:
-    """The packet with bytes changed, cut, doubled, moved, or replaced; never the packet itself."""
+LISTENER = Go1(SimConfig())
+
+
+def mutated(packet: bytes) -> st.SearchStrategy[tuple[bytes, bool]]:
+    """The packet with bytes changed, cut, doubled, moved or replaced, never the packet itself; and whether it is whole.
+
+    Half of those of the right size have a checksum of their own, so that what is in them is looked at.
+    """
     place = st.integers(0, len(packet) - 1)
-    changed = st.lists(st.tuples(place, st.integers(1, 255)), min_size=1, max_size=8).map(
-        lambda edits: bytes(b ^ dict(edits).get(k, 0) for k, b in enumerate(packet))
+    changed = st.dictionaries(place, st.integers(1, 255), min_size=1, max_size=8).map(
+        lambda edits: bytes(b ^ edits.get(k, 0) for k, b in enumerate(packet))
     )
     cut = place.map(lambda k: packet[:k])
     longer = st.binary(min_size=1, max_size=40).map(lambda more: packet + more)
     moved = place.map(lambda k: packet[k:] + packet[:k])
-    return st.one_of(changed, cut, longer, moved, st.binary(max_size=900)).filter(lambda data: data != packet)
+    odd = st.tuples(
+        st.integers(22, len(packet) - 8), st.sampled_from([math.nan, math.inf, -math.inf, 3e38, -2e9, 101.0])
+    )
+    spoilt = odd.map(lambda one: packet[: one[0]] + struct.pack("<f", one[1]) + packet[one[0] + 4 :])
+    anything = st.one_of(st.binary(max_size=900), st.binary(min_size=len(packet), max_size=len(packet)))
+    data = st.one_of(changed, cut, longer, moved, spoilt, anything).filter(lambda data: data != packet)
 
+    def perhaps_sealed(drawn: tuple[bytes, bool]) -> tuple[bytes, bool]:
+        data, seal = drawn
+        if seal and len(data) == len(packet):
+            return resealed(data, 0, b"\xfe\xef\xff"), True
+        return data, covers_nothing(data, packet)
 
-MANY = settings(max_examples=10_000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-
-
-@pytest.mark.slow("go1exp/deploy/go1_wire.py", "go1exp/sim_robot/protocols.py")
-@MANY
-@given(mutations(VENDOR_COMMAND))
-def test_of_ten_thousand_mutated_commands_none_is_obeyed(packet: bytes) -> None:
-    assert LISTENER.refusal(packet) is not None or covers_nothing(packet, VENDOR_COMMAND)
-
-
-LISTENER = Go1(SimConfig())
+    return st.tuples(data, st.booleans()).map(perhaps_sealed)
 
 
 def covers_nothing(packet: bytes, original: bytes) -> bool:
@@ -276,31 +329,134 @@ def covers_nothing(packet: bytes, original: bytes) -> bool:
     return packet[:covered] == original[:covered] and packet[-4:] == original[-4:] and len(packet) == len(original)
 
 
+class Statue:
+    """Stands for a robot: keeps what it obeys, and never moves."""
+
+    clock = 0.0
+
+    def __init__(self) -> None:
+        self.obeyed: list[LowCmd] = []
+
+    def obey(self, asked: LowCmd, number: int) -> None:
+        self.obeyed.append(asked)
+
+    def release(self) -> None:
+        self.obeyed.append(LowCmd(np.zeros(12), np.zeros(12), np.zeros(12)))
+
+    def step(self) -> None:
+        self.clock += wire.PERIOD
+
+    def sense(self) -> tuple[LowState, np.ndarray]:
+        return state(), np.zeros(13)
+
+    def in_force(self) -> np.ndarray:
+        return np.zeros(13)
+
+
+End = tuple[Any, socket.socket, Any]
+
+
+@pytest.fixture(scope="module")
+def listening() -> Iterator[End]:
+    """A simulated robot's server, a socket that speaks to it, and where to."""
+    server = Server(cast("Robot", Statue()), SimConfig())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        yield server, client, server.address
+    server.close()
+
+
+def meet_command(end: End, packet: bytes, whole: bool) -> None:
+    """Send a packet to the robot; what it obeys is within every bound, and of what is not whole it obeys nothing."""
+    server, client, to = end
+    client.sendto(packet, to)
+    before, server.robot.obeyed[:] = server.counts.foreign, []
+    with np.errstate(all="raise"):
+        server.tick()
+    obeyed = server.robot.obeyed
+    assert len(obeyed) + server.counts.foreign - before == 1  # obeyed, or refused and counted
+    assert whole or not obeyed
+    most = {"joint_target": wire.FARTHEST, "kp": 2048.0, "kd": 4096.0, "feedforward": 128.0 + 4096.0 * wire.FASTEST}
+    for name, bound in most.items():
+        values = [getattr(one, name) for one in obeyed if getattr(one, name) is not None]
+        assert (np.abs(values) <= bound).all(), name  # NaN is not
+
+
+@pytest.fixture(scope="module")
+def looking() -> Iterator[End]:
+    """A link, the socket of a robot to which it has spoken, and where to."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        other.settimeout(5.0)
+        link = Go1Link("127.0.0.1", other.getsockname()[1], 0.001)
+        link.receive()
+        yield link, other, other.recvfrom(1000)[1]
+        link.close()
+
+
+def meet_state(end: End, packet: bytes, whole: bool) -> None:
+    """Send a packet to the runtime; what it reads is finite, and of what is not whole it believes nothing."""
+    link, other, to = end
+    link._last, before = None, link.traffic.foreign  # no tick is late
+    other.sendto(packet, to)
+    with np.errstate(all="raise"):
+        states = link.receive()
+    assert len(states) + link.traffic.foreign - before == 1
+    assert whole or not states
+    for one in states:
+        parts = (getattr(one, name) for name in ("joint_pos", "joint_vel", "imu_quat", "imu_gyro", "imu_acc"))
+        assert (np.abs(np.concatenate([*parts])) <= wire.BEYOND).all()
+        assert (np.abs(one.joint_torque) <= 128.0).all()
+        assert (np.abs(one.foot_force) <= 2.0**15).all()
+        assert math.isfinite(one.clock + one.t)
+        health = wire.unpack_health(link.newest)
+        assert np.isfinite([health.current, *health.cell_voltage, *health.acceleration]).all()
+
+
+MANY = settings(max_examples=10_000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+FEW = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@pytest.mark.slow("go1exp/deploy/go1_wire.py", "go1exp/sim_robot/protocols.py", "go1exp/sim_robot/server.py")
+@MANY
+@given(mutated(VENDOR_COMMAND))
+def test_of_ten_thousand_mutated_commands_none_is_obeyed(listening: End, packet: tuple[bytes, bool]) -> None:
+    meet_command(listening, *packet)
+
+
 @pytest.mark.slow("go1exp/deploy/go1_wire.py", "go1exp/deploy/udp.py")
 @MANY
-@given(mutations(GOOD))
-def test_of_ten_thousand_mutated_states_none_is_believed(packet: bytes) -> None:
-    assert wire.refusal(packet, wire.STATE_SIZE) is not None or covers_nothing(packet, GOOD)
+@given(mutated(GOOD))
+def test_of_ten_thousand_mutated_states_none_is_believed(looking: End, packet: tuple[bytes, bool]) -> None:
+    meet_state(looking, *packet)
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(mutations(VENDOR_COMMAND), st.booleans())
-def test_a_mutated_command_raises_nothing_even_with_its_own_checksum(packet: bytes, seal: bool) -> None:
-    if seal and len(packet) == wire.COMMAND_SIZE:
-        packet = resealed(packet, 0, b"\xfe\xef\xff")
-    with np.errstate(all="raise"):
-        heard = LISTENER.read(packet)
-    if not isinstance(heard, str) and heard.command is not None:
-        told = heard.command
-        parts = (told.joint_target, told.kp, told.kd)
-        assert all(np.isfinite(part).all() for part in parts)
-        assert np.abs(told.joint_target).max() <= wire.FARTHEST
+@FEW
+@given(mutated(VENDOR_COMMAND))
+def test_a_mutated_command_raises_nothing_and_is_not_obeyed(listening: End, packet: tuple[bytes, bool]) -> None:
+    meet_command(listening, *packet)
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(mutations(GOOD))
-def test_a_mutated_state_raises_nothing_and_is_refused(packet: bytes) -> None:
-    assert wire.refusal(packet, wire.STATE_SIZE) is not None or covers_nothing(packet, GOOD)
+@FEW
+@given(mutated(GOOD))
+def test_a_mutated_state_raises_nothing_and_is_not_believed(looking: End, packet: tuple[bytes, bool]) -> None:
+    meet_state(looking, *packet)
+
+
+def test_what_is_not_mutated_is_obeyed_and_believed(listening: End, looking: End) -> None:
+    """The ways that the mutated ones take do let the good ones through."""
+    meet_command(listening, VENDOR_COMMAND, True)
+    assert [one.kp[0] for one in listening[0].robot.obeyed] == [20.0]
+    received = looking[0].traffic.received
+    meet_state(looking, GOOD, True)
+    assert looking[0].traffic.received == received + 1
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e10])
+@pytest.mark.parametrize("place", [22, 22 + 16, 22 + 28, 75 + 1, 75 + 11 * 32 + 5])
+def test_a_state_with_a_reading_that_cannot_be_is_refused_by_name(place: int, value: float) -> None:
+    packet = resealed(GOOD, place, struct.pack("<f", value))
+    assert wire.state_refusal(packet) is wire.Refusal.CONTENT
+    assert wire.state_refusal(GOOD) is None
 
 
 # ---------------------------------------------------------------------- the link

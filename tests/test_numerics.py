@@ -36,6 +36,7 @@ BAR = 0.5
 
 BARS: dict[str, tuple[tuple[float, float, float], str]] = {
     "backlash": ((4.0, 4.0, 4.0), "flanks hit each other within a step, in three coupled joints; a few ms at a time"),
+    "dead_band": ((0.5, 0.66, 0.5), "hardly damped: the torque jumps by kp x band up to half a step late"),
     "fixed_point": ((0.5, 0.59, 0.5), "hardly damped: kd 0.6 becomes 0.5625"),
     "flexibility": ((0.5, 0.75, 0.5), "the rotor swings at 30 to 70 Hz"),
     "kd_scale": ((0.5, 0.65, 0.5), "hardly damped: the leapfrog's error of phase, (frequency x step)^2 / 24, adds up"),

@@ -331,7 +331,7 @@ def test_terms_that_remember_are_called_once_a_step_and_forget_where_an_episode_
     assert not first[:, -2:].any()
     parts = core.terms.parts()
     assert list(parts) == ["reward.slow_power", "termination.wild", "observation.memory_of_speed"]
-    core.terms.noise.zero_()
+    core.terms.frames.noise.zero_()
     for step in range(1, 8):
         result = core.step(torch.full((3, 12), 0.5 * (-1) ** step))
         final, observed = result.final_observation[:, -1], result.observation[:, -1]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -23,9 +25,12 @@ pytestmark = pytest.mark.slow("go1exp/sweep/", "go1exp/cli/", "conf/launcher/", 
 LONGER = (*SMALL, "ppo.iterations=150", "checkpoint.every=5")
 
 
-@pytest.fixture(autouse=True)
-def _needs() -> None:
-    lacking = "no ray: pip install 'go1exp[ray]'" if importlib.util.find_spec("ray") is None else ""
+NO_RAY = "no ray: pip install 'go1exp[ray]'" if importlib.util.find_spec("ray") is None else ""
+
+
+@pytest.fixture
+def _network_of_its_own() -> None:
+    lacking = NO_RAY
     if not lacking and (os.getuid() != 0 or not shutil.which("unshare") or not shutil.which("ip")):
         lacking = "a network of its own needs root, unshare and ip"
     if lacking and os.environ.get("GO1EXP_TEST_RAY"):
@@ -34,6 +39,7 @@ def _needs() -> None:
         pytest.skip(lacking)
 
 
+@pytest.mark.usefixtures("_network_of_its_own")
 def test_a_node_that_dies_during_a_sweep_costs_nothing_but_time(tmp_path: Path) -> None:
     train = [sys.executable, "-m", "go1exp.cli", "train", "-m", "seed=1,2,3", *LONGER, "hydra.sweep.dir=sweep"]
     launcher = ["hydra/launcher=ray", f"hydra.launcher.address=127.0.0.1:{ray_cluster.PORT}"]
@@ -71,6 +77,45 @@ def node_of(process: int, nodes: list[int]) -> int:
             return int(fields[3])
         process = int(fields[1])
     raise AssertionError("no node's")
+
+
+@pytest.fixture(autouse=True)
+def _ray() -> None:
+    if NO_RAY and os.environ.get("GO1EXP_TEST_RAY"):
+        pytest.fail(NO_RAY)
+    elif NO_RAY:
+        pytest.skip(NO_RAY)
+
+
+def test_a_private_cluster_starts_runs_the_sweep_and_is_gone_afterwards(tmp_path: Path) -> None:
+    line = (
+        "train",
+        "-m",
+        "seed=1,2",
+        *SMALL,
+        "hydra/launcher=ray",
+        "hydra.launcher.address=null",
+        "hydra.sweep.dir=sweep",
+    )
+    done = run_alone(tmp_path, *line, RAY_AUTH_MODE="disabled", RAY_TMPDIR=(place := tempfile.mkdtemp(prefix="r")))
+    try:
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert [job.state for job in read(tmp_path / "sweep").jobs] == ["done"] * 2
+        alone = run_alone(tmp_path, "train", *SMALL, "seed=2", "hydra.run.dir=alone")
+        assert alone.returncode == 0, alone.stderr
+        assert (tmp_path / "sweep/seed-2/metrics.csv").read_bytes() == (tmp_path / "alone/metrics.csv").read_bytes()
+        assert of_sessions_in(place) == []
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def of_sessions_in(place: str) -> list[str]:
+    """Return the commands of processes that keep their files in that folder."""
+    words = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            words.append((process / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+    return [line for line in words if place in line]
 
 
 def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:

@@ -56,9 +56,12 @@ LEFT_OUT = {
     "go1exp eval policy=paper protocol=paper": "takes eight minutes: tests/test_protocols.py plays each one",
     "go1exp compare paper mpc trot@physx protocol=kicks": "needs an extra: tests/test_protocol_commands.py",
     "go1exp play policy=paper viewer=web": "goes on until Ctrl-C: tests/test_viewer_browser.py",
-    "go1exp train -m study=ablations_cpu hydra/launcher=joblib": "takes an hour: tests/test_sweeps.py",
+    "go1exp train -m study=ablations_cpu hydra/launcher=joblib": "takes an hour: tests/test_study.py has a smaller one",
+    "go1exp train -m study=ablations_cpu hydra/launcher=slurm": "needs a cluster: tests/test_study.py starts one",
+    "go1exp train sweep=runs/SWEEP": "needs a sweep that was stopped: tests/test_study.py, tests/test_sweeps.py",
     "go1exp sim": "goes on until Ctrl-C: tests/test_go1_walk.py",
     "go1exp deploy robot=go1 check=true": "needs a robot: tests/test_go1_walk.py lets it look at a simulated one",
+    "go1exp gap next logs=recordings out=gap": "takes minutes: tests/test_gap_next.py has smaller ones",
     "go1exp gap view out=gap": "goes on until Ctrl-C: tests/test_viewer.py, and the page itself as of play",
     "go1exp gap logs=recordings model=go2 out=gap": "needs recordings of a Go2: tests/test_gap_machines.py",
 }
@@ -108,7 +111,8 @@ def test_every_command_of_the_readme_is_run_or_left_out_for_a_reason() -> None:
     for first in (*BUDGETS, *STATUSES):
         assert any(command._begins(first) for command in RUN), first
     assert {command.words[0] for command in RUN} <= {words.split()[0] for words in BUDGETS}
-    assert {"record import", "record audit", "export check"} == {f"{v} {w}" for v, ws in SUBVERBS.items() for w in ws}
+    both = {f"{verb} {word}" for verb, words in SUBVERBS.items() for word in words}
+    assert both == {"record import", "record audit", "export check", "gap next", "gap loop"}
 
 
 def test_the_complaint_of_the_readme_is_what_is_printed(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,7 @@ def run(folder: Path, seed: int, weight: float = 10.0, rows: int = 20, **changes
 
 def settings(*folders: Path, **changes: Any) -> ReportSettings:
     container = compose("report", [f"folders=[{','.join(map(str, folders))}]"])
+    del container["protocol"]
     return parse(ReportSettings, {**container, **changes})
 
 
@@ -127,10 +129,26 @@ def test_the_baseline_is_named_by_name_part_or_settings(two_groups: Path) -> Non
     those = groups(study([str(two_groups)], False))
     for wanted in ("reward.gait.weight=0.0", "weight=0.0", "reward.gait.weight=0.0, reward.gait.weight=0.0"):
         assert baseline(those, wanted).settings == {"reward.gait.weight": 0.0}
-    with pytest.raises(ConfigError, match=r"2 groups of 'reward.gait.weight=0.0', 'reward.gait.weight=10.0'"):
+    with pytest.raises(ConfigError, match=r"2 groups of these:\n'reward.gait.weight=0.0'\n'reward.gait.weight=10.0'"):
         baseline(those, "gait")
-    with pytest.raises(ConfigError, match="no group of"):
+    with pytest.raises(ConfigError, match="no group of these"):
         baseline(those, "feet")
+
+
+def test_groups_of_a_sweep_have_the_names_of_its_jobs(tmp_path: Path) -> None:
+    jobs = []
+    for name, weight in (("none", 10.0), ("no_gait", 0.0), ("half_gait", 5.0)):
+        for seed in (0, 1):
+            run(tmp_path / f"{name}{seed}", seed, weight)
+            job = f"+experiment/ablation={name} seed={seed}"
+            jobs.append({"name": job, "state": "done", "run_folder": f"{name}{seed}"})
+    (tmp_path / "sweep.json").write_text(json.dumps({"jobs": jobs}))
+    got = study([str(tmp_path)], False)
+    those = groups(got)
+    assert sorted(g.name for g in those) == ["ablation=half_gait", "ablation=no_gait", "ablation=none"]
+    assert baseline(those, "ablation=none").settings == {"reward.gait.weight": 10.0}
+    got.runs[0] = replace(got.runs[0], job="")  # one that no sweep names: settings tell all of them apart
+    assert {g.name for g in groups(got)} == {f"reward.gait.weight={w}" for w in ("0.0", "5.0", "10.0")}
 
 
 def test_a_sweep_names_jobs_lists_those_that_wait_and_says_why_others_failed(tmp_path: Path) -> None:
@@ -318,6 +336,25 @@ def test_a_run_without_evaluation_and_one_evaluated_otherwise_are_named(tmp_path
     assert any(n.startswith("grid: no evaluation of 2 runs (bare, old)") for n in notes)
 
 
+def test_a_damaged_run_or_index_is_named_and_the_others_stay(tmp_path: Path) -> None:
+    """A full disk leaves files that are empty or end in the middle."""
+    for seed in range(3):
+        run(tmp_path / f"sweep/a{seed}", seed)
+    (tmp_path / "sweep/a1/config.yaml").write_text("")
+    (tmp_path / "sweep/a2/config.yaml").write_text("seed: 2\nppo: {num_envs: 4,")
+    (tmp_path / "sweep/sweep.json").write_text('{"jobs": [{"name": "seed=0"')
+    got = made(tmp_path)
+    assert [r.label for r in got.study.runs] == ["a0"]
+    assert {(a.label, a.state, a.cause) for a in got.study.absent} == {
+        (f"a{seed}", "damaged", f"{tmp_path}/sweep/a{seed}/config.yaml is not the configuration of a run")
+        for seed in (1, 2)
+    }
+    assert any(n.startswith(f"{tmp_path}/sweep/sweep.json: is damaged (JSONDecodeError") for n in got.study.notes)
+    (tmp_path / "sweep/a0/config.yaml").write_text("")
+    with pytest.raises(ConfigError, match=r"none of the 3 runs in them counts: a0: damaged \(.*config.yaml is not"):
+        study([str(tmp_path)], False)
+
+
 def test_damaged_rows_are_named_and_the_others_stay(tmp_path: Path) -> None:
     for seed in range(2):
         run(tmp_path / f"a{seed}", seed)
@@ -397,13 +434,24 @@ def test_eval_true_evaluates_what_is_missing_with_the_runs_own_policy(tmp_path: 
     run_state.write(tmp_path / "r", "done")
     brief = {"x": [0.5], "y": [], "yaw": [], "episodes": 3, "duration_s": 0.2, "settle_s": 0.1}
     changes = [f"evaluation.{key}={value}" for key, value in brief.items()]
-    _task(compose("report", [f"folders=[{tmp_path / 'r'}]", f"folder={tmp_path}/out", "eval=true", *changes]))
+    short = ["robots=2", "first_s=2.0", "every_s=2.0", "jitter_s=0.1", "recovery.hold_s=0.1", "recovery.smooth_s=0.1"]
+    changes += ["protocol=[grid,kicks]", *(f"protocol.kicks.{words}" for words in short)]
+    line = [f"folders=[{tmp_path / 'r'}]", f"folder={tmp_path}/out", *changes]
+    with pytest.raises(ConfigError, match=r"protocol=\[kicks\]: is what eval=true plays"):
+        _task(compose("report", line))
+    _task(compose("report", [*line, "eval=true"]))
     rows = table_of_run(tmp_path / "r")
     assert (rows["x"], rows["robot"]) == ([0.0] * 3 + [0.5] * 3, [0, 1, 2] * 2)
     assert {"draw.foot_friction_mean", "draw.center_of_mass_x", "draw.link_mass_range", "trot_error"} <= set(rows)
     assert len(set(rows["draw.foot_friction_mean"])) == 6
     assert all(0.4 <= v <= 1.1 for v in rows["draw.foot_friction_mean"])
     assert len(table(tmp_path / "out/grid_runs.csv")) == 1
+    assert len(table(tmp_path / "out/kicks_runs.csv")) == 1
+    played = json.loads((tmp_path / "r/protocols/kicks.json").read_text())
+    assert (played["kind"], played["settings"]["robots"], played["rates"]["seed"]) == ("kicks", 2, 1)
+    before = (tmp_path / "r/protocols/kicks.parquet").stat().st_mtime_ns
+    _task(compose("report", [*line, "eval=true"]))  # what is there is not played again
+    assert (tmp_path / "r/protocols/kicks.parquet").stat().st_mtime_ns == before
 
 
 # ---------------------------------------------------------------------- in a browser

@@ -7,6 +7,7 @@ import multiprocessing
 import socket
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ class Here:
         body = Body(**PARTS)
         settings = SimConfig(noise=0.0, **config)  # type: ignore[arg-type]
         self.server = Server(Robot(body, settings), settings)
-        self.probe = Probe(self.server)
+        self.probe = Probe(self.server, body, settings)
         self.show = SimShow(self, body)
         self.clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
 
@@ -116,6 +117,57 @@ def test_a_robot_that_hangs_cannot_be_pushed_and_is_shown_in_the_air() -> None:
     assert made.show.data.qpos[2] == 1.0
     assert np.isnan(view.height).all()
     assert np.isfinite(view.torque).all()
+
+
+def test_effects_change_while_the_robot_stands_under_its_client(here: Here) -> None:
+    view = here.live(0.3)
+    assert view.sizes == {"payload": 1.0}
+    assert {"payload", "coulomb", "fixed_point"} <= set(view.known)
+    before = here.server.robot
+    here.show.ask(ask.Effects({"payload": 0.0, "coulomb": 2.0}))
+    ends = time.monotonic() + 60.0
+    while here.server.robot is before:
+        view = here.live(0.02)  # the old one stands on meanwhile
+        assert time.monotonic() < ends
+    after = here.server.robot
+    assert after.clock >= before.clock
+    view = here.live(0.4)
+    assert view.sizes == {"coulomb": 2.0}
+    assert view.message == ""
+    assert view.posture.startswith("following, trunk at 0.")
+    assert view.height[-1] > 0.25
+    carried = [float(one.backend.field("body_mass").sum()) for one in (before, after)]
+    assert carried[0] - carried[1] == pytest.approx(1.0, abs=1e-6)  # the payload is gone, kg
+    here.show.ask(ask.Push(20.0, math.pi / 2))
+    assert max(here.live(0.2).velocity[1]) > 0.3
+
+
+def test_a_robot_takes_over_pose_speed_and_command_of_another(here: Here) -> None:
+    here.live(0.1)
+    here.show.ask(ask.Push(10.0, 0.0))
+    here.live(0.06)
+    old = here.server.robot
+    new = Robot(replace(Body(**PARTS), effect=()), SimConfig(noise=0.0))
+    new.take_over(old)
+    np.testing.assert_array_equal(new.backend.qpos, old.backend.qpos)
+    np.testing.assert_array_equal(new.backend.qvel, old.backend.qvel)
+    np.testing.assert_array_equal(new.in_force(), old.in_force())
+    np.testing.assert_array_equal(new.sense_truth(), old.sense_truth())
+    assert (new.clock, new.commanded, new.braking) == (old.clock, True, False)
+    new.step()
+    assert new.clock == pytest.approx(old.clock + TICK)
+    for _ in range(60):
+        new.step()
+    assert new.braking  # the last command grows old as it would have
+
+
+def test_effects_that_cannot_be_are_refused_and_the_robot_stays(here: Here) -> None:
+    before = here.server.robot
+    here.show.ask(ask.Effects({"gravity": 1.0}))
+    view = here.live(0.1)
+    assert "'gravity'" in view.message
+    assert here.server.robot is before
+    assert view.sizes == {"payload": 1.0}
 
 
 def test_the_timing_of_the_client_is_that_of_its_packets(here: Here) -> None:

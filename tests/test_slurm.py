@@ -33,16 +33,7 @@ SLURM = (
 
 @pytest.fixture(scope="module")
 def variables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    lacking = slurm_cluster.missing()
-    try:
-        import submitit  # noqa: F401
-    except ImportError:
-        lacking = lacking or "no submitit: pip install 'go1exp[slurm]'"
-    if lacking and os.environ.get("GO1EXP_TEST_SLURM"):
-        pytest.fail(lacking)
-    elif lacking:
-        pytest.skip(f"{lacking}; make test-slurm")
-    with slurm_cluster.cluster(tmp_path_factory.mktemp("slurm")) as needed:
+    with slurm_cluster.of_a_test(tmp_path_factory.mktemp("slurm")) as needed:
         yield needed
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 import signal
 import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
@@ -21,6 +25,8 @@ from go1exp.sweep import index
 from go1exp.sweep.command import Command, Running, run
 from go1exp.sweep.launchers import LAUNCHERS, chosen
 from go1exp.sweep.local import shares
+from go1exp.sweep.slurm import Slurm
+from go1exp.sweep.task import Task
 from go1exp.sweep.tune import Range, _rows
 from go1exp.train import run_lock, run_state
 
@@ -116,10 +122,49 @@ def test_a_command_that_is_stopped_says_its_last_words(tmp_path: Path) -> None:
 
 def test_every_launcher_has_a_file() -> None:
     assert chosen({"_target_": f"{BasicLauncher.__module__}.{BasicLauncher.__name__}"}).name == "basic"
-    files = {file.stem: OmegaConf.to_container(OmegaConf.load(file)) for file in (CONF / "launcher").glob("*.yaml")}
+    files = {file.stem: _with_defaults(file) for file in (CONF / "launcher").glob("*.yaml")}
     assert {*LAUNCHERS} == {*files} - {"slurm_gpu"}
-    for name in {*files} - {"slurm_gpu"}:
-        assert chosen(files[name]).name == name  # type: ignore[arg-type]
+    assert {name: chosen(content).name for name, content in files.items()} == {
+        name: "slurm" if name == "slurm_gpu" else name for name in files
+    }
+    assert (chosen(files["slurm_gpu"]).partition, chosen(files["slurm_gpu"]).gpus) == ("gpu", 1)
+
+
+def _with_defaults(file: Path) -> dict[str, Any]:
+    """Return the content of a file over that of the files that its ``defaults`` name."""
+    content: Any = OmegaConf.to_container(OmegaConf.load(file))
+    below = [_with_defaults(file.with_name(f"{name}.yaml")) for name in content.pop("defaults", [])]
+    return {key: value for each in (*below, content) for key, value in each.items()}
+
+
+def test_a_gpu_and_its_partition_reach_sbatch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slurm = pytest.importorskip("submitit.slurm.slurm")
+    asked: dict[str, Any] = {}
+
+    class Executor:
+        def __init__(self, **given: Any) -> None:
+            self.batch = contextlib.nullcontext
+
+        def update_parameters(self, **given: Any) -> None:
+            asked.update(given)
+
+        def submit(self, job: Any) -> Any:
+            return SimpleNamespace(job_id="7_0")
+
+    monkeypatch.setattr("submitit.SlurmExecutor", Executor)
+    settings = chosen({**_with_defaults(CONF / "launcher/slurm_gpu.yaml"), "options": {"constraint": "a100"}})
+    task = Task("seed=0", "seed-0", Command(("true",), str(tmp_path), "log"), lambda: None)
+    assert Slurm(settings)._submitted(tmp_path, "study", [task]) == {"seed-0": "7_0"}
+    script = slurm._make_sbatch_string(command="true", folder=tmp_path, **asked)
+    options = dict(re.findall(r"^#SBATCH --([\w-]+)=(.*)$", script, re.MULTILINE))
+    assert {name: options[name] for name in ("partition", "gpus-per-node", "cpus-per-task", "mem", "time")} == {
+        "partition": "gpu",
+        "gpus-per-node": "1",
+        "cpus-per-task": "8",
+        "mem": "32768M",
+        "time": "720",
+    }
+    assert (options["signal"], options["constraint"]) == ("USR2@120", "a100")
 
 
 def test_ranges_are_read_in_the_grammar_of_sweeps() -> None:

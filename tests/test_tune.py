@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import re
 import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -13,13 +20,24 @@ import yaml
 from go1exp import data_root
 from go1exp.compose import compose
 from go1exp.config import parse_train
+from go1exp.sweep import trials
+from go1exp.sweep.command import Ended
+from go1exp.sweep.settings import TuneSettings
+from go1exp.sweep.tune import Range, Search
+from go1exp.train import run_lock, wandb_writer
+from tests.command import environment
 from tests.command import run as cli
 from tests.small_run import SMALL
 
+ABOUT = ("go1exp/sweep/", "go1exp/cli/tune.py", "conf/tune.yaml")
+NEEDS_OPTUNA = pytest.mark.skipif(
+    importlib.util.find_spec("optuna") is None and not os.environ.get("GO1EXP_TEST_TUNE"),
+    reason="no optuna: pip install 'go1exp[tune]'",
+)
 SPACE = 'space=["ppo.learning_rate=tag(log,interval(1e-4,3e-3))","ppo.gamma=choice(0.97,0.99)"]'
 
 
-def test_the_agent_of_weights_and_biases_gets_a_command_that_composes() -> None:
+def test_the_agent_of_weights_and_biases_gets_a_command_that_composes(monkeypatch: pytest.MonkeyPatch) -> None:
     from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
 
     sweep = yaml.safe_load((data_root() / "docs/wandb_sweep.yaml").read_text())
@@ -29,17 +47,24 @@ def test_the_agent_of_weights_and_biases_gets_a_command_that_composes() -> None:
     for word in create_sweep_command(sweep["command"]):  # as wandb's agent puts them together
         words += values[word[2:-1]] if word.startswith("${") else [word]
     assert words[:2] == ["go1exp", "train"]
+    monkeypatch.delenv("WANDB_MODE", raising=False)
     container = compose("train", words[2:])
     config = parse_train(container)
     assert (config.ppo.learning_rate, config.ppo.minibatches) == (0.0007, 8)
-    assert container["logger"]["wandb"]
+    assert config.logger.wandb is not None
+    assert wandb_writer.mode(config.logger.wandb) == "online"  # what is offline, the search never sees
     assert {*sweep["parameters"]} == {*given}
 
 
-@pytest.mark.slow("go1exp/sweep/", "go1exp/cli/tune.py", "conf/tune.yaml")
+def test_the_sweep_in_the_document_is_the_file() -> None:
+    document = (data_root() / "docs/sweeps.md").read_text()
+    (shown,) = re.findall(r"^```yaml\n(program:.*?)^```$", document, re.MULTILINE | re.DOTALL)
+    assert yaml.safe_load(shown) == yaml.safe_load((data_root() / "docs/wandb_sweep.yaml").read_text())
+
+
+@NEEDS_OPTUNA
+@pytest.mark.slow(*ABOUT)
 def test_a_search_finds_its_best_trial_and_goes_on(tmp_path: Path) -> None:
-    if importlib.util.find_spec("optuna") is None:
-        pytest.skip("no optuna: pip install 'go1exp[tune]'")
     settings = ",".join(json.dumps(word) for word in (*SMALL, "ppo.iterations=4"))
     line = (SPACE, f"overrides=[{settings}]", "workers=2", "metric=train/kl", "direction=minimize", "out=search")
     first = cli(tmp_path, "tune", *line, "trials=2")
@@ -59,3 +84,154 @@ def test_a_search_finds_its_best_trial_and_goes_on(tmp_path: Path) -> None:
     nobody = cli(tmp_path, "tune", SPACE, "storage=sqlite:////nowhere/at/all.db", "out=elsewhere")
     assert (nobody.returncode, nobody.stderr.count("\n")) == (1, 1)
     assert "cannot be used" in nobody.stderr
+
+
+# ---------------------------------------------------------------------- draws
+
+
+class Drawing(Search):
+    """A search whose trainings are over at once: what it draws is all there is to see."""
+
+    def _train(self, trial: Any, run: Path, share: tuple[int, ...]) -> tuple[Ended, list[tuple[int, float]], bool]:
+        return Ended(0, ""), [(1, trial.params["ppo.gamma"])], False
+
+
+def searched(out: Path, **changes: Any) -> Drawing:
+    settings: dict[str, Any] = parsed_defaults() | {"trials": 3, "out": str(out), **changes}
+    search = Drawing(TuneSettings(**settings), {"ppo.gamma": Range(low=0.9, high=0.999)}, lambda overrides, run: None)
+    search.run()
+    return search
+
+
+def parsed_defaults() -> dict[str, Any]:
+    plain = yaml.safe_load((data_root() / "conf/tune.yaml").read_text())
+    return {key: plain[key] for key in TuneSettings.__dataclass_fields__} | {"space": (), "overrides": ()}
+
+
+def gammas(search: Search) -> list[float]:
+    return [trial.params["ppo.gamma"] for trial in search._study().get_trials()]
+
+
+@NEEDS_OPTUNA
+def test_the_same_search_from_nothing_draws_the_same_and_one_that_goes_on_draws_others(tmp_path: Path) -> None:
+    first, twin = gammas(searched(tmp_path / "a")), gammas(searched(tmp_path / "b"))
+    assert first == twin
+    longer = gammas(searched(tmp_path / "a", trials=12))
+    assert longer[:3] == first
+    assert len({*longer}) == 12
+    assert gammas(searched(tmp_path / "c", trials=12)) == longer  # in one sitting or, between two trials, in two
+    assert gammas(searched(tmp_path / "d", seed=1)) != first
+    assert not list((tmp_path / "a" / trials.SEARCHES).iterdir())
+
+
+# ---------------------------------------------------------------------- killed
+
+
+@NEEDS_OPTUNA
+def test_a_trial_whose_search_was_killed_goes_on_and_one_whose_search_lives_is_left_alone(tmp_path: Path) -> None:
+    from optuna.trial import TrialState
+
+    study = searched(tmp_path, trials=1)._study()
+    for search in ("killed", "lives", "elsewhere", ""):
+        trial = study.ask()
+        trial.suggest_float("ppo.gamma", 0.9, 0.999)
+        if search:
+            trial.set_user_attr(trials.SEARCH, search)
+            trial.set_user_attr(trials.FOLDER, f"trial-{trial.number:04}")
+    (tmp_path / trials.SEARCHES / "killed").mkdir()
+    with run_lock.locked(tmp_path / trials.SEARCHES / "lives"):
+        trials.put_back(study, tmp_path)
+    states = [trial.state for trial in study.get_trials()]
+    running, waiting = TrialState.RUNNING, TrialState.WAITING
+    assert states == [TrialState.COMPLETE, TrialState.FAIL, running, running, running, waiting]
+    _, lost, *_, again = study.get_trials()
+    assert again.user_attrs[trials.FOLDER] == lost.user_attrs[trials.FOLDER] == "trial-0001"
+    assert again.system_attrs["fixed_params"] == lost.params
+    assert searched(tmp_path, trials=5)._study().get_trials()[5].params == lost.params
+
+
+@NEEDS_OPTUNA
+def test_a_trial_whose_settings_are_refused_has_failed(tmp_path: Path) -> None:
+    def refuse(overrides: Sequence[str], run: Path) -> None:
+        raise ValueError("no such thing")
+
+    search = Drawing(
+        TuneSettings(**parsed_defaults() | {"out": str(tmp_path)}), {"ppo.gamma": Range(low=0.9, high=1.0)}, refuse
+    )
+    with pytest.raises(ValueError, match="no such thing"):
+        search.run()
+    assert [trial.state.name for trial in search._study().get_trials()] == ["FAIL"]
+
+
+def words(*more: str) -> str:
+    return "overrides=[" + ",".join(json.dumps(word) for word in (*SMALL, *more)) + "]"
+
+
+@NEEDS_OPTUNA
+@pytest.mark.slow(*ABOUT)
+def test_a_search_that_is_killed_loses_neither_its_trial_nor_its_count(tmp_path: Path) -> None:
+    line = (
+        "tune",
+        SPACE,
+        words("ppo.iterations=150", "checkpoint.every=5"),
+        "trials=1",
+        "metric=train/kl",
+        "out=search",
+    )
+    killed = subprocess.Popen([sys.executable, "-m", "go1exp.cli", *line], cwd=tmp_path, env=environment())
+    run = tmp_path / "search/trial-0000"
+    try:
+        limit = time.monotonic() + 200.0
+        while not any((run / "checkpoints").glob("*.pt")):
+            assert killed.poll() is None
+            assert time.monotonic() < limit
+            time.sleep(0.05)
+    finally:
+        killed.kill()
+        killed.wait()
+    again = cli(tmp_path, *line)
+    assert again.returncode == 0, again.stderr
+    assert "trial 0: its search was killed; goes on now" in again.stdout
+    assert "continuing from" in (run / "job.log").read_text()
+    jobs = json.loads((tmp_path / "search/sweep.json").read_text())["jobs"]
+    assert [(job["run_folder"], job["state"]) for job in jobs] == [("trial-0000", "done")]
+
+
+# ---------------------------------------------------------------------- pruned by evaluation
+
+
+@NEEDS_OPTUNA
+@pytest.mark.slow(*ABOUT)
+def test_a_trial_that_evaluation_shows_to_be_bad_ends_early(tmp_path: Path) -> None:
+    """Four earlier trials walk without any error; a policy of two iterations cannot, and would train for hours."""
+    import optuna
+    from optuna.distributions import FloatDistribution
+
+    changes: dict[str, Any] = {"metric": "eval/score", "direction": "minimize", "out": str(tmp_path / "search")}
+    brief = ("eval.x=[0.5]", "eval.y=[]", "eval.yaw=[]", "eval.episodes=2", "eval.duration_s=0.4", "eval.settle_s=0.2")
+    overrides = words("ppo.iterations=1000000", "eval.every=2", *brief)
+    space = {"ppo.gamma": Range(low=0.9, high=0.999)}
+    (tmp_path / "search").mkdir()
+    study = Drawing(TuneSettings(**parsed_defaults() | changes), space, lambda given, run: None)._study()
+    for gamma in (0.91, 0.92, 0.93, 0.94):
+        good = dict.fromkeys(range(2, 100_000, 50), 0.001)
+        study.add_trial(
+            optuna.create_trial(
+                params={"ppo.gamma": gamma},
+                distributions={"ppo.gamma": FloatDistribution(0.9, 0.999)},
+                value=0.001,
+                intermediate_values=good,
+            )
+        )
+    line = ("tune", 'space=["ppo.gamma=interval(0.9,0.999)"]', "metric=eval/score", "direction=minimize", "out=search")
+    done = cli(tmp_path, *line, overrides, "trials=5", "average=1", "warmup=1")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^trial 4: ended early at iteration \d+: ", done.stdout, re.MULTILINE), done.stdout
+    assert [trial.state.name for trial in study.get_trials()] == ["COMPLETE"] * 4 + ["PRUNED"]
+
+
+@NEEDS_OPTUNA
+def test_a_metric_of_evaluations_needs_evaluations(tmp_path: Path) -> None:
+    done = cli(tmp_path, "tune", SPACE, words(), "metric=eval/score", "direction=minimize")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "metric = 'eval/score': needs evaluations; add eval.every=50 to overrides" in done.stderr

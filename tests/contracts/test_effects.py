@@ -481,6 +481,7 @@ def calls(effect: Effect, n: int, k: int) -> Iterator[tuple[str, tuple[Any, ...]
         "on_target": (q,),
         "on_feedforward": (torque,),
         "on_encoder": (q, qd),
+        "on_error": (q, three[0].repeat(1, 4)),
         "on_gains": (torque.abs(), qd.abs()),
         "on_drive": (torque, q, qd),
         "on_transmission": (torque, q, qd),

@@ -12,6 +12,8 @@ from torch import Tensor
 
 import go1exp.terms  # noqa: F401  (registers every term)
 from go1exp.mdp.types import Snapshot, TermSetup
+from go1exp.recording import joint_channels
+from go1exp.robot import JOINTS, NOMINAL_STANCE
 from go1exp.schema.registry import Entry, foreign, groups, members
 from go1exp.tensors.memory import Memory
 from go1exp.testing import check_term, check_terms
@@ -30,9 +32,14 @@ ROUNDS = ("net",)
 
 
 @pytest.fixture(scope="session")
-def needs(make_net: Callable[..., Path]) -> dict[str, dict[str, Any]]:
+def needs(make_net: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
     """What a term cannot be built without."""
-    return {"delay": {"drive": {"term": "pd"}}, "net": {"file": str(make_net(bias=0.0, torque=300.0))}}
+    targets = tmp_path_factory.mktemp("targets") / "targets.csv"
+    stance = ",".join(map(str, NOMINAL_STANCE))
+    header = ",".join(["t", *joint_channels("q_target", JOINTS)])
+    targets.write_text(f"{header}\n0.0,{stance}\n1.0,{stance}\n")
+    files = {"net": {"file": str(make_net(bias=0.0, torque=300.0))}, "playback": {"file": str(targets)}}
+    return {"delay": {"drive": {"term": "pd"}}, **files}
 
 
 @pytest.mark.parametrize("entry", EVERY, ids=[f"{e.group}.{e.name}" for e in EVERY])
