@@ -121,16 +121,27 @@ class Browser:
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
-    def hold(self, x: float, y: float, *, until: Callable[[], bool], seconds: float) -> None:
-        """Press the left mouse button at a point until something is so: a slow page looks at the mouse now and then."""
-        about = {"x": x, "y": y, "button": "left", "clickCount": 1}
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        time.sleep(1.0)
-        self.call("Input.dispatchMouseEvent", type="mousePressed", buttons=1, **about)
-        try:
-            wait_until(until, seconds, "answer to the mouse")
-        finally:
-            self.call("Input.dispatchMouseEvent", type="mouseReleased", **about)
+    def hold(self, point: Callable[[], tuple[float, float]], *, until: Callable[[], bool], seconds: float) -> None:
+        """Press the left mouse button at a point until something is so, and again each 20 s, as people do.
+
+        A slow page looks at the mouse now and then.
+        """
+        end = time.monotonic() + seconds
+        while True:
+            x, y = point()
+            about = {"x": x, "y": y, "button": "left", "clickCount": 1}
+            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+            time.sleep(1.0)
+            self.call("Input.dispatchMouseEvent", type="mousePressed", buttons=1, **about)
+            try:
+                wait_until(until, min(20.0, max(end - time.monotonic(), 0.0)), "answer to the mouse")
+                return
+            except AssertionError:
+                if time.monotonic() > end:
+                    raise
+            finally:
+                self.call("Input.dispatchMouseEvent", type="mouseReleased", **about)
+            time.sleep(1.0)
 
     def hold_key(self, key: str, code: str, number: int, *, until: Callable[[], bool], seconds: float) -> None:
         """Press a key until something is so, by the three names that browsers have for it."""

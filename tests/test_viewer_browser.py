@@ -95,7 +95,7 @@ def test_a_robot_is_seen_and_driven_in_chromium() -> None:
 
         # a slider moves the robot: its speed follows
         forward = told.place("forward m/s", 0.45)  # the place has the label in it
-        browser.hold(*forward, until=lambda: told["command"][0] > 0.3, seconds=PATIENCE)
+        browser.hold(lambda: told.place("forward m/s", 0.45), until=lambda: told["command"][0] > 0.3, seconds=PATIENCE)
         wanted, start, since = told["command"][0], told["x"], told["time"]
         assert 0.3 < wanted < 1.6
         wait_until(lambda: told["time"] > since + 2.5, 3 * PATIENCE, "two seconds of walking")
@@ -113,6 +113,7 @@ def test_a_robot_is_seen_and_driven_in_chromium() -> None:
         before = told["command"][0]
         browser.hold_key("ArrowDown", "ArrowDown", 40, until=lambda: told["command"][0] < before, seconds=PATIENCE)
         browser.hold_key("0", "Digit0", 48, until=lambda: told["command"] == [0.0, 0.0, 0.0], seconds=PATIENCE)
+        assert told.place("forward m/s", 0.45) == forward  # slow or not, no panel jumped from under the mouse
 
 
 PAD = """

@@ -17,6 +17,8 @@ from go1exp.viewer.window import Vec2, Window, arrow_shape, paragraph, section
 
 SLOW = imgui.Vec4(1.0, 0.7, 0.3, 1.0)
 
+TOO_SLOW = "this computer is too slow for that"
+
 KEYS = {
     imgui.Key.UpArrow: 265,
     imgui.Key.DownArrow: 264,
@@ -156,8 +158,8 @@ class DriveWindow(Window):
         imgui.TextUnformatted("paused" if pace.paused else f"{view.achieved:.2f}x")
         imgui.SameLine()
         imgui.TextUnformatted(f"{view.time:.1f} s")
-        if not pace.paused and view.achieved < 0.9 * pace.speed:
-            imgui.TextColored(SLOW, "this computer is too slow for that")
+        slow = not pace.paused and view.achieved < 0.9 * pace.speed
+        imgui.TextColored(SLOW, TOO_SLOW if slow else "")  # a line in any case: what is below must not jump
         if view.message:
             paragraph(view.message)
 
