@@ -228,10 +228,9 @@ class Search(Ledger):
         models = [Model(effect, s.theta, may.also(effect), s.variant.free) for effect, s in chosen.items()]
         fitted = fit(self.state.scorer, models, self.state.table, self.settings.iterations, self.dt) if models else []
         near = excess(self.select_chi2) <= self.settings.adequate
-        movable = [e for e in tolerances.nominal(self.state.machine) if near and e not in self.state.terms]
-        again = {effect: self._given_back(effect, self.state.theta) for effect in movable}
-        better = [min(m, again.pop(m.name, m), key=misfit) for m in fitted]
-        better += again.values()
+        movable = {key[0] for key in self.state.keys} if near else set()
+        again = [self._freed(m.name) if m.name in movable else m for m in fitted]
+        better = [min(pair, key=misfit) for pair in zip(fitted, again, strict=True)]
         best = min(better, key=misfit).name if better else ""
         return [
             min(m, self._given_back(m.name, m.theta), key=misfit) if _confounded(m.name, best) else m for m in better
