@@ -23,6 +23,10 @@ from typing import Any
 from omegaconf import OmegaConf
 
 
+CASES_A_PROCESS = 4
+"""Cases that a process solves before another takes its place: what a heap has grown to is not given back."""
+
+
 def solve(case: Path, out: Path, settings: dict[str, Any]) -> str:
     """Solve one case and return a line about it."""
     import torch
@@ -59,7 +63,8 @@ def main(arguments: Sequence[str]) -> None:
     todo = [case for case in todo if not (out / case.name / "verdict.json").exists()]
     work = functools.partial(solve, out=out, settings=settings)
     begun = time.monotonic()
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=spawn, max_tasks_per_child=CASES_A_PROCESS) as pool:
         for done, line in enumerate(pool.map(work, todo), start=1):
             left = (time.monotonic() - begun) / done * (len(todo) - done)
             print(f"[{done}/{len(todo)}, {left / 60:.0f} min left] {line}", flush=True)

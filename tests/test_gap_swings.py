@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from go1exp.gap.data.trunk import LOADED, Log
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.replay.swinging import SwingReplayer, packed_by_leg
-from go1exp.gap.result import GapSettings
+from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.hung import HungGo1
 from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.robots.swinging import SwingingGo1
@@ -26,6 +27,7 @@ from go1exp.gap.score.localise import localise
 from go1exp.gap.score.robust import excess
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import residuals
+from go1exp.gap.stages import explain as stages_explain
 from go1exp.gap.stages.explain import explain
 from go1exp.physics.legs import Legs
 from go1exp.recording import Recording
@@ -167,6 +169,38 @@ def test_the_phase_says_what_of_a_walk_is_compared() -> None:
     assert isinstance(machine.suited(recordings, "swing"), SwingingGo1)
     assert isinstance(machine.suited(recordings, "whole"), StandingGo1)
     assert isinstance(machine.suited(recordings, "auto"), StandingGo1)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "named", "compared", "note"),
+    [
+        ("explained", True, ["swing"], "search.phase=whole"),
+        ("partly explained", True, ["swing"], "search.phase=whole"),
+        ("unexplained", False, ["swing", "whole"], "do not agree with the model, and nothing in the library explains"),
+        ("no gap", False, ["swing", "whole"], "Legs in the air agree with the model: error 7.2 times"),
+        ("bad log", False, ["swing", "whole"], ""),
+    ],
+)
+def test_the_whole_robot_is_compared_unless_legs_in_the_air_name_something(
+    monkeypatch: pytest.MonkeyPatch, verdict: Any, named: bool, compared: list[str], note: str
+) -> None:
+    config, recordings = recorded()
+    phases: list[str] = []
+    one = NamedEffect("coulomb", ("FR_hip",), {}, {}, ("coulomb",), "certified")
+
+    def judged(logs: object, robot: object, settings: GapSettings, on_progress: object) -> GapResult:
+        phases.append(settings.phase)
+        if settings.phase == "whole":
+            return GapResult("explained", "the trunk")
+        excess_of_legs = {} if verdict == "bad log" else {"box": 6.2}
+        return GapResult(verdict, "the legs", named=(one,) if named else (), excess=excess_of_legs)
+
+    monkeypatch.setattr(stages_explain, "_explained", judged)
+    found = explain(recordings, config, dataclasses.replace(SWING, phase="auto"))
+    assert phases == compared
+    assert found.sentence == ("the legs" if named else "the trunk")
+    assert len(found.warnings) == bool(note)
+    assert all(note in line for line in found.warnings)
 
 
 def test_a_robot_that_never_lifts_a_foot_is_told_so() -> None:

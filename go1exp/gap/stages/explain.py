@@ -44,8 +44,8 @@ def explain(
 ) -> GapResult:
     """Compare recordings of a robot with its model, and name what is missing.
 
-    Of a robot that walks, the legs in the air come first: they show what joints lack whatever the ground does. Only if
-    the model agrees with them, or they hardly swing, is the robot on its feet compared (``settings.phase``).
+    Of a robot that walks, the legs in the air come first: they show what joints lack whatever the ground does. If they
+    name something, that is the answer. Otherwise the robot on its feet is compared too (``settings.phase``).
 
     Args:
         recordings: of one robot.
@@ -60,14 +60,21 @@ def explain(
     if all(r.meta.base == "floating" for r in recordings):
         swing = replace(settings, phase="swing")
         legs = _explained(recordings, robot, swing, lambda what, share: on_progress(what, 0.5 * share))
-        if legs.verdict not in ("bad log", "no gap", "not excited"):
+        if legs.named:
             on_progress("done", 1.0)
             return replace(legs, warnings=(*legs.warnings, SWING_ALONE))
-        if legs.excess:
-            notes = (f"Legs in the air agree with the model: error {1 + legs.excess['box']:.3g} times the floor.",)
-        seconds = legs.seconds
+        notes, seconds = _of_legs(legs), legs.seconds
     result = _explained(recordings, robot, whole, lambda what, share: on_progress(what, 0.5 * (1.0 + share)))
     return replace(result, warnings=(*notes, *result.warnings), seconds=seconds + result.seconds)
+
+
+def _of_legs(legs: GapResult) -> tuple[str, ...]:
+    """Return what legs in the air say where they name nothing."""
+    if not legs.excess:
+        return ()
+    agree = legs.verdict in ("no gap", "not excited")
+    how = "agree with the model" if agree else "do not agree with the model, and nothing in the library explains it"
+    return (f"Legs in the air {how}: error {1 + legs.excess['box']:.3g} times the floor.",)
 
 
 def _explained(
