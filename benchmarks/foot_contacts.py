@@ -37,7 +37,7 @@ CONFIG = go1()
 BOXES = ("boxes_proportion=1.0", "bumps_proportion=0.0", "ramps_proportion=0.0", "flat_proportion=0.0")
 
 
-def walks(run: Path, seconds: float, robots: int) -> Iterator[tuple[str, list[Recording]]]:
+def walks(run: Path, seconds: float, robots: int, seed: int = 0) -> Iterator[tuple[str, list[Recording]]]:
     """Yield ground and walks on it."""
     from go1exp.evaluate.policy import load_run
 
@@ -49,7 +49,7 @@ def walks(run: Path, seconds: float, robots: int) -> Iterator[tuple[str, list[Re
         rig = Rig(task.robot, task.actuator, (), task.terrain, task.backend, 0.002)
         names = [f"{ground}_{k}" for k in range(robots)]
         walk = Walk(replace(trained.task, command=command), policy, names, seconds, None)
-        yield ground, list(play_policy(rig, walk, SENSORS, 0, lambda *_: None))
+        yield ground, list(play_policy(rig, walk, SENSORS, seed, lambda *_: None))
 
 
 def by_torque(rows: np.ndarray) -> np.ndarray:
@@ -114,10 +114,11 @@ def main() -> None:
     parser.add_argument("--run", type=Path, default=data_root() / "assets/policies/paper")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--robots", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(given.seed)
     print("| ground | s | speed mean (max) | contact from | all | x y z | worst walk |\n|---|---|---|---|---|---|---|")
-    for ground, recordings in walks(given.run, given.seconds, given.robots):
+    for ground, recordings in walks(given.run, given.seconds, given.robots, given.seed):
         errors: dict[str, list[np.ndarray]] = {}
         speeds, total = [], 0.0
         for r in recordings:

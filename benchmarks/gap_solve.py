@@ -16,7 +16,6 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +62,9 @@ def main(arguments: Sequence[str]) -> None:
     todo = [case for case in todo if not (out / case.name / "verdict.json").exists()]
     work = functools.partial(solve, out=out, settings=settings)
     begun = time.monotonic()
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=spawn, max_tasks_per_child=CASES_A_PROCESS) as pool:
-        for done, line in enumerate(pool.map(work, todo), start=1):
+    # Not ProcessPoolExecutor: with max_tasks_per_child it came to a standstill (Python 3.11).
+    with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=CASES_A_PROCESS) as pool:
+        for done, line in enumerate(pool.imap(work, todo), start=1):
             left = (time.monotonic() - begun) / done * (len(todo) - done)
             print(f"[{done}/{len(todo)}, {left / 60:.0f} min left] {line}", flush=True)
 

@@ -193,7 +193,9 @@ def _refused_override(error: Exception, name: str, overrides: Sequence[str], fol
         known = [k for k in flat_keys(name) if k != key]
     close = nearest(key, known) or nearest(key.rsplit(".", 1)[-1], known)
     hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else "see --help"
-    if key.count(".") == 2 and key.rpartition(".")[0] in known and given == f"{key}={given.partition('=')[2]}":
+    term, _, parameter = key.rpartition(".")
+    others = [k.rpartition(".")[2] for k in known if k.startswith(f"{term}.")]
+    if term.count(".") == 1 and others and given[0] not in "+~" and not nearest(parameter, others):
         hint += f" A parameter of a term that its file leaves out takes a plus: '+{given}'"
     return f"{given}: no such key {key!r}; {hint}"
 

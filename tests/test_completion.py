@@ -24,7 +24,7 @@ from go1exp.schema import registry
 PROGRAM = "import sys; from go1exp.cli import main; sys.exit(main())"
 
 
-POLICIES = ("hop", "paper", "trot")
+POLICIES = ("hop", "paper", "robust", "trot")
 """Shipped ones."""
 
 
@@ -82,7 +82,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("train resume=runs/f", {"resume=runs/flat"}),
         (
             "train start_from=",
-            {f"start_from={f}" for f in ("hop", "paper", "trot", "gap/", "logs/", "mine/", "runs/")},
+            {f"start_from={f}" for f in ("hop", "paper", "robust", "trot", "gap/", "logs/", "mine/", "runs/")},
         ),
         ("train --he", {"--help"}),
         ("eval run=r", {"run=runs/"}),

@@ -180,6 +180,7 @@ NEEDS = {
     "experiment/study": ["experiment=paper", "actuator=delay", "backend=cpu"],
     "experiment/study_cpu": ["experiment=study", "backend=cpu", "ppo=small"],
     "experiment/robust": ["experiment=trot", "backend=cpu"],
+    "experiment/robust_history": ["experiment=robust", "backend=cpu"],
     "experiment/paper_trot": ["reward=paper_trot", "command=widening", "actuator=delay", "ppo=gpu"],
     "experiment/reference_second": ["experiment=reference", "backend=cpu"],  # it changes what that one adds
 }

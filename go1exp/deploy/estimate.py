@@ -19,10 +19,13 @@ FASTEST = 10.0
 BLIND_S = 0.1
 """Longest time for which the filter may refuse all samples, s; after that its last estimate is too old."""
 
-TORQUE = {"contact_source": "torque", "contact_low": 10.0, "contact_high": 40.0}
+LOADED: dict[str, Any] = {"contact_low": 20.0, "contact_high": 40.0}
+"""Force, N, up to which a foot that swings may seem loaded, since its leg is quick; and from which it is."""
+
+TORQUE: dict[str, Any] = {"contact_source": "torque", **LOADED}
 """Contact from the joints' torques, for a robot whose foot sensors are not calibrated (``docs/estimation.md``)."""
 
-BOTH: dict[str, Any] = {"contact_source": "force", "contact_low": 10.0, "contact_high": 30.0}
+BOTH: dict[str, Any] = {"contact_source": "force", **LOADED}
 """Contact from torques and calibrated foot sensors together (``docs/estimation.md``)."""
 
 Fail = Callable[[str, str, float], None]
