@@ -22,13 +22,13 @@ class Payload(Effect):
     """A point mass on the trunk at (x, y, z) in its frame: mass, centre and inertia change together (Steiner).
 
     Walk-these-ways randomises -1 to 3 kg; published Go1 models disagree by 0.4 kg about the trunk itself. A negative
-    mass is taken away. A held trunk shows none of it. Fast motion resembles ``strength`` the other way round; standing,
-    its place looks like ``com_offset``.
+    mass is taken away; the largest is four fifths of the robot's own 12.7 kg. A held trunk shows none of it. Fast motion
+    resembles ``strength`` the other way round; standing, its place looks like ``com_offset``.
     """
 
     title = "a payload on the trunk"
     params = (
-        Param("mass", "kg", -1.0, 5.0, 0.0, 0.2, "robot", "mass carried"),
+        Param("mass", "kg", -1.0, 10.0, 0.0, 0.2, "robot", "mass carried"),
         Param("x", "m", -0.3, 0.3, 0.0, math.inf, "robot", "its place, forward of the trunk's origin"),
         Param("y", "m", -0.2, 0.2, 0.0, math.inf, "robot", "to the left"),
         Param("z", "m", -0.2, 0.3, 0.1, math.inf, "robot", "up; 0.1 lies on top"),
