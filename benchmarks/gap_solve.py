@@ -21,7 +21,6 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-
 CASES_A_PROCESS = 4
 """Cases that a process solves before another takes its place: what a heap has grown to is not given back."""
 

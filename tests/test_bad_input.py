@@ -259,8 +259,8 @@ def test_an_effect_file_may_be_called_anything(given: str, tmp_path: Path) -> No
         (
             "observation.joint_position.history=5",
             "no such key 'observation.joint_position.history'; did you mean 'observation.joint_position.noise' or "
-            "'observation.joint_position' or 'observation.joint_velocity'? A parameter of a term that its file leaves out "
-            "takes a plus: '+observation.joint_position.history=5'",
+            "'observation.joint_position' or 'observation.joint_velocity'? A parameter of a term that its file leaves "
+            "out takes a plus: '+observation.joint_position.history=5'",
         ),
         ("reward.foot_slip.wieght=-1", "no such key 'reward.foot_slip.wieght'; did you mean 'reward.foot_slip.weight'"),
         ("terrain=hilly", "terrain=hilly: unknown choice of terrain 'hilly'; known: flat, rough"),

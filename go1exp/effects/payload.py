@@ -22,8 +22,8 @@ class Payload(Effect):
     """A point mass on the trunk at (x, y, z) in its frame: mass, centre and inertia change together (Steiner).
 
     Walk-these-ways randomises -1 to 3 kg; published Go1 models disagree by 0.4 kg about the trunk itself. A negative
-    mass is taken away; the largest is four fifths of the robot's own 12.7 kg. A held trunk shows none of it. Fast motion
-    resembles ``strength`` the other way round; standing, its place looks like ``com_offset``.
+    mass is taken away; the largest is four fifths of the robot's own 12.7 kg. A held trunk shows none of it. Fast
+    motion resembles ``strength`` the other way round; standing, its place looks like ``com_offset``.
     """
 
     title = "a payload on the trunk"
