@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 
+from go1exp.cli.runs import shipped_policies
 from go1exp.cli.train import APP
 from go1exp.compose import compose
 from go1exp.config import parse_train
@@ -120,7 +121,7 @@ def test_from_the_command_line(
         (
             "nowhere",
             "start_from = 'nowhere': no run folder (it has no config.yaml) and no shipped policy "
-            "(there are: hop, paper, trot)",
+            f"(there are: {', '.join(sorted(shipped_policies()))})",
         ),
         (str(first), "ppo.hidden is [512, 256, 128] here"),
     ):
