@@ -1,8 +1,9 @@
-"""The whole sealed benchmark: ``python -m benchmarks.gap_full out=DIR seed=INT [jobs=2] [scale=1.0]``.
+"""The whole sealed benchmark: ``python -m benchmarks.gap_full out=DIR seed=INT [jobs=2] [scale=1.0] [kinds=null]``.
 
 Draws and seals the cases of every kind, solves them without their answers (``gap_solve``), scores all together, prints
 the table and writes ``OUT/gap.json`` (``docs/results/gap.json`` is one). What is done already is not done again, so an
-interrupted run goes on. ``scale`` makes all numbers of cases smaller or larger.
+interrupted run goes on. ``scale`` makes all numbers of cases smaller or larger (of single effects, half has them at
+the smaller size alone). ``kinds`` leaves out all others: a kind has the same cases whichever others are drawn with it.
 """
 
 from __future__ import annotations
@@ -50,22 +51,27 @@ def merged(out: Path, kinds: Sequence[str]) -> score.Score:
 def main(arguments: Sequence[str]) -> None:
     """Draw, solve, score."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
-    if not {"out", "seed"} <= set(given) <= {"out", "seed", "jobs", "scale"}:
-        raise SystemExit("usage: python -m benchmarks.gap_full out=DIR seed=INT [jobs=2] [scale=1.0]")
+    if not {"out", "seed"} <= set(given) <= {"out", "seed", "jobs", "scale", "kinds"}:
+        raise SystemExit("usage: python -m benchmarks.gap_full out=DIR seed=INT [jobs=2] [scale=1.0] [kinds=null,pair]")
+    kinds = tuple(given.get("kinds", ",".join(PLAN)).split(","))
+    if unknown := sorted({*kinds} - {*PLAN}):
+        raise SystemExit(f"kinds={unknown[0]}: there are {', '.join(PLAN)}")
     try:
         seed, scale = int(given["seed"]), float(given.get("scale", 1.0))
     except ValueError as error:
         raise SystemExit(f"seed must be a whole number and scale a number: {error}") from error
     out, jobs = Path(given["out"]), given.get("jobs", "2")
-    for k, (kind, (number, sizes)) in enumerate(PLAN.items()):
-        n = max(1, round(scale * number))
+    for kind in kinds:
+        number, sizes = PLAN[kind]
+        n, drawn_with = max(1, round(scale * number)), seed + list(PLAN).index(kind)
         print(f"{kind}: {n} cases", flush=True)
-        where = [f"out={out / kind}", f"seed={seed + k}", f"kinds={kind}", f"n={n}", f"sizes={sizes}"]
+        where = [f"out={out / kind}", f"seed={drawn_with}", f"kinds={kind}", f"n={n}", f"sizes={sizes}"]
         generate.main([*where, f"jobs={jobs}"])
         gap_solve.main([f"cases={out / kind}", f"out={out / f'out_{kind}'}", f"jobs={jobs}"])
-    total = merged(out, tuple(PLAN))
+    total = merged(out, kinds)
     print(score.table(total))
-    write_results(out / "gap.json", f"python -m benchmarks.gap_full seed={seed} scale={scale:g}", score.flat(total))
+    command = f"python -m benchmarks.gap_full seed={seed} scale={scale:g} kinds={','.join(kinds)}"
+    write_results(out / "gap.json", command, score.flat(total))
 
 
 if __name__ == "__main__":

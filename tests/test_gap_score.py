@@ -77,7 +77,8 @@ def test_single_effects() -> None:
     assert value(found, "param_error") == pytest.approx(0.1)  # 0.02 / 0.2 and 0.03 / 0.3
     assert value(found, "coverage") == pytest.approx(1 / 2)
     assert value(found, "closed_median") == pytest.approx(0.9)
-    assert value(found, "seconds_per_case") == 1.0
+    assert value(found, "seconds_per_case") == value(found, "seconds_single") == 1.0
+    assert value(found, "seconds_pair") is None
     assert value(found, "missing") == 1.0
     assert found.confusion["viscous", "kd_scale"] == 1
     assert found.confusion["armature", "-"] == 1

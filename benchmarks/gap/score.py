@@ -53,6 +53,9 @@ BARS = {
     "param_error": "<= 3 %",
     "coverage": "90-99 %",
     "closed_median": ">= 99 %",
+    "seconds_null": "<= 40",
+    "seconds_single": "<= 90",
+    "seconds_pair": "<= 150",
     "seconds_per_case": "<= 120",
 }
 
@@ -205,10 +208,16 @@ def judge(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
     score.figures["coverage"] = share(inside)
     closed = [float(c.result["closed"]) for c in library if c.result and c.result.get("closed") is not None]
     score.figures["closed_median"] = median(closed)
-    seconds = [float(c.result["seconds"]) for c in cases if c.result and c.result.get("seconds") is not None]
-    score.figures["seconds_per_case"] = median(seconds)
+    for kinds, name in ((("null", "near_null"), "null"), (("single",), "single"), (("pair",), "pair")):
+        score.figures[f"seconds_{name}"] = median([seconds for kind in kinds for seconds in _seconds(of(kind))])
+    score.figures["seconds_per_case"] = median(_seconds(cases))
     score.figures["missing"] = (float(sum(c.result is None for c in cases)), 0.0, 0.0, len(cases))
     return score
+
+
+def _seconds(cases: Iterable[Judged]) -> list[float]:
+    """Return the wall time of every case that has one, s."""
+    return [float(c.result["seconds"]) for c in cases if c.result and c.result.get("seconds") is not None]
 
 
 def _misses(score: Score, name: str, cases: list[tuple[Judged, bool]]) -> None:
