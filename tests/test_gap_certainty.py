@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from go1exp.effects.tolerances import DECLARED, declared
-from go1exp.gap.answer import Answer, sentence
+from go1exp.gap.answer import Answer, sentence, weak_joints
 from go1exp.gap.certainty import doubt
 from go1exp.gap.result import Candidate, GapSettings
 from go1exp.gap.search.ledger import LastCheck
@@ -90,3 +90,18 @@ def test_what_took_most_of_a_gap_is_said_though_it_is_not_named() -> None:
     assert "takes 74% away and yet is not named: too few windows show it" in text
     text = sentence(answer, Stub(candidates=tried(80.0)), {}, ())  # type: ignore[arg-type]
     assert "no effect of the library explains it" in text
+
+
+def test_a_joint_a_little_beyond_its_tolerance_is_weak_beside_a_strong_one() -> None:
+    """With 0.05 tolerated: 1.06 +- 0.03 beside 0.70 is weak; alone it is not, nor are 1.10 +- 0.03 and 0.85 +- 0.15."""
+    key = ("strength", "scale")
+
+    def weak(values: tuple[float, ...], spreads: tuple[float, ...]) -> tuple[int, ...]:
+        noise = np.random.default_rng(0).standard_normal((400, 4))
+        drawn = np.asarray(values) + 0.5 * np.asarray(spreads) * noise
+        search: Any = Stub()
+        return weak_joints(search, "strength", {key: np.asarray(values)}, {key: drawn})
+
+    assert weak((0.70, 1.06, 1.10, 0.85), (0.03, 0.03, 0.03, 0.15)) == (1,)
+    assert weak((1.0, 1.06, 1.0, 1.0), (0.03, 0.03, 0.03, 0.03)) == ()
+    assert weak((0.70, 1.04, 1.0, 1.0), (0.03, 0.03, 0.03, 0.03)) == ()

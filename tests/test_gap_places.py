@@ -75,6 +75,26 @@ def test_a_joint_that_held_out_windows_do_not_miss_is_left_out() -> None:
     assert at(cost, gain) == {JOINTS[5], JOINTS[8]}
 
 
+def test_fewer_joints_that_lose_little_are_to_be_fitted_the_fewest_first() -> None:
+    """One calf brings most, with its leg nearly all; all calves and a side are the best of four and of six."""
+    cost = np.full(12, 1.0)
+    cost[[3, 4, 5]] = 20.0, 120.0, 260.0
+    linear: Any = Quadratic({("link_mass", "scale"): np.full(12, 1.6)}, cost, np.zeros(12))
+    sets = [{5}, {3, 4, 5}, {2, 5, 8, 11}, {3, 4, 5, 9, 10, 11}]
+    assert places.fewer(linear, "link_mass", frozenset()) == sets
+    linear.theta = {("link_mass", "scale"): np.where(np.arange(12) == 5, 1.6, 1.05)}
+    assert places.fewer(linear, "link_mass", frozenset()) == []  # the others are within their tolerance
+
+
+def test_a_value_on_its_tolerance_is_not_beyond_it() -> None:
+    """A value that is clipped to 1 + 0.05 is 0.05 and 4e-17 away from 1."""
+    p = DECLARED.param(("link_mass", "scale"))
+    on, beyond = (np.full(12, p.null + far * p.tolerance) for far in (1.0, 1.001))
+    assert abs(on[0] - p.null) > p.tolerance
+    assert not evidence.beyond("link_mass", {("link_mass", "scale"): on}, JOINTS, DECLARED).any()
+    assert evidence.beyond("link_mass", {("link_mass", "scale"): beyond}, JOINTS, DECLARED).all()
+
+
 def test_joints_that_are_within_their_tolerance_are_not_asked() -> None:
     scale = np.ones(12)
     scale[3] = 2.0

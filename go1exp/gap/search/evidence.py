@@ -17,10 +17,15 @@ RELIEF = 4.0
 """Fall of chi2, were its tolerance wider, from which an effect is listed although the tolerances explain the data."""
 
 
+ROUNDING = 1e-9
+"""Share of a tolerance by which a value that was clipped to it may lie beyond it: 1.05 - 1 is more than 0.05."""
+
+
 def deviation(theta: Theta, key: Key, tolerances: Tolerances) -> np.ndarray:
-    """Return how far a parameter is from null, in tolerances."""
+    """Return how far a parameter is from null, in tolerances; 1 for a value that lies on its tolerance."""
     p = tolerances.param(key)
-    return np.asarray(np.abs(theta.get(key, np.array([p.null])) - p.null) / p.tolerance)
+    away = np.asarray(np.abs(theta.get(key, np.array([p.null])) - p.null) / p.tolerance)
+    return np.where(np.abs(away - 1.0) < ROUNDING, 1.0, away)
 
 
 def size(effect: str, theta: Theta, tolerances: Tolerances) -> float:

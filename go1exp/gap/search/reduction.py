@@ -56,14 +56,42 @@ def prune(search: Ledger) -> None:
         outside = np.flatnonzero(evidence.beyond(name, theta, joints, search.state.tolerances))
         inside = places.chosen(linear, name, kept, search.rng)
         kept |= {(name, int(j)) for j in outside if j not in inside}
-    if kept == search.state.kept:
-        return
+    if kept != search.state.kept:
+        keep_within(search, kept)
+    for name in search.state.terms:
+        concentrate(search, name)
+
+
+def concentrate(search: Ledger, name: str) -> None:
+    """Keep a term to the fewest joints with which, all else fitted again, held-out windows are no worse."""
+    linear, joints = places.Linear(search.state), search.state.machine.joints
+    outside = np.flatnonzero(evidence.beyond(name, search.state.theta, joints, search.state.tolerances))
+    for inside in places.fewer(linear, name, search.state.kept):
+        others = frozenset((name, int(j)) for j in outside if j not in inside)
+        sparse = search.state.keeping(search.state.kept | others).settled(3)
+        chi2 = sparse.held_out()
+        loss = -significance.gains(search.select_chi2, chi2[None])
+        worse = significance.max_t(loss, search.rng, len(search.state.machine.groups))[0]
+        if loss.mean() < significance.SAME and worse > places.DOUBTFUL:
+            search.state, search.select_chi2 = sparse, chi2
+            search.steps.append(("at fewer joints", excess(chi2)))
+            return
+
+
+def keep_within(search: Ledger, kept: frozenset[tuple[str, int]]) -> bool:
+    """Keep terms within tolerance at some joints, unless held-out windows miss that; return whether it was done.
+
+    Args:
+        search: whose state changes.
+        kept: effects and joints, those that are kept already among them.
+    """
     sparse = search.state.keeping(kept).settled(2)
     chi2 = sparse.held_out()
     if significance.gains(search.select_chi2, chi2[None]).mean() < -significance.SAME:
-        return  # what looked small in the linear model was not
+        return False  # what looked small in the linear model was not
     search.state, search.select_chi2 = sparse, chi2
     search.steps.append(("at fewer joints", excess(chi2)))
+    return True
 
 
 def symmetrical(search: Ledger) -> None:
