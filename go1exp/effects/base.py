@@ -99,8 +99,8 @@ class Effect(Memory):
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
     ``on_target`` and ``on_feedforward``, ``on_encoder``, ``on_error``, the actuator, ``on_drive``, ``on_transmission``,
-    ``on_gears``, then ``on_joint``, ``on_friction`` and ``on_base`` beside it. ``on_report`` is asked by whoever reads the
-    drives' torques.
+    ``on_gears``, then ``on_joint``, ``on_friction`` and ``on_base`` beside it. Whoever reads the
+    drives' torques asks ``on_report``.
     """
 
     title: ClassVar[str] = ""
@@ -165,7 +165,7 @@ class Effect(Memory):
         return torque
 
     def on_report(self, torque: Tensor) -> Tensor:
-        """Return what the drive reports of the ``torque`` that it makes. Called more than once a step: changes nothing."""
+        """Return what the drive reports of its ``torque``. Called more than once a step: changes nothing."""
         return torque
 
     def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
