@@ -447,7 +447,7 @@ def test_jitter_reorders_and_the_walk_goes_on(file: str, tmp_path: Path) -> None
     steps = np.rint(np.diff(r.t) / TICK)
     np.testing.assert_allclose(np.diff(r.t), steps * TICK, atol=1e-9)
     assert steps.min() == 1
-    assert (steps - 1).sum() == link["lost"] == pytest.approx(0.01 * len(r.t), abs=8)
+    assert link["lost"] - 3 <= (steps - 1).sum() <= link["lost"]  # some before the first command and while it brakes
     had = {round(clock / TICK): target for clock, target, _ in done.world.targets}
     assert r.joint("q_target").tobytes() == np.array([had[round(t / TICK)] for t in r.t]).tobytes()
     packets = done.account["packets"]
