@@ -2,7 +2,8 @@
 
 The walks of ``benchmarks/foot_contacts.py``; their states, 500 a second, go through a network that delays each by up
 to ``jitter`` more than the fastest and loses some. The runtime's estimator gets them as the link would deliver them,
-and is asked at each cycle. RMSE of the three components together, m/s, against the truth at the cycle less the fastest way:
+and is asked at each cycle. RMSE of the three components together, m/s, against the truth at the cycle less the fastest
+way:
 
 - in order of arrival: what was overtaken is left out, and the estimate is that of the newest state (how it was before);
 - in their turn: overtaken states are waited for, as ``KalmanEstimator`` does;
@@ -92,7 +93,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=3)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    print(f"| ground | s | cycles | jitter, ms | lost | age p50, p99, ms | {' | '.join(WAYS)} |")
+    print(f"| ground | s | cycles at | jitter, ms | lost | age p50, p99, ms | {' | '.join(WAYS)} |")
     print(f"|---|---|---|---|---|---|{'---|' * len(WAYS)}")
     for ground, recordings in walks(given.run, given.seconds, given.robots, given.seed):
         for rate in (50, 400):
