@@ -80,7 +80,7 @@ def _verdicts(outcome: Outcome, baseline: str) -> Table:
     note = (
         f"Against {baseline}. better, worse: the permutation test over runs (mean ranks) tells them apart at 5 % after"
         " the correction; not told apart: it does not. Differences of interquartile means, with Yuen's interval over"
-        " runs. On the same robots: the mean difference of these policies, robot by robot, and its interval over robots."
+        " runs. On the same robots: the difference of these policies robot by robot, mean and interval over the robots."
     )
     hopeless = [v for v in outcome.verdicts if v.hopeless]
     if hopeless:
