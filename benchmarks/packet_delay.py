@@ -44,8 +44,17 @@ def arrivals(rows: np.ndarray, jitter: float, loss: float, rng: np.random.Genera
 
 
 def _state(row: np.ndarray, t: float, clock: float) -> LowState:
-    parts = (readings.Q, readings.QD, readings.TAU, readings.QUAT, readings.GYRO, readings.ACC, readings.FOOT_FORCE)
-    return LowState(t, *(row[part] for part in parts), clock=clock)
+    return LowState(
+        t=t,
+        clock=clock,
+        joint_pos=row[readings.Q],
+        joint_vel=row[readings.QD],
+        joint_torque=row[readings.TAU],
+        imu_quat=row[readings.QUAT],
+        imu_gyro=row[readings.GYRO],
+        imu_acc=row[readings.ACC],
+        foot_force=row[readings.FOOT_FORCE],
+    )
 
 
 class AsTheyArrive:
