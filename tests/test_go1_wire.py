@@ -534,6 +534,12 @@ def test_without_the_ticks_unit_a_state_has_no_clock() -> None:
             other.sendto(sent(tick), address)
         assert [math.isnan(one.clock) for one in link.receive()] == [True, True]
         assert (link.traffic.late, link.traffic.lost) == (1, 0)
+        # The check before a walk measures the unit on this link: from then on states have a clock.
+        link.tick_s = 0.001
+        for tick in (6, 12, 10, 14):
+            other.sendto(sent(tick), address)
+        assert [round(1e3 * one.clock) for one in link.receive()] == [6, 12, 10, 14]
+        assert (link.traffic.overtaken, link.traffic.late, link.traffic.lost) == (1, 1, 1)
         link.close()
 
 

@@ -212,7 +212,7 @@ class Go1Link:
         self._last: int | None = None
         self._first = 0
         self._heard: deque[int] = deque(maxlen=KNOWN)
-        self._clock, self._packet = 0.0, go1_wire.IDLE
+        self._clock, self._packet = math.nan, go1_wire.IDLE
         self._spoken, self.sent_at = -math.inf, math.nan
 
     @property
@@ -249,8 +249,10 @@ class Go1Link:
             return self._overtaken(data, extra, tick, ahead)
         known = math.isfinite(self.tick_s)
         if ahead is None:
-            self._clock, self._first = tick * self.tick_s, tick
-        elif known:
+            self._first = tick
+        if ahead is None or math.isnan(self._clock):  # the first, or the first since the tick's unit is known
+            self._clock = tick * self.tick_s
+        else:
             # By whole ticks since the first: a float of a tick that has wrapped around would jump back.
             self._clock += ahead * self.tick_s
             self.traffic.lost += max(round(ahead * self.tick_s / go1_wire.PERIOD) - 1, 0)
