@@ -16,7 +16,7 @@ from go1exp.viewer.drive_window import PUSH_KEY, SLOW
 from go1exp.viewer.history import SPAN
 from go1exp.viewer.panels import EffectsPanel, PushPanel
 from go1exp.viewer.sim_show import SimView
-from go1exp.viewer.window import Vec2, Window, arrow_shape, paragraph, section
+from go1exp.viewer.window import MESSAGE_LINES, Vec2, Window, arrow_shape, paragraph, section
 
 PACKETS = 150.0
 """Height of the plot of intervals, pixels."""
@@ -67,10 +67,9 @@ class SimWindow(Window):
         imgui.SameLine()
         imgui.TextUnformatted(f"{view.time:.1f} s")
         paragraph(view.posture)
-        if view.slipped > BEHIND_S:
-            imgui.TextColored(SLOW, f"{1e3 * view.slipped:.0f} ms behind real time since it began")
-        if view.message:
-            paragraph(view.message)
+        late = f"{1e3 * view.slipped:.0f} ms behind real time since it began" if view.slipped > BEHIND_S else ""
+        imgui.TextColored(SLOW, late)
+        paragraph(view.message, MESSAGE_LINES)
         if section("Who speaks"):
             self._speaker(view)
         if section("Push"):
