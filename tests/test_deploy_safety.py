@@ -307,11 +307,12 @@ class Velocity:
 
     def update(self, state: LowState) -> np.ndarray:
         self.count += 1
-        if self.count >= self._fails_at:
-            if self._how == "raise":
-                raise FloatingPointError("singular")
-            return np.full(3, np.nan)
-        return np.array([self.count, 0.0, 0.0])
+        if self.count >= self._fails_at and self._how == "raise":
+            raise FloatingPointError("singular")
+        return self.ahead(0.0)
+
+    def ahead(self, age: float) -> np.ndarray:
+        return np.array([math.nan if self.count >= self._fails_at else self.count, 0.0, 0.0])
 
 
 def always(cycle: int) -> Sequence[LowState]:

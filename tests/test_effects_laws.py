@@ -374,6 +374,18 @@ def test_fixed_point_cuts_gains_and_torques_as_the_go1s_packets_do(
     assert isinstance(asked, go1_wire.MotorCommand)
     assert cut == pytest.approx([steps * values[0] for values in (asked.kp, asked.kd, asked.tau)], abs=1e-12)
     assert cut[1] < 2.35 < 2.35 + cut[1] - cut[2]
+    assert torch.equal(law.on_report(torque), law.on_feedforward(torque))  # the same field both ways
+
+
+def test_fixed_point_cuts_what_the_drives_report_and_not_what_they_make() -> None:
+    plant, plain = stand({"fixed_point": {"steps": 1.0}}), stand({})  # kp = 20 and kd = 0.5 are whole steps
+    for one in (plant, plain):
+        one.step(STANCE + 0.0123)
+    assert torch.equal(plant.torque, plain.torque)
+    made, reported = plain.torque[0].tolist(), plant.reported_torque()[0].tolist()
+    assert reported == [math.copysign(math.floor(abs(value) * 256) / 256, value) for value in made]
+    assert any(a != b for a, b in zip(made, reported, strict=True))
+    assert torch.equal(plain.reported_torque(), plain.torque)
 
 
 def test_strength_is_both_gains_and_viscous_friction_is_kd_while_no_drive_saturates() -> None:

@@ -543,7 +543,7 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
     observed: list[Any] = []
     link = SimpleNamespace(receive=lambda: [states[len(sent)]], send=sent.append, sent_at=0.0)
     commands = lambda t: trace["input.command"][len(sent)]  # noqa: E731
-    estimator = SimpleNamespace(update=lambda state: trace["input.base_lin_vel_b"][len(sent)])
+    estimator = SimpleNamespace(update=lambda state: None, ahead=lambda age: trace["input.base_lin_vel_b"][len(sent)])
     safety = Safety(robot.JOINTS, robot.JOINT_POS_LIMITS, np.array(good.metadata.torque_limit))
     runtime = Controller(
         good, cast(Link, link), commands, estimator, safety, stages=Stages(stand_up=0.0), on_cycle=observed.append

@@ -486,11 +486,15 @@ def test_a_link_leaves_out_what_is_old_doubled_or_damaged_and_counts_it(
     link, other, address = pair
     for data in (GOOD[:-1], VENDOR_COMMAND, GOOD[:80] + b"\7" + GOOD[81:], b""):
         other.sendto(data, address)
-    for tick in (10, 12, 12, 8, 18, 16, 10):
+    for tick in (10, 12, 12, 8, 18, 16, 10, 16):
         other.sendto(sent(tick), address)
-    assert [round(1e3 * one.clock) for one in link.receive()] == [10, 12, 18]
+    assert [round(1e3 * one.clock) for one in link.receive()] == [10, 12, 18, 16]  # 16 was overtaken
     traffic = link.traffic
-    assert (traffic.received, traffic.late, traffic.lost, traffic.foreign) == (3, 4, 2, 4)
+    assert (traffic.received, traffic.overtaken, traffic.late, traffic.lost, traffic.foreign) == (4, 1, 4, 1, 4)
+    for tick in (38, 26, 28):  # 12 and 10 ms older than the newest: the first is of no use any more
+        other.sendto(sent(tick), address)
+    assert [round(1e3 * one.clock) for one in link.receive()] == [38, 28]
+    assert (traffic.received, traffic.overtaken, traffic.late, traffic.lost) == (6, 2, 5, 9)
     assert traffic.refused_because == {"wrong size": 3, "wrong checksum": 1}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(sent(20), address)
@@ -500,10 +504,10 @@ def test_a_link_leaves_out_what_is_old_doubled_or_damaged_and_counts_it(
 
 def test_a_tick_wraps_around(pair: tuple[Go1Link, socket.socket, tuple[str, int]]) -> None:
     link, other, address = pair
-    for tick in (2**32 - 2, 0, 2):
+    for tick in (2**32 - 4, 0, 2**32 - 2, 2):
         other.sendto(sent(tick), address)
     clocks = [one.clock for one in link.receive()]
-    np.testing.assert_allclose(np.diff(clocks), 0.002, atol=1e-9)
+    np.testing.assert_allclose(np.diff(clocks), [0.004, -0.002, 0.004], atol=1e-9)
     assert link.traffic.late == 0
 
 
@@ -530,6 +534,12 @@ def test_without_the_ticks_unit_a_state_has_no_clock() -> None:
             other.sendto(sent(tick), address)
         assert [math.isnan(one.clock) for one in link.receive()] == [True, True]
         assert (link.traffic.late, link.traffic.lost) == (1, 0)
+        # The check before a walk measures the unit on this link: from then on states have a clock.
+        link.tick_s = 0.001
+        for tick in (6, 12, 10, 14):
+            other.sendto(sent(tick), address)
+        assert [round(1e3 * one.clock) for one in link.receive()] == [6, 12, 10, 14]
+        assert (link.traffic.overtaken, link.traffic.late, link.traffic.lost) == (1, 1, 1)
         link.close()
 
 

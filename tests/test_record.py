@@ -108,6 +108,15 @@ def test_the_reported_torque_is_the_law_of_the_drive_on_the_recorded_motion() ->
     assert np.std(r.joint("tau_est") - expected) < 0.05 * np.std(expected)
 
 
+def test_fixed_point_numbers_show_in_the_reported_torque() -> None:
+    plain, cut = (
+        make("excitation=[multisine]", "seconds=1.0", *NOISELESS, "sensors.jitter=0.0", *effect)[0].joint("tau_est")
+        for effect in ((), ("effect=fixed_point",))
+    )
+    np.testing.assert_allclose(cut * 256, np.trunc(plain * 256), atol=1e-9)  # gains of 20 and 0.5 are whole steps
+    assert np.abs(cut - plain).max() > 0.9 / 256
+
+
 def test_lost_samples_leave_gaps_and_no_trace() -> None:
     (r,) = make("excitation=[multisine]", "seconds=4.0", "sensors.dropped=0.1", "sensors.jitter=0.0")
     assert 1700 < len(r.t) < 1900

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from scipy import stats
 
 import go1exp.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.cli.report import _task
@@ -28,7 +29,7 @@ from go1exp.report.groups import baseline, groups
 from go1exp.report.made import Report, report
 from go1exp.report.runs import study
 from go1exp.report.settings import ReportSettings
-from go1exp.report.tables import tables
+from go1exp.report.tables import plain_rows, tables
 from go1exp.report.writing import page, write
 from go1exp.schema.registry import ConfigError
 from go1exp.schema.settings import parse
@@ -276,12 +277,48 @@ def test_few_runs_are_said_to_be_unable_to_tell(tmp_path: Path) -> None:
     assert "5 runs in each group could tell" in tables(got)[0]["note"]
     plain = made(tmp_path, correction="none", paired=True)
     assert all(v.difference.least_p == 2 / 8 for v in plain.outcomes[0].verdicts)
+    assert "6 runs in each group could tell" in tables(plain)[0]["note"]  # 2 / 2**6 < 0.05 < 2 / 2**5
+    alone = made(tmp_path, correction="none")
+    assert all(v.hopeless for v in alone.outcomes[0].verdicts)
+    assert "4 runs in each group could tell" in tables(alone)[0]["note"]  # 2 / 70 < 0.05 < 2 / 20
 
 
 def test_pairs_are_runs_of_one_seed(two_groups: Path) -> None:
     (outcome,) = made(two_groups, paired=True, correction="none").outcomes
     verdict = next(v for v in outcome.verdicts if v.column.name == "error_yaw")
     assert verdict.difference.p == pytest.approx(2 / 2**6)
+
+
+def test_policies_are_compared_on_the_same_robots_too(two_groups: Path) -> None:
+    """Against the robots of the files one by one: what the same friction does to both cancels."""
+    (outcome,) = made(two_groups, baseline="weight=10.0").outcomes
+    verdict = next(v for v in outcome.verdicts if v.column.name == "error_yaw")
+    robots = verdict.robots
+    assert robots is not None
+    values = {
+        side: np.array([table_of_run(two_groups / f"{side}{seed}")["error_yaw"] for seed in range(6)]).mean(axis=0)
+        for side in ("with", "without")
+    }
+    each = (values["without"] - values["with"]).reshape(len(COMMANDS), ROBOTS)
+    assert (robots.n, robots.estimate) == (each.size, pytest.approx(each.mean()))
+    error = math.sqrt(each.var(axis=1, ddof=1).mean() / each.size)
+    assert robots.high - robots.estimate == pytest.approx(stats.t.ppf(0.975, each.size - len(COMMANDS)) * error)
+    # Of unpaired robots the interval would be wider: most of their difference is that of their friction.
+    apart = math.sqrt(sum(one.reshape(3, ROBOTS).var(axis=1, ddof=1).mean() / each.size for one in values.values()))
+    assert error < 0.5 * apart
+    row = next(r for r in plain_rows(made(two_groups))["grid_comparison"] if r["figure"] == "error_yaw")
+    assert abs(row["same_robots"]) == pytest.approx(robots.estimate)
+
+
+def test_without_anything_random_there_are_no_robots_to_pair(tmp_path: Path) -> None:
+    for seed in range(2):
+        for weight in (10.0, 0.0):
+            folder = run(tmp_path / f"{weight}{seed}", seed, weight)
+            about = json.loads((folder / "eval.json").read_text())
+            about["settings"] |= {"noise": False, "randomize": False}
+            (folder / "eval.json").write_text(json.dumps(about))
+    (outcome,) = made(tmp_path).outcomes
+    assert all(v.robots is not None and math.isnan(v.robots.low) for v in outcome.verdicts)
 
 
 def test_a_protocols_rows_are_compared_by_its_claims(tmp_path: Path) -> None:

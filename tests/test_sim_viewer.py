@@ -173,15 +173,17 @@ def test_effects_that_cannot_be_are_refused_and_the_robot_stays(here: Here) -> N
 def test_the_timing_of_the_client_is_that_of_its_packets(here: Here) -> None:
     now = time.perf_counter()
     here.server.peer = ("127.0.0.1", 5)
-    for at in np.cumsum(np.r_[now - 0.9, np.full(99, 0.004), 0.030, np.full(9, 0.004)]):
-        here.probe._hear(float(at))
+    for k, at in enumerate(np.cumsum(np.r_[now - 0.9, np.full(99, 0.004), 0.030, np.full(9, 0.004)])):
+        here.probe._hear(float(at), b"%d" % (k // 5))  # each command five times: a cycle of 20 ms
     here.show.tick()
     view = here.show.view()
     assert view is not None
     p = view.packets
-    assert (p.p50, p.worst) == (pytest.approx(4.0), pytest.approx(30.0))
+    assert (p.every.p50, p.every.worst) == (pytest.approx(4.0), pytest.approx(30.0))
+    assert (p.new.p50, p.new.worst) == (pytest.approx(20.0), pytest.approx(46.0))
+    assert len(p.new.interval) == 110 / 5 - 1
     assert p.rate == 110
-    assert p.t[int(np.argmax(p.interval))] == pytest.approx(-0.9 + 99 * 0.004 + 0.030, abs=0.05)
+    assert p.every.t[int(np.argmax(p.every.interval))] == pytest.approx(-0.9 + 99 * 0.004 + 0.030, abs=0.05)
 
 
 def test_intervals_rate_and_who_speaks_are_seen_as_they_happen(here: Here) -> None:
@@ -201,19 +203,22 @@ def test_intervals_rate_and_who_speaks_are_seen_as_they_happen(here: Here) -> No
     assert p.speaking
     assert p.refused == {STRANGER: 1, "wrong size": 1}
     assert p.rate == here.server.counts.heard
-    assert 10.0 <= p.p50 <= p.p99 <= p.worst
-    assert len(p.interval) == here.server.counts.heard - 1
-    assert sum(p.interval) < 1e3 * SPAN
-    assert -SPAN < p.t[0] < p.t[-1] <= 0.0
+    assert 10.0 <= p.every.p50 <= p.every.p99 <= p.every.worst
+    assert len(p.every.interval) == here.server.counts.heard - 1
+    assert sum(p.every.interval) < 1e3 * SPAN
+    assert -SPAN < p.every.t[0] < p.every.t[-1] <= 0.0
+    assert p.new.interval == []  # the same packet all the time
 
 
 def test_another_speaker_begins_a_new_row_of_intervals(here: Here) -> None:
-    here.probe._hear(10.0)
-    here.probe._hear(10.5)
-    here.probe._hear(12.0)  # silent for more than a second: gone, and come again
+    here.probe._hear(10.0, b"a")
+    here.probe._hear(10.5, b"b")
+    here.probe._hear(12.0, b"b")  # silent for more than a second: gone, and come again
     here.server.peer = ("127.0.0.1", 5)
-    here.probe._hear(12.1)
-    assert [None if math.isnan(since) else since for _, since in here.probe._packets] == [None, 0.5, None, None]
+    here.probe._hear(12.1, b"b")
+    for column in (1, 2):
+        times = [packet[column] for packet in here.probe._packets]
+        assert [None if math.isnan(since) else since for since in times] == [None, 0.5, None, None]
 
 
 def test_a_page_that_does_not_ask_costs_a_gap_and_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,7 +280,7 @@ def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(capfd: p
     assert view is not None
     assert view.packets.peer is None
     assert view.packets.refused == {}
-    assert math.isnan(view.packets.worst)
+    assert math.isnan(view.packets.every.worst)
     process.close()
     assert process._process.exitcode == 0
     assert "lived for" in capfd.readouterr().out

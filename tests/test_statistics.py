@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from go1exp import data_root
 from go1exp.statistics import association, compare
-from go1exp.statistics.intervals import Interval, share_interval
+from go1exp.statistics.intervals import Interval, mean_interval, share_interval, stratified_mean_interval
 from go1exp.statistics.runs import (
     clustered_share,
     iqm,
@@ -66,6 +66,31 @@ def test_intervals_move_and_stretch_with_the_values() -> None:
 
 
 # ---------------------------------------------------------------------- rliable's examples
+
+
+def test_what_differs_between_strata_makes_nothing_uncertain() -> None:
+    rng = np.random.default_rng(4)
+    values, strata = rng.normal(size=(5, 8)), np.repeat(np.arange(5), 8).reshape(5, 8)
+    one = stratified_mean_interval(values, strata)
+    shifted = stratified_mean_interval(values + 10.0 * np.arange(5)[:, None], strata)
+    assert shifted.estimate - one.estimate == pytest.approx(20.0)
+    assert shifted.high - shifted.low == pytest.approx(one.high - one.low)
+    alone = stratified_mean_interval(values[0], np.zeros(8))
+    assert vars(alone) == pytest.approx(vars(mean_interval(values[0])))
+    # A stratum with fewer robots counts as much as the others, and is known less well.
+    fewer = stratified_mean_interval(values.ravel()[:-6], strata.ravel()[:-6])
+    means = [*values[:4].mean(axis=1), values[4, :2].mean()]
+    assert (fewer.n, fewer.estimate) == (34, pytest.approx(np.mean(means)))
+    assert math.isnan(stratified_mean_interval([1.0, 2.0], [0, 1]).low)
+
+
+def test_intervals_within_strata_hold_the_truth_in_nineteen_of_twenty_studies() -> None:
+    rng, strata = np.random.default_rng(7), np.repeat(np.arange(4), 5)
+    studies = rng.normal(size=(2000, 20)) + np.array([0.0, 3.0, -1.0, 5.0])[strata]
+    held = [
+        abs(i.estimate - 1.75) <= i.high - i.estimate for i in (stratified_mean_interval(s, strata) for s in studies)
+    ]
+    assert 0.93 <= np.mean(held) <= 0.97
 
 
 def test_the_examples_of_rliable_give_its_numbers() -> None:

@@ -151,6 +151,27 @@ def test_a_trial_whose_search_was_killed_goes_on_and_one_whose_search_lives_is_l
 
 
 @NEEDS_OPTUNA
+def test_a_training_that_does_not_end_holds_nobody_up_and_its_trial_goes_on_when_it_has(tmp_path: Path) -> None:
+    from optuna.trial import TrialState
+
+    study = searched(tmp_path, trials=1)._study()
+    trial = study.ask()
+    trial.suggest_float("ppo.gamma", 0.9, 0.999)
+    trial.set_user_attr(trials.SEARCH, "killed")
+    trial.set_user_attr(trials.FOLDER, "trial-0001")
+    (tmp_path / trials.SEARCHES / "killed").mkdir()
+    (tmp_path / "trial-0001").mkdir()
+    with run_lock.locked(tmp_path / "trial-0001"):
+        begin = time.monotonic()
+        assert trials.put_back(study, tmp_path, patience=0.2)
+        assert time.monotonic() - begin < 0.2 + 3 * trials.LOOK_S
+        assert trials.put_back(study, tmp_path, patience=0.0)
+        assert study.get_trials()[1].state is TrialState.RUNNING
+    assert not trials.put_back(study, tmp_path, patience=0.0)
+    assert [t.state for t in study.get_trials()[1:]] == [TrialState.FAIL, TrialState.WAITING]
+
+
+@NEEDS_OPTUNA
 def test_a_trial_whose_settings_are_refused_has_failed(tmp_path: Path) -> None:
     def refuse(overrides: Sequence[str], run: Path) -> None:
         raise ValueError("no such thing")

@@ -14,6 +14,7 @@ import numpy as np
 
 from go1exp.deploy.bundle import Bundle
 from go1exp.deploy.messages import Link, LowCmd, LowState
+from go1exp.deploy.packet_delay import PacketDelay
 from go1exp.deploy.past import PolicyMemory
 from go1exp.deploy.safety import Safety
 
@@ -62,7 +63,10 @@ class Estimator(Protocol):
     """Estimates the trunk's velocity from the robot's sensors."""
 
     def update(self, state: LowState) -> np.ndarray:
-        """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame."""
+        """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame, at the newest."""
+
+    def ahead(self, age: float) -> np.ndarray:
+        """Return the velocity (3,), m/s, ``age`` s after the newest state; NaN: the age is not known."""
 
 
 class Mover(Protocol):
@@ -94,8 +98,9 @@ class Cycle:
         velocity: (3,) the commanded velocity as the policy saw it.
         base_lin_vel: (3,) the estimate; NaN before the first.
         observation: (O,) input of the network; None unless walking.
-        fresh: the states received since the last cycle, oldest first.
+        fresh: the states received since the last cycle, in the order of arrival.
         sent_at: when the command left, s of the runtime's clock; NaN if none did.
+        age: time since the newest state was measured, less the fastest way, s; NaN if the robot tells no clock.
     """
 
     t: float
@@ -107,6 +112,7 @@ class Cycle:
     observation: np.ndarray | None
     fresh: Sequence[LowState] = ()
     sent_at: float = math.nan
+    age: float = math.nan
 
 
 class Controller:
@@ -167,6 +173,7 @@ class Controller:
         self._memory = PolicyMemory(about, about.policy_dt if rate is None else 1.0 / rate)
         self._target = self._nominal.copy()
         self._state: LowState | None = None
+        self._way, self._age = PacketDelay(), math.nan
         self._early: list[LowState] = []  # received before their cycle; of these so many are in the estimate
         self._estimated, self._failed_early = 0, cast("Exception | None", None)
         self._origin, self._halting = self._nominal, False
@@ -183,9 +190,13 @@ class Controller:
         self._begin = now if self._begin is None else self._begin
         fresh, estimated = [*self._early, *self._link.receive()], self._estimated
         self._early, self._estimated = [], 0
-        if fresh:
-            self._state = fresh[-1]
-        elif self._state is None and now - self._begin > self._stages.patience:
+        for each in fresh:
+            self._way.note(each.t, each.clock)
+            # `not <`: the clock may be NaN
+            self._state = each if self._state is None or not each.clock < self._state.clock else self._state
+        if self._state is not None:
+            self._age = self._way.age(now, self._state.clock)
+        elif now - self._begin > self._stages.patience:
             self.safety.fail("no_state", f"the robot has not said anything for {self._stages.patience:g} s", now)
         self._observation = None
         try:
@@ -202,7 +213,7 @@ class Controller:
             self._link.send(sent)
         command = sent if heard else None
         sent_at = self._link.sent_at if heard else math.nan
-        about = (self._velocity, self._base, self._observation, fresh, sent_at)
+        about = (self._velocity, self._base, self._observation, fresh, sent_at, self._age)
         self._on_cycle(Cycle(now, self.phase, self._state, command, *about))
         return self.phase != "damping" or now - self._since < self._stages.brake
 
@@ -221,7 +232,7 @@ class Controller:
         try:
             for state in self._link.receive():
                 self._early.append(state)
-                self._base = self._estimator.update(state)
+                self._estimator.update(state)
                 self._estimated += 1
         except Exception as error:
             self._failed_early = error
@@ -246,7 +257,8 @@ class Controller:
         if self._failed_early is not None:
             raise self._failed_early
         for each in unestimated:
-            self._base = self._estimator.update(each)
+            self._estimator.update(each)
+        self._base = self._estimator.ahead(self._age)
         if self.phase == "waiting":
             self.phase, self._since, self._origin = "standing_up", now, state.joint_pos.copy()
         if self.phase == "standing_up":

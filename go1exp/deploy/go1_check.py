@@ -16,6 +16,7 @@ import numpy as np
 
 from go1exp.deploy import go1_wire
 from go1exp.deploy.messages import LowState
+from go1exp.deploy.packet_delay import delays, spread
 from go1exp.deploy.safety import SafetyConfig, lean
 from go1exp.deploy.udp import Traffic
 from go1exp.estimation import FilterConfig
@@ -108,6 +109,12 @@ class Heard:
         seconds = (end - begin) / turned if turned > 0 else math.nan
         return next((unit for unit in TICKS_S if abs(seconds / unit - 1.0) < 0.1), math.nan)
 
+    @property
+    def delays(self) -> np.ndarray:
+        """Delays beyond the fastest packet, s, of those in ``ticks``; NaN if the unit of the tick is not known."""
+        clock = [go1_wire.newer(tick, self.ticks[0][0]) * self.tick_s for tick, _ in self.ticks]
+        return delays([arrived for _, arrived in self.ticks], clock)
+
 
 def listen(
     link: Looked,
@@ -187,9 +194,12 @@ def _packets(heard: Heard, link: Looked) -> list[str]:
     unit = f"{heard.tick_s:g} s" if math.isfinite(heard.tick_s) else "not known; times of arrival are used"
     refused = ", ".join(f"{count} x {why}" for why, count in traffic.refused_because.items()) or "none"
     counted = f"refused: {refused}; late or doubled {traffic.late}"
+    late = spread(heard.delays)
+    beyond = "not known" if late is None else ", ".join(f"{name} {1e3 * value:.2f}" for name, value in late.items())
     return [
         f"packets: {_rate(heard):.0f} a second; between two p50 {p50:.2f}, p99 {p99:.2f}, worst {gaps.max():.2f} ms",
         f"  {counted if traffic.complete else 'the SDK does not tell what it refuses'}; unit of the tick: {unit}",
+        f"  delay beyond the fastest packet's: {beyond}{'' if late is None else ' ms'}",
     ]
 
 

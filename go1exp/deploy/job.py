@@ -288,7 +288,7 @@ def _about(job: Job, bundle: Bundle, simulated: bool) -> About:
 
 
 def summary_lines(content: Mapping[str, Any]) -> list[str]:
-    """Return lines about the velocity of the walk and the timing of the simulated robot."""
+    """Return lines about the velocity of the walk, delays of packets and the timing of the simulated robot."""
     lines = []
     if velocity := content.get("velocity"):
         mean, rmse, off = (
@@ -297,6 +297,11 @@ def summary_lines(content: Mapping[str, Any]) -> list[str]:
         )
         lines.append(f"true velocity {mean} m/s over {velocity['distance']:.1f} m; RMSE of the estimate {rmse}")
         lines.append(f"RMSE against the command: x, y {off.rsplit(' ', 1)[0]} m/s, yaw {off.rsplit(' ', 1)[1]} rad/s")
+    if packets := content.get("packets"):
+        late, age = (
+            ", ".join(f"{name} {1e3 * value:.1f}" for name, value in packets[part].items()) for part in ("delay", "age")
+        )
+        lines.append(f"packets, beyond the fastest way: delay {late} ms; age of the newest at a cycle {age} ms")
     if robot := content.get("simulated_robot"):
         timing = robot["timing"]
         lines.append(

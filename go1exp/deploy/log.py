@@ -28,10 +28,10 @@ STATE = (
 )
 CYCLE = (
     *(("t", 1), ("phase", 1), ("number", 1), ("damping", 1), ("q_target", 12), ("command", 3), ("estimate", 3)),
-    ("sent_at", 1),
+    *(("sent_at", 1), ("age", 1)),
 )
 """Parts of a row: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0;
-``sent_at`` when it left."""
+``sent_at`` when it left; ``age`` as in ``Cycle``."""
 
 
 class Ring:
@@ -65,7 +65,11 @@ class Ring:
 
     def part(self, name: str) -> np.ndarray:
         """Return a part of all rows that are kept, (T, width), or (T,) if its width is 1."""
-        values = self.rows()[:, self.columns[name]]
+        return self.part_of(self.rows(), name)
+
+    def part_of(self, rows: np.ndarray, name: str) -> np.ndarray:
+        """Return a part of ``rows`` (T, ...), as ``part`` does of those that are kept."""
+        values = rows[:, self.columns[name]]
         return values[:, 0] if values.shape[1] == 1 else values
 
 
@@ -132,7 +136,8 @@ class Log:
             self._sent += 1
             self.first_command = cycle.t if self.first_command is None else self.first_command
             row[2], row[3], row[4:16] = self._sent, cycle.command.damping, cycle.command.joint_target
-        row[16:19], row[19:22], row[22] = cycle.velocity, cycle.base_lin_vel, cycle.sent_at
+        row[16:19], row[19:22] = cycle.velocity, cycle.base_lin_vel
+        row[22], row[23] = cycle.sent_at, cycle.age
         self.phases.setdefault(cycle.phase, cycle.t)
 
     def recording(
@@ -151,8 +156,8 @@ class Log:
         if rows is None:
             return None
         kept, targets = rows
-        clock = self.states.part("clock")[kept]
-        t = self.states.part("t")[kept] if np.isnan(clock).any() else clock
+        clock = self.measured("clock")[kept]
+        t = self.measured("t")[kept] if np.isnan(clock).any() else clock
         channels = self._channels(about, kept, targets)
         if truth is not None:
             channels |= _joined(truth, clock)
@@ -161,7 +166,7 @@ class Log:
         good &= np.isfinite(np.stack(list(channels.values()))).all(axis=0)
         if good.sum() < 2:
             return None
-        known = obeyed is not None or (self.states.part("in_force")[kept] >= 0).all()
+        known = obeyed is not None or (self.measured("in_force")[kept] >= 0).all()
         notes = [about.notes, "" if known else UNKNOWN_DELAY]
         notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
         channels = {name: np.ascontiguousarray(values[good]) for name, values in {"t": t, **channels}.items()}
@@ -171,29 +176,41 @@ class Log:
         """Return what was measured in the states ``kept`` (S,) bool, by column, each (T,), with targets (T, J)."""
         from go1exp.recording import FOOT_FORCE, VECTORS, joint_channels
 
-        states, joints = self.states, about.metadata.joints
+        joints = about.metadata.joints
         channels: dict[str, np.ndarray] = {}
         for name in ("q", "qd", "tau_est"):
-            channels |= dict(zip(joint_channels(name, joints), states.part(name)[kept].T, strict=True))
+            channels |= dict(zip(joint_channels(name, joints), self.measured(name)[kept].T, strict=True))
         channels |= dict(zip(joint_channels("q_target", joints), targets.T, strict=True))
-        quat = states.part("imu_quat")[kept]
+        quat = self.measured("imu_quat")[kept]
         length = np.linalg.norm(quat, axis=1, keepdims=True)
         quat = quat / np.where(length > 0.5, length, np.nan)  # an IMU that has not started has no attitude
-        vectors = {"imu_quat": quat} | {name: states.part(name)[kept] for name in ("imu_gyro", "imu_acc")}
+        vectors = {"imu_quat": quat} | {name: self.measured(name)[kept] for name in ("imu_gyro", "imu_acc")}
         for name, values in vectors.items():
             channels |= dict(zip(VECTORS[name], values.T, strict=True))
         if about.newton:
-            feet = states.part("foot_force")[kept]
+            feet = self.measured("foot_force")[kept]
             channels |= {FOOT_FORCE + leg: feet[:, k] for k, leg in enumerate(about.metadata.legs)}
         return channels
 
+    def measured(self, name: str) -> np.ndarray:
+        """Return a part of the states that are kept, (T, ...), in the order in which they were measured.
+
+        A state that others overtook on the way arrived, as far as commands go, no later than those.
+        """
+        rows = self.states.rows()
+        clock = self.states.part_of(rows, "clock")
+        if np.isnan(clock).any() or (np.diff(clock) >= 0.0).all():
+            return self.states.part_of(rows, name)
+        part = self.states.part_of(rows, name)[np.argsort(clock, kind="stable")]
+        return np.minimum.accumulate(part[::-1])[::-1] if name == "t" else part
+
     def _numbered(self) -> bool:
         """Return whether the robot told in its states which command was in force."""
-        return bool((self.states.part("in_force") >= 0).any())
+        return bool((self.measured("in_force") >= 0).any())
 
     def _as_told(self, obeyed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""
-        clock = self.states.part("clock")
+        clock = self.measured("clock")
         if not len(obeyed) or not len(clock) or np.isnan(clock).any():
             return None
         nearest = np.clip(np.searchsorted(obeyed[:, 0], clock - 1e-6), 0, len(obeyed) - 1)
@@ -207,9 +224,9 @@ class Log:
             return None
         number, at = self.cycles.part("number")[sent], self.cycles.part("t")[sent]
         damping, target = self.cycles.part("damping")[sent] > 0, self.cycles.part("q_target")[sent]
-        known = self.states.part("in_force")
+        known = self.measured("in_force")
         # If the robot does not report the command in force, the newest one sent by then is taken.
-        by_number, by_time = np.searchsorted(number, known), np.searchsorted(at, self.states.part("t"), "right") - 1
+        by_number, by_time = np.searchsorted(number, known), np.searchsorted(at, self.measured("t"), "right") - 1
         k = np.where(known >= 0, by_number, by_time)
         in_force = (k >= 0) & (k < len(number)) & (known != 0) & ((known < 0) | (known >= number[0]))
         place = np.clip(k, 0, len(number) - 1)

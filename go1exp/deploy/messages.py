@@ -9,6 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
+OVERTAKEN_S = 0.01
+"""How much older than the newest a state may be and still be taken, s: 5 ms of jitter, and as much again."""
+
 
 @dataclass(frozen=True)
 class LowState:
@@ -69,7 +72,10 @@ class Link(Protocol):
     sent_at: float
 
     def receive(self) -> Sequence[LowState]:
-        """Return the states that have arrived since the last call, oldest first, without waiting."""
+        """Return the states that have arrived since the last call, in the order of arrival, without waiting.
+
+        None comes twice. One that others overtook, by ``OVERTAKEN_S`` at most, comes after them; its ``clock`` tells.
+        """
 
     def send(self, command: LowCmd) -> None:
         """Send a command, without waiting."""

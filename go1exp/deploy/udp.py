@@ -7,16 +7,20 @@ import math
 import socket
 import struct
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from go1exp.deploy import go1_wire, wire
-from go1exp.deploy.messages import LowCmd, LowState
+from go1exp.deploy.messages import OVERTAKEN_S, LowCmd, LowState
 
 HOST = "127.0.0.1"
 AT_ONCE = 1024
 """Most datagrams that one call reads: a flood of them delays a cycle but does not stop it."""
+
+KNOWN = 64
+"""Newest ticks that are remembered, so that no state is taken twice: more than ``OVERTAKEN_S`` holds."""
 
 GREETING_S = 0.1
 """Period at which a hello is sent until the robot answers, s: a hello can be lost."""
@@ -39,8 +43,9 @@ class Traffic:
         repeated: commands that were sent again between two cycles.
         foreign: datagrams that were not a state of this version.
         refused_because: these by their reason, where the protocol tells.
-        late: states older than one received before, or received twice; they are left out.
-        lost: states missing in the robot's count (a late one counts here too).
+        overtaken: states of ``received`` that came after a newer one (of the Go1's protocol, where the tick is known).
+        late: states received twice, or too late to be of use; they are left out.
+        lost: states missing in the robot's count (one that came too late counts here too).
         refused: times that the port at the other end was closed.
         complete: whether all of this is counted; else only what was received and sent is known.
     """
@@ -50,6 +55,7 @@ class Traffic:
     repeated: int = 0
     foreign: int = 0
     refused_because: dict[str, int] = field(default_factory=dict)
+    overtaken: int = 0
     late: int = 0
     lost: int = 0
     refused: int = 0
@@ -132,7 +138,7 @@ class UdpLink:
         self.traffic = self._datagrams.traffic
 
     def receive(self) -> Sequence[LowState]:
-        """Return the states that have arrived since the last call, oldest first, without waiting."""
+        """Return the states that have arrived since the last call, in the order of arrival, without waiting."""
         states = []
         for data, extra in self._datagrams.arrived():
             state = self._taken(data, extra)
@@ -204,7 +210,9 @@ class Go1Link:
         self._datagrams = Datagrams(port, host, go1_wire.STATE_SIZE)
         self.traffic, self.tick_s, self.newest = self._datagrams.traffic, tick_s, b""
         self._last: int | None = None
-        self._clock, self._packet = 0.0, go1_wire.IDLE
+        self._first = 0
+        self._heard: deque[int] = deque(maxlen=KNOWN)
+        self._clock, self._packet = math.nan, go1_wire.IDLE
         self._spoken, self.sent_at = -math.inf, math.nan
 
     @property
@@ -218,7 +226,7 @@ class Go1Link:
         return go1_wire.unpack_health(self.newest) if self.newest else None
 
     def receive(self) -> Sequence[LowState]:
-        """Return the states that have arrived since the last call, oldest first, without waiting."""
+        """Return the states that have arrived since the last call, in the order of arrival, without waiting."""
         states = []
         for data, extra in self._datagrams.arrived():
             state = self._taken(data, extra)
@@ -238,18 +246,32 @@ class Go1Link:
         tick = go1_wire.tick_of(data)
         ahead = None if self._last is None else go1_wire.newer(tick, self._last)
         if ahead is not None and ahead <= 0:
-            self.traffic.late += 1
-            return None
+            return self._overtaken(data, extra, tick, ahead)
         known = math.isfinite(self.tick_s)
         if ahead is None:
+            self._first = tick
+        if ahead is None or math.isnan(self._clock):  # the first, or the first since the tick's unit is known
             self._clock = tick * self.tick_s
-        elif known:
+        else:
             # By whole ticks since the first: a float of a tick that has wrapped around would jump back.
             self._clock += ahead * self.tick_s
             self.traffic.lost += max(round(ahead * self.tick_s / go1_wire.PERIOD) - 1, 0)
         self.traffic.received += 1
         self._last, self.newest = tick, data
+        self._heard.append(tick)
         return go1_wire.unpack_state(data, arrival(extra), self._clock if known else math.nan)
+
+    def _overtaken(self, data: bytes, extra: list[tuple[int, int, bytes]], tick: int, ahead: int) -> LowState | None:
+        """Return a state of ``ahead`` <= 0 ticks after the newest one; None if it is doubled, or of no use any more."""
+        awaited = go1_wire.newer(tick, self._first) > 0 and tick not in self._heard
+        if not (awaited and -ahead * self.tick_s <= OVERTAKEN_S + 1e-9):  # NaN too: its age is not known
+            self.traffic.late += 1
+            return None
+        self.traffic.received += 1
+        self.traffic.overtaken += 1
+        self.traffic.lost -= 1
+        self._heard.append(tick)
+        return go1_wire.unpack_state(data, arrival(extra), self._clock + ahead * self.tick_s)
 
     def send(self, command: LowCmd) -> None:
         """Send a command, without waiting.

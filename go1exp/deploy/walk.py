@@ -24,6 +24,7 @@ from go1exp.deploy.estimate import BOTH, TORQUE, KalmanEstimator, NoEstimator, s
 from go1exp.deploy.log import About, Log, write_cycles
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.messages import Link
+from go1exp.deploy.packet_delay import delays, spread
 from go1exp.deploy.safety import RULES, Fault, Safety, SafetyConfig
 from go1exp.estimation.feet import FootCalibration
 from go1exp.files import write_json
@@ -303,11 +304,24 @@ def account(bundle: Bundle, plan: Plan, outcome: Outcome, extra: Mapping[str, An
         "clamped": dict(zip(joints, map(int, outcome.safety.clamped), strict=True)),
         "commands_cut": dict(zip(("x", "y", "yaw"), map(int, outcome.commands.cut), strict=True)),
         "estimator": outcome.estimator,
+        "packets": packet_delays(log),
         "first_command_after_s": None if start is None or lived is None else lived - (time.perf_counter() - start),
         "memory_mb": outcome.memory_mb,
         "log": {"states": log.states.count, "overwritten": log.states.overwritten},
         **extra,
     }
+
+
+def packet_delays(log: Log) -> dict[str, Any] | None:
+    """Return how late packets came, and how old the newest state of a cycle was, s; None where no clock is told.
+
+    Returns:
+        ``delay`` of the states that are kept, and ``age`` at the cycles: each with p50, p99 and worst, both without the
+        time that the fastest packet takes, which is not known.
+    """
+    late = spread(delays(log.states.part("t"), log.states.part("clock")))
+    age = spread(log.cycles.part("age"))
+    return None if late is None or age is None else {"delay": dict(late), "age": dict(age)}
 
 
 def save(
@@ -342,30 +356,37 @@ def save(
 def velocity_errors(log: Log, truth: Mapping[str, np.ndarray]) -> dict[str, Any] | None:
     """Compare estimate and command with the truth, cycle by cycle while walking; None if there is nothing to compare.
 
+    The truth is that at the cycle, less the time that the fastest packet takes: nobody knows that one on a real robot.
+
     Returns:
         ``mean`` true velocity (3,), m/s in the trunk's frame; RMSE of the estimate, ``estimate_rmse`` (3,), and of the
         walk against its command after a second, ``tracking_rmse``: x and y in m/s, yaw in rad/s; ``distance``, m.
     """
     from go1exp.deploy.controller import PHASES
 
-    known = np.isfinite(log.states.part("clock"))
+    arrived, clock = log.states.part("t"), log.states.part("clock")
+    known = np.isfinite(clock)
     at = log.cycles.part("t")
     walking = (log.cycles.part("phase") == PHASES.index("walking")) & np.isfinite(log.cycles.part("estimate")).all(1)
     if not known.any() or not walking.any() or not truth:
         return None
-    newest = np.searchsorted(log.states.part("t")[known], at[walking], "right") - 1
-    clock = log.states.part("clock")[known][np.maximum(newest, 0)]
-    k = np.clip(np.searchsorted(truth["clock"], clock - 1e-6), 0, len(truth["clock"]) - 1)
-    w, x, y, z = (truth[f"base_quat_{part}"][k] for part in "wxyz")
-    v = np.stack([truth[f"base_lin_vel_{axis}_w"][k] for axis in "xyz"], axis=1)
+    newest = np.searchsorted(arrived[known], at[walking], "right") - 1
+    when = np.maximum.accumulate(clock[known])[np.maximum(newest, 0)] + log.cycles.part("age")[walking]
+    w, x, y, z = (truth[f"base_quat_{part}"] for part in "wxyz")
+    v = np.stack([truth[f"base_lin_vel_{axis}_w"] for axis in "xyz"], axis=1)
     turn = np.stack([x, y, z], axis=1)
     # R' v = v - 2 w (u x v) + 2 u x (u x v), u the vector part
     cross = np.cross(turn, v)
-    body = v - 2.0 * w[:, None] * cross + 2.0 * np.cross(turn, cross)
-    true = np.column_stack([body[:, :2], truth["base_ang_vel_z_b"][k]])
+    every = v - 2.0 * w[:, None] * cross + 2.0 * np.cross(turn, cross)
+
+    def then(values: np.ndarray) -> np.ndarray:
+        return np.interp(when, truth["clock"], values)
+
+    body = np.stack([then(values) for values in every.T], axis=1)
+    true = np.column_stack([body[:, :2], then(truth["base_ang_vel_z_b"])])
     late = at[walking] - at[walking][0] >= min(1.0, 0.5 * (at[walking][-1] - at[walking][0]))
     off = true[late] - log.cycles.part("command")[walking][late]
-    place = np.stack([truth["base_pos_x_w"][k], truth["base_pos_y_w"][k]], axis=1)
+    place = np.stack([then(truth["base_pos_x_w"]), then(truth["base_pos_y_w"])], axis=1)
     return {
         "mean": body[late].mean(axis=0).tolist(),
         "estimate_rmse": np.sqrt(np.mean((log.cycles.part("estimate")[walking] - body) ** 2, axis=0)).tolist(),

@@ -99,7 +99,8 @@ class Effect(Memory):
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
     ``on_target`` and ``on_feedforward``, ``on_encoder``, ``on_error``, the actuator, ``on_drive``, ``on_transmission``,
-    ``on_gears``, then ``on_joint``, ``on_friction`` and ``on_base`` beside it.
+    ``on_gears``, then ``on_joint``, ``on_friction`` and ``on_base`` beside it. Whoever reads the
+    drives' torques asks ``on_report``.
     """
 
     title: ClassVar[str] = ""
@@ -160,7 +161,11 @@ class Effect(Memory):
         return kp, kd
 
     def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the torque that the motor really makes; it is the one that the drive reports. q, qd: the encoder's."""
+        """Return the torque that the motor really makes. q, qd: the encoder's."""
+        return torque
+
+    def on_report(self, torque: Tensor) -> Tensor:
+        """Return what the drive reports of its ``torque``. Called more than once a step: changes nothing."""
         return torque
 
     def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:

@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 @effect("fixed_point", gains=True)
 class FixedPoint(Effect):
-    """Commanded gains and feed-forward torques are cut towards zero to whole steps: ``steps`` times those of a Go1.
+    """Gains, feed-forward torques and reported torques are cut towards zero to whole steps, ``steps`` times a Go1's.
 
-    A Go1's packets carry kp in steps of 1/32 N m/rad, kd of 1/16 N m s/rad, torque of 1/256 N m
+    A Go1's packets carry kp in steps of 1/32 N m/rad, kd of 1/16 N m s/rad, torque of 1/256 N m both ways
     (``deploy/go1_wire.py``, read off the vendor's client), so that kd = 0.3 becomes 0.25 and kd = 0.5 stays. Targets
-    are floats and stay as they are. Only what is commanded is cut: the torque that a drive reports is not (that of
-    ``deploy`` is, by the packets themselves; its step is 1.1 mN m of noise). The packets' range is never reached by a
-    Go1. It changes nothing but gains and torques that are fed forward, so recordings at one gain cannot tell it from
+    are floats and stay as they are. The torque that acts is not cut, only what the drive reports of it: policies that
+    observe it, recordings and the replay of ``gap`` have its steps. The packets' range is never reached by a Go1. What
+    moves differently are gains and torques that are fed forward, so recordings at one gain cannot tell it from
     ``kp_scale``, ``kd_scale``, ``viscous``.
     """
 
-    title = "fixed-point numbers in the commands"
+    title = "fixed-point numbers in commands and reported torques"
     params = (Param("steps", "-", 0.0, 8.0, 0.0, 1.0, "robot", "steps over those of a Go1's packets; 0: none"),)
     identification = Identification(
         levels=({"steps": 4.0},),
@@ -45,6 +45,10 @@ class FixedPoint(Effect):
 
     def on_feedforward(self, torque: Tensor) -> Tensor:
         """Return the torque that the packets carry."""
+        return self._cut(torque, TORQUE_STEP)
+
+    def on_report(self, torque: Tensor) -> Tensor:
+        """Return the torque that the packets carry back."""
         return self._cut(torque, TORQUE_STEP)
 
     def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term
 
 HOOKS = (
-    *("on_target", "on_feedforward", "on_encoder", "on_error", "on_gains", "on_drive"),
+    *("on_target", "on_feedforward", "on_encoder", "on_error", "on_gains", "on_drive", "on_report"),
     *("on_transmission", "on_gears", "on_joint", "on_friction", "on_base"),
 )
 
@@ -138,6 +138,12 @@ class EffectStack:
             torque = effect.on_drive(torque, q, qd)
         return torque
 
+    def on_report(self, torque: Tensor) -> Tensor:
+        """Return the torque that the drives report."""
+        for effect in self._acting["on_report"]:
+            torque = effect.on_report(torque)
+        return torque
+
     def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque that reaches the joints."""
         for effect in self._acting["on_transmission"]:
@@ -177,8 +183,9 @@ class EffectStack:
 
     @property
     def senses(self) -> bool:
-        """Whether any effect changes what the sensors say."""
-        return self.acts("on_sensor") or self.acts("on_encoder") or self.rotors is not None
+        """Whether any effect changes what the sensors or the drives say."""
+        hooks = ("on_sensor", "on_encoder", "on_report")
+        return any(self.acts(hook) for hook in hooks) or self.rotors is not None
 
     # ------------------------------------------------------------------ state
 

@@ -131,6 +131,10 @@ class Plant:
         if self._rotors:
             self._rotors.reset(mask)
 
+    def reported_torque(self) -> Tensor:
+        """(N, J) what the drives report of ``torque``, N m; never to be written to."""
+        return self.effects.on_report(self.torque)
+
     def speed(self) -> Tensor:
         """(N, J) joint speeds at the instant of ``q``, rad/s."""
         return torch.lerp(self._before, self.qd, 1.5)
@@ -230,6 +234,7 @@ class Plant:
         assert sensed.gravity is not None
         assert sensed.gyro is not None
         joints = {"joint_pos": sensed.joint_pos.float(), "joint_vel": sensed.joint_vel.float()}
+        joints["joint_torque"] = self.reported_torque().float()
         return dataclasses.replace(s, **joints, projected_gravity_b=sensed.gravity, base_ang_vel_b=sensed.gyro)
 
     _STATE = ("before", "target", "bound", "inertia")

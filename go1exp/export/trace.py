@@ -32,7 +32,7 @@ def readings(core: Go1Core) -> dict[str, Tensor]:
         "imu_gyro": measured.gyro,
         "imu_quat": measured.quat,
         "base_lin_vel_b": s.base_lin_vel_b,
-        "joint_torque": s.joint_torque,
+        "joint_torque": core.plant.reported_torque(),
         "joint_target": s.joint_target,
         "command": s.command,
         "previous_action": s.action,

@@ -68,7 +68,7 @@ def sample(plant: Plant, target: Tensor) -> dict[str, Tensor]:
         "q": measured.joint_pos,
         "qd": measured.joint_vel,
         "q_target": target,
-        "tau_est": plant.torque,
+        "tau_est": plant.reported_torque(),
         "gyro": measured.gyro,
         "acc": measured.acc,
         "quat": measured.quat,

@@ -11,13 +11,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.protocol.quantities import Column
+from go1exp.protocol.quantities import ROBOT, Column
 from go1exp.report.evaluations import Judged
 from go1exp.report.groups import Group
 from go1exp.schema.registry import ConfigError, unknown_name
 from go1exp.statistics import compare
 from go1exp.statistics.compare import Word
-from go1exp.statistics.intervals import Interval
+from go1exp.statistics.intervals import Interval, stratified_mean_interval
 from go1exp.statistics.runs import clustered_share, iqm_interval, pooled_share, share_bootstrap
 
 Floats = NDArray[np.float64]
@@ -60,6 +60,7 @@ class Verdict:
         word: better, worse or not told apart.
         needed: runs in each group that would tell a difference like the one seen; None if it is told, or none was seen.
         hopeless: whether even a clear difference could not have been told with so few runs among so many comparisons.
+        robots: the difference robot by robot, of these policies; None where no two robots of a condition differ.
     """
 
     group: str
@@ -71,6 +72,7 @@ class Verdict:
     word: Word
     needed: int | None
     hopeless: bool
+    robots: Interval | None
 
 
 def means(judged: Judged, group: Group, column: Column, rows: dict[Path, NDArray[np.bool_]] | None = None) -> Floats:
@@ -176,8 +178,43 @@ def compared(
             needed = compare.runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=level)
         first, other = (float(iqm_interval(v).estimate) for v in (b, a))
         hopeless = not d.least_p * family <= compare.ALPHA
-        entries.append(Verdict(group.name, column, first, other, d, p, said_word, needed, hopeless))
+        robots = by_robot(judged, group, baseline, column)
+        entries.append(Verdict(group.name, column, first, other, d, p, said_word, needed, hopeless, robots))
     return entries
+
+
+def by_robot(judged: Judged, group: Group, baseline: Group, column: Column) -> Interval | None:
+    """Return how a group's policies differ from the baseline's on the same robots; None without such pairs.
+
+    All evaluations have one seed: the k-th robot of a condition is the same for every policy. Of each robot it is the
+    mean over the group's runs less that over the baseline's, with the interval over robots, condition by condition. It
+    says how certain the difference of these policies is, and nothing of other training seeds.
+    """
+    sides = [
+        [judged.runs[run.folder].table for run in side.runs if run.folder in judged.runs] for side in (group, baseline)
+    ]
+    tables = [table for side in sides for table in side]
+    keys = [key for key in (*judged.keys, ROBOT) if key in tables[0]] if tables else []
+    if not all(sides) or ROBOT not in keys or any(column.name not in table for table in tables):
+        return None
+    rows = [list(zip(*(table[key].tolist() for key in keys), strict=True)) for table in tables]
+    if any(sorted(each) != sorted(rows[0]) for each in rows) or len(set(rows[0])) < len(rows[0]):
+        return None
+    places = [sorted(range(len(each)), key=each.__getitem__) for each in rows]
+    values = np.array(
+        [table[column.name][place] for table, place in zip(tables, places, strict=True)], dtype=np.float64
+    )
+    here, there = np.split(values, [len(sides[0])])
+    conditions = {row[:-1]: k for k, row in enumerate(sorted(rows[0]))}
+    strata = [conditions[row[:-1]] for row in sorted(rows[0])]
+    return stratified_mean_interval(_mean(here) - _mean(there), strata)
+
+
+def _mean(values: Floats) -> Floats:
+    """Return the mean over the first axis of what is defined; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    return np.asarray(np.where(known, values, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan))
 
 
 def _samples(judged: Judged, group: Group, baseline: Group, column: Column, paired: bool) -> tuple[Floats, Floats]:

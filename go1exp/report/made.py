@@ -14,6 +14,7 @@ from go1exp.report.groups import Group, baseline, groups
 from go1exp.report.runs import Study
 from go1exp.report.sensitivity import Sensitivity, sensitivities
 from go1exp.report.settings import ReportSettings
+from go1exp.statistics.compare import runs_that_can_tell
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Outcome:
         figures: of all conditions together.
         by_condition: of each condition.
         verdicts: against the baseline; none of one group alone.
+        can_tell: least number of runs in each group with which so many comparisons can tell anything; None for none.
         sensitivities: what goes with the main figures.
     """
 
@@ -32,6 +34,7 @@ class Outcome:
     figures: list[Figure]
     by_condition: list[Figure]
     verdicts: list[Verdict]
+    can_tell: int | None
     sensitivities: list[Sensitivity]
 
 
@@ -77,5 +80,7 @@ def report(study: Study, settings: ReportSettings, plain: dict[str, Any]) -> Rep
         if not any(run.folder in judged.runs for run in first.runs):
             study.notes.append(f"{judged.name}: the baseline has none, so that nothing is compared with it")
         each = by_condition(judged, made)
-        outcomes.append(Outcome(judged, table(judged, made), each, verdicts, sensitivities(judged, made)))
+        together = max(len(verdicts), 1) if settings.correction == "holm" else 1
+        can_tell = runs_that_can_tell(settings.paired, together)
+        outcomes.append(Outcome(judged, table(judged, made), each, verdicts, can_tell, sensitivities(judged, made)))
     return Report(study, made, first, drawn, outcomes, plain)

@@ -11,7 +11,7 @@ from go1exp.protocol.report.words import condition_text, number
 from go1exp.report.drawings import label
 from go1exp.report.figures import Figure, Verdict
 from go1exp.report.made import Outcome, Report
-from go1exp.statistics.compare import RESAMPLES, runs_that_can_tell
+from go1exp.statistics.compare import RESAMPLES
 from go1exp.statistics.intervals import Interval
 
 ORDER = ("better", "worse", "not told apart")
@@ -52,28 +52,43 @@ def _verdicts(outcome: Outcome, baseline: str) -> Table:
         gain = d.improvement if better == "higher" else 1.0 - d.improvement
         chance = number(gain) if math.isfinite(gain) else ""
         between = _cell(d.estimate, f"n {d.estimate.n}")
+        robots = "" if v.robots is None else _cell(v.robots, f"n {v.robots.n}")
         pair = [number(x) if math.isfinite(x) else "" for x in (v.first, v.other)]
         rows.append(
-            [{"name": v.group, "note": label(v.column)}, {"word": v.word}, *pair, between, p, effect, chance, needed]
+            [
+                {"name": v.group, "note": label(v.column)},
+                {"word": v.word},
+                *pair,
+                between,
+                robots,
+                p,
+                effect,
+                chance,
+                needed,
+            ]
         )
-    header = ["group", "verdict", "baseline", "group's", "difference [95 %] n", "p after Holm (alone)"]
+    header = [
+        "group",
+        "verdict",
+        "baseline",
+        "group's",
+        "difference [95 %] n",
+        "on the same robots",
+        "p after Holm (alone)",
+    ]
     header += ["effect size g", "better with probability", "runs that would tell"]
     note = (
         f"Against {baseline}. better, worse: the permutation test over runs (mean ranks) tells them apart at 5 % after"
-        " the correction; not told apart: it does not. Differences of interquartile means, with Yuen's interval."
+        " the correction; not told apart: it does not. Differences of interquartile means, with Yuen's interval over"
+        " runs. On the same robots: the difference of these policies robot by robot, mean and interval over the robots."
     )
     hopeless = [v for v in outcome.verdicts if v.hopeless]
     if hopeless:
-        least = runs_that_can_tell(figures=len(outcome.verdicts))
-        note += (
-            f" {len(hopeless)} of {len(outcome.verdicts)} comparisons could not have been told whatever came out: too"
-        )
-        if least is None:
-            note += f" many comparisons for {RESAMPLES:,} permutations; name fewer with figures=."
+        note += f" {len(hopeless)} of {len(outcome.verdicts)} comparisons could not have been told whatever came out:"
+        if outcome.can_tell is None:
+            note += f" too many comparisons for {RESAMPLES:,} permutations; name fewer with figures=."
         else:
-            note += (
-                f" few runs for so many comparisons; {least} runs in each group could tell, or more of the baseline."
-            )
+            note += f" too few runs; {outcome.can_tell} runs in each group could tell, or more of the baseline."
     return {"title": f"{outcome.judged.name}: against the baseline", "note": note, "header": header, "rows": rows}
 
 
@@ -242,8 +257,16 @@ def _verdict_row(v: Verdict, baseline: str) -> PlainRow:
         "p_adjusted": v.adjusted_p,
         "hedges_g": d.effect,
         "probability_of_more": d.improvement,
+        **_robots_cells(v.robots),
         "runs_needed": "" if v.needed is None else v.needed,
     }
+
+
+def _robots_cells(robots: Interval | None) -> PlainRow:
+    """Return the difference on the same robots with its interval; empty where there is none."""
+    if robots is None:
+        return dict.fromkeys(("same_robots", "same_robots_low", "same_robots_high"), "")
+    return {"same_robots": robots.estimate, "same_robots_low": robots.low, "same_robots_high": robots.high}
 
 
 def counts(verdicts: Sequence[Verdict]) -> dict[str, int]:

@@ -212,8 +212,8 @@ class Robot:
         rate = speed[:, 3:6] if floats else readings[:, blocks.imu_gyro]
         about = {"acc": readings[:, blocks.imu_acc], "quat": readings[:, blocks.imu_quat]}
         imu = plant.effects.measure(Measured(plant.q, plant.speed(), gyro=rate, **about))
-        readings_now = {"q": q, "qd": qd, "tau_est": plant.torque, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
-        readings_now["foot_force"] = feet
+        readings_now = {"q": q, "qd": qd, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
+        readings_now |= {"tau_est": plant.reported_torque(), "foot_force": feet}
         self._now = {name: values[0].numpy().copy() for name, values in readings_now.items() if values is not None}
         trunk = torch.cat([pose[:, :7], speed[:, :6]], dim=1)[0].numpy() if floats else np.full(13, np.nan)
         self._true = np.array(trunk)

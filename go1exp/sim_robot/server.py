@@ -138,11 +138,11 @@ class Server:
         peer: who it listens to; None before anybody has spoken.
         truth: the trunk's true motion, the newest of it.
         obeyed: what was in force, in the columns of ``OBEYED``, the newest of it.
-        on_heard: called for each datagram of ``peer``, with its time of arrival, s on ``time.perf_counter``'s clock.
+        on_heard: called for each datagram of ``peer``: its time of arrival, s on ``time.perf_counter``'s clock; itself.
         on_tick: called after each tick.
     """
 
-    on_heard: Callable[[float], None] | None = None
+    on_heard: Callable[[float, bytes], None] | None = None
     on_tick: Callable[[], None] | None = None
 
     def __init__(self, robot: Robot, config: SimConfig, port: int = 0, host: str = HOST, kept: float = KEPT_S) -> None:
@@ -233,7 +233,7 @@ class Server:
                 self.peer, self._heard = sender, now
                 self.counts.heard += 1
                 if self.on_heard is not None:
-                    self.on_heard(arrival(extra))
+                    self.on_heard(arrival(extra), data)
                 self._uplink.put(now, data)
 
     def _refuse(self, why: str) -> None:

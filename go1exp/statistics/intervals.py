@@ -172,6 +172,35 @@ def paired_share_interval(first: ArrayLike, second: ArrayLike, level: float = LE
     return Interval(float(b.mean() - a.mean()), max(middle - half, -1.0), min(middle + half, 1.0), n)
 
 
+def stratified_mean_interval(values: ArrayLike, strata: ArrayLike, level: float = LEVEL) -> Interval:
+    """Return the mean of the strata's means with Student's interval of what varies within them; NaNs are left out.
+
+    For one value per robot under several conditions, which are the same in every evaluation: that conditions differ
+    makes nothing uncertain. The variance is pooled over the strata. The interval is NaN where nothing varies.
+
+    Args:
+        values: (n,).
+        strata: (n,) which stratum each is of.
+        level: of the interval.
+    """
+    from scipy import stats
+
+    each = np.asarray(values, dtype=np.float64).ravel()
+    known = np.isfinite(each)
+    each, (labels, stratum) = each[known], np.unique(np.asarray(strata).ravel()[known], return_inverse=True)
+    if not len(each):
+        return Interval(np.nan, np.nan, np.nan, 0)
+    sizes = np.bincount(stratum)
+    means = np.bincount(stratum, each) / sizes
+    estimate, free = float(means.mean()), len(each) - len(labels)
+    within = float(((each - means[stratum]) ** 2).sum())
+    if not (free and within > 0.0):
+        return Interval(estimate, np.nan, np.nan, len(each))
+    error = np.sqrt(within / free * (1.0 / sizes).sum()) / len(labels)
+    half = float(stats.t.ppf(0.5 + 0.5 * level, free) * error)
+    return Interval(estimate, estimate - half, estimate + half, len(each))
+
+
 def pairs_needed(difference: ArrayLike, power: float = 0.8, level: float = LEVEL) -> int | None:
     """Return how many robots would tell a mean difference like the one seen from zero; None if it is zero.
 

@@ -60,21 +60,32 @@ def sampler(seed: int, number: int, parallel: bool) -> Any:
     return optuna.samplers.TPESampler(seed=int(word), constant_liar=parallel)
 
 
-def put_back(study: Any, folder: Path) -> None:
+PATIENCE_S = 60.0
+"""Longest wait for the training that a killed search left, s; after that the search goes on with others."""
+
+
+def put_back(study: Any, folder: Path, patience: float = PATIENCE_S) -> bool:
     """Put the trials of searches that were killed in front, so that they go on in their run folders.
+
+    Returns whether the trainings of some still ran after ``patience``: those trials stay as they are.
 
     Args:
         study: Optuna's.
         folder: of the trials.
+        patience: longest wait for trainings to end, s, for all of them together.
     """
     from optuna.trial import TrialState
 
+    until, some_left = time.monotonic() + patience, False
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         if _is_run(trial, folder):
             continue
         run = trial.user_attrs.get(FOLDER)
-        if run:
-            _outwait(folder / run)
+        if run and not _ended(folder / run, until):
+            some_left = True
+            if patience:
+                print(f"trial {trial.number}: its training still runs, so others go first", flush=True)
+            continue
         try:
             study.tell(trial.number, state=TrialState.FAIL)
         except (ValueError, RuntimeError):  # another search was quicker
@@ -84,6 +95,7 @@ def put_back(study: Any, folder: Path) -> None:
         print(
             f"trial {trial.number}: its search was killed; {'goes on now' if run else 'counts as failed'}", flush=True
         )
+    return some_left
 
 
 def _is_run(trial: Any, folder: Path) -> bool:
@@ -97,9 +109,15 @@ def _is_run(trial: Any, folder: Path) -> bool:
     return bool(datetime.now() - trial.datetime_start < NAMELESS)
 
 
-def _outwait(run: Path) -> None:
-    """Wait for the training that a killed search left: it ends with a checkpoint after its iteration."""
-    if run_lock.in_use(run):
+def _ended(run: Path, until: float) -> bool:
+    """Wait ``until`` (``time.monotonic``) for the training that a killed search left; return whether it has ended.
+
+    It ends with a checkpoint after its iteration, if it can: one that is suspended cannot.
+    """
+    if run_lock.in_use(run) and time.monotonic() < until:
         print(f"{run}: waiting for its training to save a checkpoint", flush=True)
     while run_lock.in_use(run):
+        if time.monotonic() >= until:
+            return False
         time.sleep(LOOK_S)
+    return True

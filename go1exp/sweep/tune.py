@@ -80,7 +80,7 @@ class Search:
         self.folder = Path(settings.out).absolute()
         self._lock = threading.Lock()
         self._running: dict[int, Running] = {}
-        self._stopping = False
+        self._stopping = self._some_left = False
 
     def run(self) -> Any:
         """Run the trials that are left; return Optuna's best one, None if none has a value.
@@ -91,7 +91,7 @@ class Search:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         study = self._study()
-        trials.put_back(study, self.folder)
+        self._some_left = trials.put_back(study, self.folder)
         cores = sorted(os.sched_getaffinity(0))
         free = shares(cores, self.settings.workers)
         with trials.alive(self.folder) as name, ThreadPoolExecutor(self.settings.workers) as pool:
@@ -137,6 +137,8 @@ class Search:
         """Run one trial after the other on the cores of ``share``; ``search`` is the name of this search."""
         while not self._stopping:
             with self._lock:
+                if self._some_left:
+                    self._some_left = trials.put_back(study, self.folder, patience=0.0)
                 counted = [t for t in study.get_trials(deepcopy=False) if t.state.name not in ("FAIL", "WAITING")]
                 if len(counted) >= self.settings.trials:
                     return

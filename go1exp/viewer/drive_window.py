@@ -13,7 +13,7 @@ from go1exp.viewer import requests as ask
 from go1exp.viewer.gamepad import PUSH, STAND, Gamepad, steered
 from go1exp.viewer.panels import EffectsPanel, PushPanel, ReleasedSlider
 from go1exp.viewer.walk import WalkView
-from go1exp.viewer.window import Vec2, Window, arrow_shape, paragraph, section
+from go1exp.viewer.window import MESSAGE_LINES, Vec2, Window, arrow_shape, paragraph, section
 
 SLOW = imgui.Vec4(1.0, 0.7, 0.3, 1.0)
 
@@ -160,8 +160,7 @@ class DriveWindow(Window):
         imgui.TextUnformatted(f"{view.time:.1f} s")
         slow = not pace.paused and view.achieved < 0.9 * pace.speed
         imgui.TextColored(SLOW, TOO_SLOW if slow else "")  # a line in any case: what is below must not jump
-        if view.message:
-            paragraph(view.message)
+        paragraph(view.message, MESSAGE_LINES)
 
     def _command_panel(self, view: WalkView) -> None:
         for axis, (name, (low, high)) in enumerate(zip(AXES, view.limits, strict=True)):

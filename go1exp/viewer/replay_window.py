@@ -25,7 +25,7 @@ SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
 
 NAMES = {"q": "angle", "qd": "speed", "tau_est": "torque, reported", "tau_cmd": "torque, commanded"}
 
-HEIGHT = 150.0
+HEIGHT = 165.0
 """Of a plot, pixels."""
 
 NOW = imgui.Vec4(1.0, 1.0, 1.0, 0.6)
@@ -121,8 +121,9 @@ class ReplayWindow(Window):
         changed, index = imgui.Combo("speed", near, [f"{v:g}x" for v in SPEEDS])
         if changed:
             self.ask(Play(view.running, SPEEDS[index]))
-        imgui.SameLine()
-        _, self.follow = imgui.Checkbox("follow", self.follow)
+        if self._story.kind == "log":  # two robots side by side are followed by nobody
+            imgui.SameLine()
+            _, self.follow = imgui.Checkbox("follow", self.follow)
         imgui.SetNextItemWidth(-40.0)
         changed, time = imgui.SliderFloat("s", view.time, 0.0, piece.duration, "%.3f")
         if changed:
@@ -132,11 +133,14 @@ class ReplayWindow(Window):
 
     def _shown(self, view: ReplayView) -> None:
         imgui.SetNextItemWidth(-110.0)
-        changed, times = imgui.SliderFloat("errors times", view.magnify, 1.0, MOST, "%.0f")
+        changed, times = imgui.SliderFloat("magnified", view.magnify, 1.0, MOST, "%.0f times")
         if changed:
             self.ask(Magnify(times))
+        paragraph("errors, as they are drawn in the scene; curves and numbers are not magnified")
         _, self._ghosts_shown = imgui.Checkbox("measured, and after", self._ghosts_shown)
-        paragraph("left: the model as it was. Right, green: with what was named. Blue, over both: measured.")
+        paragraph(
+            "Left: before, the model as it was. Right, green: after, with what was named. Blue, over both: measured."
+        )
 
     def _joints(self, piece: Piece) -> None:
         errors = piece.errors()
@@ -182,7 +186,7 @@ class ReplayWindow(Window):
         margin = Vec2(0.0, 0.1)  # or a constant error lies on the frame, unseen
         implot.PushStyleVar(int(implot.StyleVar.FitPadding), margin)
         fit = int(implot.AxisFlags.AutoFit)
-        implot.SetupAxes("", unit, 0, fit)
+        implot.SetupAxes("time, s", unit, 0, fit)
         implot.SetupAxisLimits(int(implot.Axis.X1), 0.0, piece.duration, int(implot.Cond.Once))
         outside = int(implot.LegendFlags.Horizontal) | int(implot.LegendFlags.Outside)
         implot.SetupLegend(int(implot.Location.North), outside)

@@ -53,8 +53,8 @@ class Frame:
         qpos: (19,) position, attitude and joint angles.
         first: number of the first row, counted since the robot began.
         rows: (R, 29) in the columns above, ``ROW_S`` apart.
-        packets: (P, 2) of each packet of the one who is listened to: arrival, s, and time since that before, s; NaN for
-            the first of a speaker.
+        packets: (P, 3) of each packet of the one who is listened to: arrival, s; time since that before, s, NaN for the
+            first of a speaker; time from new packet to new packet, s, NaN for one that repeats the packet before.
         peer: who is listened to; None before anybody has spoken.
         speaking: whether that one has been heard in the last second.
         states: sent so far.
@@ -105,18 +105,22 @@ class Probe:
         self._builder: _Builder | None = None
         kept = round(KEPT_S / ROW_S)
         self._rows: deque[NDArray[np.float32]] = deque(maxlen=kept)
-        self._packets: deque[tuple[float, float]] = deque(maxlen=round(KEPT_S / TICK))
+        self._packets: deque[tuple[float, float, float]] = deque(maxlen=round(KEPT_S / TICK))
         self._count, self._peer, self._heard = 0, server.peer, math.nan
+        self._said, self._changed = b"", math.nan  # the newest packet, and when it first came
         self._message, self._push = "", PushMade(-math.inf, 0.0, 0.0)
         self._account = Account(server, lambda line: None)
         self._kicker = _kicker(server.robot)
         server.on_heard, server.on_tick = self._hear, self._tick
 
-    def _hear(self, arrived: float) -> None:
+    def _hear(self, arrived: float, packet: bytes) -> None:
         since = arrived - self._heard
         if self.server.peer != self._peer or since > GONE_S:
-            since = math.nan
-        self._packets.append((arrived, since))
+            since, self._changed, self._said = math.nan, math.nan, b""
+        cycle = math.nan
+        if packet != self._said:
+            cycle, self._changed, self._said = arrived - self._changed, arrived, packet
+        self._packets.append((arrived, since, cycle))
         self._peer, self._heard = self.server.peer, arrived
 
     def _tick(self) -> None:
@@ -134,7 +138,7 @@ class Probe:
         """Return what has happened since the call before."""
         server, counts, now = self.server, self.server.counts, time.perf_counter()
         rows = np.array(self._rows, np.float32).reshape(-1, FORCE.stop)
-        packets = np.array(self._packets, float).reshape(-1, 2)
+        packets = np.array(self._packets, float).reshape(-1, 3)
         self._rows.clear()
         self._packets.clear()
         return Frame(

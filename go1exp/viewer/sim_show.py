@@ -38,32 +38,46 @@ MOST_POINTS = 1000
 
 
 @dataclass(frozen=True)
+class Intervals:
+    """Times between packets of the last ``history.SPAN`` s.
+
+    Attributes:
+        t: times of arrival, 0 for now, s; thinned out.
+        interval: time since the packet before, ms; of each group the longest.
+        p50: median of all intervals, ms; NaN without any.
+        p99: ms.
+        worst: ms.
+    """
+
+    t: list[float]
+    interval: list[float]
+    p50: float
+    p99: float
+    worst: float
+
+
+@dataclass(frozen=True)
 class Packets:
-    """The packets of the one who is listened to, of the last ``history.SPAN`` s.
+    """The packets of the one who is listened to.
 
     Attributes:
         peer: who; None before anybody has spoken.
         speaking: whether that one has been heard in the last second.
-        t: times of arrival, 0 for now, s; thinned out.
-        interval: time since the packet before, ms; of each group the longest.
+        every: of all packets.
+        new: of those that say something else than the packet before: the cycles of a client that sends each command
+            again until it has the next one.
         rate: packets heard in the last second.
         answers: states sent per second.
-        p50: median of all intervals, ms; NaN without any.
-        p99: ms.
-        worst: ms.
         lost: datagrams that the simulated network lost, both ways, so far.
         refused: datagrams by the reason, so far.
     """
 
     peer: str | None
     speaking: bool
-    t: list[float]
-    interval: list[float]
+    every: Intervals
+    new: Intervals
     rate: int
     answers: float
-    p50: float
-    p99: float
-    worst: float
     lost: int
     refused: dict[str, int]
 
@@ -128,7 +142,7 @@ class SimShow:
         self.model, self.data = self._stage.model, self._stage.data
         self._limit = np.maximum(robot.per_joint(body.robot.effort_limit), 1e-9)
         self._history = History(WIDTHS, ROW_S)
-        self._packets: deque[tuple[float, float]] = deque()
+        self._packets: deque[tuple[float, float, float]] = deque()
         self._pushes: deque[PushMade] = deque(maxlen=20)
         self._sent: deque[tuple[float, int]] = deque(maxlen=round(1.0 / LOOK_S))
         self._known = lines(catalogue(body.effect, randomize=True)[0])
@@ -208,25 +222,27 @@ class SimShow:
 
     def _timing(self, frame: Frame) -> Packets:
         """Return how the client's packets came."""
-        arrived, since = np.array(self._packets, float).reshape(-1, 2).T
-        known = np.isfinite(since)
-        all_ms, at = 1e3 * since[known], arrived[known] - frame.now
-        p50, p99, worst = np.percentile(all_ms, (50, 99, 100)) if len(all_ms) else (np.nan,) * 3
-        t, drawn = longest(at, all_ms, MOST_POINTS)
+        arrived, since, cycle = np.array(self._packets, float).reshape(-1, 3).T
         (begin, before), (end, states) = self._sent[0], self._sent[-1]
         return Packets(
             peer=frame.peer,
             speaking=frame.speaking,
-            t=t.tolist(),
-            interval=drawn.tolist(),
+            every=intervals(arrived - frame.now, since),
+            new=intervals(arrived - frame.now, cycle),
             rate=int((arrived > frame.now - 1.0).sum()),
             answers=(states - before) / (end - begin) if end > begin else 0.0,
-            p50=float(p50),
-            p99=float(p99),
-            worst=float(worst),
             lost=frame.lost,
             refused=frame.refused,
         )
+
+
+def intervals(at: Array, since: Array) -> Intervals:
+    """Return what is drawn of packets that came at ``at`` (P,), s, ``since`` (P,) s after others; NaNs are left out."""
+    known = np.isfinite(since)
+    all_ms = 1e3 * since[known]
+    p50, p99, worst = np.percentile(all_ms, (50, 99, 100)) if len(all_ms) else (np.nan,) * 3
+    t, drawn = longest(at[known], all_ms, MOST_POINTS)
+    return Intervals(t.tolist(), drawn.tolist(), float(p50), float(p99), float(worst))
 
 
 def longest(t: Array, values: Array, most: int) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from go1exp.viewer.drive_window import PUSH_KEY, SLOW
 from go1exp.viewer.history import SPAN
 from go1exp.viewer.panels import EffectsPanel, PushPanel
 from go1exp.viewer.sim_show import SimView
-from go1exp.viewer.window import Vec2, Window, arrow_shape, paragraph, section
+from go1exp.viewer.window import MESSAGE_LINES, Vec2, Window, arrow_shape, paragraph, section
 
 PACKETS = 150.0
 """Height of the plot of intervals, pixels."""
@@ -67,10 +67,9 @@ class SimWindow(Window):
         imgui.SameLine()
         imgui.TextUnformatted(f"{view.time:.1f} s")
         paragraph(view.posture)
-        if view.slipped > BEHIND_S:
-            imgui.TextColored(SLOW, f"{1e3 * view.slipped:.0f} ms behind real time since it began")
-        if view.message:
-            paragraph(view.message)
+        late = f"{1e3 * view.slipped:.0f} ms behind real time since it began" if view.slipped > BEHIND_S else ""
+        imgui.TextColored(SLOW, late)
+        paragraph(view.message, MESSAGE_LINES)
         if section("Who speaks"):
             self._speaker(view)
         if section("Push"):
@@ -85,8 +84,9 @@ class SimWindow(Window):
         else:
             paragraph(p.peer if p.speaking else f"nobody; {p.peer} did")
         rows = [("packets in, last 1 s", f"{p.rate}"), ("states out, per s", f"{p.answers:.0f}")]
-        spread = ((name, getattr(p, name)) for name in ("p50", "p99", "worst"))
-        rows += [(f"interval {name}, ms", "-" if math.isnan(v) else f"{v:.2f}") for name, v in spread]
+        for label, times in (("interval", p.every), ("new command", p.new)):
+            spread = ((name, getattr(times, name)) for name in ("p50", "p99", "worst"))
+            rows += [(f"{label} {name}, ms", "-" if math.isnan(v) else f"{v:.2f}") for name, v in spread]
         rows += [("lost by the network", f"{p.lost}"), ("refused", f"{sum(p.refused.values())}")]
         rows += [(f"  {why}", f"{count}") for why, count in p.refused.items()]
         if not imgui.BeginTable("packets", 2, int(imgui.TableFlags.SizingStretchProp)):
@@ -101,7 +101,7 @@ class SimWindow(Window):
     def right(self) -> None:
         """Draw the curves."""
         view: SimView = self.view
-        if section("Intervals between the client's packets"):
+        if section("Client's timing: every packet, new commands"):
             self._intervals(view)
         if section("True velocity"):
             lines = list(zip(("forward m/s", "left m/s", "turn rad/s"), view.velocity, strict=True))
@@ -117,12 +117,15 @@ class SimWindow(Window):
     def _intervals(self, view: SimView) -> None:
         """Draw a point for each packet of the last seconds."""
         p = view.packets
-        if not implot.BeginPlot("##intervals", Vec2(-1.0, PACKETS), PLAIN | int(implot.Flags.NoLegend)):
+        if not implot.BeginPlot("##intervals", Vec2(-1.0, PACKETS), PLAIN | int(implot.Flags.NoTitle)):
             return
         implot.SetupAxes("", "ms", 0, 0)
         implot.SetupAxisLimits(int(implot.Axis.X1), -SPAN, 0.0, int(implot.Cond.Always))
-        top = 1.1 * max([LEAST_MS, *p.interval])
+        top = 1.1 * max([LEAST_MS, *p.every.interval, *p.new.interval])
         implot.SetupAxisLimits(int(implot.Axis.Y1), 0.0, top, int(implot.Cond.Always))
-        if p.t:
-            implot.PlotScatter("interval", p.t, p.interval)
+        outside = int(implot.LegendFlags.Horizontal) | int(implot.LegendFlags.Outside)
+        implot.SetupLegend(int(implot.Location.North), outside)
+        for name, times in (("every packet", p.every), ("new command", p.new)):
+            if times.t:
+                implot.PlotScatter(name, times.t, times.interval)
         implot.EndPlot()

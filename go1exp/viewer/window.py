@@ -142,11 +142,19 @@ def arrow_shape(arrow: Arrow) -> Any:
     return geom
 
 
-def paragraph(text: str) -> None:
-    """Write text over several lines, broken between words (ImGui's own breaks fall within them)."""
+def paragraph(text: str, lines: int = 0) -> None:
+    """Write text over several lines, broken between words (ImGui's own breaks fall within them).
+
+    It takes the room of ``lines`` at least: what is below text that comes and goes must not jump from under the mouse.
+    """
     columns = int(imgui.GetContentRegionAvail().x / imgui.CalcTextSize("n").x)
-    for line in textwrap.wrap(text, max(columns, 10)):
+    broken = textwrap.wrap(text, max(columns, 10))
+    for line in broken + [""] * (lines - len(broken)):
         imgui.TextUnformatted(line)
+
+
+MESSAGE_LINES = 2
+"""Room for what a user must know, of ``paragraph``."""
 
 
 def section(label: str, is_open: bool = True) -> bool:
@@ -155,4 +163,4 @@ def section(label: str, is_open: bool = True) -> bool:
     return bool(imgui.CollapsingHeader(label, flags))
 
 
-__all__ = ["Vec2", "Window", "arrow_shape", "imgui", "paragraph", "section"]
+__all__ = ["MESSAGE_LINES", "Vec2", "Window", "arrow_shape", "imgui", "paragraph", "section"]

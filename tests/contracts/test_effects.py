@@ -484,6 +484,7 @@ def calls(effect: Effect, n: int, k: int) -> Iterator[tuple[str, tuple[Any, ...]
         "on_error": (q, three[0].repeat(1, 4)),
         "on_gains": (torque.abs(), qd.abs()),
         "on_drive": (torque, q, qd),
+        "on_report": (torque,),
         "on_transmission": (torque, q, qd),
         "on_joint": (q, qd),
         "on_friction": (torque.abs(), torque, qd),

@@ -164,7 +164,7 @@ class Replayer:
                 carry(k)
             plant.step(targets[past + k])
             if torque is not None and k >= first:
-                torque[k - first] = plant.torque.numpy()
+                torque[k - first] = plant.reported_torque().numpy()
         self.made += len(index) * steps
         at = w.t[rows.window] / dt - first
         y = _sampled(q, qd, torque, at, dt)
