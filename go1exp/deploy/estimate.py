@@ -96,12 +96,17 @@ class KalmanEstimator:
             self.refused[Status.LATE.name] += 1
             return self.ahead(0.0)
         # The robot's own clock is even; times of arrival have the delays of the network.
+        row = self._sample(state, state.clock)
+        if not self._turn and self._is_due(state.clock, state.clock):  # as nearly always
+            self._taken_until = state.clock
+            self._take(state, row)
+            return self._velocity
         self._count += 1
-        heapq.heappush(self._turn, (state.clock, self._count, state, self._sample(state, state.clock)))
+        heapq.heappush(self._turn, (state.clock, self._count, state, row))
         newest = max(clock for clock, *_ in self._turn)
         while self._turn and self._is_due(self._turn[0][0], newest):
-            self._taken_until, _, first, row = heapq.heappop(self._turn)
-            self._take(first, row)
+            self._taken_until, _, first, its_row = heapq.heappop(self._turn)
+            self._take(first, its_row)
         return self.ahead(0.0)
 
     def _is_due(self, clock: float, newest: float) -> bool:

@@ -204,10 +204,10 @@ def by_robot(judged: Judged, group: Group, baseline: Group, column: Column) -> I
     values = np.array(
         [table[column.name][place] for table, place in zip(tables, places, strict=True)], dtype=np.float64
     )
-    here, there = np.split(values, [len(sides[0])])
+    of_group, of_baseline = np.split(values, [len(sides[0])])
     conditions = {row[:-1]: k for k, row in enumerate(sorted(rows[0]))}
     strata = [conditions[row[:-1]] for row in sorted(rows[0])]
-    return stratified_mean_interval(_mean(here) - _mean(there), strata)
+    return stratified_mean_interval(_mean(of_group) - _mean(of_baseline), strata)
 
 
 def _mean(values: Floats) -> Floats:

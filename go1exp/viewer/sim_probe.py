@@ -107,7 +107,7 @@ class Probe:
         self._rows: deque[NDArray[np.float32]] = deque(maxlen=kept)
         self._packets: deque[tuple[float, float, float]] = deque(maxlen=round(KEPT_S / TICK))
         self._count, self._peer, self._heard = 0, server.peer, math.nan
-        self._said, self._changed = b"", math.nan  # the newest packet, and when it first came
+        self._newest, self._changed = b"", math.nan  # the newest packet, and when it first came
         self._message, self._push = "", PushMade(-math.inf, 0.0, 0.0)
         self._account = Account(server, lambda line: None)
         self._kicker = _kicker(server.robot)
@@ -116,10 +116,10 @@ class Probe:
     def _hear(self, arrived: float, packet: bytes) -> None:
         since = arrived - self._heard
         if self.server.peer != self._peer or since > GONE_S:
-            since, self._changed, self._said = math.nan, math.nan, b""
+            since, self._changed, self._newest = math.nan, math.nan, b""
         cycle = math.nan
-        if packet != self._said:
-            cycle, self._changed, self._said = arrived - self._changed, arrived, packet
+        if packet != self._newest:
+            cycle, self._changed, self._newest = arrived - self._changed, arrived, packet
         self._packets.append((arrived, since, cycle))
         self._peer, self._heard = self.server.peer, arrived
 
