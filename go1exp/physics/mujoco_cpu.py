@@ -20,6 +20,13 @@ STATE_FIELDS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl")
 """What one simulation carries from step to step (no activations in this model; applied forces are written anew)."""
 
 
+def _shared(output: np.ndarray) -> Tensor:
+    """Return an output of the engine as a tensor on its memory."""
+    with warnings.catch_warnings():  # it is read-only: torch has no such notion
+        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+        return torch.from_numpy(output)
+
+
 class MujocoCpu:
     """N simulations on ``threads`` threads; the same bits whatever their number (see ``PhysicsBackend``)."""
 
@@ -30,9 +37,7 @@ class MujocoCpu:
         self.qpos = torch.from_numpy(self._batch.bind("qpos"))
         self.qvel = torch.from_numpy(self._batch.bind("qvel"))
         self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
-        with warnings.catch_warnings():  # an output, shared read-only: torch has no such notion
-            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
-            self.sensordata = torch.from_numpy(self._batch.bind("sensordata"))
+        self.sensordata = _shared(self._batch.bind("sensordata"))
         self._fields: dict[str, Tensor] = {}
         self._baseline: dict[str, Tensor] = {}
         self._applied: Tensor | None = None
@@ -78,6 +83,10 @@ class MujocoCpu:
         if self._applied is None:
             self._applied = torch.from_numpy(self._batch.bind("qfrc_applied"))
         return self._applied
+
+    def bias(self) -> Tensor:
+        """Live forces (N, nv), N and N m, that gravity and speeds ask of the joints, of the resets and steps to come."""
+        return _shared(self._batch.bind("qfrc_bias"))
 
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
         """Indices of named bodies or geoms."""
