@@ -9,12 +9,14 @@ import torch
 
 from go1exp.drive import DriveSetup, ModelFields
 from go1exp.effects.base import Effect, Param
-from go1exp.effects.identification import TWO_ATTITUDES, Identification
+from go1exp.effects.identification import Identification
 from go1exp.schema.joint_values import JointValues
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+BOLT = "record a chirp with the trunk bolted to something heavy"
 
 RESOLVED = 0.1
 """Square of the largest frequency of the mount, in radians per physics step, that is left as it is."""
@@ -46,6 +48,16 @@ class SoftMount(Effect):
         Param("pitch", "rad/(N m)", 0.0, 0.2, 0.0, 5e-4, "robot", "about y"),
         Param("yaw", "rad/(N m)", 0.0, 0.2, 0.0, 5e-4, "robot", "about z"),
         Param("damping", "-", 0.01, 1.0, 0.1, math.inf, "robot", "damping ratio"),
+    )
+    identification = Identification(
+        needs_stand=True,
+        levels=(
+            {"sway": 1e-4, "heave": 1e-4, "roll": 0.003, "pitch": 0.003, "yaw": 0.003},
+            {"sway": 1e-3, "heave": 5e-4, "roll": 0.02, "pitch": 0.02, "yaw": 0.02},
+        ),
+        free_shapes=("damping",),
+        confounded=("base_tilt", "link_com", "armature"),
+        told_apart_by=BOLT,
     )
     fields = (
         *("jnt_stiffness", "dof_damping", "dof_armature", "qpos_spring", "opt.tolerance"),
