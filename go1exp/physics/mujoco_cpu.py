@@ -19,6 +19,9 @@ from go1exp.tensors.randomness import unit_numbers
 STATE_FIELDS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl")
 """What one simulation carries from step to step (no activations in this model; applied forces are written anew)."""
 
+DERIVED = "dof_M0"
+"""A field that robots have of their own once constants have been derived from their models."""
+
 
 def _shared(output: np.ndarray) -> Tensor:
     """Return an output of the engine as a tensor on its memory."""
@@ -127,6 +130,12 @@ class MujocoCpu:
         """Continue from ``state_dict``: bit for bit if it is of this backend, else from the same state and model."""
         for name, value in state["fields"].items():
             self.field(name).copy_(value)
+        if "engine" not in state and (DERIVED in state["fields"] or self._batch.expanded(DERIVED) is not None):
+            # What was derived here before is not all among the fields saved. The mean inertia, to which the solver's
+            # tolerance is relative, is no field at all.
+            self._batch.set_const()
+            for name, value in state["fields"].items():
+                self.field(name).copy_(value)
         self._baseline = {n: v.to(self.field(n).dtype, copy=True) for n, v in state["baseline"].items()}
         for name in STATE_FIELDS:
             live = self._batch.bind(name)
