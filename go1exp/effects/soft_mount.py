@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
@@ -22,8 +22,7 @@ RESOLVED = 0.1
 """Square of the largest frequency of the mount, in radians per physics step, that is left as it is."""
 
 BOLTED = 1.0e9
-"""Inertia, kg or kg m2, of a direction in which a trunk is bolted while it is not in others: legs of some kilograms move
-it by less than a rounding error of their own motion."""
+"""Inertia, kg or kg m2, of a direction in which a trunk is bolted while it yields in others: legs move it by 1e-8."""
 
 
 @effect("soft_mount")
@@ -32,12 +31,12 @@ class SoftMount(Effect):
 
     In each direction: deflection = compliance load at rest, and a damping ratio of ``damping`` with the legs straight.
     ``sway`` along the world's x and y, ``heave`` along z, ``roll``, ``pitch`` and ``yaw`` about the trunk's axes. The
-    weight at straight legs is borne without deflection. Legs that swing push the trunk, and all legs feel it. Straps
-    of half a metre let 12 kg sway at 0.7 Hz (0.004 m/N); stands of profiles turn by 0.001 to 0.01 rad/(N m) (a judgement).
-    The model needs joints of the trunk for it (``physics/mount.py``), which it has where the effect is not null; a
-    trunk that is free feels nothing. It looks like ``armature`` or ``link_inertia`` of joints that swing together.
+    weight is borne without deflection. Legs that swing push the trunk, and all legs feel it. Straps of half a metre
+    let 12 kg sway by 0.004 m/N, at 0.7 Hz; stands turn by 0.001 to 0.01 rad/(N m) (a judgement). The model has joints
+    of the trunk for it (``physics/mount.py``) where the effect is not null; a trunk that is free, and the simulated
+    robot of ``go1exp deploy``, feel nothing. It looks like ``base_tilt``, ``link_com`` and ``armature``.
 
-    A spring that the physics step cannot resolve is given inertia until it can; with compliance 0 that is infinite.
+    A spring that the physics step cannot resolve is given inertia until it can; with compliance 0 that is ``BOLTED``.
     """
 
     title = "a mount of the trunk that gives way"
@@ -59,7 +58,7 @@ class SoftMount(Effect):
         confounded=("base_tilt", "link_com", "armature"),
         told_apart_by=BOLT,
     )
-    fields = (
+    fields: ClassVar[tuple[str, ...]] = (
         *("jnt_stiffness", "dof_damping", "dof_armature", "qpos_spring", "opt.tolerance"),
         *("body_mass", "opt.gravity"),  # to read what other effects have made of them
     )
@@ -76,7 +75,7 @@ class SoftMount(Effect):
         """Leave the model as it is where there is no mount in it."""
         super().__init__(setup, **values)
         if not setup.mounted:
-            self.fields = ()  # type: ignore[misc]  # of this robot
+            self.fields = ()  # type: ignore[misc]  # this robot's own
 
     @property
     def compliance(self) -> Tensor:
@@ -96,6 +95,6 @@ class SoftMount(Effect):
         stiffness[:, :6], armature[:, :6] = k, added
         damping[:, :6] = 2.0 * self.damping * torch.sqrt(k * (inertia + added))
         # The engine solves friction and stops to a tolerance in units of all inertia, and the legs' is what counts.
-        model.field("opt.tolerance").mul_((legs / (legs + (inertia + added).sum(1))))
+        model.field("opt.tolerance").mul_(legs / (legs + (inertia + added).sum(1)))
         weight = model.field("body_mass").sum(1, keepdim=True) * model.field("opt.gravity")
         model.field("qpos_spring")[:, :3] = -self.compliance[:, :3] * weight

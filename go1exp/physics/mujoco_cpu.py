@@ -88,7 +88,7 @@ class MujocoCpu:
         return self._applied
 
     def bias(self) -> Tensor:
-        """Live forces (N, nv), N and N m, that gravity and speeds ask of the joints, of the resets and steps to come."""
+        """Live forces (N, nv), N and N m, that gravity and speeds ask of the joints in resets and steps to come."""
         return _shared(self._batch.bind("qfrc_bias"))
 
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from go1exp.env.plant import FRICTION, Plant
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Rows, bolted, mounted
+from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.schema.registry import bind
 
 Base = tuple[tuple[float, ...], bool]
@@ -115,7 +116,7 @@ class Replayer:
 
     def _state(self, plant: Plant, rows: Rows, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coordinates and speeds of robots whose joints are at ``q`` (R, J) and ``qd``."""
-        backend = plant.backend
+        backend = cast(MujocoCpu, plant.backend)  # of all held robots
         mount = backend.qpos.shape[1] - q.shape[1]
         if not mount:
             return q, qd

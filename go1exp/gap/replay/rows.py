@@ -13,7 +13,7 @@ from go1exp.gap.replay.machine import Machine
 from go1exp.schema.registry import members
 
 MOUNT_LOAD = 2 * (10.0, 10.0, 10.0, 2.0, 2.0, 2.0)
-"""Standard deviation of ``Rows.mount``, N and N m (chosen: legs of 2 kg that swing at 5 m/s2, 0.2 m from the middle)."""
+"""Standard deviation of ``Rows.mount``, N and N m (chosen: a leg of 2 kg that swings at 5 m/s2)."""
 
 Key = tuple[str, str]
 """Effect and parameter."""

@@ -92,7 +92,7 @@ class Scorer:
         return np.asarray(whole / self.size[window][:, None])
 
 
-def state_probes(machine: Machine, theta: Theta) -> list[Probe]:
+def state_probes(machine: Machine, theta: Theta | None = None) -> list[Probe]:
     """Return the probes of the initial state: angles, then speeds, of each place in the groups; then of the base.
 
     A base has a state where it is free, or where ``theta`` puts it on a mount that gives way.
@@ -104,7 +104,7 @@ def state_probes(machine: Machine, theta: Theta) -> list[Probe]:
         for place in places
     ]
     of_base = [Probe("base", None, row) for row in np.diag(machine.base_probe)]
-    on_mount = mounted(variants(machine, theta, np.zeros(1, dtype=int), []))[0]
+    on_mount = mounted(variants(machine, theta or {}, np.zeros(1, dtype=int), []))[0]
     return joints_probes + of_base + [Probe("mount", None, row) for row in np.diag(MOUNT_LOAD) if on_mount]
 
 
