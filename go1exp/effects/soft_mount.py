@@ -51,7 +51,7 @@ class SoftMount(Effect):
     identification = Identification(
         needs_stand=True,
         levels=(
-            {"sway": 1e-4, "heave": 1e-4, "roll": 0.003, "pitch": 0.003, "yaw": 0.003},
+            {"sway": 4e-5, "heave": 4e-5, "roll": 0.001, "pitch": 0.001, "yaw": 0.001},
             {"sway": 1e-3, "heave": 5e-4, "roll": 0.02, "pitch": 0.02, "yaw": 0.02},
         ),
         free_shapes=("damping",),
