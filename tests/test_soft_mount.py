@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from functools import cache
@@ -15,18 +16,26 @@ import pytest
 import torch
 from torch import Tensor
 
-from go1exp import robot
+from go1exp import data_root, robot
 from go1exp.compose import compose
 from go1exp.config import TaskConfig, parse_task
 from go1exp.effects.rules import on_mount
 from go1exp.effects.soft_mount import SoftMount
 from go1exp.env.plant import Plant, drive_setup
-from go1exp.gap.replay.rows import Rows, bolted, mounted
+from go1exp.gap.comparison import LEVEL
+from go1exp.gap.data.prepare import Ready
+from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.rows import Rows, Theta, bolted, mounted, variants
+from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
+from go1exp.gap.robots.hung import hung
+from go1exp.gap.score.likelihood import state_probes
+from go1exp.gap.search.fit import stacked
 from go1exp.physics.mount import MOUNT
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
+from go1exp.recording import read_folder
 from go1exp.schema.registry import Term, bind
 from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import build_terrain
@@ -256,3 +265,64 @@ def test_a_free_trunk_has_no_mount() -> None:
     setup = drive_setup(task().robot, 0.002, backend, EnvRandom(0, 1))
     assert (setup.floating, setup.mounted) == (True, False)
     assert SoftMount(setup, roll=0.01).fields == ()
+
+
+# ---------------------------------------------------------------------- in a replay of recordings
+
+
+@cache
+def replayer() -> Replayer:
+    """Four windows of one recording of a Go1 that hangs."""
+    machine, recordings = hung(task().robot), read_folder(data_root() / "assets/demo/hung_go1")[:1]
+    windows = machine.windows(Ready(tuple(recordings), GapSettings(stride_s=0.4)))
+    return machine.replayer(windows, np.tile(LEVEL, (len(windows), 1)), 64, 1)
+
+
+def replayed(theta: Theta, more: Theta | None = None) -> list[np.ndarray]:
+    """Replay four windows with ``theta``, and then also with ``more`` beside it in one call."""
+    four, machine = np.arange(4), replayer().machine
+    rows = [variants(machine, values, four, []) for values in (theta, *([] if more is None else [more]))]
+    return list(replayer().run(stacked(rows), 0.001).reshape(len(rows), 4, *replayer().windows.y.shape[1:]))
+
+
+def test_null_values_change_no_bit_of_a_replay_whatever_is_replayed_beside_them() -> None:
+    null, roll = {("soft_mount", "roll"): np.zeros(1)}, {("soft_mount", "roll"): np.array([0.02])}
+    (plain,) = replayed({})
+    first, second = replayed(null, roll)
+    assert np.array_equal(plain, first)
+    assert np.array_equal(plain, replayed({**null, ("soft_mount", "damping"): np.array([0.7])})[0])
+    assert np.array_equal(second, replayed(roll)[0])
+    assert np.abs(second - plain)[:, :, 0].max() > 1e-3
+
+
+def test_a_replay_begins_where_the_mount_bears_the_legs_or_so_far_from_it_as_is_asked() -> None:
+    values = {("soft_mount", name): np.array([value]) for name, value in SOFT.items()}
+    soft_rows = variants(replayer().machine, values, np.arange(4), [])
+    load = np.tile([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 5.0, 0.0, 0.0, 0.0, 0.5, 0.0], (4, 1))
+    plant = replayer()._plant(soft_rows, 0.001, (LEVEL, True))
+    w, backend = replayer().windows, plant.backend
+    assert isinstance(backend, MujocoCpu)
+    q, qd = torch.as_tensor(w.q[:4]), torch.as_tensor(w.qd[:4])
+    rest, still = replayer()._state(plant, soft_rows, q, qd)
+    moved, speed = replayer()._state(plant, dataclasses.replace(soft_rows, mount=load), q, qd)
+    model = backend.env_model(0)
+    data = mujoco.MjData(model)
+    for k in range(4):
+        data.qpos[6:] = w.q[k]
+        mujoco.mj_forward(model, data)
+        lever = data.subtree_com[1] - data.xpos[1]  # from the trunk's origin to the centre of mass
+        x, y = G * model.body_mass.sum() * lever[:2]
+        expected = [0.0, 0.0, 0.0, -SOFT["roll"] * y, SOFT["pitch"] * x, 0.0]
+        np.testing.assert_allclose(rest[k, :6], expected, atol=1e-9)
+    assert torch.equal(rest[:, 6:], q)
+    assert torch.equal(still[:, :6], torch.zeros(4, 6).double())
+    np.testing.assert_allclose((moved - rest)[:, :6], load[:, :6] * COMPLIANCE, atol=1e-12)
+    swing = np.sqrt(np.array(COMPLIANCE) / model.dof_M0[:6])  # 1 / sqrt(stiffness inertia)
+    np.testing.assert_allclose(speed[:, :6], load[:, 6:] * swing, atol=1e-9)
+
+
+def test_what_the_trunk_does_at_first_is_unknown_only_on_a_mount() -> None:
+    machine = replayer().machine
+    plain, soft_ones = state_probes(machine), state_probes(machine, {("soft_mount", "roll"): np.array([0.01])})
+    assert [p.key for p in plain] == ["q"] * 3 + ["qd"] * 3
+    assert [p.key for p in soft_ones] == ["q"] * 3 + ["qd"] * 3 + ["mount"] * 12
