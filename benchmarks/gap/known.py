@@ -39,7 +39,7 @@ TOLERANCES: dict[str, dict[str, float]] = {
     "payload": {"mass": 0.2},
     "point_load": {"mass": 0.01},
     "quadratic_drag": {"drag": 0.002},
-    "soft_mount": {"sway": 2e-5, "heave": 2e-5, "roll": 5e-4, "pitch": 5e-4, "yaw": 5e-4},
+    "soft_mount": {"sway": 2e-5, "heave": 2e-5, "roll": 5e-4, "pitch": 5e-4},
     "strength": {"scale": 0.05},
     "strength_drift": {"rate": 0.0025},
     "stribeck": {"strength": 0.05},

@@ -16,6 +16,9 @@ from go1exp.schema.registry import effect
 if TYPE_CHECKING:
     from torch import Tensor
 
+AXES = 5
+"""Directions in which a mount may yield."""
+
 BOLT = "record a chirp with the trunk bolted to something heavy"
 
 RESOLVED = 0.1
@@ -30,7 +33,7 @@ class SoftMount(Effect):
     """A held trunk hangs in straps or on a stand that yields: on springs and dampers about the pose it is held in.
 
     In each direction: deflection = compliance load at rest, and a damping ratio of ``damping`` with the legs straight.
-    ``sway`` along the world's x and y, ``heave`` along z, ``roll``, ``pitch`` and ``yaw`` about the trunk's axes. The
+    ``sway`` along the world's x and y, ``heave`` along z, ``roll`` and ``pitch`` about the trunk's axes. The
     weight is borne without deflection. Legs that swing push the trunk, and all legs feel it. Straps of half a metre
     let 12 kg sway by 0.004 m/N, at 0.7 Hz; stands turn by 0.001 to 0.01 rad/(N m) (a judgement). The model has joints
     of the trunk for it (``physics/mount.py``) where the effect is not null; a trunk that is free, and the simulated
@@ -45,14 +48,14 @@ class SoftMount(Effect):
         Param("heave", "m/N", 0.0, 0.005, 0.0, 2e-5, "robot", "along z"),
         Param("roll", "rad/(N m)", 0.0, 0.2, 0.0, 5e-4, "robot", "turn about the trunk's x per torque"),
         Param("pitch", "rad/(N m)", 0.0, 0.2, 0.0, 5e-4, "robot", "about y"),
-        Param("yaw", "rad/(N m)", 0.0, 0.2, 0.0, 5e-4, "robot", "about z"),
         Param("damping", "-", 0.01, 1.0, 0.1, math.inf, "robot", "damping ratio"),
     )
     identification = Identification(
         needs_stand=True,
         levels=(
-            {"sway": 4e-5, "heave": 4e-5, "roll": 0.001, "pitch": 0.001, "yaw": 0.001},
-            {"sway": 1e-3, "heave": 5e-4, "roll": 0.02, "pitch": 0.02, "yaw": 0.02},
+            {"sway": 4e-5, "heave": 4e-5, "roll": 0.001, "pitch": 0.001},
+            {"roll": 0.02, "pitch": 0.02},
+            {"sway": 1e-3, "heave": 5e-4, "roll": 0.02, "pitch": 0.02},
         ),
         free_shapes=("damping",),
         confounded=("base_tilt", "link_com", "armature"),
@@ -68,7 +71,6 @@ class SoftMount(Effect):
     heave: Tensor
     roll: Tensor
     pitch: Tensor
-    yaw: Tensor
     damping: Tensor
 
     def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
@@ -79,8 +81,8 @@ class SoftMount(Effect):
 
     @property
     def compliance(self) -> Tensor:
-        """(N, 6) in the order of ``physics/mount.py``, m/N and rad/(N m)."""
-        return torch.cat([self.sway, self.sway, self.heave, self.roll, self.pitch, self.yaw], dim=1)
+        """(N, 5) in the order of ``physics/mount.py``, m/N and rad/(N m)."""
+        return torch.cat([self.sway, self.sway, self.heave, self.roll, self.pitch], dim=1)
 
     def edit_model(self, model: ModelFields) -> None:
         """Give the mount's joints their springs and dampers."""
@@ -90,10 +92,10 @@ class SoftMount(Effect):
         dt, soft = self.setup.physics_dt, self.compliance > 0.0
         k = torch.where(soft, 1.0 / self.compliance, 0.0)
         whole = model.nominal("dof_M0").to(k)
-        inertia, legs = whole[:, :6], whole[:, 6:].sum()
+        inertia, legs = whole[:, :AXES], whole[:, AXES:].sum()
         added = torch.where(soft, (k * dt**2 / RESOLVED - inertia).clamp(min=0.0), BOLTED)
-        stiffness[:, :6], armature[:, :6] = k, added
-        damping[:, :6] = 2.0 * self.damping * torch.sqrt(k * (inertia + added))
+        stiffness[:, :AXES], armature[:, :AXES] = k, added
+        damping[:, :AXES] = 2.0 * self.damping * torch.sqrt(k * (inertia + added))
         # The engine solves friction and stops to a tolerance in units of all inertia, and the legs' is what counts.
         model.field("opt.tolerance").mul_(legs / (legs + (inertia + added).sum(1)))
         weight = model.field("body_mass").sum(1, keepdim=True) * model.field("opt.gravity")

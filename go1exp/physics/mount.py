@@ -10,12 +10,15 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-MOUNT = ("mount_x", "mount_y", "mount_z", "mount_roll", "mount_pitch", "mount_yaw")
-"""The mount's joints, the model's first: slides along the axes of the world, then hinges about those of the trunk."""
+MOUNT = ("mount_x", "mount_y", "mount_z", "mount_roll", "mount_pitch")
+"""The mount's joints, the model's first: slides along the axes of the world, then hinges about those of the trunk.
+
+None about z: legs that hang hardly turn a trunk that way, and a fit gets lost in what else it might explain.
+"""
 
 
 def add_mount(trunk: mujoco.MjsBody) -> None:
-    """Let a held trunk move: three slides and three hinges, none of which has a spring or a damper yet.
+    """Let a held trunk move: three slides and two hinges, none of which has a spring or a damper yet.
 
     Args:
         trunk: body of the trunk, a child of the world, with its attitude set and without joints.

@@ -12,7 +12,7 @@ from go1exp.effects.tolerances import declared, effect_class, sizes
 from go1exp.gap.replay.machine import Machine
 from go1exp.schema.registry import members
 
-MOUNT_LOAD = 2 * (10.0, 10.0, 10.0, 2.0, 2.0, 2.0)
+MOUNT_LOAD = 2 * (10.0, 10.0, 10.0, 2.0, 2.0)
 """Standard deviation of ``Rows.mount``, N and N m (chosen: a leg of 2 kg that swings at 5 m/s2)."""
 
 Key = tuple[str, str]
@@ -31,8 +31,8 @@ class Rows:
         q: (R, J) added to the initial angles, rad; None for nothing.
         qd: (R, J) added to the initial speeds, rad/s.
         base: (R, 9) added to a free base's first height, roll and pitch, velocity and rate.
-        mount: (R, 12) how far from rest a trunk on a mount begins: by what these forces, N, and torques, N m, along the
-            mount's six directions deflect it, then at the speeds with which it would swing so far.
+        mount: (R, 10) how far from rest a trunk on a mount begins: by what these forces, N, and torques, N m, along the
+            mount's five directions deflect it, then at the speeds with which it would swing so far.
     """
 
     window: np.ndarray

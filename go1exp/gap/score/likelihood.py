@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -56,6 +56,8 @@ class Scorer:
         renewed: returns a scorer whose floors and initial states suit other values of the model.
         clock_s: what the clock was taken to be off by, s.
         expected: the windows with their initial states as sensors tell them, where those were moved; None if not.
+        common: (k,) bool, which columns of ``state`` are of a trunk on a mount, which all groups feel. In scores each
+            group has it to itself.
     """
 
     replayer: Replayer
@@ -64,6 +66,7 @@ class Scorer:
     renewed: Callable[[Theta], Scorer] | None = None
     clock_s: float = 0.0
     expected: Windows | None = None
+    common: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def windows(self) -> Windows:
@@ -145,4 +148,6 @@ def scorer(
     columns += [empty.unit(change, everything) for change in w.unknown(y[:, 0])]
     if clock_s:
         columns.append(empty.unit(clock_s * np.gradient(y[:, 0], w.period, axis=1), everything))
-    return dataclasses.replace(empty, state=np.stack(columns, axis=-1))
+    common = np.zeros(len(columns), dtype=bool)
+    common[: len(probes)] = [probe.key == "mount" for probe in probes]
+    return dataclasses.replace(empty, state=np.stack(columns, axis=-1), common=common)
