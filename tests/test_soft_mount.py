@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -30,6 +31,7 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.hung import hung
+from go1exp.gap.score.angle_errors import unexplained
 from go1exp.gap.score.likelihood import state_probes
 from go1exp.gap.search.fit import stacked
 from go1exp.physics.mount import MOUNT
@@ -326,3 +328,19 @@ def test_what_the_trunk_does_at_first_is_unknown_only_on_a_mount() -> None:
     plain, soft_ones = state_probes(machine), state_probes(machine, {("soft_mount", "roll"): np.array([0.01])})
     assert [p.key for p in plain] == ["q"] * 3 + ["qd"] * 3
     assert [p.key for p in soft_ones] == ["q"] * 3 + ["qd"] * 3 + ["mount"] * 10
+
+
+def test_what_all_legs_feel_explains_their_errors_by_one_number() -> None:
+    """Two legs, three samples of one joint each; the trunk would move the first sample of both the same way."""
+    state = np.zeros((1, 2, 3, 2))
+    state[..., 0, 0] = 100.0  # the trunk's, as good as unknown
+    state[..., 1, 1] = 100.0  # each leg's own
+    windows = SimpleNamespace(t=np.zeros((1, 3)), quantities=("q",))
+    score: Any = SimpleNamespace(state=state, common=np.array([True, False]), windows=windows)
+    residual = np.array([[[1.0, 4.0, 7.0], [-1.0, -5.0, 8.0]]])
+    left = unexplained(score, residual, np.arange(1))[0, :, :, 0, 0]
+    np.testing.assert_allclose(left, [[1.0, 0.0, 7.0], [-1.0, 0.0, 8.0]], atol=1e-3)
+    same = unexplained(score, np.abs(residual), np.arange(1))[0, :, :, 0, 0]
+    np.testing.assert_allclose(same, [[0.0, 0.0, 7.0], [0.0, 0.0, 8.0]], atol=1e-3)
+    score.common = np.zeros(2, dtype=bool)
+    np.testing.assert_allclose(unexplained(score, residual, np.arange(1))[0, :, 0, 0, 0], 0.0, atol=1e-3)
