@@ -33,8 +33,8 @@ def _without(state: np.ndarray, residual: np.ndarray) -> np.ndarray:
 
 def _together(state: np.ndarray, common: np.ndarray) -> np.ndarray:
     """Return the columns (G m, l) of all groups at once from those (G, m, k) of each: what is common is there once."""
-    own = block_diag(*state[..., ~common].astype(float))
-    return np.concatenate([own, state[..., common].reshape(len(own), -1)], axis=1)
+    by_group = block_diag(*state[..., ~common].astype(float))
+    return np.concatenate([by_group, state[..., common].reshape(len(by_group), -1)], axis=1)
 
 
 def of_angles(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np.ndarray:
