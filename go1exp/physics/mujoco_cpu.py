@@ -23,13 +23,6 @@ DERIVED = "dof_M0"
 """A field that robots have of their own once constants have been derived from their models."""
 
 
-def _shared(output: np.ndarray) -> Tensor:
-    """Return an output of the engine as a tensor on its memory."""
-    with warnings.catch_warnings():  # it is read-only: torch has no such notion
-        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
-        return torch.from_numpy(output)
-
-
 class MujocoCpu:
     """N simulations on ``threads`` threads; the same bits whatever their number (see ``PhysicsBackend``)."""
 
@@ -40,10 +33,16 @@ class MujocoCpu:
         self.qpos = torch.from_numpy(self._batch.bind("qpos"))
         self.qvel = torch.from_numpy(self._batch.bind("qvel"))
         self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
-        self.sensordata = _shared(self._batch.bind("sensordata"))
+        self.sensordata = self._output("sensordata")
         self._fields: dict[str, Tensor] = {}
         self._baseline: dict[str, Tensor] = {}
         self._applied: Tensor | None = None
+
+    def _output(self, name: str) -> Tensor:
+        """Return live values that the engine writes."""
+        with warnings.catch_warnings():  # shared read-only: torch has no such notion
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            return torch.from_numpy(self._batch.bind(name))
 
     def step(self, torque: Tensor) -> None:
         """Advance one physics step under joint torques (N, 12), N m."""
@@ -88,8 +87,8 @@ class MujocoCpu:
         return self._applied
 
     def bias(self) -> Tensor:
-        """Live forces (N, nv), N and N m, that gravity and speeds ask of the joints in resets and steps to come."""
-        return _shared(self._batch.bind("qfrc_bias"))
+        """Live torques that hold the links against weight and inertia at their speeds."""
+        return self._output("qfrc_bias")
 
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
         """Indices of named bodies or geoms."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +17,6 @@ from go1exp.env.plant import FRICTION, Plant
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Rows, bolted, mounted
-from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.schema.registry import bind
 
 Base = tuple[tuple[float, ...], bool]
@@ -116,7 +115,7 @@ class Replayer:
 
     def _state(self, plant: Plant, rows: Rows, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coordinates and speeds of robots whose joints are at ``q`` (R, J) and ``qd``."""
-        backend = cast(MujocoCpu, plant.backend)  # of all held robots
+        backend = plant.backend
         mount = backend.qpos.shape[1] - q.shape[1]
         if not mount:
             return q, qd
