@@ -34,6 +34,7 @@ from go1exp.gap.robots.hung import hung
 from go1exp.gap.score.angle_errors import unexplained
 from go1exp.gap.score.likelihood import state_probes
 from go1exp.gap.search.fit import stacked
+from go1exp.gap.stages.explain import explain
 from go1exp.physics.mount import MOUNT
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
@@ -41,6 +42,7 @@ from go1exp.recording import read_folder
 from go1exp.schema.registry import Term, bind
 from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import build_terrain
+from tests.laboratory import recorded
 
 MASS, INERTIA, G = 12.0, (0.1, 0.2, 0.3), 9.81
 BLOCK = f"""<mujoco><worldbody><body name="block" pos="0 0 1">
@@ -344,3 +346,28 @@ def test_what_all_legs_feel_explains_their_errors_by_one_number() -> None:
     np.testing.assert_allclose(same, [[0.0, 0.0, 7.0], [0.0, 0.0, 8.0]], atol=1e-3)
     score.common = np.zeros(2, dtype=bool)
     np.testing.assert_allclose(unexplained(score, residual, np.arange(1))[0, :, 0, 0, 0], 0.0, atol=1e-3)
+
+
+# ---------------------------------------------------------------------- found in recordings
+
+
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+def test_a_hidden_mount_is_named_with_its_values_and_not_taken_for_a_tilt_or_inertia() -> None:
+    hidden = {"roll": 0.012, "pitch": 0.008, "damping": 0.15}
+    made = ["physics_dt=0.0005", "seconds=3", "excitation=[chirp,steps]", "gains=[[20,0.5],[35,1.2]]"]
+    rig, recordings = recorded(made, {"soft_mount": hidden})
+    settings = GapSettings(
+        stride_s=0.6,
+        effects=("soft_mount", "base_tilt", "link_com", "armature", "coulomb", "flexibility"),
+        shortlist=4,
+        max_terms=1,
+        bootstraps=20,
+        overlays=1,
+    )
+    result = explain(recordings, hung(rig.robot), settings)
+    assert [n.effect for n in result.named] == ["soft_mount"]
+    values = result.named[0].params
+    assert values["roll"]["robot"] == pytest.approx(0.012, rel=0.15)
+    assert values["pitch"]["robot"] == pytest.approx(0.008, rel=0.15)
+    assert values["damping"]["robot"] == pytest.approx(0.15, rel=0.15)
+    assert result.closed > 0.75
