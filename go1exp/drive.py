@@ -43,6 +43,7 @@ class DriveSetup:
         device: of the tensors to come.
         dtype: of the joint state to come (float64 on the CPU backend).
         floating: the trunk is free; else it is held.
+        mounted: it is held by a mount that may give way, whose degrees of freedom stand before those of the joints.
     """
 
     num_envs: int
@@ -55,6 +56,7 @@ class DriveSetup:
     device: torch.device
     dtype: torch.dtype
     floating: bool = True
+    mounted: bool = False
 
     def tensor(self, values: JointValues | Sequence[float]) -> Tensor:
         """Spread values over the joints, (J,), on the right device."""

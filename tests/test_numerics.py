@@ -19,6 +19,7 @@ from torch import Tensor
 from go1exp import data_root, robot
 from go1exp.compose import compose
 from go1exp.config import MANY_TERMS, TaskConfig, parse_task
+from go1exp.effects.rules import on_mount
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import Sensors, build_model
@@ -41,6 +42,7 @@ BARS: dict[str, tuple[tuple[float, float, float], str]] = {
     "flexibility": ((0.5, 0.75, 0.5), "the rotor swings at 30 to 70 Hz"),
     "kd_scale": ((0.5, 0.65, 0.5), "hardly damped: the leapfrog's error of phase, (frequency x step)^2 / 24, adds up"),
     "lag": ((0.5, 0.85, 0.5), "hardly damped: a lag takes kp x time from kd"),
+    "soft_mount": ((0.5, 0.63, 0.5), "hardly damped, and legs swing at other frequencies on a trunk that yields"),
     "stribeck": ((0.7, 0.55, 0.5), "a jump of the target frees a stuck joint half a step late"),
     "torque_delay": ((0.5, 0.8, 0.5), "hardly damped: a delay takes kp x delay from kd"),
 }
@@ -52,8 +54,8 @@ def task() -> TaskConfig:
     return parse_task(compose("train", ["rand=none", "backend.threads=1"]))
 
 
-def held(dt: float) -> tuple[mujoco.MjModel, Sensors]:
-    return build_model(task().robot, build_terrain(task().terrain), dt, held=(1.0, 0.0, 0.0, 0.0))
+def held(dt: float, mounted: bool = False) -> tuple[mujoco.MjModel, Sensors]:
+    return build_model(task().robot, build_terrain(task().terrain), dt, held=(1.0, 0.0, 0.0, 0.0), mounted=mounted)
 
 
 def choice(name: str) -> dict[str, Any]:
@@ -65,12 +67,12 @@ def choice(name: str) -> dict[str, Any]:
 def hanging(dt: float, effects: Mapping[str, Any]) -> Plant:
     """Hang up one robot for each of ``GAINS``."""
     n = len(GAINS)
-    backend = MujocoCpu(*held(dt), n, 1)
     terms = []
     for name, values in effects.items():
         term, problems = bind("effect", name, values, f"effect.{name}", MANY_TERMS["effect"])
         assert term, problems
         terms.append(term)
+    backend = MujocoCpu(*held(dt, on_mount(terms)), n, 1)
     plant = Plant(backend, drive_setup(task().robot, dt, backend, EnvRandom(0, n)), task().actuator, terms)
     kp, kd = (torch.tensor([[g[i]] for g in GAINS], dtype=torch.float64).expand(n, robot.NUM_JOINTS) for i in (0, 1))
     plant.set_gains(kp, kd)
@@ -95,8 +97,9 @@ def ours(dt: float, effects: Mapping[str, Any], step: float = STEP) -> Tensor:
     """The response of drives and effects as the package steps them."""
     plant = hanging(dt, effects)
     stance = torch.as_tensor(robot.NOMINAL_STANCE).repeat(len(GAINS), 1)
-    everyone = torch.ones(len(GAINS), dtype=torch.bool)
-    plant.backend.reset(everyone, stance, torch.zeros_like(stance))
+    everyone, qpos = torch.ones(len(GAINS), dtype=torch.bool), torch.zeros_like(plant.backend.qpos)
+    qpos[:, -robot.NUM_JOINTS :] = stance
+    plant.backend.reset(everyone, qpos, torch.zeros_like(plant.backend.qvel))
     plant.reset(everyone, stance)
     return step_response(dt, plant.q, plant.step, step)
 

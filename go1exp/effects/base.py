@@ -112,6 +112,8 @@ class Effect(Memory):
     """Model fields that ``edit_model`` writes."""
     joint_values: ClassVar[tuple[str, ...]] = ()
     """Parameters with a value per joint (filled in by itself)."""
+    mounts: ClassVar[bool] = False
+    """Whether it acts on joints between the world and a trunk that is held (``physics/mount.py``)."""
     order: ClassVar[int] = 0
     """Place among the effects of the same hook: smaller is nearer to the command."""
 

@@ -53,6 +53,7 @@ class Identification:
         rank: place among the nominal effects, smaller first, then in the order of registration. Resampling draws its
             random numbers in this order, so a change of it changes intervals within their own uncertainty.
         needs_ground: it acts on the trunk or on the feet; a robot whose trunk is held does not feel it.
+        needs_stand: it acts on what holds a trunk; a robot whose trunk is free does not feel it.
         common: its parameters have one value for all joints at which it is. For effects that few joints ever show.
         weighs_on_legs: one such error, equal at all joints, moves the legs of a standing robot as a change of weight
             does; an effect of the trunk must explain recordings better than it.
@@ -73,6 +74,7 @@ class Identification:
     nominal: bool = False
     rank: int = LAST
     needs_ground: bool = False
+    needs_stand: bool = False
     common: bool = False
     weighs_on_legs: bool = False
     levels: tuple[Mapping[str, float], ...] = ()

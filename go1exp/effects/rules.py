@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
+from typing import cast
 
 import numpy as np
 
-from go1exp.schema.joint_values import spread
+from go1exp.effects.base import Effect
+from go1exp.schema.joint_values import numbers, spread
 from go1exp.schema.registry import Term, members, unknown_name
 
 
@@ -24,6 +27,17 @@ def has_gains(actuator: Term) -> bool:
     """Return whether the drive has a position and a speed gain; a wrapper has those of the ``drive`` in it."""
     *_, (innermost, _) = drives(actuator)
     return bool(innermost.entry.traits.get("gains"))
+
+
+def on_mount(effects: Iterable[Term]) -> bool:
+    """Return whether a held trunk needs the joints of a mount: whether an effect on it is somewhere not null."""
+    return any(
+        numbers(term.parameters.get(p.name, p.null)) != (p.null,) or p.name in term.slots.get("spread", ())
+        for term in effects
+        if issubclass(kind := cast("type[Effect]", term.entry.target), Effect) and kind.mounts
+        for p in kind.params
+        if math.isfinite(p.tolerance)
+    )
 
 
 def _values_problems(term: Term, path: str, joints: Sequence[str]) -> list[str]:

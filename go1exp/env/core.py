@@ -17,6 +17,7 @@ from torch import Tensor
 
 from go1exp import robot
 from go1exp.config import TaskConfig
+from go1exp.effects.rules import on_mount
 from go1exp.env.engine import CapturedStep, make_backend
 from go1exp.env.evidence import Evidence, accuse
 from go1exp.env.gait_log import GaitLog
@@ -77,9 +78,9 @@ class Go1Core:
         critic: bool = False,
     ) -> None:
         self.task, self.num_envs, self.noise, self._spread_starts = task, num_envs, noise, spread_starts
-        self.terrain = build_terrain(task.terrain)
-        time, contact = task.sim, task.contact
-        model, sensors = build_model(task.robot, self.terrain, time.physics_dt, contact=contact, imu=imu, held=held)
+        self.terrain, time = build_terrain(task.terrain), task.sim
+        scene = partial(build_model, contact=task.contact, imu=imu, held=held, mounted=on_mount(task.effect))
+        model, sensors = scene(task.robot, self.terrain, time.physics_dt)
         self.backend = make_backend(task.backend, model, sensors, num_envs)
         self.device = self.backend.qpos.device
         self.random = EnvRandom(seed, num_envs, first_env, self.device, units=self.backend.units)

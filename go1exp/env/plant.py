@@ -40,6 +40,8 @@ def drive_setup(config: RobotConfig, physics_dt: float, backend: PhysicsBackend,
         return torch.as_tensor(robot.per_joint(hip_thigh_calf), dtype=like.dtype, device=like.device)
 
     like = backend.qpos
+    freedom = backend.qvel.shape[1]
+    floating = like.shape[1] != freedom  # a free joint has a quaternion
     return DriveSetup(
         num_envs=backend.num_envs,
         physics_dt=physics_dt,
@@ -50,7 +52,8 @@ def drive_setup(config: RobotConfig, physics_dt: float, backend: PhysicsBackend,
         random=random,
         device=like.device,
         dtype=like.dtype,
-        floating=like.shape[1] > robot.NUM_JOINTS,
+        floating=floating,
+        mounted=not floating and freedom > robot.NUM_JOINTS,
     )
 
 

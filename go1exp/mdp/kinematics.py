@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from go1exp import robot
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -35,11 +37,12 @@ class KinematicState:
     def view(cls, qpos: Tensor, qvel: Tensor, held: tuple[float, float, float, float] | None = None) -> KinematicState:
         """View MuJoCo's qpos (N, 19) and qvel (N, 18): writing here writes there.
 
-        The state of a robot whose trunk is ``held`` at an attitude w-x-y-z is its joints' alone, (N, 12); its trunk
-        rests at the origin, and writing that writes nowhere.
+        The state of a robot whose trunk is ``held`` at an attitude w-x-y-z is its joints' alone, (N, 12), after that of
+        a mount if there is one; its trunk rests at the origin, and writing that writes nowhere.
         """
         if held is None:
             return cls(qpos[:, :3], qpos[:, 3:7], qvel[:, :3], qvel[:, 3:6], qpos[:, 7:], qvel[:, 6:])
         still = torch.zeros(len(qpos), 3, dtype=qpos.dtype, device=qpos.device)
         quat = torch.tensor(held, dtype=qpos.dtype, device=qpos.device).repeat(len(qpos), 1)
-        return cls(still, quat, still.clone(), still.clone(), qpos, qvel)
+        joints = slice(-robot.NUM_JOINTS, None)
+        return cls(still, quat, still.clone(), still.clone(), qpos[:, joints], qvel[:, joints])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 
+from go1exp.physics.mount import MOUNT, add_mount
 from go1exp.physics.scene import RIGID, Sensors
 from go1exp.schema.registry import Expected
 
@@ -29,6 +30,7 @@ def build_fixed_base(
     physics_dt: float,
     base_quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
     disable: int = 0,
+    mounted: bool = False,
 ) -> mujoco.MjModel:
     """Compile a robot that is bolted down.
 
@@ -43,6 +45,7 @@ def build_fixed_base(
         physics_dt: timestep, s.
         base_quat: attitude of the base, w-x-y-z, base to world; it replaces the file's.
         disable: further disable flags of MuJoCo.
+        mounted: the base has the joints of ``physics/mount.py``, before its own.
 
     Raises:
         FixedBaseError: if the file is missing or no MJCF, has no such body or hinge, has them in another order, or has
@@ -62,6 +65,8 @@ def build_fixed_base(
         spec.delete(part)
     trunk = spec.body(base)
     trunk.quat, trunk.name = list(base_quat), BASE
+    if mounted:
+        add_mount(trunk)
     for name, limit in zip(joints, effort, strict=True):
         joint = spec.joint(name)
         joint.parent.name = name
@@ -79,7 +84,7 @@ def build_fixed_base(
         model = spec.compile()
     except ValueError as error:
         raise FixedBaseError(f"mjcf = {str(file)!r}: does not compile ({str(error).splitlines()[0]})") from None
-    order = [model.joint(k).name for k in range(model.njnt)]
+    order = [model.joint(k).name for k in range(len(MOUNT) if mounted else 0, model.njnt)]
     if order != list(joints):
         raise FixedBaseError(f"joints: must be in the order of {str(file)!r}: {', '.join(order)}")
     return model

@@ -19,6 +19,9 @@ from go1exp.tensors.randomness import unit_numbers
 STATE_FIELDS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl")
 """What one simulation carries from step to step (no activations in this model; applied forces are written anew)."""
 
+DERIVED = "dof_M0"
+"""A field that robots have of their own once constants have been derived from their models."""
+
 
 class MujocoCpu:
     """N simulations on ``threads`` threads; the same bits whatever their number (see ``PhysicsBackend``)."""
@@ -30,12 +33,16 @@ class MujocoCpu:
         self.qpos = torch.from_numpy(self._batch.bind("qpos"))
         self.qvel = torch.from_numpy(self._batch.bind("qvel"))
         self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
-        with warnings.catch_warnings():  # an output, shared read-only: torch has no such notion
-            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
-            self.sensordata = torch.from_numpy(self._batch.bind("sensordata"))
+        self.sensordata = self._output("sensordata")
         self._fields: dict[str, Tensor] = {}
         self._baseline: dict[str, Tensor] = {}
         self._applied: Tensor | None = None
+
+    def _output(self, name: str) -> Tensor:
+        """Return live values that the engine writes."""
+        with warnings.catch_warnings():  # shared read-only: torch has no such notion
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            return torch.from_numpy(self._batch.bind(name))
 
     def step(self, torque: Tensor) -> None:
         """Advance one physics step under joint torques (N, 12), N m."""
@@ -79,6 +86,10 @@ class MujocoCpu:
             self._applied = torch.from_numpy(self._batch.bind("qfrc_applied"))
         return self._applied
 
+    def bias(self) -> Tensor:
+        """Live torques that hold the links against weight and inertia at their speeds."""
+        return self._output("qfrc_bias")
+
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
         """Indices of named bodies or geoms."""
         return torch.tensor([getattr(self.model, kind)(name).id for name in names])
@@ -118,6 +129,12 @@ class MujocoCpu:
         """Continue from ``state_dict``: bit for bit if it is of this backend, else from the same state and model."""
         for name, value in state["fields"].items():
             self.field(name).copy_(value)
+        if "engine" not in state and (DERIVED in state["fields"] or self._batch.expanded(DERIVED) is not None):
+            # What was derived here before is not all among the fields saved. The mean inertia, to which the solver's
+            # tolerance is relative, is no field at all.
+            self._batch.set_const()
+            for name, value in state["fields"].items():
+                self.field(name).copy_(value)
         self._baseline = {n: v.to(self.field(n).dtype, copy=True) for n, v in state["baseline"].items()}
         for name in STATE_FIELDS:
             live = self._batch.bind(name)

@@ -11,6 +11,7 @@ import mujoco
 
 from go1exp import robot
 from go1exp.physics.model import load_robot
+from go1exp.physics.mount import add_mount
 from go1exp.physics.terrain_geom import FLOOR, add_to_spec
 from go1exp.robot import RobotConfig
 from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
@@ -62,6 +63,7 @@ def build_model(
     contact: ContactConfig = MUJOCO_CONTACT,
     imu: bool = False,
     held: tuple[float, float, float, float] | None = None,
+    mounted: bool = False,
 ) -> tuple[mujoco.MjModel, Sensors]:
     """Compile the scene.
 
@@ -74,6 +76,7 @@ def build_model(
         imu: add the IMU's sensors (they cost time and a policy does not need them).
         held: orientation w-x-y-z in which the trunk is held in the air, as on a stand; None lets it go. A held robot's
             state is its joints' alone.
+        mounted: the held trunk has the joints of ``physics/mount.py``, whose state stands before that of the legs.
     """
     spec = load_robot(config.inertia)
     if held is not None:
@@ -81,6 +84,8 @@ def build_model(
         for key in list(spec.keys):  # their state has a free trunk
             spec.delete(key)
         spec.body("trunk").pos, spec.body("trunk").quat = [0.0, 0.0, HELD_HEIGHT], list(held)
+        if mounted:
+            add_mount(spec.body("trunk"))
     if not decoration:
         for geom in list(spec.geoms):
             if geom.group == DECORATION_GROUP:

@@ -17,7 +17,7 @@ from go1exp import __version__, robot
 from go1exp.config import TaskConfig, time_rules
 from go1exp.controller.batch import Driven
 from go1exp.controller.types import Controller
-from go1exp.effects.rules import drives, has_gains
+from go1exp.effects.rules import drives, has_gains, on_mount
 from go1exp.env.core import Go1Core
 from go1exp.env.engine import make_backend
 from go1exp.env.plant import Plant, drive_setup
@@ -98,6 +98,7 @@ def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
         rig.physics_dt,
         imu=True,
         held=None if hang is None else held_quat(hang),
+        mounted=on_mount(rig.effect),
     )
     backend = make_backend(rig.backend, model, blocks, n)
     random = EnvRandom(seed, n, device=backend.qpos.device, alike=True)  # one robot, in all its recordings

@@ -75,7 +75,7 @@ def sample(plant: Plant, target: Tensor) -> dict[str, Tensor]:
         "foot_force": contact[..., 1:].norm(dim=-1),
     }
     qpos, qvel = plant.backend.qpos, plant.backend.qvel
-    if qpos.shape[1] > robot.NUM_JOINTS:
+    if qpos.shape[1] != qvel.shape[1]:  # a free trunk, which has a quaternion
         values |= {
             "base_pos": qpos[:, :3],
             "base_quat": qpos[:, 3:7],

@@ -25,6 +25,7 @@ from go1exp.config import MANY_TERMS, TaskConfig, parse_task
 from go1exp.drive import DriveSetup
 from go1exp.effects.base import Effect, Measured, Param
 from go1exp.effects.identification import LAST
+from go1exp.effects.rules import on_mount
 from go1exp.effects.stack import HOOKS
 from go1exp.env.core import Go1Core
 from go1exp.env.plant import Plant, drive_setup
@@ -69,9 +70,9 @@ def task() -> TaskConfig:
 
 
 @cache
-def compiled(held: bool) -> tuple[mujoco.MjModel, Sensors]:
-    ground = build_terrain(task().terrain)
-    return build_model(task().robot, ground, DT, imu=True, held=(1.0, 0.0, 0.0, 0.0) if held else None)
+def compiled(held: bool, mounted: bool = False) -> tuple[mujoco.MjModel, Sensors]:
+    ground, attitude = build_terrain(task().terrain), (1.0, 0.0, 0.0, 0.0) if held else None
+    return build_model(task().robot, ground, DT, imu=True, held=attitude, mounted=mounted)
 
 
 def term(name: str, values: Mapping[str, Any]) -> Term:
@@ -82,10 +83,15 @@ def term(name: str, values: Mapping[str, Any]) -> Term:
 
 
 class Rig:
-    """N robots on a stand, or on the ground, with effects."""
+    """N robots on a stand, or on the ground, with effects.
 
-    def __init__(self, n: int, effects: Sequence[Term], *, held: bool, first_env: int = 0) -> None:
-        model, sensors = compiled(held)
+    A stand gives way where an effect says so; ``mounted``: or where one may be told to later.
+    """
+
+    def __init__(
+        self, n: int, effects: Sequence[Term], *, held: bool, first_env: int = 0, mounted: bool = False
+    ) -> None:
+        model, sensors = compiled(held, mounted or on_mount(effects))
         self.backend = MujocoCpu(model, sensors, n, 1)
         self.random = EnvRandom(3, n, first_env)
         setup = drive_setup(task().robot, DT, self.backend, self.random)
@@ -409,7 +415,7 @@ def test_every_size_moves_something_that_a_robot_measures(entry: Entry) -> None:
     """An identification can find no parameter that does not."""
     moved: dict[str, dict[str, float]] = {p.name: {} for p in sizes(entry)}
     for held in places(entry):
-        rig = Rig(1 + len(moved), [term(entry.name, {})], held=held)
+        rig = Rig(1 + len(moved), [term(entry.name, {})], held=held, mounted=kind(entry).mounts)
         for row, p in enumerate(sizes(entry), start=1):
             rig.write(entry.name, row, {p.name: probe(entry, p)})
         rig.plant.refresh()
@@ -428,13 +434,14 @@ def test_robots_of_a_batch_have_their_own_values_and_move_as_alone(entry: Entry)
     """Rows: absent, probe, half a probe, all written while it runs; alone: configured."""
     values = [{p.name: p.null + share * (probe(entry, p) - p.null) for p in sizes(entry)} for share in (0.0, 1.0, 0.5)]
     for held in places(entry)[:1]:
-        batch = Rig(3, [term(entry.name, {})], held=held)
+        mounted = kind(entry).mounts
+        batch = Rig(3, [term(entry.name, {})], held=held, mounted=mounted)
         for row, own in enumerate(values):
             batch.write(entry.name, row, own)
         batch.plant.refresh()
         together = batch.run(80)
         for row, own in enumerate(values):
-            alone = Rig(1, [term(entry.name, own)], held=held, first_env=row).run(80)
+            alone = Rig(1, [term(entry.name, own)], held=held, first_env=row, mounted=mounted).run(80)
             assert same({k: v[:, row : row + 1] for k, v in together.items()}, alone) == [], (row, held)
 
 
@@ -442,7 +449,8 @@ def test_robots_of_a_batch_have_their_own_values_and_move_as_alone(entry: Entry)
 def test_an_effect_continues_from_its_saved_state(entry: Entry) -> None:
     held = places(entry)[0]
     configured = [term(entry.name, probes(entry))]
-    first, second = Rig(2, configured, held=held), Rig(2, [term(entry.name, {})], held=held)
+    mounted = kind(entry).mounts
+    first, second = Rig(2, configured, held=held), Rig(2, [term(entry.name, {})], held=held, mounted=mounted)
     first.run(50)
     second.load_state_dict(first.state_dict())
     assert same(first.run(50), second.run(50)) == []

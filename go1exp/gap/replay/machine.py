@@ -48,8 +48,18 @@ class Machine(Protocol):
     def drive(self) -> Term:
         """Return what turns commands into torques."""
 
-    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
-        """Return a backend with ``num`` held robots, and their drives."""
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, DriveSetup]:
+        """Return a backend with ``num`` robots, and their drives.
+
+        Args:
+            num: of the robots.
+            physics_dt: step, s.
+            base_quat: attitude of a held base, w-x-y-z.
+            threads: of the engine.
+            mounted: a held base has the joints of ``physics/mount.py``; nothing to one that is free.
+        """
 
 
 def pd() -> Term:

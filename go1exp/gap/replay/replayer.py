@@ -16,8 +16,11 @@ from go1exp.effects.base import Measured
 from go1exp.env.plant import FRICTION, Plant
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
 from go1exp.gap.replay.machine import Machine
-from go1exp.gap.replay.rows import Rows
+from go1exp.gap.replay.rows import Rows, bolted, mounted
 from go1exp.schema.registry import bind
+
+Base = tuple[tuple[float, ...], bool]
+"""Attitude of a base, and whether it can move on a mount."""
 
 
 @dataclass
@@ -45,21 +48,25 @@ class Replayer:
         """Return what sensors would measure (R, n, C, J) at the windows' sample times."""
         w = self.windows
         y = np.empty((len(rows.window), w.t.shape[1], len(w.quantities), len(w.joints)))
-        attitudes, which = np.unique(self.quats[rows.window].round(6), axis=0, return_inverse=True)
-        for k, quat in enumerate(attitudes):
+        soft = mounted(rows)
+        kinds, which = np.unique(np.c_[self.quats[rows.window].round(6), soft], axis=0, return_inverse=True)
+        for k, (*quat, softly) in enumerate(kinds):
             members = np.flatnonzero(which.ravel() == k)
+            part = rows if softly else bolted(rows)
             pieces = int(np.ceil(len(members) / self.max_rows))
             for piece in np.array_split(members, pieces):
                 size = min(padded(len(piece)), self.max_rows)
                 full = np.concatenate([piece, np.repeat(piece[-1:], size - len(piece))])
-                y[piece] = self._batch(rows.part(full), dt, tuple(float(v) for v in quat))[: len(piece)]
+                base = tuple(float(v) for v in quat), bool(softly)
+                y[piece] = self._batch(part.part(full), dt, base)[: len(piece)]
         return y
 
-    def _plant(self, rows: Rows, dt: float, quat: tuple[float, ...]) -> Plant:
+    def _plant(self, rows: Rows, dt: float, base: Base) -> Plant:
         """Return a plant whose effects are exactly those of ``rows``, on a backend that may be an old one."""
-        key = (len(rows.window), dt, quat)
+        key = (len(rows.window), dt, base)
         if key not in self._backends:
-            self._backends[key] = (*self.machine.build(len(rows.window), dt, quat, self.threads), set())
+            quat, softly = base
+            self._backends[key] = (*self.machine.build(len(rows.window), dt, quat, self.threads, softly), set())
         backend, setup, touched = self._backends[key]
         for name in touched:
             backend.field(name).copy_(backend.compiled(name))
@@ -108,7 +115,21 @@ class Replayer:
 
     def _state(self, plant: Plant, rows: Rows, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coordinates and speeds of robots whose joints are at ``q`` (R, J) and ``qd``."""
-        return q, qd
+        backend = plant.backend
+        mount = backend.qpos.shape[1] - q.shape[1]
+        if not mount:
+            return q, qd
+        # The trunk rests where the mount bears the legs as they are.
+        still = torch.zeros(len(q), mount, dtype=q.dtype)
+        everyone, bias = torch.ones(len(q), dtype=torch.bool), backend.bias()
+        backend.reset(everyone, torch.cat([still, q], dim=1), torch.cat([still, torch.zeros_like(qd)], dim=1))
+        stiffness = backend.field("jnt_stiffness")[:, :mount]
+        inertia = backend.field("dof_M0")[:, :mount]
+        load = torch.zeros(len(q), 2 * mount, dtype=q.dtype) if rows.mount is None else torch.as_tensor(rows.mount)
+        place = backend.field("qpos_spring")[:, :mount] + (load[:, :mount] - bias[:, :mount]) / stiffness
+        speed = load[:, mount:] / torch.sqrt(stiffness * inertia)
+        place, speed = (v.where(stiffness > 0.0, still) for v in (place, speed))
+        return torch.cat([place, q], dim=1), torch.cat([speed, qd], dim=1)
 
     def observing(self, windows: Windows) -> Replayer:
         """Return a replayer of the same windows with other quantities (``Windows.observable``): with torques."""
@@ -132,10 +153,10 @@ class Replayer:
             self._inputs[dt] = torch.as_tensor(targets), torch.as_tensor(enabled)
         return self._inputs[dt]
 
-    def _batch(self, rows: Rows, dt: float, quat: tuple[float, ...]) -> np.ndarray:
+    def _batch(self, rows: Rows, dt: float, base: Base) -> np.ndarray:
         """Run a batch, all windows at once."""
         w = self.windows
-        plant = self._plant(rows, dt, quat)
+        plant = self._plant(rows, dt, base)
         index = torch.as_tensor(rows.window)
         targets, enabled = self._signals(dt)
         targets, enabled = targets[:, index], enabled[:, index]

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 import go1exp.effects  # noqa: F401  (registers every effect)
+from go1exp.effects.tolerances import declared, effect_class, sizes
 from go1exp.gap.replay.machine import Machine
 from go1exp.schema.registry import members
+
+MOUNT_LOAD = 2 * (10.0, 10.0, 10.0, 2.0, 2.0)
+"""Standard deviation of ``Rows.mount``, N and N m (chosen: a leg of 2 kg that swings at 5 m/s2)."""
 
 Key = tuple[str, str]
 """Effect and parameter."""
@@ -27,6 +31,8 @@ class Rows:
         q: (R, J) added to the initial angles, rad; None for nothing.
         qd: (R, J) added to the initial speeds, rad/s.
         base: (R, 9) added to a free base's first height, roll and pitch, velocity and rate.
+        mount: (R, 10) how far from rest a trunk on a mount begins: by what these forces, N, and torques, N m, along the
+            mount's five directions deflect it, then at the speeds with which it would swing so far.
     """
 
     window: np.ndarray
@@ -34,11 +40,27 @@ class Rows:
     q: np.ndarray | None = None
     qd: np.ndarray | None = None
     base: np.ndarray | None = None
+    mount: np.ndarray | None = None
 
     def part(self, which: np.ndarray) -> Rows:
         """Return some of them."""
-        moved = (None if v is None else v[which] for v in (self.q, self.qd, self.base))
+        moved = (None if v is None else v[which] for v in (self.q, self.qd, self.base, self.mount))
         return Rows(self.window[which], {k: v[which] for k, v in self.values.items()}, *moved)
+
+
+def mounted(rows: Rows) -> np.ndarray:
+    """Return which rows (R,) need a trunk that can move on a mount: those with an effect on it that is not null."""
+    away = np.zeros(len(rows.window), dtype=bool)
+    for (effect, name), values in rows.values.items():
+        kind = effect_class(effect)
+        if kind.mounts and name in {key for _, key in sizes(effect)}:
+            away |= (values != declared((effect, name)).null).any(axis=1)
+    return away
+
+
+def bolted(rows: Rows) -> Rows:
+    """Return rows without effects on a mount."""
+    return replace(rows, values={key: v for key, v in rows.values.items() if not effect_class(key[0]).mounts})
 
 
 def null(effect: str) -> Theta:
@@ -78,10 +100,14 @@ def variants(
             wide = joints if per == "joint" else 1
             full[key] = np.tile(np.broadcast_to(theta.get(key, value), (wide,)), (count, 1))
     q, qd, base = np.zeros((count, joints)), np.zeros((count, joints)), np.zeros((count, len(machine.base_probe)))
+    mount = np.zeros((count, len(MOUNT_LOAD)))
     for k, probe in enumerate(probes):
         changed = slice(1 + k, None, size)
         if probe.key == "base":
             base[changed] += probe.delta
+            continue
+        if probe.key == "mount":
+            mount[changed] += probe.delta
             continue
         columns = slice(None) if probe.place is None else groups[:, probe.place]
         if isinstance(probe.key, str):
@@ -90,4 +116,4 @@ def variants(
         for key, value in probe.also.items():
             full[key][changed] = value
         full[probe.key][changed, columns] += probe.delta[columns]
-    return Rows(np.repeat(windows, size), full, q, qd, base)
+    return Rows(np.repeat(windows, size), full, q, qd, base, mount)

@@ -100,14 +100,16 @@ class FixedBase:
         model = self.model(0.001, (1.0, 0.0, 0.0, 0.0))
         return np.where(model.jnt_limited[:, None], model.jnt_range, np.nan)
 
-    def model(self, physics_dt: float, base_quat: Sequence[float]) -> Any:
-        """Return the compiled MuJoCo model."""
+    def model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool = False) -> Any:
+        """Return the compiled MuJoCo model; the base of one that is ``mounted`` can move."""
         file, base = Path(self.config.mjcf), self.config.base
-        return build_fixed_base(file, base, self.joints, self.effort, physics_dt, base_quat, NEEDLESS)
+        return build_fixed_base(file, base, self.joints, self.effort, physics_dt, base_quat, NEEDLESS, mounted)
 
-    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` robots, and their drives."""
-        backend = MujocoCpu(self.model(physics_dt, base_quat), NO_SENSORS, num, threads)
+        backend = MujocoCpu(self.model(physics_dt, base_quat, mounted), NO_SENSORS, num, threads)
         like = backend.qpos
 
         def tensor(values: Sequence[float]) -> Tensor:
@@ -119,11 +121,12 @@ class FixedBase:
             joints=self.joints,
             effort_limit=tensor(self.effort),
             velocity_limit=tensor(self.top_speed),
-            armature=backend.compiled("dof_armature"),
+            armature=backend.compiled("dof_armature")[-len(self.joints) :],
             random=EnvRandom(0, num, device=like.device),
             device=like.device,
             dtype=like.dtype,
             floating=False,
+            mounted=mounted,
         )
         return backend, setup
 

@@ -66,11 +66,13 @@ class HungGo1(Go1):
         """Lowest and highest angle (J, 2), rad."""
         return robot.JOINT_POS_LIMITS.copy()
 
-    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
         w, x, y, z = base_quat
         ground = build_terrain(TerrainConfig(kind="flat"))
-        model, blocks = build_model(self.config, ground, physics_dt, held=(w, x, y, z))
+        model, blocks = build_model(self.config, ground, physics_dt, held=(w, x, y, z), mounted=mounted)
         model.opt.disableflags |= NEEDLESS
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))

@@ -60,7 +60,9 @@ class StandingGo1(Go1):
     tolerances: Tolerances = DECLARED
     free_trunk: ClassVar[bool] = True
 
-    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
         model, blocks = build_model(self.config, build_terrain(TerrainConfig(kind="flat")), physics_dt)
         model.opt.disableflags |= NO_SENSORS

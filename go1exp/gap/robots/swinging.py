@@ -55,7 +55,9 @@ class SwingingGo1(Go1):
     tolerances: Tolerances = DECLARED
     free_trunk: ClassVar[bool] = True
 
-    def build(self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int) -> tuple[Any, DriveSetup]:
+    def build(
+        self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
+    ) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` robots in the air on heavy trunks, and their drives."""
         model, blocks = build_model(self.config, build_terrain(TerrainConfig(kind="flat")), physics_dt)
         model.opt.disableflags |= NEEDLESS

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from go1exp.gap.result import AngleErrors
 from go1exp.gap.score.likelihood import Scorer
@@ -12,12 +13,28 @@ from go1exp.gap.score.likelihood import Scorer
 
 def unexplained(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np.ndarray:
     """Return residuals (V, G, m) of windows without what their initial states explain, (V, G, n, C, K), in noises."""
-    state = scorer.state[windows].astype(float)
-    inner = np.swapaxes(state, -1, -2) @ state + np.eye(state.shape[-1])
-    cross = np.swapaxes(state, -1, -2) @ residual[..., None]
-    left = residual - (state @ np.linalg.solve(inner, cross))[..., 0]
+    if scorer.common.any():
+        pairs = zip(scorer.state[windows], residual, strict=True)
+        left = np.stack(
+            [_without(_together(state, scorer.common), one.ravel()).reshape(one.shape) for state, one in pairs]
+        )
+    else:
+        left = _without(scorer.state[windows].astype(float), residual)
     n, quantities = scorer.windows.t.shape[1], len(scorer.windows.quantities)
     return np.asarray(left.reshape(*left.shape[:2], n, quantities, -1))
+
+
+def _without(state: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return residuals (..., m) without the likeliest changes of the initial state, whose columns are (..., m, k)."""
+    inner = np.swapaxes(state, -1, -2) @ state + np.eye(state.shape[-1])
+    cross = np.swapaxes(state, -1, -2) @ residual[..., None]
+    return np.asarray(residual - (state @ np.linalg.solve(inner, cross))[..., 0])
+
+
+def _together(state: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """Return the columns (G m, l) of all groups at once from those (G, m, k) of each: what is common is there once."""
+    by_group = block_diag(*state[..., ~common].astype(float))
+    return np.concatenate([by_group, state[..., common].reshape(len(by_group), -1)], axis=1)
 
 
 def of_angles(scorer: Scorer, residual: np.ndarray, windows: np.ndarray) -> np.ndarray:
@@ -40,19 +57,20 @@ def within(scorer: Scorer, residual: np.ndarray, windows: np.ndarray, accept: fl
 
 
 def angle_errors(
-    scorer: Scorer,
+    scorers: tuple[Scorer, Scorer],
     before: np.ndarray,
     after: np.ndarray,
     windows: np.ndarray,
     episodes: Sequence[str],
     accept: float = 0.0,
 ) -> AngleErrors:
-    """Compare two models by their residuals (V, G, m) on windows (V,); ``episodes`` are the names of the recordings.
+    """Compare two models by their residuals (V, G, m) on windows (V,), each in units of its scorer.
 
-    ``accept`` is what the user does not care about, rad; 0 for nothing. Medians of windows, so that a few wild ones do
-    not decide.
+    ``episodes`` are the names of the recordings; ``accept`` is what the user does not care about, rad; 0 for nothing.
+    Medians of windows, so that a few wild ones do not decide.
     """
-    pair = np.stack([of_angles(scorer, residual, windows) for residual in (before, after)])  # 2 V J
+    scorer, residuals = scorers[0], (before, after)
+    pair = np.stack([of_angles(s, r, windows) for s, r in zip(scorers, residuals, strict=True)])  # 2 V J
     whole = np.sqrt(np.nanmean(pair**2, axis=2))
     episode = scorer.windows.episode[windows]
     gone = 1.0 - whole[1] / np.maximum(whole[0], 1e-300)
@@ -69,5 +87,7 @@ def angle_errors(
         worse=float(np.mean(gone < 0.0)),
         by_joint={name: medians(pair[:, :, j]) for j, name in enumerate(scorer.windows.joints)},
         by_episode={episodes[e]: medians(whole[:, episode == e]) for e in np.unique(episode)},
-        within=(within(scorer, before, windows, accept), within(scorer, after, windows, accept)) if accept else None,
+        within=(within(scorer, before, windows, accept), within(scorers[1], after, windows, accept))
+        if accept
+        else None,
     )

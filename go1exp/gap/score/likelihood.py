@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.replayer import Replayer
-from go1exp.gap.replay.rows import Probe, Rows, Theta, variants
+from go1exp.gap.replay.rows import MOUNT_LOAD, Probe, Rows, Theta, mounted, variants
 
 STATE_PROBE = (1.0e-3, 0.05)
 """Change of an initial angle, rad, and speed, rad/s, by which its influence is measured."""
@@ -56,6 +56,8 @@ class Scorer:
         renewed: returns a scorer whose floors and initial states suit other values of the model.
         clock_s: what the clock was taken to be off by, s.
         expected: the windows with their initial states as sensors tell them, where those were moved; None if not.
+        common: (k,) bool, which columns of ``state`` are of a trunk on a mount, which all groups feel. In scores each
+            group has it to itself.
     """
 
     replayer: Replayer
@@ -64,6 +66,7 @@ class Scorer:
     renewed: Callable[[Theta], Scorer] | None = None
     clock_s: float = 0.0
     expected: Windows | None = None
+    common: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def windows(self) -> Windows:
@@ -92,15 +95,20 @@ class Scorer:
         return np.asarray(whole / self.size[window][:, None])
 
 
-def state_probes(machine: Machine) -> list[Probe]:
-    """Return the probes of the initial state: angles, then speeds, of each place in the groups; then of a free base."""
+def state_probes(machine: Machine, theta: Theta | None = None) -> list[Probe]:
+    """Return the probes of the initial state: angles, then speeds, of each place in the groups; then of the base.
+
+    A base has a state where it is free, or where ``theta`` puts it on a mount that gives way.
+    """
     places, joints = range(len(machine.groups[0])), len(machine.joints)
     joints_probes = [
         Probe(kind, place, np.full(joints, size))
         for kind, size in zip(("q", "qd"), STATE_PROBE, strict=True)
         for place in places
     ]
-    return joints_probes + [Probe("base", None, row) for row in np.diag(machine.base_probe)]
+    of_base = [Probe("base", None, row) for row in np.diag(machine.base_probe)]
+    on_mount = mounted(variants(machine, theta or {}, np.zeros(1, dtype=int), []))[0]
+    return joints_probes + of_base + [Probe("mount", None, row) for row in np.diag(MOUNT_LOAD) if on_mount]
 
 
 def _start_sd(windows: Windows, machine: Machine, probe: Probe) -> np.ndarray:
@@ -108,6 +116,8 @@ def _start_sd(windows: Windows, machine: Machine, probe: Probe) -> np.ndarray:
     if probe.key == "base":
         axis = int(np.argmax(probe.delta))
         return windows.base_sd[:, axis, None] / machine.base_probe[axis]
+    if probe.key == "mount":
+        return np.ones((len(windows), 1))
     sd = windows.q_sd if probe.key == "q" else windows.qd_sd
     return sd[:, np.array(machine.groups)[:, probe.place]] / STATE_PROBE[probe.key == "qd"]
 
@@ -125,7 +135,7 @@ def scorer(
     ``subset`` holds the numbers of windows; with it, ``state`` is that of those windows alone.
     """
     w, machine = replayer.windows, replayer.machine
-    probes = state_probes(machine)
+    probes = state_probes(machine, theta)
     everything = np.arange(len(w)) if subset is None else subset
     rows = variants(machine, theta, everything, probes)
     empty = Scorer(replayer, scale, np.empty(0), clock_s=clock_s)
@@ -138,4 +148,6 @@ def scorer(
     columns += [empty.unit(change, everything) for change in w.unknown(y[:, 0])]
     if clock_s:
         columns.append(empty.unit(clock_s * np.gradient(y[:, 0], w.period, axis=1), everything))
-    return dataclasses.replace(empty, state=np.stack(columns, axis=-1))
+    common = np.zeros(len(columns), dtype=bool)
+    common[: len(probes)] = [probe.key == "mount" for probe in probes]
+    return dataclasses.replace(empty, state=np.stack(columns, axis=-1), common=common)

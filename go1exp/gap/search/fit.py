@@ -51,7 +51,7 @@ def stacked(parts: Sequence[Rows]) -> Rows:
         wide = max(rows.values[key].shape[1] for rows in parts if key in rows.values)
         columns = [rows.values.get(key, np.broadcast_to(value, (len(rows.window), wide))) for rows in parts]
         values[key] = np.concatenate(columns)
-    moved = [np.concatenate([getattr(rows, name) for rows in parts]) for name in ("q", "qd", "base")]
+    moved = [np.concatenate([getattr(rows, name) for rows in parts]) for name in ("q", "qd", "base", "mount")]
     return Rows(np.concatenate([rows.window for rows in parts]), values, *moved)
 
 

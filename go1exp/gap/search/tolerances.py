@@ -39,7 +39,13 @@ def identification(effect: str) -> Identification:
 
 def felt(machine: Machine) -> tuple[str, ...]:
     """Return the registered effects that a robot can feel; one whose trunk is held has no use for ground."""
-    return tuple(name for name in members("effect") if machine.on_ground or not identification(name).needs_ground)
+    free = bool(machine.base_probe)
+    return tuple(
+        name
+        for name in members("effect")
+        if not (identification(name).needs_ground and not machine.on_ground)
+        and not (identification(name).needs_stand and free)
+    )
 
 
 def nominal(machine: Machine) -> tuple[str, ...]:

@@ -173,10 +173,12 @@ def written(
 
 def _angle_errors(comparison: Comparison, search: Search) -> AngleErrors:
     """Return the errors of the angles before and after, on windows that no fitted value has seen."""
-    score, windows = comparison.scorer, search.splits.judged  # the same floors for both, whatever was named
-    before, after = residuals(score, [{}, search.state.theta], windows, search.dt)
+    windows, plain, theta = search.splits.judged, comparison.scorer, search.state.theta
+    # The same floors for both, whatever was named; only a trunk on a mount has a first state that a bolted one has not.
+    last = search.state.scorer if search.state.scorer.common.any() else plain
+    (before,), (after,) = (residuals(s, [values], windows, search.dt) for s, values in ((plain, {}), (last, theta)))
     names = [r.meta.episode for r in comparison.recordings]
-    return angle_errors(score, before, after, windows, names, search.settings.accept)
+    return angle_errors((plain, last), before, after, windows, names, search.settings.accept)
 
 
 def provenance(
