@@ -56,6 +56,13 @@ class PhysicsBackend(Protocol):
         The first six of a floating trunk are a force on its origin in the world frame and a torque in its own.
         """
 
+    def bias(self) -> Tensor:
+        """Live torques (N, nv) that hold the links against their weight, Coriolis and centrifugal forces, N and N m.
+
+        MuJoCo's ``qfrc_bias``; no forces of contacts. Stale as ``sensordata`` is. Ask for it before it is needed: its
+        values count from the next ``step`` or ``reset`` on.
+        """
+
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
         """Indices ``(len(names),)`` of named objects; ``kind`` is ``body`` or ``geom``."""
 

@@ -30,12 +30,16 @@ class MujocoCpu:
         self.qpos = torch.from_numpy(self._batch.bind("qpos"))
         self.qvel = torch.from_numpy(self._batch.bind("qvel"))
         self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
-        with warnings.catch_warnings():  # an output, shared read-only: torch has no such notion
-            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
-            self.sensordata = torch.from_numpy(self._batch.bind("sensordata"))
+        self.sensordata = self._output("sensordata")
         self._fields: dict[str, Tensor] = {}
         self._baseline: dict[str, Tensor] = {}
         self._applied: Tensor | None = None
+
+    def _output(self, name: str) -> Tensor:
+        """Return live values that the engine writes."""
+        with warnings.catch_warnings():  # shared read-only: torch has no such notion
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            return torch.from_numpy(self._batch.bind(name))
 
     def step(self, torque: Tensor) -> None:
         """Advance one physics step under joint torques (N, 12), N m."""
@@ -78,6 +82,10 @@ class MujocoCpu:
         if self._applied is None:
             self._applied = torch.from_numpy(self._batch.bind("qfrc_applied"))
         return self._applied
+
+    def bias(self) -> Tensor:
+        """Live torques that hold the links against weight and inertia at their speeds."""
+        return self._output("qfrc_bias")
 
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
         """Indices of named bodies or geoms."""

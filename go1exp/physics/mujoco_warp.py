@@ -117,7 +117,7 @@ class MujocoWarp:
         self._memory = {"time": wp.to_torch(d.time), "qacc_warmstart": wp.to_torch(d.qacc_warmstart)}
         self._memory |= {"qpos": self.qpos, "qvel": self.qvel, "ctrl": self._ctrl}
         self._overflow = wp.to_torch(d.overflow)
-        self._qfrc_applied = wp.to_torch(d.qfrc_applied)
+        self._qfrc_applied, self._qfrc_bias = wp.to_torch(d.qfrc_applied), wp.to_torch(d.qfrc_bias)
         self._fields: dict[str, Tensor] = {}
         self._ids: dict[tuple[str, tuple[str, ...]], Tensor] = {}
         self._compiled: dict[str, Tensor] = {}
@@ -209,6 +209,10 @@ class MujocoWarp:
     def applied(self) -> Tensor:
         """Live generalised forces beside the drives'."""
         return self._qfrc_applied
+
+    def bias(self) -> Tensor:
+        """Live torques that hold the links against weight and inertia at their speeds."""
+        return self._qfrc_bias
 
     def ids(self, kind: str, names: tuple[str, ...]) -> Tensor:
         """Indices of named bodies or geoms."""
