@@ -39,6 +39,8 @@ class LoadFriction(Effect):
         free_shapes=("external",),
         simpler="coulomb",
         excitation="slow_ramps",
+        confounded=("coulomb",),
+        told_apart_by="record slow_ramps through poses of different load, and torque_off",
     )
     coefficient: Tensor
     external: Tensor
