@@ -116,7 +116,7 @@ def test_a_servo_is_a_motor_at_a_voltage_if_its_model_says_so() -> None:
         drive: Any = motor.drive()(setup)
         drive.kp.fill_(3.0)
         drive.kd.zero_()
-        line = ((0.1, 0.0, 0.3), (9.0, 0.0, 0.81), (9.0, 12.0, stall / 4), (9.0, 16.0, 0.0), (0.1, 8.0, 0.3 - stall / 2))
+        line = ((0.1, 0.0, 0.3), (9.0, 0.0, 0.81), (9.0, 12.0, 0.25 * stall), (9.0, 16.0, 0.0))
         for error, speed, torque in line:
             assert float(drive.torque(error * one, 0.0 * one, speed * one)) == pytest.approx(torque, abs=1e-12)
     with pytest.raises(NotComparable, match="says no gains"):
