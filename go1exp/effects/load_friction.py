@@ -26,7 +26,7 @@ class LoadFriction(Effect):
 
     BAM's files have 0.02 to 0.26 for servos at 1; at 0 a held weight takes twice that for the same friction. The forces
     on the feet of a robot that stands are not in ``outside``, so that its gears rub too little at 1. At a constant load
-    this is ``coulomb``; in slow motion it resembles ``strength`` and ``kp_scale``.
+    this is ``coulomb``; in slow motion it resembles ``strength`` and ``kp_scale``. Identification tries 0 and 1.
     """
 
     title = "friction that grows with load"
@@ -35,8 +35,7 @@ class LoadFriction(Effect):
         Param("external", "-", 0.0, 2.0, 0.0, math.inf, "joint", "share of the load from outside that counts"),
     )
     identification = Identification(
-        shapes=({"external": 0.0}, {"external": 1.0}),
-        free_shapes=("external",),
+        laws=({"external": 0.0}, {"external": 1.0}),
         simpler="coulomb",
         excitation="slow_ramps",
         confounded=("coulomb",),

@@ -290,6 +290,9 @@ def test_the_excitation_that_shows_an_effect_exists_and_stands_if_the_effect_nee
 def test_shapes_and_levels_are_parameters_within_their_bounds(entry: Entry) -> None:
     how, by_name = kind(entry).identification, {p.name: p for p in kind(entry).params}
     assert {*how.free_shapes} <= names_of(entry, shapes=True)
+    for law in how.laws:
+        assert {*law} <= names_of(entry, shapes=True) - {*how.free_shapes}
+        assert all(by_name[name].low <= value <= by_name[name].high for name, value in law.items())
     for shapes in how.shapes:
         assert {*shapes} <= {*how.free_shapes}, "a shape that is tried and then held fast"
         for name, value in shapes.items():
