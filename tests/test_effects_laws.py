@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 from torch import Tensor
 
@@ -105,7 +106,13 @@ INSTANT: dict[str, dict[str, Slow]] = {
             b + e["strength"] * math.exp(-math.exp(e["exponent"] * (math.log(abs(qd)) - math.log(e["speed"]))))
         )
     },
-    "load_friction": {"on_friction": lambda e, b, tau, qd: b + e["coefficient"] * max(tau, -tau)},
+    "load_friction": {
+        "on_load": lambda e, b, tau, out: (
+            b
+            + max(e["coefficient"] * tau, e["coefficient"] * e["external"] * out)
+            - min(e["coefficient"] * tau, e["coefficient"] * e["external"] * out)
+        )
+    },
     "asymmetric_friction": {
         "on_joint": lambda e, q, qd: (e["backward"] - e["forward"]) / 2,
         "on_friction": lambda e, b, tau, qd: b + (e["backward"] + e["forward"]) / 2,
@@ -147,6 +154,7 @@ def test_a_law_without_memory_agrees_with_one_reckoned_joint_by_joint(
     arguments = {
         "on_joint": (q, qd),
         "on_friction": (q.abs(), torque, qd),
+        "on_load": (q.abs(), torque, 10.0 * q),
         "on_drive": (torque, q, qd),
         "on_gains": (q.abs(), qd.abs()),
         "on_encoder": (q, qd),
@@ -547,9 +555,13 @@ def test_a_joint_sticks_until_the_drive_overcomes_its_friction(effects: Mapping[
     assert moved[-1] > 2e-3
 
 
+@pytest.mark.parametrize("load", [0.0, 0.3], ids=["dry", "loaded"])
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.1, 2.0])
-def test_a_weight_on_a_rough_axle_sticks_or_slips(share: float) -> None:
-    """Coulomb's block on a slope: drives off, gravity pulls the calf, the other joints are held by theirs."""
+def test_a_weight_on_a_rough_axle_sticks_or_slips(share: float, load: float) -> None:
+    """Coulomb's block on a slope: drives off, gravity pulls the calf, the other joints are held by theirs.
+
+    Of the friction, which is a share of the weight's torque, ``load`` is that of the gears that this torque loads.
+    """
     q = STANCE.clone()
     q[0, CALF] = -2.0
     reference = stand({}, gravity=True, q=q).backend
@@ -558,8 +570,9 @@ def test_a_weight_on_a_rough_axle_sticks_or_slips(share: float) -> None:
     mujoco.mj_forward(model, data)
     weight, column = -float(data.qfrc_bias[CALF]), np.zeros(model.nv)
     mujoco.mj_mulM(model, data, column, np.eye(model.nv)[CALF])
-    bound = {"hip": 3.0, "thigh": 3.0, "calf": 3.0, "FR_calf": share * abs(weight)}
-    plant = stand({"coulomb": {"bound": bound}}, gravity=True, q=q, kp=0.0, kd=0.0)
+    bound = {"hip": 3.0, "thigh": 3.0, "calf": 3.0, "FR_calf": (share - load) * abs(weight)}
+    gears = {"coefficient": {"FR_calf": 0.5}, "external": 2.0 * load}
+    plant = stand({"coulomb": {"bound": bound}, "load_friction": gears}, gravity=True, q=q, kp=0.0, kd=0.0)
     steps = 10
     for _ in range(steps):
         plant.step(q)
@@ -572,3 +585,47 @@ def test_a_weight_on_a_rough_axle_sticks_or_slips(share: float) -> None:
     else:
         speed = (1.0 - share) * weight / column[CALF] * steps * DT
         assert float(plant.qd[0, CALF]) == pytest.approx(speed, rel=0.05)
+
+
+def test_a_swing_without_a_drive_loses_what_the_loaded_gears_take() -> None:
+    """The calf falls from 1.2 rad beside the vertical; SciPy integrates I qdd = weight - friction of the weight."""
+    q = STANCE.clone()
+    q[0, CALF] = -2.6
+    gears = {"coefficient": {"FR_calf": 0.3}, "external": 1.0}
+    others = {"hip": 3.0, "thigh": 3.0, "calf": 3.0, "FR_calf": 0.0}
+    plant = stand({"coulomb": {"bound": others}, "load_friction": gears}, gravity=True, q=q, kp=0.0, kd=0.0, dt=0.001)
+    model = plant.backend.model
+    data, column = mujoco.MjData(model), np.zeros(model.nv)
+    data.qpos[:] = q[0]
+    mujoco.mj_forward(model, data)
+    mujoco.mj_mulM(model, data, column, np.eye(model.nv)[CALF])
+
+    def slopes(_: float, state: np.ndarray) -> list[float]:
+        data.qpos[CALF], data.qvel[CALF] = state
+        mujoco.mj_forward(model, data)
+        weight = -data.qfrc_bias[CALF]
+        return [state[1], (weight - 0.3 * abs(weight) * np.sign(state[1])) / column[CALF]]
+
+    found = []
+    for _ in range(150):
+        plant.step(q)
+        found.append(float(plant.q[0, CALF]))
+    expected = solve_ivp(slopes, (0.0, 0.15), [-2.6, 0.0], rtol=1e-8, atol=1e-10, first_step=1e-4).y[0, -1]
+    free = stand({"coulomb": {"bound": others}}, gravity=True, q=q, kp=0.0, kd=0.0, dt=0.001)
+    for _ in range(150):
+        free.step(q)
+    assert abs(expected + 2.6) > 0.1
+    assert abs(float(free.q[0, CALF]) - expected) > 0.05
+    assert found[-1] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize(("external", "load"), [(0.0, 1.0), (1.0, 2.0), (0.4, 1.4)])
+def test_a_weight_that_is_held_loads_the_gears_from_both_sides(external: float, load: float) -> None:
+    """BAM's |motor torque - external torque|: a weight w that the drive holds counts as w + external w."""
+    plant = stand({"load_friction": {"coefficient": 1e-3, "external": external}}, gravity=True, kp=300.0, kd=5.0)
+    for _ in range(500):
+        plant.step(STANCE)
+    weight = plant.backend.bias()[0].abs()
+    assert weight[2::3].min() > 0.1
+    bound = plant.backend.field("dof_frictionloss")[0]
+    assert bound[2::3].tolist() == pytest.approx((1e-3 * load * weight[2::3]).tolist(), rel=0.01)

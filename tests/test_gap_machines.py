@@ -108,17 +108,19 @@ def test_the_double_pendulums_are_the_textbooks(
 
 
 def test_a_servo_is_a_motor_at_a_voltage_if_its_model_says_so() -> None:
-    """Torque and speed of its limits are the ends of the motor's line; gains are still asked for."""
-    motor = machine("xl330_pendulum", drive="voltage", kd=0.0)
-    _, setup = motor.build(1, 0.001, LEVEL, 1)
-    drive: Any = motor.drive()(setup)
-    drive.kp.fill_(3.0)
-    drive.kd.zero_()
+    """Stall torque and top speed are the ends of the motor's line, the limit cuts it; gains are still asked for."""
     one = torch.ones(1, 1, dtype=torch.float64)
-    for error, speed, torque in ((0.1, 0.0, 0.3), (9.0, 0.0, 0.77), (9.0, 16.0, 0.0), (0.1, 8.0, 0.3 - 0.385)):
-        assert float(drive.torque(error * one, 0.0 * one, speed * one)) == pytest.approx(torque, abs=1e-12)
+    for given, stall in ((1.01, 1.01), (None, 0.81)):
+        motor = machine("xl330_pendulum", stall_torque=given)
+        _, setup = motor.build(1, 0.001, LEVEL, 1)
+        drive: Any = motor.drive()(setup)
+        drive.kp.fill_(3.0)
+        drive.kd.zero_()
+        line = ((0.1, 0.0, 0.3), (9.0, 0.0, 0.81), (9.0, 12.0, 0.25 * stall), (9.0, 16.0, 0.0))
+        for error, speed, torque in line:
+            assert float(drive.torque(error * one, 0.0 * one, speed * one)) == pytest.approx(torque, abs=1e-12)
     with pytest.raises(NotComparable, match="says no gains"):
-        prepare([servo()], machine("xl330_pendulum", drive="voltage", firmware=None, kp=None, kd=None), GapSettings())
+        prepare([servo()], machine("xl330_pendulum", firmware=None, kp=None, kd=None), GapSettings())
 
 
 def test_a_straight_leg_of_the_go2_hangs_like_a_plumb_line() -> None:
@@ -155,6 +157,7 @@ def test_the_arm_is_held_up_by_its_servos() -> None:
         ({"torque_limit": {"elbow": 3.0}}, "model.torque_limit: gives shoulder no value"),
         ({"torque_limit": 0.0}, "model.torque_limit = 0.0: every value must be at least"),
         ({"kp": 3.0}, "model.drive = 'torque': takes no kp, kd or firmware"),
+        ({"stall_torque": 3.0}, "model.drive = 'torque': takes no stall_torque; drive: voltage does"),
         ({"drive": "current"}, "model.drive = 'current': "),
         ({"masss": 1.0}, "model.masss: unknown key 'masss'"),
         ({"tolerances": {"colomb": {"bound": 1.0}}}, "model.tolerances.colomb: unknown effect 'colomb'; did you mean"),
@@ -227,8 +230,8 @@ def servo(episode: str = "one", seconds: float = 6.0, **about: Any) -> Recording
 def test_gains_come_from_the_recording_else_from_its_notes_else_from_the_model() -> None:
     xl330 = machine("xl330_pendulum")
     _, ready = prepare([servo(), servo("two", kp=(1.5,), kd=(0.1,))], xl330, GapSettings())
-    assert [(r.meta.kp, r.meta.kd) for r in ready.recordings] == [((0.0019 * 200,), (0.048,)), ((1.5,), (0.1,))]
-    assert any("guess: kp 0.38 1.5, kd 0.048 0.1" in line for line in ready.warnings)
+    assert [(r.meta.kp, r.meta.kd) for r in ready.recordings] == [((0.0029 * 200,), (0.0,)), ((1.5,), (0.1,))]
+    assert any("guess: kp 0.58 1.5, kd 0 0.1" in line for line in ready.warnings)
     without = machine("xl330_pendulum", firmware=None)
     with pytest.raises(NotComparable, match="says no gains"):
         prepare([servo()], without, GapSettings())
@@ -318,7 +321,7 @@ def played(robot: FixedBase, effects: Mapping[str, Mapping[str, Any]], target: n
     backend, setup = robot.build(1, 0.0005, LEVEL, 1)
     terms = [bind("effect", name, dict(values), name)[0] for name, values in effects.items()]
     plant = Plant(backend, setup, robot.drive(), [term for term in terms if term])
-    if robot.config.drive == "position":
+    if robot.config.drive != "torque":
         plant.set_gains(torch.full((1, 1), 3.0).double(), torch.full((1, 1), 0.05).double())
     plant.startup()
     everyone = torch.ones(1, dtype=torch.bool)

@@ -99,8 +99,8 @@ class Effect(Memory):
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
     ``on_target`` and ``on_feedforward``, ``on_encoder``, ``on_error``, the actuator, ``on_drive``, ``on_transmission``,
-    ``on_gears``, then ``on_joint``, ``on_friction`` and ``on_base`` beside it. Whoever reads the
-    drives' torques asks ``on_report``.
+    ``on_gears``, then ``on_joint``, ``on_friction``, ``on_load`` and ``on_base`` beside it. Whoever reads the drives'
+    torques asks ``on_report``.
     """
 
     title: ClassVar[str] = ""
@@ -184,6 +184,14 @@ class Effect(Memory):
 
     def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:
         """Return the bound of the joint's dry friction under the drive's ``torque``; ``bound`` is that so far."""
+        return bound
+
+    def on_load(self, bound: Tensor, torque: Tensor, outside: Tensor) -> Tensor:
+        """Return the bound of the joint's dry friction with that of its loaded gears; ``bound`` is that so far.
+
+        ``torque`` is the drive's, ``outside`` what weight, Coriolis and centrifugal forces of the links make at the
+        joint. A weight that is held at rest has ``outside = -torque``.
+        """
         return bound
 
     def on_base(self, wrench: Tensor) -> Tensor:

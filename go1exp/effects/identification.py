@@ -63,6 +63,8 @@ class Identification:
             at shares of the largest torque that a part was asked for, since one above does nothing. Empty for none.
         shapes: values of its shape parameters with which it is tried. Empty: their null values.
         free_shapes: shape parameters that a full fit may change.
+        laws: values of further shape parameters, each of which makes another law of the effect; the law that screening
+            finds best is fitted, and its values are held. Empty: their null values.
         periodic: its parameters, if it is a torque that is periodic in the angle.
         simpler: effect that explains nearly the same with fewer numbers, and is taken where it does as well.
         simpler_if_equal: two parameters that make it the simpler effect where they are equal.
@@ -81,6 +83,7 @@ class Identification:
     limits_torque: str = ""
     shapes: tuple[Mapping[str, float], ...] = ()
     free_shapes: tuple[str, ...] = ()
+    laws: tuple[Mapping[str, float], ...] = ()
     periodic: Periodic | None = None
     simpler: str = ""
     simpler_if_equal: tuple[str, ...] = ()

@@ -17,7 +17,7 @@ from go1exp.schema.registry import Term
 
 HOOKS = (
     *("on_target", "on_feedforward", "on_encoder", "on_error", "on_gains", "on_drive", "on_report"),
-    *("on_transmission", "on_gears", "on_joint", "on_friction", "on_base"),
+    *("on_transmission", "on_gears", "on_joint", "on_friction", "on_load", "on_base"),
 )
 
 
@@ -165,6 +165,12 @@ class EffectStack:
         """Return the bound of the joints' dry friction."""
         for effect in self._acting["on_friction"]:
             bound = effect.on_friction(bound, torque, qd)
+        return bound
+
+    def on_load(self, bound: Tensor, torque: Tensor, outside: Tensor) -> Tensor:
+        """Return the bound of the joints' dry friction with that of the gears' load."""
+        for effect in self._acting["on_load"]:
+            bound = effect.on_load(bound, torque, outside)
         return bound
 
     def on_base(self, wrench: Tensor) -> Tensor:

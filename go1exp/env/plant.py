@@ -86,9 +86,13 @@ class Plant:
         self._before, self._target, self._bound = setup.zeros(), setup.zeros(), setup.zeros()
         self._rotors, self._floating = self.effects.rotors, setup.floating
         self._inertia = setup.zeros()
-        self._dry = self.effects.acts("on_friction") or FRICTION in self.effects.fields
+        self._bounded = self.effects.acts("on_friction") or self.effects.acts("on_load")
+        self._dry = self._bounded or FRICTION in self.effects.fields
         self._dry |= bool(backend.compiled(FRICTION).any())
         self._beside = self._dry or self._rotors is not None or self.effects.acts("on_joint")
+        self._outside: Tensor | None = None  # torque of the links' weight and speed, of a step ago
+        if self.effects.acts("on_load"):
+            self._bias, self._outside = backend.bias(), setup.zeros()
         self._fed: Tensor | None = None  # the feed-forward torque of the last step, from the first one on
         self._ease = setup.physics_dt * backend.compiled("dof_invweight0")[self._joints]
         live = [*self.effects.fields, *([FRICTION] if self._dry else []), *([ARMATURE] if self._rotors else [])]
@@ -116,7 +120,7 @@ class Plant:
             self.backend.derive_constants(torch.ones(len(self.q), dtype=torch.bool, device=self.q.device))
         if self._gains:
             self.effects.set_gains(self.actuator, *self._gains)
-        if self.effects.acts("on_friction"):
+        if self._bounded:
             self._bound.copy_(self.backend.nominal(FRICTION)[:, self._joints])
         if self._rotors:
             self._inertia.copy_(self.backend.nominal(ARMATURE)[:, self._joints])
@@ -133,6 +137,8 @@ class Plant:
         self.effects.reset(mask)
         if self._rotors:
             self._rotors.reset(mask)
+        if self._outside is not None:
+            self._outside.copy_(torch.where(rows, -self._bias[:, self._joints], self._outside))
 
     def reported_torque(self) -> Tensor:
         """(N, J) what the drives report of ``torque``, N m; never to be written to."""
@@ -178,8 +184,11 @@ class Plant:
         if self.enabled is not None:  # a demand of zero, which a lag or a delay treats as any other
             made = made * self.enabled.unsqueeze(1)
         self.torque.copy_(effects.on_drive(made, *encoder))
-        if effects.acts("on_friction"):
-            self.backend.field(FRICTION)[:, self._joints] = effects.on_friction(self._bound, self.torque, qd)
+        if self._bounded:
+            bound = effects.on_friction(self._bound, self.torque, qd)
+            if self._outside is not None:
+                bound = effects.on_load(bound, self.torque, self._outside)
+            self.backend.field(FRICTION)[:, self._joints] = bound
         geared = effects.on_transmission(self.torque, q, qd)
         if self._beside:
             geared = self._act_beside(geared, q, qd, turn)
@@ -187,6 +196,8 @@ class Plant:
             wrench = self.backend.applied()[:, :6]
             wrench.copy_(effects.on_base(torch.zeros_like(wrench)))
         self.backend.step(geared)
+        if self._outside is not None:
+            torch.neg(self._bias[:, self._joints], out=self._outside)
         if self._rotors:
             # What is carried is this step's; constants that a reset derives from the model are the whole rotor's.
             self.backend.field(ARMATURE)[:, self._joints] = self._inertia
@@ -249,7 +260,8 @@ class Plant:
         if self._rotors:
             parts["rotors"] = self._rotors.state_dict()
         fed = {} if self._fed is None else {"fed": self._fed.clone()}
-        return {**physics, "torque": self.torque.clone(), **parts, **fed}
+        outside = {} if self._outside is None else {"outside": self._outside.clone()}
+        return {**physics, "torque": self.torque.clone(), **parts, **fed, **outside}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``; the backend holds the model."""
@@ -257,6 +269,8 @@ class Plant:
             getattr(self, f"_{name}").copy_(state[name])
         self.torque.copy_(state["torque"])
         self._fed = state["fed"].clone() if "fed" in state else None
+        if self._outside is not None:
+            self._outside.copy_(state["outside"])
         self.actuator.load_state_dict(state["actuator"])
         self.effects.load_state_dict(state["effects"])
         if self._rotors:

@@ -387,6 +387,9 @@ def _lacking(effect: NamedEffect, everyone: Sequence[str], known: Tolerances) ->
         spread = f", {values.min():.3g} to {values.max():.3g}" if len(values) > 1 else ""
         unit = "" if p.unit == "-" else f" {p.unit}"
         texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}")
+    held = dict.fromkeys(name for law in effect_class(effect.effect).identification.laws for name in law)
+    laws = {name: effect.params[name].values() for name in held if effect.params.get(name)}
+    texts += [f"{name} {np.mean(list(values)):.3g}" for name, values in laws.items()]
     at = f" at {where(effect.joints, everyone)}" if effect.joints else ""
     doubted = "" if effect.status == "certified" else f" (compensating, not certified: {effect.reason})"
     title = f"{effect_class(effect.effect).title} ({effect.effect})"

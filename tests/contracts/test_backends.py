@@ -145,6 +145,28 @@ def test_a_reset_touches_masked_rows_only_and_they_go_on_like_new(build: Build, 
 
 
 @ENGINES
+def test_what_holds_the_links_is_mujocos_bias_of_the_state_before_the_step(
+    build: Build, engine: tuple[str, ...]
+) -> None:
+    backend = build(2, *engine)
+    bias = backend.bias()
+    put(backend, everyone(backend), *initial(2, height=1.0))
+
+    def serial(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        data, held = mujoco.MjData(backend.model), []
+        for data.qpos[:], data.qvel[:] in zip(qpos, qvel, strict=True):
+            mujoco.mj_forward(backend.model, data)
+            held.append(data.qfrc_bias.copy())
+        return np.stack(held)
+
+    np.testing.assert_allclose(host(bias), serial(host(backend.qpos), host(backend.qvel)), rtol=1e-3, atol=1e-3)
+    drive(backend, 20)
+    before = host(backend.qpos), host(backend.qvel)
+    drive(backend, 1, start=20)
+    np.testing.assert_allclose(host(bias), serial(*before), rtol=1e-3, atol=1e-3)
+
+
+@ENGINES
 def test_after_a_step_sensors_describe_the_state_before_it(build: Build, engine: tuple[str, ...]) -> None:
     backend = build(2, *engine)
     put(backend, everyone(backend), *initial(2))

@@ -296,6 +296,9 @@ def test_the_excitation_that_shows_an_effect_exists_and_stands_if_the_effect_nee
 def test_shapes_and_levels_are_parameters_within_their_bounds(entry: Entry) -> None:
     how, by_name = kind(entry).identification, {p.name: p for p in kind(entry).params}
     assert {*how.free_shapes} <= names_of(entry, shapes=True)
+    for law in how.laws:
+        assert {*law} <= names_of(entry, shapes=True) - {*how.free_shapes}
+        assert all(by_name[name].low <= value <= by_name[name].high for name, value in law.items())
     for shapes in how.shapes:
         assert {*shapes} <= {*how.free_shapes}, "a shape that is tried and then held fast"
         for name, value in shapes.items():
@@ -496,6 +499,7 @@ def calls(effect: Effect, n: int, k: int) -> Iterator[tuple[str, tuple[Any, ...]
         "on_transmission": (torque, q, qd),
         "on_joint": (q, qd),
         "on_friction": (torque.abs(), torque, qd),
+        "on_load": (torque.abs(), torque, 3.0 * q),
         "on_base": (torch.cat([three[0], three[0]], dim=1),),
     }
     for hook, tensors in given.items():
@@ -604,6 +608,10 @@ def test_a_brake_only_brakes(name: str, drives: Callable[..., DriveSetup]) -> No
         bound = effect.on_friction(none, torque, qd)
         assert (bound >= 0.0).all()
         power -= bound * qd.abs()
+    if overrides(entry, "on_load"):
+        bound = effect.on_load(none, torque, joint_noise(500, 5.0, 3))
+        assert (bound >= 0.0).all()
+        power -= bound * qd.abs()
     assert (power <= 1e-12).all()
     assert (power < -1e-3).any()
 
@@ -632,5 +640,24 @@ def test_a_brake_takes_energy_from_a_swinging_robot(name: str, share: float) -> 
         mujoco.mj_energyVel(model, data)
         energy.append(float(data.energy[1]))
     assert all(b <= a * (1.0 + 2e-3) + 1e-6 for a, b in pairwise(energy)), energy
-    if name != "load_friction":  # without a drive's torque there is none
+    if name != "load_friction":  # without a drive's torque and a weight there is none
         assert energy[-1] < 0.97 * energy[0]
+
+
+def test_gears_under_the_load_of_a_weight_only_take_energy() -> None:
+    """Drives off, legs swing in gravity: kinetic and potential energy fall together, at the largest values too."""
+    for coefficient, external in ((0.1, 1.0), (0.5, 2.0)):
+        rig = Rig(1, [term("load_friction", {"coefficient": coefficient, "external": external})], held=True)
+        rig.plant.set_gains(torch.zeros(1, 12), torch.zeros(1, 12))
+        rig.backend.reset(torch.tensor([True]), rig.backend.qpos.clone(), 3.0 * torch.ones(1, 12).double())
+        rig.plant.reset(torch.tensor([True]), rig.stance)
+        energy = []
+        for _ in range(60):
+            rig.plant.step(rig.stance)
+            model, data = rig.backend.env_model(0), rig.backend.env_data(0)
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_energyPos(model, data)
+            mujoco.mj_energyVel(model, data)
+            energy.append(float(data.energy.sum()))
+        assert all(b <= a + 1e-3 * (energy[0] - min(energy)) + 1e-6 for a, b in pairwise(energy)), energy
+        assert energy[-1] < energy[0] - 0.1

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import go1exp.actuator
 import go1exp.effects  # noqa: F401  (registers every effect)
 from go1exp.drive import DriveSetup
 from go1exp.effects.tolerances import Tolerances
+from go1exp.schema.joint_values import JointValues
 from go1exp.schema.registry import Term, bind
 
 NEEDLESS = 1 << 4 | 1 << 13
@@ -64,15 +65,18 @@ class Machine(Protocol):
 
 def pd() -> Term:
     """Return the ideal PD law."""
-    return _plain("pd")
+    return _bound("pd", {})
 
 
-def voltage() -> Term:
-    """Return a motor at a voltage, whose line goes from the robot's peak torque to its top speed."""
-    return _plain("voltage")
+def voltage(stall: JointValues | None) -> Term:
+    """Return a motor at a voltage, whose line goes from ``stall``, N m, to the robot's top speed.
+
+    None: from the robot's peak torque.
+    """
+    return _bound("voltage", {"stall": stall})
 
 
-def _plain(actuator: str) -> Term:
-    term = bind("actuator", actuator, {}, actuator)[0]
+def _bound(actuator: str, settings: Mapping[str, Any]) -> Term:
+    term = bind("actuator", actuator, settings, actuator)[0]
     assert term is not None
     return term

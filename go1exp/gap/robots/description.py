@@ -70,11 +70,12 @@ class ModelConfig:
         joints: driven hinges, in the order of the MuJoCo file; all others are held at zero.
         groups: joints that feel each other, equally many in each group; all in one if null.
         drive: ``position``: torque = kp (target - q) - kd qd, clipped; ``voltage``: that clipped, then less the back
-            EMF (torque_limit / speed_limit) qd, as in servos; ``torque``: ``tau_cmd`` played open loop.
+            EMF (stall_torque / speed_limit) qd, as in servos; ``torque``: ``tau_cmd`` played open loop.
         kp: position gain of recordings that say none, N m/rad.
         kd: speed gain of recordings that say none, N m s/rad.
         firmware: how to read the position gain from a recording's notes instead; null for not at all.
-        torque_limit: peak torque, N m.
+        torque_limit: peak torque, N m; with ``drive: voltage`` what the current limit allows.
+        stall_torque: with ``drive: voltage``, torque at rest with full duty, N m; the peak torque if null.
         speed_limit: top speed without load, rad/s.
         speeds: ``checked``: recorded speeds are compared unless the audit finds them wrong; ``ignored``: never.
         clock: ``recorded``: times are those of the recording; ``speeds``: it has none worth the name, and the time
@@ -91,6 +92,7 @@ class ModelConfig:
     joints: Annotated[tuple[Name, ...], Field(min_length=1)]
     torque_limit: Limit
     speed_limit: Limit
+    stall_torque: Limit | None = None
     groups: tuple[Annotated[tuple[Name, ...], Field(min_length=1)], ...] | None = None
     drive: Literal["position", "voltage", "torque"] = "position"
     kp: Gain | None = None
@@ -106,6 +108,8 @@ class ModelConfig:
         wrong = [*_joint_problems(self), *tolerance_problems(self.tolerances, "tolerances")]
         if self.drive == "torque" and (self.kp is not None or self.kd is not None or self.firmware is not None):
             wrong.append("drive = 'torque': takes no kp, kd or firmware")
+        if self.drive != "voltage" and self.stall_torque is not None:
+            wrong.append(f"drive = {self.drive!r}: takes no stall_torque; drive: voltage does")
         if wrong:
             raise ValueError("\n".join(wrong))
 
@@ -149,7 +153,7 @@ def _joint_problems(config: ModelConfig) -> list[str]:
         wrong.append("groups: must have every joint once")
     if len({len(group) for group in config.joint_groups}) > 1:
         wrong.append("groups: must be of equal size")
-    for name in ("torque_limit", "speed_limit", "kp", "kd"):
+    for name in ("torque_limit", "speed_limit", "stall_torque", "kp", "kd"):
         if getattr(config, name) is None:
             continue
         try:

@@ -134,7 +134,7 @@ class FixedBase:
         """Return what turns commands into torques."""
         if self.config.drive == "torque":
             return Term("torque", Entry("actuator", "torque", TorqueDrive), {})
-        return voltage() if self.config.drive == "voltage" else pd()
+        return voltage(self.config.stall_torque) if self.config.drive == "voltage" else pd()
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> FixedBase:
         """Return itself: its base is always fixed."""

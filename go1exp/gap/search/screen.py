@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
@@ -143,7 +144,7 @@ SHARES = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4)
 
 
 def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -> Iterator[Variant]:
-    """Yield a variant for each choice of shapes and each level at which the effect is probed."""
+    """Yield a variant for each law, each choice of shapes and each level at which the effect is probed."""
     levels: list[Mapping[str, float | np.ndarray]] = [*how.levels]
     if how.limits_torque:
         limit = machine.tolerances.param((effect, how.limits_torque))
@@ -153,8 +154,8 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
                 change = np.zeros(len(machine.joints))
                 change[part] = np.clip(share * largest, limit.low, limit.null - limit.tolerance) - limit.null
                 levels.append({how.limits_torque: change})
-    for chosen in how.shapes or ({},):
-        shapes: Theta = {(effect, name): moved.angle(value) for name, value in chosen.items()}
+    for law, chosen in product(how.laws or ({},), how.shapes or ({},)):
+        shapes: Theta = {(effect, name): moved.angle(value) for name, value in {**law, **chosen}.items()}
         for level in levels or [{}]:
             keys = [key for key in sizes(effect) if not level or key[1] in level]
             probes = []
