@@ -21,6 +21,9 @@ JOINT_KINDS = ("hip", "thigh", "calf")
 JOINTS = tuple(f"{leg}_{kind}" for leg in LEGS for kind in JOINT_KINDS)
 """Joint order of the vendor SDK (leg-major), used for every ``(N, 12)`` array."""
 
+GRAVITY = 9.81
+"""m/s2; MuJoCo's own, and what is taken for it on a robot."""
+
 NUM_JOINTS = len(JOINTS)
 NUM_LEGS = len(LEGS)
 

@@ -22,7 +22,7 @@ from go1exp.controller import forces, ground, swing
 from go1exp.controller.as_targets import AsTargets
 from go1exp.controller.batch import Driven
 from go1exp.controller.feet import Feet
-from go1exp.controller.forces import GRAVITY, Body, ForcePlan, Problem
+from go1exp.controller.forces import Body, ForcePlan, Problem
 from go1exp.controller.gait import Clock
 from go1exp.controller.mpc import Mpc
 from go1exp.controller.settings import MpcSettings, parse_controller
@@ -31,6 +31,7 @@ from go1exp.env.core import Go1Core
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.physics.kinematics import Kinematics
 from go1exp.physics.model import load_robot
+from go1exp.robot import GRAVITY
 from go1exp.schema.registry import ConfigError
 
 FILE = data_root() / "conf/controller/mpc.yaml"

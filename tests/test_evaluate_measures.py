@@ -20,7 +20,7 @@ from go1exp.evaluate.delay_margin import delay_margin, delayed
 from go1exp.evaluate.recorder import Recorder
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task
 from go1exp.measures import every_measure
-from go1exp.measures.contact import GRAVITY
+from go1exp.robot import GRAVITY
 
 MakeTask = Callable[..., TaskConfig]
 

@@ -108,8 +108,6 @@ DELAY_SAMPLES = 0.25
 """Samples; error of a delay because motion between samples is not known (measured: a fifth of a sample at 50 Hz)."""
 DELAY_ERROR = 4e-3
 """s; delays with a larger standard error are not given: the motion was too smooth to tell."""
-GRAVITY = 9.81
-"""m/s2."""
 GRAVITY_ERROR = (0.06, 0.15)
 """Relative error of the accelerometer at rest: 6 % is a poor calibration."""
 TILT = (10.0, 30.0)

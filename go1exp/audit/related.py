@@ -12,6 +12,7 @@ import go1exp.audit.signals as signals
 from go1exp.audit.log import Log, finding, graded
 from go1exp.audit.report import Finding
 from go1exp.recording import VECTORS, joint_channel
+from go1exp.robot import GRAVITY
 
 SPEED_CHECKS = ("scale", "lag", "repeats")
 """Checks after which a recorded speed is not to be trusted, even if they only call it suspect."""
@@ -203,10 +204,10 @@ def gravity(log: Log) -> Iterator[Finding]:
     rest = log.still if log.still.sum() >= limits.ENOUGH else np.ones(len(acc), dtype=bool)
     reading = float(np.median(np.linalg.norm(acc[rest], axis=1)))
     where = "at rest" if rest is log.still else "on average"
-    off = abs(reading / limits.GRAVITY - 1)
+    off = abs(reading / GRAVITY - 1)
     channel = "imu_acc"
     if off > limits.GRAVITY_ERROR[0]:
-        message = f"reads {reading:.4g} {where}; gravity is {limits.GRAVITY} m/s2"
+        message = f"reads {reading:.4g} {where}; gravity is {GRAVITY} m/s2"
         guess = "g instead of m/s2" if 0.9 < reading < 1.1 else "milli-g" if 900 < reading < 1100 else ""
         guess = guess or ("gravity taken out" if reading < 0.5 else "")
         if guess:

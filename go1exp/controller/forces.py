@@ -18,12 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from go1exp.errors import Expected
+from go1exp.robot import GRAVITY
 
 if TYPE_CHECKING:
     from go1exp.controller.settings import ForceSettings
-
-GRAVITY = 9.81
-"""m/s2"""
 
 
 class SolverError(Expected):

@@ -14,15 +14,13 @@ from go1exp.deploy.go1_fields import PERIOD
 from go1exp.deploy.messages import OVERTAKEN_S, LowState
 from go1exp.estimation import FilterConfig, Status, from_json, go1, make_filter, readings, sample
 from go1exp.estimation.feet import FootCalibration, LoadByBoth
+from go1exp.robot import GRAVITY
 
 FASTEST = 10.0
 """Speed above which an estimate has diverged, m/s: the top speed of a Go1's joints gives about 6 m/s."""
 
 BLIND_S = 0.1
 """Longest time for which the filter may refuse all samples, s; after that its last estimate is too old."""
-
-GRAVITY = 9.81
-"""m/s2."""
 
 LONGEST_AHEAD = 0.01
 """Longest time over which one reading of the accelerometer is taken to last, s: impacts are shorter."""

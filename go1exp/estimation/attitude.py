@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-GRAVITY = 9.81
-"""m/s2"""
+from go1exp.robot import GRAVITY
 
 
 def levelled(

@@ -9,8 +9,10 @@ from go1exp.estimation import readings as column
 from go1exp.estimation.config import FilterConfig
 from go1exp.estimation.legs import foot
 from go1exp.estimation.readings import Status
+from go1exp.robot import GRAVITY
 
-GRAVITY = np.array([0.0, 0.0, 9.81])
+WEIGHT = np.array([0.0, 0.0, GRAVITY])
+"""Specific force, m/s2, of what stands still, in the world."""
 MOST_LATE = 10
 """Samples in a row that are not newer; the last of them restarts the filter, since the clock has jumped."""
 PERIOD = 0.002
@@ -132,7 +134,7 @@ class NumpyFilter:
         # uniformly distributed between the last and the present one, with their mean and the variance jump^2 / 12.
         unseen, jump = max(dt - PERIOD, 0.0), self.R @ acc - self.force
         self.force = self.R @ acc
-        a, v = self.force - unseen / (2 * dt) * jump - self.R @ self.x[6:9] - GRAVITY, self.x[3:5].copy()
+        a, v = self.force - unseen / (2 * dt) * jump - self.R @ self.x[6:9] - WEIGHT, self.x[3:5].copy()
         self.x[21] += dt * self.x[22:] @ v
         self.x[:3] += dt * self.x[3:6] + dt**2 / 2 * a
         self.x[3:6] += dt * a
@@ -141,7 +143,7 @@ class NumpyFilter:
         F[21, 22:], F[21, 3:5] = dt * v, dt * self.x[22:]
         F[:3, 3:6], F[:3, 6:9], F[3:6, 6:9] = dt * eye, -(dt**2) / 2 * self.R, -dt * self.R
         # Impacts: the noise grows with the excess of the acceleration over gravity.
-        n = c.acceleration_noise**2 * (1 + ((np.linalg.norm(acc) - GRAVITY[2]) / c.impact_acceleration) ** 2)
+        n = c.acceleration_noise**2 * (1 + ((np.linalg.norm(acc) - GRAVITY) / c.impact_acceleration) ** 2)
         Q = np.zeros((24, 24))
         along = np.diag(n + jump**2 * unseen**2 / (12 * dt))
         # White acceleration noise, integrated exactly over dt to position and velocity.

@@ -10,6 +10,7 @@ import numpy as np
 
 from go1exp.importers.source import Arrays, columns, files, joint_columns, load_npz, rate, recording
 from go1exp.recording import FOOT_FORCE, VECTORS, Recording, RecordingError
+from go1exp.robot import GRAVITY
 from go1exp.schema.registry import Positive, importer
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def open_run(path: Path) -> tuple[Arrays, np.ndarray, list[str]]:
 
 def specific_force(t: np.ndarray, gyro: np.ndarray, reported: np.ndarray, seconds: float) -> np.ndarray:
     """Correct the sign of everything except gravity in the reported acceleration, ``(T, 3)`` m/s2 (see ``TURNED``)."""
-    from go1exp.estimation.attitude import GRAVITY, levelled, vertical
+    from go1exp.estimation.attitude import levelled, vertical
 
     return 2 * GRAVITY * vertical(levelled(t, gyro, reported, seconds=seconds)) - reported
 

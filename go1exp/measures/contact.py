@@ -9,9 +9,6 @@ from go1exp.measures.runs import largest_within
 from go1exp.measures.trace import Array, Trace, mean_over, percentile_by_robot, ratio
 from go1exp.schema.registry import NonNegative, Positive, measure
 
-GRAVITY = 9.81
-"""m/s2."""
-
 HIGH = 95.0
 """Percentile of impacts that counts as high."""
 
@@ -41,7 +38,7 @@ def touchdown_speed_p95(trace: Trace) -> Array:
 @measure("peak_force_p95", unit="body weights")
 def peak_force_p95(trace: Trace) -> Array:
     """Largest force on a foot in each stance, 95th percentile over the stances of all feet, over m g (N,)."""
-    weight = trace.need("mass") * GRAVITY
+    weight = trace.need("mass") * robot.GRAVITY
     force = np.moveaxis(trace.need("foot_peak_force"), 0, -1).reshape(-1, trace.steps).astype(np.float64)
     stance = trace.stances.where(1, whole=False)
     first, last = stance.start // trace.samples, (stance.stop - 1) // trace.samples

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from go1exp import robot
-from go1exp.measures.contact import GRAVITY
 from go1exp.measures.trace import Array, Trace, mean_over, percentile_over, ratio
 from go1exp.schema.registry import NonNegative, Positive, measure
 
@@ -34,7 +33,7 @@ def cost_of_transport(trace: Trace, *, least_speed: NonNegative = 0.1) -> Array:
         power = np.maximum(trace.need("joint_torque") * trace.need("joint_vel"), 0.0).sum(-1)
     speed = mean_over(np.hypot(*np.moveaxis(trace.need("base_lin_vel_b")[..., :2], -1, 0)), trace.moving)
     quick = np.where(speed >= least_speed, speed, np.nan)
-    return ratio(mean_over(power, trace.moving), trace.need("mass") * GRAVITY * quick)
+    return ratio(mean_over(power, trace.moving), trace.need("mass") * robot.GRAVITY * quick)
 
 
 @measure("torque_share_p99", unit="-")

@@ -20,10 +20,8 @@ from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Rows
+from go1exp.robot import GRAVITY
 from go1exp.tensors.rotation import quat_multiply, rotate_inverse
-
-GRAVITY = 9.81
-"""m/s2, MuJoCo's own default, which the scene leaves as it is."""
 
 
 class ImuRecorder:

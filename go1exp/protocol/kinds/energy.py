@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp import robot
-from go1exp.measures.contact import GRAVITY
 from go1exp.measures.trace import Trace, mean_over
 from go1exp.protocol.base import Drawing, Played
 from go1exp.protocol.kinds.gait import straight
@@ -107,7 +106,7 @@ def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:
     """Return figures (N,) of power, heat and saturation of a trace, NaN for robots without a step that counts."""
     torque, power = trace.need("joint_torque"), np.abs(trace.need("joint_torque") * trace.need("joint_vel")).sum(-1)
     speed = np.linalg.norm(trace.need("base_lin_vel_b")[..., :2], axis=-1)
-    weight = trace.need("mass") * GRAVITY
+    weight = trace.need("mass") * robot.GRAVITY
     way = mean_over(speed, trace.moving)
     with np.errstate(divide="ignore", invalid="ignore"):
         per_way = 1.0 / np.where(way >= 0.1, weight * way, np.nan)
