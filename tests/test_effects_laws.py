@@ -629,3 +629,11 @@ def test_a_weight_that_is_held_loads_the_gears_from_both_sides(external: float, 
     assert weight[2::3].min() > 0.1
     bound = plant.backend.field("dof_frictionloss")[0]
     assert bound[2::3].tolist() == pytest.approx((1e-3 * load * weight[2::3]).tolist(), rel=0.01)
+
+
+def test_without_a_share_from_outside_the_gears_feel_the_drive_alone_bit_for_bit(
+    drives: Callable[..., DriveSetup],
+) -> None:
+    effect: Any = term("effect", "load_friction", {"coefficient": 0.13})(drives(8))
+    bound, torque, outside = noise(8, 1.0, 5).abs(), noise(8, 25.0, 6), noise(8, 9.0, 7)
+    assert torch.equal(effect.on_load(bound, torque, outside), bound + effect.coefficient * torque.abs())

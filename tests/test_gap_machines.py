@@ -374,6 +374,28 @@ def test_friction_hidden_in_a_servo_is_named() -> None:
 
 
 @pytest.mark.usefixtures("few")
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/", "conf/model/")
+@pytest.mark.parametrize("external", [0.0, 1.0])
+def test_friction_of_loaded_gears_is_told_from_dry_friction_and_by_its_law(external: float) -> None:
+    """A weight that is swung up to the level loads the gears by up to 0.5 N m, hanging down by nothing."""
+    robot = machine("xl330_pendulum", tolerances={"coulomb": {"bound": 0.01}})
+    steps, logs, hidden = np.arange(0.0, 6.0, 0.0005), [], {"coefficient": 0.2, "external": external}
+    for n, speed in enumerate((2.0, 3.0, 5.0, 8.0)):
+        target = (1.0 * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
+        q = played(robot, {"load_friction": hidden}, target, 10)
+        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
+        logs.append(recording(("pendulum",), steps[::10], {"q": q, "q_target": target[::10]}, kp=(3.0,), kd=(0.05,)))
+    logs = [dataclasses.replace(r, meta=dataclasses.replace(r.meta, episode=f"e{n}")) for n, r in enumerate(logs)]
+    result = explain(logs, robot, dataclasses.replace(QUICK, effects=("coulomb", "load_friction")))
+    assert [n.effect for n in result.named] == ["load_friction"], result.sentence
+    assert result.named[0].params["external"]["pendulum"] == external
+    assert result.named[0].params["coefficient"]["pendulum"] == pytest.approx(0.2, abs=0.02)
+    low, high = result.named[0].interval["coefficient"]["pendulum"]
+    assert low < 0.2 < high
+    assert ("external 1" in result.sentence) == (external == 1.0)
+
+
+@pytest.mark.usefixtures("few")
 def test_friction_hidden_in_a_double_pendulum_of_torque_drives_is_named() -> None:
     robot = machine("ak80_double_pendulum_a", tolerances={})
     steps, logs, joints = np.arange(0.0, 2.5, 0.0005), [], ("shoulder", "elbow")
