@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from go1exp.effects.tolerances import DECLARED, declared
-from go1exp.gap.answer import Answer, sentence, weak_joints
+from go1exp.gap.answer import Answer, weak_joints
 from go1exp.gap.certainty import doubt
 from go1exp.gap.result import Candidate, GapSettings
 from go1exp.gap.search.ledger import LastCheck
+from go1exp.gap.sentence import sentence
 
 JOINTS = ("a_hip", "a_thigh", "b_hip", "b_thigh")
 BORNE_OUT = LastCheck(True, 0.9)

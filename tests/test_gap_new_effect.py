@@ -12,7 +12,7 @@ import pytest
 
 from go1exp import data_root
 from go1exp.config import RobotConfig
-from go1exp.gap import answer
+from go1exp.gap import answer, sentence
 from go1exp.gap.robots.hung import HungGo1
 from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.score.linear import Layout
@@ -88,8 +88,8 @@ def test_a_new_effect_is_screened_fitted_and_worded_by_its_own_file() -> None:
         np.testing.assert_allclose(variant.probes[0].delta, 2.0 * 0.02)
     assert free_shapes("creep") == (("creep", "speed"),)
     assert answer.not_excited({"creep": 0.0})["creep"] == "slow_ramps"
-    (sentence,) = answer.advice({"coulomb": ("coulomb", "creep")})
-    assert sentence == "These logs cannot tell coulomb from creep; record slow_ramps at two gain sets to separate them."
+    (text,) = sentence.advice({"coulomb": ("coulomb", "creep")})
+    assert text == "These logs cannot tell coulomb from creep; record slow_ramps at two gain sets to separate them."
 
 
 @pytest.mark.parametrize("registered", ["nominal=True"], indirect=True)

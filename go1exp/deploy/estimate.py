@@ -12,9 +12,8 @@ import numpy as np
 
 from go1exp.deploy.go1_fields import PERIOD
 from go1exp.deploy.messages import OVERTAKEN_S, LowState
-from go1exp.estimation import FilterConfig, Status, from_json, go1, make_filter, readings, sample
+from go1exp.estimation import GRAVITY, FilterConfig, Status, from_json, go1, make_filter, readings, sample
 from go1exp.estimation.feet import FootCalibration, LoadByBoth
-from go1exp.robot import GRAVITY
 
 FASTEST = 10.0
 """Speed above which an estimate has diverged, m/s: the top speed of a Go1's joints gives about 6 m/s."""

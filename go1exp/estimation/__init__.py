@@ -14,6 +14,7 @@ import numpy as np
 
 from go1exp.estimation.config import ChainLeg, FilterConfig, from_json, go1, load, scaler, to_json
 from go1exp.estimation.readings import WIDTH, Status, sample
+from go1exp.robot import GRAVITY
 from go1exp.schema.registry import Expected
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from go1exp.estimation import _kalman
 
 __all__ = [
+    "GRAVITY",
     "WIDTH",
     "EstimatorError",
     "FilterConfig",

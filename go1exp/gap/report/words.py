@@ -14,8 +14,8 @@ import go1exp.effects
 import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
 from go1exp.effects.base import Param
 from go1exp.effects.tolerances import DECLARED, Tolerances
-from go1exp.gap.answer import where
 from go1exp.gap.result import AngleErrors, GapResult, GapSettings, Localisation, NamedEffect
+from go1exp.gap.sentence import where
 from go1exp.schema.registry import members
 
 NOTHING = "–"

@@ -12,7 +12,7 @@ import numpy as np
 
 from go1exp import __version__
 from go1exp.effects.tolerances import declared
-from go1exp.gap.answer import Answer, advice, concluded, evidence, not_excited, sentence
+from go1exp.gap.answer import Answer, concluded, evidence, not_excited
 from go1exp.gap.comparison import FEWEST_WINDOWS, Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.replay.rows import Theta, variants
@@ -24,6 +24,7 @@ from go1exp.gap.score.localise import localise
 from go1exp.gap.score.robust import excess
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
+from go1exp.gap.sentence import advice, sentence
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.tensors.threads import one_thread
