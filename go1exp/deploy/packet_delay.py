@@ -21,9 +21,8 @@ class PacketDelay:
 
     def __init__(self) -> None:
         """Begin without any packet."""
-        self._least: deque[tuple[float, float]] = (
-            deque()
-        )  # arrival and offset; offsets increase: the first is the least
+        # Arrival and offset. Offsets increase, so that the first is the least.
+        self._least: deque[tuple[float, float]] = deque()
 
     def note(self, arrived: float, clock: float) -> float:
         """Take a packet that ``arrived`` by our clock, s, measured at ``clock`` by the robot's; return its delay, s.
