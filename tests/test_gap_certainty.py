@@ -13,7 +13,7 @@ import pytest
 from go1exp.effects.tolerances import DECLARED, declared
 from go1exp.gap.answer import Answer, weak_joints
 from go1exp.gap.certainty import doubt
-from go1exp.gap.result import Candidate, GapSettings
+from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.sentence import sentence
 
@@ -91,6 +91,20 @@ def test_what_took_most_of_a_gap_is_said_though_it_is_not_named() -> None:
     assert "takes 74% away and yet is not named: too few windows show it" in text
     text = sentence(answer, Stub(candidates=tried(80.0)), {}, ())  # type: ignore[arg-type]
     assert "no effect of the library explains it" in text
+
+
+def test_what_is_named_is_not_said_to_be_rejected() -> None:
+    """Plain friction takes the place of one that depends on direction, although as a candidate it had been rejected."""
+    tried = [
+        Candidate(name, (), {}, 1.0, 1.0, 0.2, 3.0, (name,), "rejected", "")
+        for name in ("asymmetric_friction", "coulomb", "stribeck")
+    ]
+    friction = NamedEffect(
+        "coulomb", ("a_hip",), {"bound": {"a_hip": 0.3}}, {"bound": {"a_hip": (0.28, 0.32)}}, ("coulomb",), "certified"
+    )
+    answer = Answer("explained", (friction,), {}, {"box": 25.0, "final": 0.0}, 1.0)
+    text = sentence(answer, Stub(candidates=tried), {}, ())  # type: ignore[arg-type]
+    assert "asymmetric_friction and stribeck were considered and rejected." in text
 
 
 def test_a_joint_a_little_beyond_its_tolerance_is_weak_beside_a_strong_one() -> None:

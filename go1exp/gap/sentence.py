@@ -77,7 +77,9 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggesti
         parts.append(f"{answer.within:.0%} of the held-out windows are within the {accepted:.3g} mrad accepted.")
     if answer.verdict == "partly explained":
         parts.append("The rest is explained by nothing in the library, so what is named may stand for something else.")
-    rejected = [c.effect for c in search.candidates if c.status == "rejected" and c.stage == 1][:2]
+    named = {effect.effect for effect in answer.named}  # a simpler one may have taken the place of what was accepted
+    first_tried = [c for c in search.candidates if c.stage == 1 and c.effect not in named]
+    rejected = [c.effect for c in first_tried if c.status == "rejected"][:2]
     if answer.named and rejected:
         parts.append(f"{' and '.join(rejected)} {'was' if len(rejected) == 1 else 'were'} considered and rejected.")
     quiet = [
