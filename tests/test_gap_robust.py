@@ -91,6 +91,7 @@ def test_errors_are_told_in_mrad_by_joint_and_episode() -> None:
         replayer=SimpleNamespace(machine=machine),
         scale=np.full((4, 1, 2), 0.5e-3),
         state=state,
+        common=np.zeros(1, dtype=bool),
     )
     wave = np.sin(np.linspace(0.0, 6 * np.pi, samples, endpoint=False))
     before = np.zeros((4, 1, samples, 2))
@@ -99,7 +100,7 @@ def test_errors_are_told_in_mrad_by_joint_and_episode() -> None:
     after = before * np.array([1.0, 0.5])
     after[3] *= 100.0  # one wild window
     flat, halved = (r.reshape(4, 1, -1) for r in (before, after))
-    errors = angle_errors(scorer, flat, halved, np.arange(4), ["slow", "fast"])
+    errors = angle_errors((scorer, scorer), flat, halved, np.arange(4), ["slow", "fast"])
     assert errors.by_joint["hip"][0] < 0.1e-3
     assert errors.by_joint["calf"] == pytest.approx((6e-3, 3e-3), rel=0.02)
     assert errors.by_episode["slow"] == pytest.approx((4e-3 / np.sqrt(2), 2e-3 / np.sqrt(2)), rel=0.02)
