@@ -3,7 +3,8 @@
 Draws and seals the cases of every kind, solves them without their answers (``gap_solve``), scores all together, prints
 the table and writes ``OUT/gap.json`` (``docs/results/gap.json`` is one). What is done already is not done again, so an
 interrupted run goes on. ``scale`` makes all numbers of cases smaller or larger (of single effects, half has them at
-the smaller size alone). ``kinds`` leaves out all others: a kind has the same cases whichever others are drawn with it.
+the smaller size alone). ``kinds`` leaves out all others: a kind has the same cases whichever others are drawn with it,
+and what earlier calls have drawn into ``OUT`` is scored with it.
 """
 
 from __future__ import annotations
@@ -68,9 +69,10 @@ def main(arguments: Sequence[str]) -> None:
         where = [f"out={out / kind}", f"seed={drawn_with}", f"kinds={kind}", f"n={n}", f"sizes={sizes}"]
         generate.main([*where, f"jobs={jobs}"])
         gap_solve.main([f"cases={out / kind}", f"out={out / f'out_{kind}'}", f"jobs={jobs}"])
-    total = merged(out, kinds)
+    drawn = [kind for kind in PLAN if (out / kind / "SEAL").is_file()]
+    total = merged(out, drawn)
     print(score.table(total))
-    command = f"python -m benchmarks.gap_full seed={seed} scale={scale:g} kinds={','.join(kinds)}"
+    command = f"python -m benchmarks.gap_full seed={seed} scale={scale:g} kinds={','.join(drawn)}"
     write_results(out / "gap.json", command, score.flat(total))
 
 

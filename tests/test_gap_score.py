@@ -229,6 +229,10 @@ def test_the_command_checks_the_seal_and_writes_flat_results(
     assert (flat["false_names"], flat["nulls"], flat["first"]) == (1.0, 2.0, None)
     assert set(score.BARS) | {"nulls"} <= set(flat)
     assert all(x is None or isinstance(x, int | float) for x in flat.values())
+    (results / "case_a.json").unlink()
+    for only, cases in (("solved=false", 2.0), ("solved=true", 1.0)):
+        score.main([*words, only])
+        assert json.loads((tmp_path / "results.json").read_text())["nulls"] == cases
     seal.write_text("0" * 64 + "  answers.json\n")
     with pytest.raises(SystemExit, match="not the answers that were sealed"):
         score.main(words)
