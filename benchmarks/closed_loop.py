@@ -1,12 +1,13 @@
 """The loop closed on a policy: hidden robots are recorded, the gap is named, the policy is fine-tuned and walks again.
 
-    python -m benchmarks.closed_loop out=DIR [size=full|small|tiny] [robots=friction,late] [seed=0] [threads=2]
+    python -m benchmarks.closed_loop out=DIR [size=full|small|tiny] [robots=friction,late] [seed=0] [jobs=1] [threads=2]
 
 For each hidden robot (``benchmarks/gap/hidden.py``, physics that is not the library's) ``go1exp gap`` writes an
 ``effect.yaml`` from its recordings, hung, or on its feet where those give no effect. Then the policy is fine-tuned
 with it, and with equally many steps on the plain model and with an actuator net fitted to hung recordings.
 All four policies walk on the hidden robot with the same seeds. Writes ``robots.json``, ``robots.csv`` and
-``closed_loop.json``. What is done already is not done again, so an interrupted run goes on.
+``closed_loop.json``. What is done already is not done again, so an interrupted run goes on. ``jobs`` robots are worked
+on at a time: the searches want processor cores, the trainings share the GPU.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +90,7 @@ SIZES = {
         task=("experiment=trot", "actuator=pd", "~actuator.command", "effect=none", "rand=none"),
         first=(),
         walker=("ppo.iterations=50",),
-        tuned=("ppo.iterations=150",),
+        tuned=("ppo.iterations=100",),
         physics_dt=0.002,
         ground=Ground(time_constant=0.005),
         recordings=8,
@@ -147,11 +150,20 @@ DONE = "done.json"
 
 @dataclass(frozen=True)
 class Place:
-    """Where a run of this benchmark keeps its files, its size, seed and threads."""
+    """Where a run of this benchmark keeps its files, its size and seed, and how much it does at a time.
+
+    Attributes:
+        out: folder of the run.
+        size: how much is done.
+        seed: of robots, trainings and walks.
+        jobs: robots at a time.
+        threads: of each search.
+    """
 
     out: Path
     size: Size
     seed: int
+    jobs: int
     threads: int
 
     def named(self, *parts: str) -> Path:
@@ -210,30 +222,30 @@ def tuned(place: Place, run: Path, *words: str) -> Path:
     return trained(place, run, f"start_from={place.named('walker')}", *place.size.tuned, *words)
 
 
-def named_effects(place: Place, name: str) -> dict[str, Any]:
-    """Return what ``go1exp gap`` says of a robot: by its hung logs, or by those on its feet if they give no effect.
+def searched(place: Place, name: str, support: str) -> dict[str, Any]:
+    """Return what ``go1exp gap`` says of a robot by its logs of one support, hung or on the ground.
 
     ``file`` is the ``effect.yaml``, which has what is certified; where nothing is, it is empty.
     """
-    verdict: dict[str, Any] = {}
-    for support in ("hung", "ground"):
-        logs, out = place.named(name, support), place.named(name, f"gap_{support}")
-        if support == "ground":
-            record(place, name, logs)
-        if not finished(out):
-            begun = time.monotonic()
-            where = (f"logs={logs}", f"out={out}", f"train_dt={place.size.physics_dt}")
-            search = ("search.overlays=0", f"search.threads={place.threads}", *place.size.search)
-            status = go1exp("gap", *where, *search, allowed=VERDICTS)
-            answer = json.loads((out / "verdict.json").read_text())
-            names = [f"{n['effect']} ({n['status']})" for n in answer["named"]]
-            certain = any(n["status"] == "certified" for n in answer["named"])
-            about = {"verdict": answer["verdict"], "named": names, "certain": certain, "exit": status}
-            finish(out, logs=support, **about, seconds=round(time.monotonic() - begun, 1))
-        verdict = json.loads((out / DONE).read_text()) | {"file": str(out / "effect.yaml")}
-        if verdict["certain"]:
-            break
-    return verdict
+    logs, out = place.named(name, support), place.named(name, f"gap_{support}")
+    if not finished(out):
+        record(place, name, logs)
+        begun = time.monotonic()
+        where = (f"logs={logs}", f"out={out}", f"train_dt={place.size.physics_dt}")
+        search = ("search.overlays=0", f"search.threads={place.threads}", *place.size.search)
+        status = go1exp("gap", *where, *search, allowed=VERDICTS)
+        answer = json.loads((out / "verdict.json").read_text())
+        names = [f"{n['effect']} ({n['status']})" for n in answer["named"]]
+        certain = any(n["status"] == "certified" for n in answer["named"])
+        about = {"verdict": answer["verdict"], "named": names, "certain": certain, "exit": status}
+        finish(out, logs=support, **about, seconds=round(time.monotonic() - begun, 1))
+    return json.loads((out / DONE).read_text()) | {"file": str(out / "effect.yaml")}
+
+
+def named_effects(place: Place, name: str) -> dict[str, Any]:
+    """Return what ``go1exp gap`` says by the hung logs, or by those on its feet if the hung ones give no effect."""
+    hung = searched(place, name, "hung")
+    return hung if hung["certain"] else searched(place, name, "ground")
 
 
 def fitted_net(place: Place, name: str) -> Path:
@@ -398,23 +410,57 @@ def write_table(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 # ---------------------------------------------------------------------- the whole
 
 
+def hung(place: Place, name: str) -> None:
+    """Do what a robot needs before there is a policy: hung logs, the search in them, and the actuator net."""
+    searched(place, name, "hung")
+    fitted_net(place, name)
+
+
+def judge_nominal(place: Place) -> None:
+    """Let the policy that all others start from walk on the robot of which the model is right."""
+    judge(place, hidden.nominal(place.size.ground), walker(place), place.named("walks_nominal.json"))
+
+
 def robot_of(place: Place, name: str) -> tuple[dict[str, Any], dict[str, Walks]]:
     """Record a robot, name its gap, fine-tune, and let all four policies walk on it."""
-    record(place, name, place.named(name, "hung"))
-    verdict = named_effects(place, name)
-    net = fitted_net(place, name)
+    hung(place, name)
+    net = place.named(name, "net_fit", "net.npz")
+    through_net = ("actuator=net", f"actuator.file={net}", "actuator.period=resample")
     runs = {
         "before": place.named("walker"),
         "plain": place.named("plain"),
-        "net": tuned(
-            place, place.named(name, "net"), "actuator=net", f"actuator.file={net}", "actuator.period=resample"
-        ),
-        "effects": tuned(place, place.named(name, "effects"), f"effect={verdict['file']}"),
+        "net": tuned(place, place.named(name, "net"), *through_net),
     }
+    verdict = named_effects(place, name)
+    runs["effects"] = tuned(place, place.named(name, "effects"), f"effect={verdict['file']}")
     robot = hidden.make(name, place.seed, place.size.ground)
     for policy, run in runs.items():
         judge(place, robot, run, place.named(name, f"walks_{policy}.json"))
     return verdict, {policy: Walks.read(place.named(name, f"walks_{policy}.json")) for policy in runs}
+
+
+def in_turn(place: Place, names: Sequence[str]) -> Iterator[tuple[dict[str, Any], dict[str, Walks]]]:
+    """Yield what came of each robot, in order, ``jobs`` of them at a time.
+
+    Several at a time begin with what needs no policy, while the first ones are trained.
+    """
+    if place.jobs == 1:
+        walker(place)
+        tuned(place, place.named("plain"))
+        judge_nominal(place)
+        yield from (robot_of(place, name) for name in names)
+        return
+    with ProcessPoolExecutor(place.jobs, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        early = {pool.submit(hung, place, name): name for name in names}
+        walker(place)
+        tuned(place, place.named("plain"))
+        nominal = pool.submit(judge_nominal, place)
+        whole: dict[str, Future[tuple[dict[str, Any], dict[str, Walks]]]] = {}
+        for done in as_completed(early):
+            done.result()
+            whole[early[done]] = pool.submit(robot_of, place, early[done])
+        nominal.result()
+        yield from (whole[name].result() for name in names)
 
 
 def settled(given: Mapping[str, str]) -> tuple[Place, tuple[str, ...]]:
@@ -425,22 +471,25 @@ def settled(given: Mapping[str, str]) -> tuple[Place, tuple[str, ...]]:
     """
     usage = (
         f"usage: python -m benchmarks.closed_loop out=DIR [size={'|'.join(SIZES)}] [robots=NAME,NAME] [seed=0] "
-        f"[threads=INT]\nrobots: {', '.join(hidden.SECRETS)}"
+        f"[jobs=1] [threads=INT]\nrobots: {', '.join(hidden.SECRETS)}"
     )
-    if not {"out"} <= set(given) <= {"out", "size", "robots", "seed", "threads"}:
+    if not {"out"} <= set(given) <= {"out", "size", "robots", "seed", "jobs", "threads"}:
         raise SystemExit(usage)
     name = given.get("size", "full")
     if name not in SIZES:
         raise SystemExit(f"size={name}: must be one of {', '.join(SIZES)}\n{usage}")
     try:
-        seed, threads = int(given.get("seed", 0)), int(given.get("threads", os.cpu_count() or 1))
+        seed, jobs = int(given.get("seed", 0)), int(given.get("jobs", 1))
+        threads = int(given.get("threads", max((os.cpu_count() or 1) // max(jobs, 1), 1)))
     except ValueError as error:
-        raise SystemExit(f"seed and threads must be whole numbers: {error}\n{usage}") from None
+        raise SystemExit(f"seed, jobs and threads must be whole numbers: {error}\n{usage}") from None
+    if min(jobs, threads) < 1:
+        raise SystemExit(f"jobs={jobs} threads={threads}: each must be at least 1\n{usage}")
     robots = tuple(given["robots"].split(",")) if "robots" in given else SIZES[name].robots
     for robot in robots:
         if robot not in hidden.SECRETS:
             raise SystemExit(f"robots: {robot!r} must be one of {', '.join(hidden.SECRETS)}\n{usage}")
-    place = Place(Path(given["out"]).resolve(), SIZES[name], seed, threads)
+    place = Place(Path(given["out"]).resolve(), SIZES[name], seed, jobs, threads)
     settings = json.loads(json.dumps({**asdict(place.size), "seed": seed}))
     del settings["robots"]  # others may be added
     file = place.named("settings.json")
@@ -457,13 +506,9 @@ def main(arguments: Sequence[str]) -> None:
     place, robots = settled(given if len(given) == len(arguments) else {})
     torch.set_num_threads(1)
     begun = time.monotonic()
-    run = walker(place)
-    tuned(place, place.named("plain"))
-    judge(place, hidden.nominal(place.size.ground), run, place.named("walks_nominal.json"))
-    nominal = Walks.read(place.named("walks_nominal.json"))
     rows, walks = [], []
-    for count, name in enumerate(robots, start=1):
-        verdict, of_robot = robot_of(place, name)
+    for count, (name, (verdict, of_robot)) in enumerate(zip(robots, in_turn(place, robots), strict=True), start=1):
+        nominal = Walks.read(place.named("walks_nominal.json"))
         walks.append(of_robot)
         rows.append(row_of(name, verdict, nominal, of_robot))
         print(f"robot {count}/{len(robots)}, {(time.monotonic() - begun) / 60:.1f} min\n{table(rows)}\n", flush=True)

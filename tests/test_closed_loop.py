@@ -273,7 +273,7 @@ def test_an_interrupted_training_goes_on_and_a_finished_one_is_left(
         return 0
 
     monkeypatch.setattr(closed_loop, "go1exp", listening)
-    place, run = Place(tmp_path, SIZES["tiny"], 3, 1), tmp_path / "plain"
+    place, run = Place(tmp_path, SIZES["tiny"], seed=3, jobs=1, threads=1), tmp_path / "plain"
     (run / "checkpoints").mkdir(parents=True)
     closed_loop.tuned(place, run)
     (run / closed_loop.DONE).unlink()
@@ -304,7 +304,7 @@ def test_the_feet_are_asked_only_where_hung_logs_give_no_effect(
 
     monkeypatch.setattr(closed_loop, "go1exp", answering)
     monkeypatch.setattr(closed_loop, "record", lambda place, name, folder: None)
-    place = Place(tmp_path, SIZES["tiny"], 0, 1)
+    place = Place(tmp_path, SIZES["tiny"], seed=0, jobs=1, threads=1)
     for name, support, named in (("friction", "hung", "coulomb"), ("payload", "ground", "payload")):
         for _ in range(2):  # the second time from what was noted
             verdict = closed_loop.named_effects(place, name)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from go1exp.deploy.metadata import Port
 
+if TYPE_CHECKING:
+    from onnxruntime import NodeArg
+
 # The published builds of onnxruntime send telemetry (its Privacy.md) unless this is set before they are loaded; 1.31
 # writes an identifier and a database into the home folder for that. A value set by the user is kept.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-
-import onnxruntime as ort
 
 
 class OnnxPolicy:
@@ -28,8 +30,12 @@ class OnnxPolicy:
         """Prepare the graph.
 
         Raises:
-            ValueError: if it is not a valid graph, or has other inputs and outputs.
+            ValueError: if it is not a valid graph, has other inputs and outputs, or onnxruntime is not installed.
         """
+        try:  # here, since commands that run no bundle read the settings of those that do
+            import onnxruntime as ort
+        except ImportError as error:
+            raise ValueError(f"needs the package onnxruntime ({error}): pip install 'go1exp[deploy]'") from None
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4  # errors are raised; no messages on stderr
@@ -74,7 +80,7 @@ class OnnxPolicy:
         return dict(zip(self._names, self._session.run(self._names, given), strict=True))
 
 
-def _compare(what: str, nodes: Sequence[ort.NodeArg], wanted: Sequence[Port]) -> None:
+def _compare(what: str, nodes: Sequence[NodeArg], wanted: Sequence[Port]) -> None:
     names = [node.name for node in nodes]
     if names != [port.name for port in wanted]:
         raise ValueError(f"its {what}s are {', '.join(names)} instead of {', '.join(port.name for port in wanted)}")
