@@ -1,0 +1,208 @@
+"""Two clocks as competing models of the time between rows: which of them lets the robot's model explain the recordings.
+
+A model that lacks things can do better by a wrong clock: a wrong rate looks like wrong inertias. So for each clock the
+nominal parameters move within their tolerances, and a search finds the first terms. Both are then judged on held-out
+windows of the same rows, by one floor.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from go1exp.gap.data.splits import Splits, stretches
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.result import DEFAULT_CLOCK, Clock, ClockChoice, GapSettings
+from go1exp.gap.score.angle_errors import of_angles
+from go1exp.gap.score.initial_state import rescaled
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.robust import log_chi2
+from go1exp.gap.search import significance
+from go1exp.gap.search.fit import residuals
+from go1exp.gap.search.stepwise import Search
+
+TERMS = 2
+"""Most terms that are found by each clock before the two are compared: the first ones close most of a gap."""
+
+RESAMPLES = 4000
+"""Of the interval."""
+
+QUANTILES = (0.025, 0.975)
+"""Of a 95 % interval."""
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """Windows by one clock.
+
+    Attributes:
+        scorer: of them.
+        dt: physics step, s.
+    """
+
+    scorer: Scorer
+    dt: float
+
+
+def contest(
+    sides: Mapping[Clock, Contestant],
+    parts: Splits,
+    settings: GapSettings,
+    on_progress: Callable[[str, float], None] = lambda what, share: None,
+) -> ClockChoice:
+    """Fit the model by both clocks, and judge both on held-out windows.
+
+    A clock is taken if the sign-flip test over stretches of neighbouring windows is significant (``settings.alpha``),
+    the mean of log chi2 differs by more than what means the same (``significance.SAME``), and the model without terms
+    does not significantly want the other one. Otherwise it is not decided, and the default is taken.
+
+    Args:
+        sides: the windows by the clocks ``recorded`` and ``speeds``, of the same rows.
+        parts: which windows are fitted (``train``) and which judge (``select``).
+        settings: of the search.
+        on_progress: called with what is being done, and which share of the work is finished.
+    """
+    searches: dict[Clock, Search] = {}
+    asked = dataclasses.replace(settings, max_terms=min(TERMS, settings.max_terms), bootstraps=0)
+    for k, (name, side) in enumerate(sides.items()):
+
+        def show(what: str, share: float, name: str = name, k: int = k) -> None:
+            on_progress(f"clock {name}: {what}", (k + share) / len(sides))
+
+        rng = np.random.default_rng(settings.seed)
+        searches[name] = Search(side.scorer, parts, asked, side.dt, rng, show)
+        searches[name].run()
+    select = parts.select
+    stretch = stretches(sides["recorded"].scorer.windows.episode)[select]
+    nominal = {name: s.nominal for name, s in searches.items()}
+    last = {name: s.state.theta for name, s in searches.items()}
+    first_scorers = {name: side.scorer for name, side in sides.items()}
+    rng = np.random.default_rng(settings.seed)
+    before, nominal_errors = _scored(first_scorers, nominal, sides, select)
+    after, errors = _scored({name: s.state.scorer for name, s in searches.items()}, last, sides, select)
+    nominal_gain, _, nominal_p = judged(before, stretch, rng)
+    gain, interval, p = judged(after, stretch, rng)
+    choice = ClockChoice(
+        taken=DEFAULT_CLOCK,
+        decided=False,
+        windows=len(select),
+        stretches=len(np.unique(stretch)),
+        nominal_errors=nominal_errors,
+        errors=errors,
+        terms={name: s.state.terms for name, s in searches.items()},
+        gain=gain,
+        interval=interval,
+        p=p,
+        nominal_gain=nominal_gain,
+        nominal_p=nominal_p,
+    )
+    return decided(choice, settings.alpha)
+
+
+def decided(choice: ClockChoice, alpha: float) -> ClockChoice:
+    """Return a choice with the clock that its figures prefer, or with why they prefer none."""
+    reason = ""
+    if abs(choice.gain) <= significance.SAME:
+        reason = "the two do as well"
+    elif choice.p >= alpha:
+        reason = f"the difference is not significant (p = {choice.p:.2g} of {choice.stretches} stretches)"
+    elif choice.nominal_p < alpha and choice.nominal_gain * choice.gain < 0:
+        reason = "without the first terms the other clock is the better one"
+    if reason:
+        return dataclasses.replace(choice, taken=DEFAULT_CLOCK, decided=False, reason=reason)
+    taken: Clock = "speeds" if choice.gain > 0 else "recorded"
+    return dataclasses.replace(choice, taken=taken, decided=True, reason="")
+
+
+def judged(
+    log_chi2_of: Mapping[Clock, np.ndarray], stretch: np.ndarray, rng: np.random.Generator
+) -> tuple[float, tuple[float, float], float]:
+    """Return by how much log chi2 (V,) is larger by the written times: mean, 95 % interval, two-sided p.
+
+    Windows of one stretch (V,) are neighbours and not independent, so signs are flipped, and samples drawn, by stretch.
+    """
+    units = np.unique(stretch)
+    difference = log_chi2_of["recorded"] - log_chi2_of["speeds"]
+    total = np.array([difference[stretch == u].sum() for u in units])
+    count = np.array([np.sum(stretch == u) for u in units])
+    drawn = rng.integers(0, len(units), (RESAMPLES, len(units)))
+    means = total[drawn].sum(1) / count[drawn].sum(1)
+    low, high = np.quantile(means, QUANTILES)
+    p = significance.max_t(np.stack([total, -total]), rng).min()
+    return float(difference.mean()), (float(low), float(high)), float(p)
+
+
+def _scored(
+    scorers: Mapping[Clock, Scorer], thetas: Mapping[Clock, Theta], sides: Mapping[Clock, Contestant], which: np.ndarray
+) -> tuple[dict[Clock, np.ndarray], dict[Clock, float]]:
+    """Return log chi2 (V,) of windows, mean of their groups, and the median window's error of the angles, rad.
+
+    By one floor: each scorer has the error of the step of its own model in it, and the larger of the two counts.
+    """
+    floor = np.max([s.scale for s in scorers.values()], axis=0)
+    logs: dict[Clock, np.ndarray] = {}
+    errors: dict[Clock, float] = {}
+    for name, scorer in scorers.items():
+        with np.errstate(invalid="ignore"):  # what is not compared has an infinite scale
+            same = rescaled(scorer, floor / scorer.scale)
+        residual = residuals(same, [thetas[name]], which, sides[name].dt)[0]
+        logs[name] = log_chi2(same.chi2(residual, which)).mean(axis=1)
+        errors[name] = float(np.median(np.sqrt(np.nanmean(of_angles(same, residual, which) ** 2, axis=1))))
+    return logs, errors
+
+
+# ---------------------------------------------------------------------- in words
+
+OF_CLOCK: dict[Clock, str] = {"recorded": "the written times", "speeds": "times worked out from the speeds"}
+"""Clock -> what it is called in a sentence."""
+
+UNEVEN = 0.1
+"""Difference of the quantiles of the steps, in medians, from which written times are called uneven."""
+
+
+def sentence(choice: ClockChoice) -> str:
+    """Return in one sentence which clock was taken, by how much it is better, and how sure that is."""
+    taken = OF_CLOCK[choice.taken]
+    if not choice.errors:
+        return f"Clocks were not compared, and {taken} are taken: {choice.reason}."
+    errors = [f"{1e3 * value:.3g} mrad by {OF_CLOCK[name]}" for name, value in _ordered(choice)]
+    low, high = choice.interval
+    figures = (
+        f"angles are {' and '.join(errors)} off in the median of {choice.windows} held-out windows of the same rows; "
+        f"log chi2 differs by {choice.gain:.2g} for the speeds, {low:.2g} to {high:.2g}, p = {choice.p:.2g}"
+    )
+    if choice.decided:
+        return f"The clock is that of {taken}: {figures}."
+    return f"Which clock is right is not decided, and {taken} are taken: {choice.reason} ({figures})."
+
+
+def details(choice: ClockChoice) -> str:
+    """Return that sentence, and what it rests on."""
+    sentences = [sentence(choice)]
+    if choice.rate_hz:
+        rates = [f"{_span(*rate)} Hz by {OF_CLOCK[name]}" for name, rate in choice.rate_hz.items()]
+        sentences.append(f"Rows come at {' and '.join(rates)}.")
+    low, high = choice.steps
+    if high - low > UNEVEN:
+        sentences.append(f"The written times are uneven: nine of ten steps are {low:.3g} to {high:.3g} of the median.")
+    if choice.errors:
+        terms = [f"{', '.join(names) or 'no term'} by {OF_CLOCK[name]}" for name, names in choice.terms.items()]
+        first = [f"{1e3 * value:.3g} mrad by {OF_CLOCK[name]}" for name, value in choice.nominal_errors.items()]
+        sentences.append(
+            f"That is with the first terms of a search by each, {'; '.join(terms)}; within the tolerances alone it is "
+            f"{' and '.join(first)} (log chi2 {choice.nominal_gain:.2g}, p = {choice.nominal_p:.2g})."
+        )
+    return " ".join(sentences)
+
+
+def _ordered(choice: ClockChoice) -> list[tuple[Clock, float]]:
+    """Return the errors by clock, that of the one taken first."""
+    other: Clock = "recorded" if choice.taken == "speeds" else "speeds"
+    return [(name, choice.errors[name]) for name in (choice.taken, other)]
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
