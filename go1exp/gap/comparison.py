@@ -21,7 +21,7 @@ from go1exp.gap.robots.hung import hung
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.floors import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.search.clocks import Contestant, contest, details
+from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details
 from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
 
@@ -39,8 +39,8 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 FEWEST_STRETCHES = 8
 """Stretches of held-out windows below which no sign-flip test of two clocks comes to p < 0.01: 2 / 2^8."""
 
-CONTEST = 0.6
-"""Share of the progress that a comparison of clocks is shown as."""
+USABLE = 0.5
+"""Share of the windows that must be without holes by a clock for it to compete."""
 
 
 class NotComparable(Expected):
@@ -231,9 +231,14 @@ def _compared_clocks(
     cuts = {name: _cut(robot.by_clock(name, "ignored"), ready[name]) for name in names}
     plan = ready["recorded"].settings
     try:
-        windows = same_rows({name: r.recordings for name, r in ready.items()}, cuts, plan, spared)
+        windows, left = same_rows({name: r.recordings for name, r in ready.items()}, cuts, plan, spared)
     except RecordingError as error:
         return replace(default, reason=str(error))
+    most, worst = max(left.values()), min(left, key=lambda name: left[name])
+    if left[worst] < USABLE * most:
+        taken: Clock = "speeds" if worst == "recorded" else "recorded"
+        reason = f"by {OF_CLOCK[worst]} only {left[worst]} of {most} windows are without holes"
+        return replace(default, taken=taken, reason=reason)
     episode = windows["recorded"].episode
     parts = splits([r.meta for r in written], episode, 0.0, np.random.default_rng(settings.seed))
     judging = len(np.unique(stretches(episode)[parts.select]))
@@ -244,7 +249,7 @@ def _compared_clocks(
     for name in names:
         dt, scorer, _ = _scored(robot.by_clock(name), ready[name], windows[name], plan)
         sides[name] = Contestant(scorer, dt)
-    choice = contest(sides, parts, plan, lambda what, share: on_progress(what, CONTEST * share))
+    choice = contest(sides, parts, plan, lambda what, share: on_progress(what, 0.0))
     return replace(choice, rate_hz=default.rate_hz, steps=default.steps)
 
 

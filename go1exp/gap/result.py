@@ -274,7 +274,7 @@ class ClockChoice:
 
     Attributes:
         taken: the clock that is used.
-        decided: whether held-out windows prefer it; otherwise it is the default.
+        decided: whether held-out windows prefer it; otherwise it is the default, or the only one that is usable.
         reason: why it is not decided; empty if it is.
         rate_hz: clock -> least and largest rate of rows of the recordings, Hz.
         steps: 5 % and 95 % quantile of the steps of the written times over their median; (1, 1) is an even clock.

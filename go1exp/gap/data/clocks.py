@@ -79,8 +79,10 @@ def same_rows(
     cuts: Mapping[Key, Cut],
     settings: GapSettings,
     spared: Sequence[np.ndarray],
-) -> dict[Key, Windows]:
+) -> tuple[dict[Key, Windows], dict[Key, int]]:
     """Return windows by each clock that begin at the same rows, compare the same rows, and have the same floor.
+
+    Beside them, how many of the places that were tried each clock leaves: no window may have a hole by its clock.
 
     Noise is the smaller of what is seen by the clocks, since a wrong one makes motion look like noise. The first states
     are as uncertain as by the clock that knows them less.
@@ -98,17 +100,24 @@ def same_rows(
     first = next(iter(recordings.values()))
     order = list(range(len(first)))
     rows = [beginnings([c[e] for c in clocks.values()], first[e].joint("q"), settings, spared[e]) for e in order]
-    for _ in range(2):  # a hole may be one by one clock only: then windows of the others go as well
-        windows = {
-            name: cuts[name]([[Place(t[r], t[r]) for r in rows[e]] for e, t in enumerate(clocks[name])])
-            for name in clocks
-        }
-        begun = {name: _begun(w, clocks[name]) for name, w in windows.items()}
-        common = set.intersection(*(set(b) for b in begun.values()))
-        rows = [[r for r in rows[e] if (e, r) in common] for e in order]
+    windows = _cut_at(rows, clocks, cuts)
+    begun = {name: _begun(w, clocks[name]) for name, w in windows.items()}
+    left = {name: len(each) for name, each in begun.items()}
+    common = set.intersection(*(set(each) for each in begun.values()))
     if not common:
-        raise RecordingError("no window begins at the same row by both clocks")
-    return _shared({name: _masked(windows[name], clocks[name], list(clocks.values()), settings) for name in windows})
+        raise RecordingError("no window is whole by both clocks")
+    windows = _cut_at([[r for r in rows[e] if (e, r) in common] for e in order], clocks, cuts)
+    return _shared({n: _masked(w, clocks[n], list(clocks.values()), settings) for n, w in windows.items()}), left
+
+
+def _cut_at(
+    rows: Sequence[Sequence[int]], clocks: Mapping[Key, Sequence[np.ndarray]], cuts: Mapping[Key, Cut]
+) -> dict[Key, Windows]:
+    """Cut windows that begin at rows of each recording, by each clock."""
+    return {
+        name: cuts[name]([[Place(t[r], t[r]) for r in rows[e]] for e, t in enumerate(clock)])
+        for name, clock in clocks.items()
+    }
 
 
 def _begun(windows: Windows, clock: Sequence[np.ndarray]) -> list[tuple[int, int]]:

@@ -16,7 +16,7 @@ import numpy as np
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Rows, Theta, variants
-from go1exp.gap.score.likelihood import Scorer, scorer
+from go1exp.gap.score.likelihood import Scorer, grouped, scorer
 from go1exp.gap.score.robust import log_chi2
 
 ROUNDS = 6
@@ -58,7 +58,7 @@ def rescaled(score: Scorer, factor: np.ndarray) -> Scorer:
     """Return the scorer with ``factor`` (W, C, J) times the noise."""
     factor = np.where(np.isfinite(factor), factor, 1.0)
     long = np.broadcast_to(factor[:, None], (len(factor), score.windows.t.shape[1], *factor.shape[1:]))
-    state = score.state / long.reshape(len(factor), 1, -1, 1)
+    state = score.state / grouped(score.replayer.machine, long)[..., None]
     return dataclasses.replace(score, scale=score.scale * factor, state=state.astype(np.float32))
 
 

@@ -156,7 +156,7 @@ def _scored(
 
 # ---------------------------------------------------------------------- in words
 
-OF_CLOCK: dict[Clock, str] = {"recorded": "the written times", "speeds": "times worked out from the speeds"}
+OF_CLOCK: dict[Clock, str] = {"recorded": "written times", "speeds": "times from the speeds"}
 """Clock -> what it is called in a sentence."""
 
 UNEVEN = 0.1
@@ -164,19 +164,19 @@ UNEVEN = 0.1
 
 
 def sentence(choice: ClockChoice) -> str:
-    """Return in one sentence which clock was taken, by how much it is better, and how sure that is."""
-    taken = OF_CLOCK[choice.taken]
+    """Return in words which clock was taken, by how much it is better, and how sure that is."""
+    taken = f"The {OF_CLOCK[choice.taken]} are taken"
     if not choice.errors:
-        return f"Clocks were not compared, and {taken} are taken: {choice.reason}."
-    errors = [f"{1e3 * value:.3g} mrad by {OF_CLOCK[name]}" for name, value in _ordered(choice)]
+        return f"The clocks could not be compared: {choice.reason}. {taken}."
     low, high = choice.interval
     figures = (
-        f"angles are {' and '.join(errors)} off in the median of {choice.windows} held-out windows of the same rows; "
-        f"log chi2 differs by {choice.gain:.2g} for the speeds, {low:.2g} to {high:.2g}, p = {choice.p:.2g}"
+        f"in the median of {choice.windows} held-out windows of the same rows angles are "
+        f"{_by_clock(choice.errors)} off, and log chi2 by the written times less that by the speeds is "
+        f"{choice.gain:.2g} ({low:.2g} to {high:.2g}), p = {choice.p:.2g}"
     )
     if choice.decided:
-        return f"The clock is that of {taken}: {figures}."
-    return f"Which clock is right is not decided, and {taken} are taken: {choice.reason} ({figures})."
+        return f"{taken}: {figures}."
+    return f"Which clock is right is not decided: {choice.reason}. {taken} ({figures})."
 
 
 def details(choice: ClockChoice) -> str:
@@ -187,21 +187,20 @@ def details(choice: ClockChoice) -> str:
         sentences.append(f"Rows come at {' and '.join(rates)}.")
     low, high = choice.steps
     if high - low > UNEVEN:
-        sentences.append(f"The written times are uneven: nine of ten steps are {low:.3g} to {high:.3g} of the median.")
+        sentences.append(f"The written times are uneven: nine of ten steps are {low:.2g} to {high:.2g} of the median.")
     if choice.errors:
-        terms = [f"{', '.join(names) or 'no term'} by {OF_CLOCK[name]}" for name, names in choice.terms.items()]
-        first = [f"{1e3 * value:.3g} mrad by {OF_CLOCK[name]}" for name, value in choice.nominal_errors.items()]
+        terms = [f"{', '.join(names) or 'none'} by {OF_CLOCK[name]}" for name, names in choice.terms.items()]
         sentences.append(
-            f"That is with the first terms of a search by each, {'; '.join(terms)}; within the tolerances alone it is "
-            f"{' and '.join(first)} (log chi2 {choice.nominal_gain:.2g}, p = {choice.nominal_p:.2g})."
+            f"The first terms that a search finds count there ({'; '.join(terms)}). Within the tolerances alone angles "
+            f"are {_by_clock(choice.nominal_errors)} off (log chi2 {choice.nominal_gain:.2g}, p = "
+            f"{choice.nominal_p:.2g})."
         )
     return " ".join(sentences)
 
 
-def _ordered(choice: ClockChoice) -> list[tuple[Clock, float]]:
-    """Return the errors by clock, that of the one taken first."""
-    other: Clock = "recorded" if choice.taken == "speeds" else "speeds"
-    return [(name, choice.errors[name]) for name in (choice.taken, other)]
+def _by_clock(errors: Mapping[Clock, float]) -> str:
+    """Return errors, rad, as a list in mrad."""
+    return " and ".join(f"{1e3 * value:.3g} mrad by {OF_CLOCK[name]}" for name, value in errors.items())
 
 
 def _span(low: float, high: float) -> str:
