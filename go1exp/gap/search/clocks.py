@@ -170,8 +170,8 @@ def sentence(choice: ClockChoice) -> str:
         return f"The clocks could not be compared: {choice.reason}. {taken}."
     low, high = choice.interval
     figures = (
-        f"in the median of {choice.windows} held-out windows of the same rows angles are "
-        f"{_by_clock(choice.errors)} off, and log chi2 by the written times less that by the speeds is "
+        f"in the median of {choice.windows} held-out windows of the same rows angles are off by "
+        f"{_by_clock(choice.errors)}, and log chi2 by the written times less that by the speeds is "
         f"{choice.gain:.2g} ({low:.2g} to {high:.2g}), p = {choice.p:.2g}"
     )
     if choice.decided:
@@ -192,7 +192,7 @@ def details(choice: ClockChoice) -> str:
         terms = [f"{', '.join(names) or 'none'} by {OF_CLOCK[name]}" for name, names in choice.terms.items()]
         sentences.append(
             f"The first terms that a search finds count there ({'; '.join(terms)}). Within the tolerances alone angles "
-            f"are {_by_clock(choice.nominal_errors)} off (log chi2 {choice.nominal_gain:.2g}, p = "
+            f"are off by {_by_clock(choice.nominal_errors)} (log chi2 {choice.nominal_gain:.2g}, p = "
             f"{choice.nominal_p:.2g})."
         )
     return " ".join(sentences)
@@ -200,7 +200,7 @@ def details(choice: ClockChoice) -> str:
 
 def _by_clock(errors: Mapping[Clock, float]) -> str:
     """Return errors, rad, as a list in mrad."""
-    return " and ".join(f"{1e3 * value:.3g} mrad by {OF_CLOCK[name]}" for name, value in errors.items())
+    return " and ".join(f"{1e3 * value:.3g} mrad with {OF_CLOCK[name]}" for name, value in errors.items())
 
 
 def _span(low: float, high: float) -> str:
