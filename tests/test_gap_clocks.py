@@ -55,11 +55,11 @@ def pendulum(clock: str = "compare") -> FixedBase:
 
 @pytest.fixture(scope="module")
 def motions() -> list[tuple[np.ndarray, ...]]:
-    """Times, angles, true speeds and targets of six motions of the pendulum with friction within its tolerance."""
+    """Times, angles, true speeds and targets of four motions of the pendulum with friction within its tolerance."""
     made: list[tuple[np.ndarray, ...]] = []
     robot = pendulum("recorded")
-    steps = np.arange(0.0, 9.0, 0.0005)
-    for n, speed in enumerate((3.0, 4.0, 5.0, 6.0, 7.0, 8.0)):
+    steps = np.arange(0.0, 7.0, 0.0005)
+    for n, speed in enumerate((3.0, 4.0, 6.0, 8.0)):
         target = (0.8 * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
         fine = played(robot, {"coulomb": {"bound": 0.01}}, target, 1)
         q = fine[::EVERY] + 2e-4 * np.random.default_rng(n).standard_normal((len(steps[::EVERY]), 1))
@@ -161,9 +161,9 @@ def test_without_speeds_there_is_one_clock(motions: list[tuple[np.ndarray, ...]]
     _, choice = clock_taken(several, pendulum(), QUICK)
     assert choice is not None
     assert (choice.taken, choice.decided) == ("recorded", False)
-    assert choice.reason == "1 of 6 recordings have no speeds, so there is one clock only"
+    assert choice.reason == "1 of 4 recordings have no speeds, so there is one clock only"
     assert choice.errors == {}
-    assert "The clocks could not be compared: 1 of 6" in clocks.details(choice)
+    assert "The clocks could not be compared: 1 of 4" in clocks.details(choice)
 
 
 def test_too_few_windows_decide_nothing(motions: list[tuple[np.ndarray, ...]]) -> None:

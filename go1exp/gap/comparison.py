@@ -141,7 +141,7 @@ def compare(
     """Prepare recordings, cut them into windows, and measure the floors.
 
     Where the model leaves open which clock they are read by, that is decided first, which takes as long
-    as two short searches.
+    as four short searches.
 
     Args:
         recordings: of one robot.
@@ -241,7 +241,7 @@ def _compared_clocks(
         return replace(default, taken=taken, reason=reason)
     episode = windows["recorded"].episode
     parts = splits([r.meta for r in written], episode, 0.0, np.random.default_rng(settings.seed))
-    judging = len(np.unique(stretches(episode)[parts.select]))
+    judging = len(np.unique(stretches(episode)[np.concatenate([parts.train, parts.select])]))
     if judging < FEWEST_STRETCHES:
         reason = f"only {judging} stretches of held-out windows could judge, and {FEWEST_STRETCHES} are needed"
         return replace(default, reason=reason)

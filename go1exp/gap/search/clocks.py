@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -53,7 +53,7 @@ def contest(
     settings: GapSettings,
     on_progress: Callable[[str, float], None] = lambda what, share: None,
 ) -> ClockChoice:
-    """Fit the model by both clocks, and judge both on held-out windows.
+    """Fit the model by both clocks on one half of the windows, judge both on the other, and the other way round.
 
     A clock is taken if the sign-flip test over stretches of neighbouring windows is significant (``settings.alpha``),
     the mean of log chi2 differs by more than what means the same (``significance.SAME``), and the model without terms
@@ -61,38 +61,41 @@ def contest(
 
     Args:
         sides: the windows by the clocks ``recorded`` and ``speeds``, of the same rows.
-        parts: which windows are fitted (``train``) and which judge (``select``).
+        parts: the two halves, ``train`` and ``select``, which take turns.
         settings: of the search.
         on_progress: called with what is being done, and which share of the work is finished.
     """
-    searches: dict[Clock, Search] = {}
     asked = dataclasses.replace(settings, max_terms=min(TERMS, settings.max_terms), bootstraps=0)
-    for k, (name, side) in enumerate(sides.items()):
+    halves = (parts, dataclasses.replace(parts, train=parts.select, select=parts.train))
+    nominal, last = _Judged(), _Judged()
+    terms: dict[Clock, dict[str, None]] = {name: {} for name in sides}
+    for k, half in enumerate(halves):
+        searches: dict[Clock, Search] = {}
+        for name, side in sides.items():
 
-        def show(what: str, share: float, name: str = name, k: int = k) -> None:
-            on_progress(f"clock {name}: {what}", (k + share) / len(sides))
+            def show(what: str, share: float, name: str = name, k: int = k) -> None:
+                on_progress(f"clock {name}, half {k + 1}: {what}", share)
 
-        rng = np.random.default_rng(settings.seed)
-        searches[name] = Search(side.scorer, parts, asked, side.dt, rng, show)
-        searches[name].run()
-    select = parts.select
-    stretch = stretches(sides["recorded"].scorer.windows.episode)[select]
-    nominal = {name: s.nominal for name, s in searches.items()}
-    last = {name: s.state.theta for name, s in searches.items()}
-    first_scorers = {name: side.scorer for name, side in sides.items()}
+            rng = np.random.default_rng(settings.seed)
+            searches[name] = Search(side.scorer, half, asked, side.dt, rng, show)
+            searches[name].run()
+            terms[name] |= dict.fromkeys(searches[name].state.terms)
+        plain = {name: (side.scorer, searches[name].nominal) for name, side in sides.items()}
+        nominal = nominal.also(plain, sides, half.select)
+        last = last.also({n: (s.state.scorer, s.state.theta) for n, s in searches.items()}, sides, half.select)
+    which = np.concatenate([half.select for half in halves])
+    stretch = stretches(sides["recorded"].scorer.windows.episode)[which]
     rng = np.random.default_rng(settings.seed)
-    before, nominal_errors = _scored(first_scorers, nominal, sides, select)
-    after, errors = _scored({name: s.state.scorer for name, s in searches.items()}, last, sides, select)
-    nominal_gain, _, nominal_p = judged(before, stretch, rng)
-    gain, interval, p = judged(after, stretch, rng)
+    nominal_gain, _, nominal_p = judged(nominal.log_chi2, stretch, rng)
+    gain, interval, p = judged(last.log_chi2, stretch, rng)
     choice = ClockChoice(
         taken=DEFAULT_CLOCK,
         decided=False,
-        windows=len(select),
+        windows=len(which),
         stretches=len(np.unique(stretch)),
-        nominal_errors=nominal_errors,
-        errors=errors,
-        terms={name: s.state.terms for name, s in searches.items()},
+        nominal_errors=nominal.median_errors,
+        errors=last.median_errors,
+        terms={name: tuple(names) for name, names in terms.items()},
         gain=gain,
         interval=interval,
         p=p,
@@ -135,23 +138,36 @@ def judged(
     return float(difference.mean()), (float(low), float(high)), float(p)
 
 
-def _scored(
-    scorers: Mapping[Clock, Scorer], thetas: Mapping[Clock, Theta], sides: Mapping[Clock, Contestant], which: np.ndarray
-) -> tuple[dict[Clock, np.ndarray], dict[Clock, float]]:
-    """Return log chi2 (V,) of windows, mean of their groups, and the median window's error of the angles, rad.
+@dataclass(frozen=True)
+class _Judged:
+    """What was found of windows that were held out: by clock, log chi2 (V,) and errors of the angles (V,), rad."""
 
-    By one floor: each scorer has the error of the step of its own model in it, and the larger of the two counts.
-    """
-    floor = np.max([s.scale for s in scorers.values()], axis=0)
-    logs: dict[Clock, np.ndarray] = {}
-    errors: dict[Clock, float] = {}
-    for name, scorer in scorers.items():
-        with np.errstate(invalid="ignore"):  # what is not compared has an infinite scale
-            same = rescaled(scorer, floor / scorer.scale)
-        residual = residuals(same, [thetas[name]], which, sides[name].dt)[0]
-        logs[name] = log_chi2(same.chi2(residual, which)).mean(axis=1)
-        errors[name] = float(np.median(np.sqrt(np.nanmean(of_angles(same, residual, which) ** 2, axis=1))))
-    return logs, errors
+    log_chi2: dict[Clock, np.ndarray] = field(default_factory=dict)
+    errors: dict[Clock, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def median_errors(self) -> dict[Clock, float]:
+        """Of the angles in the median window, rad."""
+        return {name: float(np.median(values)) for name, values in self.errors.items()}
+
+    def also(
+        self, models: Mapping[Clock, tuple[Scorer, Theta]], sides: Mapping[Clock, Contestant], which: np.ndarray
+    ) -> _Judged:
+        """Return the same with more windows (numbers), scored by models with one floor.
+
+        Each scorer has the error of the step of its own model in its noise. The larger of the two counts.
+        """
+        floor = np.max([scorer.scale for scorer, _ in models.values()], axis=0)
+        logs, errors = dict(self.log_chi2), dict(self.errors)
+        for name, (scorer, theta) in models.items():
+            with np.errstate(invalid="ignore"):  # what is not compared has an infinite scale
+                same = rescaled(scorer, floor / scorer.scale)
+            residual = residuals(same, [theta], which, sides[name].dt)[0]
+            chi2 = log_chi2(same.chi2(residual, which)).mean(axis=1)
+            off = np.sqrt(np.nanmean(of_angles(same, residual, which) ** 2, axis=1))
+            logs[name] = np.concatenate([logs.get(name, np.empty(0)), chi2])
+            errors[name] = np.concatenate([errors.get(name, np.empty(0)), off])
+        return _Judged(logs, errors)
 
 
 # ---------------------------------------------------------------------- in words
