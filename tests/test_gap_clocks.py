@@ -218,6 +218,39 @@ def test_windows_of_one_stretch_count_as_one() -> None:
     assert (swapped, low, high) == pytest.approx((-1.0, -1.0, -1.0))
 
 
+def test_every_window_judges_once_by_a_fit_that_has_not_seen_it(
+    motions: list[tuple[np.ndarray, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a search that does nothing, and twice the same clock: no difference at all."""
+    comparison = compare(logs(motions), pendulum("recorded"), QUICK)
+    parts = comparison.split(np.random.default_rng(0))
+    made: list[Any] = []
+
+    class Nothing:
+        nominal: Any = {}  # noqa: RUF012  (as the real one has it, never written)
+
+        def __init__(self, scorer: Any, half: Any, *others: Any) -> None:
+            self.state = SimpleNamespace(scorer=scorer, theta={}, terms=())
+            made.append(half)
+
+        def run(self) -> None:
+            pass
+
+    monkeypatch.setattr(clocks, "Search", Nothing)
+    side = clocks.Contestant(comparison.scorer, comparison.dt)
+    choice = clocks.contest({"recorded": side, "speeds": side}, parts, QUICK)
+    assert len(made) == 4
+    for half in made:
+        assert not set(half.train) & set(half.select)
+        assert not set(parts.confirm) & {*half.train, *half.select}
+    judging = np.concatenate([half.select for half in made[::2]])
+    assert sorted(judging) == sorted([*parts.train, *parts.select])
+    assert choice.windows == len(judging)
+    assert (choice.gain, *choice.interval, choice.p) == (0.0, 0.0, 0.0, 1.0)
+    assert choice.errors["recorded"] == choice.errors["speeds"] > 0.0
+    assert choice.reason == "the two do as well"
+
+
 # ---------------------------------------------------------------------- the windows
 
 
