@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
 from go1exp.audit import audit
 from go1exp.errors import Expected
+from go1exp.gap.data.clocks import rows_of, same_rows
+from go1exp.gap.data.cutting import Place
 from go1exp.gap.data.prepare import Ready
-from go1exp.gap.data.splits import Splits, splits
+from go1exp.gap.data.splits import Splits, splits, stretches
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.result import Floors, GapSettings
+from go1exp.gap.result import DEFAULT_CLOCK, Clock, ClockChoice, Floors, GapSettings
+from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.floors import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details
 from go1exp.recording import Recording, RecordingError
 from go1exp.robot import RobotConfig
 
@@ -30,6 +35,12 @@ FEWEST_RECORDINGS = 3
 """Recordings that must remain if others are left out."""
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+FEWEST_STRETCHES = 8
+"""Stretches of held-out windows below which no sign-flip test of two clocks comes to p < 0.01: 2 / 2^8."""
+
+USABLE = 0.5
+"""Share of the windows that must be without holes by a clock for it to compete."""
 
 
 class NotComparable(Expected):
@@ -57,6 +68,7 @@ class Comparison:
         dt: physics step, s.
         scorer: scores models on the windows.
         numerical: error of the physics step by quantity, SI units.
+        clock: which of two clocks the recordings are read by; None if the model says which.
     """
 
     robot: Robot
@@ -65,6 +77,7 @@ class Comparison:
     dt: float
     scorer: Scorer
     numerical: dict[str, float]
+    clock: ClockChoice | None = None
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
@@ -127,6 +140,9 @@ def compare(
 ) -> Comparison:
     """Prepare recordings, cut them into windows, and measure the floors.
 
+    Where the model leaves open which clock they are read by, that is decided first, which takes as long
+    as four short searches.
+
     Args:
         recordings: of one robot.
         robot: the model.
@@ -139,8 +155,11 @@ def compare(
     Raises:
         NotComparable: if the recordings do not suit the robot, or are too short.
     """
+    robot, clock = clock_taken(recordings, robot, settings, on_progress)
     on_progress("auditing the logs", 0.0)
     robot, ready = prepare(recordings, robot, settings)
+    if clock is not None:
+        ready = replace(ready, warnings=(details(clock), *ready.warnings))
     try:
         windows = robot.windows(ready)
     except RecordingError as error:
@@ -149,10 +168,108 @@ def compare(
         short = f"{len(windows)} windows of {ready.settings.window_s:g} s"
         sentence = f"These logs are too short: {short}, {fewest} are needed."
         raise NotComparable(sentence, [f"{short}; {fewest} are needed"], [sentence])
+    on_progress("measuring the floors", 0.02)
+    dt, scorer, numerical = _scored(robot, ready, windows, settings, physics_dt)
+    return Comparison(robot, ready, windows, dt, scorer, numerical, clock)
+
+
+def _scored(
+    robot: Robot, ready: Ready, windows: Windows, settings: GapSettings, physics_dt: float | None = None
+) -> tuple[float, Scorer, dict[str, float]]:
+    """Return the physics step, s, what scores windows at that step, and its error by quantity."""
     longest = settings.physics_dt if physics_dt is None else physics_dt
     dt = float(windows.period / np.ceil(windows.period / longest - 1e-3))
-    on_progress("measuring the floors", 0.02)
     quats = np.array([ready.recordings[e].meta.base_quat or LEVEL for e in windows.episode])
     replayer = robot.replayer(windows, quats, settings.max_rows, settings.threads)
     scorer, numerical = measured(replayer, dt, 2.0 * dt if physics_dt is None else dt, settings.clock_s)
-    return Comparison(robot, ready, windows, dt, scorer, numerical)
+    return dt, scorer, numerical
+
+
+# ---------------------------------------------------------------------- two clocks
+
+
+def clock_taken(
+    recordings: Sequence[Recording],
+    robot: Robot,
+    settings: GapSettings,
+    on_progress: Progress = lambda what, share: None,
+) -> tuple[Robot, ClockChoice | None]:
+    """Return the robot whose recordings are read by one clock, and how that was chosen; None if its model says which.
+
+    With ``clock: compare`` both compete on windows that a later search does not keep for its last check, by either
+    clock. Only angles are compared there: the speeds make one of the clocks.
+
+    Raises:
+        NotComparable: if too many recordings do not suit the robot.
+    """
+    if not (isinstance(robot, FixedBase) and robot.config.clock == "compare"):
+        return robot, None
+    choice = _compared_clocks(recordings, robot, settings, on_progress)
+    return robot.by_clock(choice.taken), choice
+
+
+def _compared_clocks(
+    recordings: Sequence[Recording], robot: FixedBase, settings: GapSettings, on_progress: Progress
+) -> ClockChoice:
+    """Return which clock is taken, and the figures that it rests on."""
+    names: tuple[Clock, ...] = get_args(Clock)
+    ready = {name: prepare(recordings, robot.by_clock(name, "ignored"), settings)[1] for name in names}
+    written = ready["recorded"].recordings
+    steps = np.concatenate([np.diff(r.t) / np.median(np.diff(r.t)) for r in written])
+    low, high = np.quantile(steps, (0.05, 0.95))
+    rate_hz = {name: _rates(r.recordings) for name, r in ready.items()}
+    default = ClockChoice(DEFAULT_CLOCK, False, rate_hz=rate_hz, steps=(float(low), float(high)))
+    compared = {r.meta.episode for r in written}
+    without = [r.meta.episode for r in recordings if r.meta.episode in compared and not r.has("qd")]
+    if without:
+        reason = f"{len(without)} of {len(written)} recordings have no speeds, so there is one clock only"
+        return replace(default, reason=reason)
+    spared = [np.zeros(len(r.t), dtype=bool) for r in written]
+    for name in names:
+        for mask, kept in zip(spared, _last_check(recordings, robot.by_clock(name), settings), strict=True):
+            mask |= kept
+    cuts = {name: _cut(robot.by_clock(name, "ignored"), ready[name]) for name in names}
+    plan = ready["recorded"].settings
+    try:
+        windows, left = same_rows({name: r.recordings for name, r in ready.items()}, cuts, plan, spared)
+    except RecordingError as error:
+        return replace(default, reason=str(error))
+    most, worst = max(left.values()), min(left, key=lambda name: left[name])
+    if left[worst] < USABLE * most:
+        taken: Clock = "speeds" if worst == "recorded" else "recorded"
+        reason = f"by {OF_CLOCK[worst]} only {left[worst]} of {most} windows are without holes"
+        return replace(default, taken=taken, reason=reason)
+    episode = windows["recorded"].episode
+    parts = splits([r.meta for r in written], episode, 0.0, np.random.default_rng(settings.seed))
+    judging = len(np.unique(stretches(episode)[np.concatenate([parts.train, parts.select])]))
+    if judging < FEWEST_STRETCHES:
+        reason = f"only {judging} stretches of held-out windows could judge, and {FEWEST_STRETCHES} are needed"
+        return replace(default, reason=reason)
+    sides: dict[Clock, Contestant] = {}
+    for name in names:
+        dt, scorer, _ = _scored(robot.by_clock(name), ready[name], windows[name], plan)
+        sides[name] = Contestant(scorer, dt)
+    choice = contest(sides, parts, plan, lambda what, share: on_progress(what, 0.0))
+    return replace(choice, rate_hz=default.rate_hz, steps=default.steps)
+
+
+def _cut(robot: FixedBase, ready: Ready) -> Callable[[Sequence[Sequence[Place]]], Windows]:
+    return lambda places: robot.windows(ready, places)
+
+
+def _rates(recordings: Sequence[Recording]) -> tuple[float, float]:
+    """Return the least and the largest rate of rows, Hz."""
+    rates = [(len(r.t) - 1) / float(r.t[-1] - r.t[0]) for r in recordings]
+    return min(rates), max(rates)
+
+
+def _last_check(recordings: Sequence[Recording], robot: FixedBase, settings: GapSettings) -> list[np.ndarray]:
+    """Return the rows (T,) bool of each comparable recording that a search by the robot's clock keeps for its last."""
+    _, ready = prepare(recordings, robot, settings)
+    try:
+        windows = robot.windows(ready)
+    except RecordingError:  # too short by this clock, so there is no last check to spare
+        return [np.zeros(len(r.t), dtype=bool) for r in ready.recordings]
+    share, rng = settings.confirm_fraction, np.random.default_rng(settings.seed)
+    parts = splits([r.meta for r in ready.recordings], windows.episode, share, rng)
+    return rows_of(windows, parts.confirm, ready.recordings)

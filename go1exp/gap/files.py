@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -17,6 +17,8 @@ from go1exp.gap.result import (
     EXIT_CODES,
     AngleErrors,
     Candidate,
+    Clock,
+    ClockChoice,
     Floors,
     GapResult,
     GapSettings,
@@ -75,6 +77,7 @@ def from_dict(plain: Mapping[str, Any]) -> GapResult:
     # Results of older versions call it bags.
     values["bootstrap_share"] = _numbers(plain["bags"] if "bags" in plain else plain["bootstrap_share"])
     values["tolerances"] = _numbers(plain.get("tolerances", {}))  # of an older version: the declared ones
+    values["clock"] = _clock(plain.get("clock"))  # older results have none
     for name in ("closed", "seconds"):
         values[name] = _number(plain[name])
     for name in ("advice", "warnings"):
@@ -114,6 +117,19 @@ def _errors(item: Mapping[str, Any] | None) -> AngleErrors | None:
     numbers = {name: _number(item[name]) for name in ("removed", "worse")}
     within = _pair(item["within"]) if item.get("within") else None  # older results have none
     return AngleErrors(**{**item, **numbers, **pairs, "median": _pair(item["median"]), "within": within})
+
+
+def _clock(item: Mapping[str, Any] | None) -> ClockChoice | None:
+    if item is None:
+        return None
+    if item["taken"] not in get_args(Clock):
+        raise ValueError(f"clock.taken {item['taken']!r}")
+    numbers = {name: _number(item[name]) for name in ("gain", "p", "nominal_gain", "nominal_p")}
+    tables = {name: _numbers(item[name]) for name in ("nominal_errors", "errors")}
+    pairs = {name: _pair(item[name]) for name in ("steps", "interval")}
+    rates = {name: _pair(value) for name, value in item["rate_hz"].items()}
+    terms = {name: tuple(value) for name, value in item["terms"].items()}
+    return ClockChoice(**{**item, **numbers, **tables, **pairs, "rate_hz": rates, "terms": terms})
 
 
 def _pair(item: Sequence[float | None]) -> tuple[float, float]:

@@ -31,6 +31,12 @@ EXIT_CODES: dict[str, int] = {
 Phase = Literal["auto", "whole", "swing"]
 """What of a robot that walks is compared: everything, or the legs that are in the air."""
 
+Clock = Literal["recorded", "speeds"]
+"""Where times are from: the recording says them, or recorded speeds and angles tell them."""
+
+DEFAULT_CLOCK: Clock = "recorded"
+"""The clock that is taken where two were compared and neither is better: it asks nothing of the speeds."""
+
 Share = Annotated[float, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(ge=1)]
 
@@ -260,6 +266,49 @@ class AngleErrors:
 
 
 @dataclass(frozen=True)
+class ClockChoice:
+    """Which of two clocks the recordings are read by, and what that rests on.
+
+    Both are judged on readings of the same rows, by the same floor, on windows that no fit has seen and that are not
+    of the last check. By clock: of the written times (``recorded``), and of the speeds (``speeds``).
+
+    Attributes:
+        taken: the clock that is used.
+        decided: whether held-out windows prefer it; otherwise it is the default, or the only one that is usable.
+        reason: why it is not decided; empty if it is.
+        rate_hz: clock -> least and largest rate of rows of the recordings, Hz.
+        steps: 5 % and 95 % quantile of the steps of the written times over their median; (1, 1) is an even clock.
+        windows: how many judged.
+        stretches: of neighbouring windows, which count as one in the test.
+        nominal_errors: clock -> error of the angles in the median window, rad, of the model within its tolerances.
+        errors: clock -> the same with the first terms that a search finds by that clock.
+        terms: clock -> names of these terms.
+        gain: mean over windows by how much log chi2 is larger by the written times, with those terms; positive where
+            the speeds tell the better clock.
+        interval: its 95 % interval, from resampled stretches.
+        p: two-sided sign-flip test over stretches.
+        nominal_gain: the same mean within the tolerances.
+        nominal_p: its p.
+    """
+
+    taken: Clock
+    decided: bool
+    reason: str = ""
+    rate_hz: dict[Clock, tuple[float, float]] = field(default_factory=dict)
+    steps: tuple[float, float] = (math.nan, math.nan)
+    windows: int = 0
+    stretches: int = 0
+    nominal_errors: dict[Clock, float] = field(default_factory=dict)
+    errors: dict[Clock, float] = field(default_factory=dict)
+    terms: dict[Clock, tuple[str, ...]] = field(default_factory=dict)
+    gain: float = math.nan
+    interval: tuple[float, float] = (math.nan, math.nan)
+    p: float = math.nan
+    nominal_gain: float = math.nan
+    nominal_p: float = math.nan
+
+
+@dataclass(frozen=True)
 class GapResult:
     """The answer.
 
@@ -283,6 +332,7 @@ class GapResult:
         overlays: windows to look at.
         box: parameters within their tolerances: effect -> parameter -> joint or ``robot`` -> value.
         tolerances: that counted: effect -> parameter -> tolerance; where there is none, the effect's declared one.
+        clock: which of two clocks was taken; None if the model did not ask for a comparison.
         provenance: hashes, versions, seeds, steps.
         warnings: what a reader must know, a sentence each.
         seconds: time it took.
@@ -305,6 +355,7 @@ class GapResult:
     overlays: tuple[Overlay, ...] = ()
     box: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
     tolerances: dict[str, dict[str, float]] = field(default_factory=dict)
+    clock: ClockChoice | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     seconds: float = math.nan

@@ -40,7 +40,7 @@ class Splits:
         return self.confirm if len(self.confirm) else self.select
 
 
-def _stretch(episode: np.ndarray) -> np.ndarray:
+def stretches(episode: np.ndarray) -> np.ndarray:
     """Return the number of the stretch of ``STRETCH`` windows that each window (W,) is in."""
     place = np.arange(len(episode)) - np.searchsorted(episode, episode)
     return np.asarray(np.unique(episode * len(episode) + place // STRETCH, return_inverse=True)[1])
@@ -93,7 +93,7 @@ def splits(metas: Sequence[Meta], episode: np.ndarray, confirm: float, rng: np.r
         if len(shuffled) == 1:
             name, inside = units[shuffled[0]], unit == shuffled[0]
             alone.append(name)
-            stretch = np.unique(_stretch(episode)[inside], return_inverse=True)[1]
+            stretch = np.unique(stretches(episode)[inside], return_inverse=True)[1]
             count = int(stretch.max(initial=-1)) + 1
             spared = (before + stretch) % KEPT_EVERY == KEPT_EVERY - 1
             if cut and spared.any() and (len(units) > 3 or count >= KEPT_EVERY):

@@ -79,7 +79,8 @@ class ModelConfig:
         speed_limit: top speed without load, rad/s.
         speeds: ``checked``: recorded speeds are compared unless the audit finds them wrong; ``ignored``: never.
         clock: ``recorded``: times are those of the recording; ``speeds``: it has none worth the name, and the time
-            between two rows is what it takes the recorded speeds to make the change of the angles.
+            between two rows is what it takes the recorded speeds to make the change of the angles; ``compare``: the
+            two compete, and held-out windows decide (``gap/search/clocks.py``).
         tolerances: effect -> parameter -> tolerance that replaces the declared one (unit as there).
         search: settings that suit it.
     """
@@ -99,7 +100,7 @@ class ModelConfig:
     kd: Gain | None = None
     firmware: Firmware | None = None
     speeds: Literal["checked", "ignored"] = "checked"
-    clock: Literal["recorded", "speeds"] = "recorded"
+    clock: Literal["recorded", "speeds", "compare"] = "recorded"
     tolerances: dict[str, dict[str, Positive]] = field(default_factory=dict)
     search: SearchDefaults = field(default_factory=SearchDefaults)
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,12 +16,12 @@ from go1exp.actuator.setup import Gains
 from go1exp.audit import AuditReport
 from go1exp.drive import DriveSetup
 from go1exp.effects.tolerances import DECLARED, Tolerances
-from go1exp.gap.data.cutting import cut
+from go1exp.gap.data.cutting import Place, cut
 from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.machine import NEEDLESS, pd, voltage
 from go1exp.gap.replay.replayer import Replayer
-from go1exp.gap.result import GapSettings, Phase
+from go1exp.gap.result import Clock, GapSettings, Phase
 from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, gain_warnings, wrong_speeds
 from go1exp.gap.robots.description import ModelConfig
 from go1exp.physics.fixed_base import NO_SENSORS, FixedBaseError, build_fixed_base, feel_each_other
@@ -144,8 +144,18 @@ class FixedBase:
         """Return why a recording cannot be compared, a line each."""
         return flaws_of(recording, report, self.config)
 
+    def by_clock(self, clock: Clock, speeds: Literal["checked", "ignored"] | None = None) -> FixedBase:
+        """Return the robot whose recordings are read by one clock; ``speeds`` as in its description, kept if None."""
+        return replace(self, config=replace(self.config, clock=clock, speeds=speeds or self.config.speeds))
+
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
-        """Return recordings with what they lack taken from the description, and windows whose number is affordable."""
+        """Return recordings with what they lack taken from the description, and windows whose number is affordable.
+
+        Raises:
+            ValueError: if which clock they are read by is still to be compared.
+        """
+        if self.config.clock == "compare":
+            raise ValueError("model.clock = 'compare': take a clock first (gap.comparison.compare does)")
         warnings = []
         wrong = wrong_speeds(recordings, reports, self.config)
         if wrong:
@@ -155,9 +165,9 @@ class FixedBase:
         settings, spacing_warnings = spaced(whole, settings, len(self.groups[0]))
         return Ready(whole, settings, ("qd",) if wrong else (), (*warnings, *spacing_warnings))
 
-    def windows(self, ready: Ready) -> Windows:
-        """Cut recordings into windows; what is ignored has infinite noise."""
-        windows = cut(ready.recordings, ready.settings)
+    def windows(self, ready: Ready, places: Sequence[Sequence[Place]] | None = None) -> Windows:
+        """Cut recordings into windows, at ``places`` of each if given; what is ignored has infinite noise."""
+        windows = cut(ready.recordings, ready.settings, places=places)
         if self.config.clock == "speeds":
             windows.scale[:, 0] = noise_in_time(ready.recordings)
         for c, quantity in enumerate(windows.quantities):

@@ -16,7 +16,7 @@ import numpy as np
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Rows, Theta, variants
-from go1exp.gap.score.likelihood import Scorer, scorer
+from go1exp.gap.score.likelihood import Scorer, grouped, scorer
 from go1exp.gap.score.robust import log_chi2
 
 ROUNDS = 6
@@ -54,11 +54,11 @@ def _with(score: Scorer, windows: Windows) -> Scorer:
     return dataclasses.replace(score, replayer=dataclasses.replace(score.replayer, windows=windows))
 
 
-def _rescaled(score: Scorer, factor: np.ndarray) -> Scorer:
+def rescaled(score: Scorer, factor: np.ndarray) -> Scorer:
     """Return the scorer with ``factor`` (W, C, J) times the noise."""
     factor = np.where(np.isfinite(factor), factor, 1.0)
     long = np.broadcast_to(factor[:, None], (len(factor), score.windows.t.shape[1], *factor.shape[1:]))
-    state = score.state / long.reshape(len(factor), 1, -1, 1)
+    state = score.state / grouped(score.replayer.machine, long)[..., None]
     return dataclasses.replace(score, scale=score.scale * factor, state=state.astype(np.float32))
 
 
@@ -89,7 +89,7 @@ def settled(
     fine = np.abs(replayer.run(rows, 0.5 * dt) - replayer.run(rows, dt))
     rough = np.hypot(replayer.windows.scale, 2.0 * np.sqrt(np.mean(fine**2, axis=1)))
     score = _fitted(scorer(replayer, theta, rough, dt, clock_s), rows, theta, dt)
-    score = _rescaled(score, score.windows.scale / np.where(np.isfinite(rough), rough, 1.0))
+    score = rescaled(score, score.windows.scale / np.where(np.isfinite(rough), rough, 1.0))
     score, numerical = stepped(score, rows, dt)
     score = _bent(score, rows, dt)
     score = dataclasses.replace(score, expected=replayer.windows)
@@ -142,7 +142,7 @@ def stepped(score: Scorer, rows: Rows, dt: float) -> tuple[Scorer, dict[str, flo
     x, _ = solved(score.state[:, 0], whole)
     left = whole - (score.state[:, 0] @ x[..., None].astype(np.float32))[..., 0]
     error = 2.0 * np.sqrt(np.mean(change**2, axis=1))
-    return _rescaled(score, np.sqrt(1.0 + 4.0 * _mean_square(score, left))), windows.by_quantity(error)
+    return rescaled(score, np.sqrt(1.0 + 4.0 * _mean_square(score, left))), windows.by_quantity(error)
 
 
 def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
@@ -161,4 +161,4 @@ def _bent(score: Scorer, plain: Rows, dt: float) -> Scorer:
         drawn = Rows(everything, plain.values, off[:, :joints], off[:, joints : 2 * joints], off[:, 2 * joints :])
         change = score.unit(replayer.run(drawn, dt) - nominal, everything)[:, 0]
         square += _mean_square(score, change - (score.state[:, 0] @ x[..., None].astype(np.float32))[..., 0])
-    return _rescaled(score, np.sqrt(1.0 + square / DRAWS))
+    return rescaled(score, np.sqrt(1.0 + square / DRAWS))

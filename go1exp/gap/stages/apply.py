@@ -20,6 +20,7 @@ from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.files import GapFileError
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
+from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search.fit import scores
@@ -258,7 +259,7 @@ def prove(
         GapFileError: if logs or settings are not those of the search: what it held out would not be known.
         NotComparable: if the recordings do not suit the robot.
     """
-    robot = robot_from(robot)
+    robot = read_as(robot_from(robot), result)
     phase = result.provenance.get("settings", {}).get("phase", "whole")  # what auto came to
     settings = replace(settings, phase=phase)
     _same_search(recordings, settings, result, robot.tolerances)
@@ -271,6 +272,19 @@ def prove(
     holds = both <= max(settings.adequate, min(plain, 1.5 * reported + 0.1))
     closed = removed(plain, both)
     return Applied((), comparison.dt, plain, both, effect_only, reported, closed, bool(holds))
+
+
+def read_as(robot: Robot, result: GapResult) -> Robot:
+    """Return the robot whose recordings are read by the clock that a result was found by.
+
+    Raises:
+        GapFileError: if the model says now what the search was to compare, or the other way round.
+    """
+    clock = robot.config.clock if isinstance(robot, FixedBase) else None
+    if (clock == "compare") == (result.clock is not None):
+        return robot.by_clock(result.clock.taken) if isinstance(robot, FixedBase) and result.clock else robot
+    before = "compare" if result.clock else "another one"
+    raise GapFileError(f"model.clock = {clock}: {before} in the search that found this; run go1exp gap explain again")
 
 
 def _proposals(contents: Mapping[str, Mapping[str, Any]], robot: Robot) -> tuple[Theta, Theta, Theta]:

@@ -22,6 +22,7 @@ from go1exp.gap.score.angle_errors import angle_errors
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import localise
 from go1exp.gap.score.robust import excess
+from go1exp.gap.search import clocks
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.sentence import advice, sentence
@@ -148,9 +149,10 @@ def written(
     silent = not_excited(search.signal, held=not comparison.robot.on_ground)
     suggestions = advice({n.effect: n.alias_set for n in answer.named})
     named = {n.effect: n for n in answer.named}
+    of_clock = [clocks.sentence(comparison.clock)] if comparison.clock else []
     return GapResult(
         verdict=answer.verdict,
-        sentence=sentence(answer, search, silent, suggestions),
+        sentence=" ".join([sentence(answer, search, silent, suggestions), *of_clock]),
         named=answer.named,
         candidates=evidence(search),
         floors=comparison.floors(),
@@ -165,6 +167,7 @@ def written(
         waterfall=(("model as it is", answer.excess["null"]), *search.steps),
         overlays=overlays(score, comparison.recordings, search.state.theta, parts.select, settings.overlays, dt),
         tolerances=comparison.robot.tolerances.by_effect(),
+        clock=comparison.clock,
         box=_nested(answer.theta, score.windows.joints, named),
         provenance={**about, "simulation_steps": score.replayer.made},
         warnings=tuple(warnings),

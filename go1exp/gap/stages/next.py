@@ -24,7 +24,7 @@ from go1exp.gap.result import Candidate, GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.search import significance, tolerances
 from go1exp.gap.search.screen import PROBE
-from go1exp.gap.stages.apply import composed, terms_of, theta_of
+from go1exp.gap.stages.apply import composed, read_as, terms_of, theta_of
 from go1exp.record.simulate import held_quat
 from go1exp.recording import Recording
 from go1exp.robot import JOINTS, RobotConfig
@@ -241,7 +241,7 @@ def design(
         DesignError: if there is nothing that a recording could tell apart, or none is within the limits.
         NotComparable: if the recordings do not suit the robot.
     """
-    robot = robot_from(robot).suited(recordings)
+    robot = read_as(robot_from(robot), result).suited(recordings)
     _same_logs(result, recordings)
     lots = [pairs_of(result, robot), [] if names_only else unseen(result, robot)]
     rate = recordings[0].meta.rate_hz
