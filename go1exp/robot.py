@@ -27,6 +27,14 @@ GRAVITY = 9.81
 NUM_JOINTS = len(JOINTS)
 NUM_LEGS = len(LEGS)
 
+MOUNT_SLIDES = ("mount_x", "mount_y", "mount_z")
+MOUNT_HINGES = ("mount_roll", "mount_pitch")
+MOUNT = (*MOUNT_SLIDES, *MOUNT_HINGES)
+"""Joints between the world and a trunk that is held by what gives way, before those of the legs (``physics/mount.py``).
+
+None about z: legs that hang hardly turn a trunk that way, and a fit gets lost in what else it might explain.
+"""
+
 MIRROR_LEGS = (1, 0, 3, 2)
 """Index of the leg opposite across the sagittal (x-z) plane."""
 

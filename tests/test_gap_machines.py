@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,15 +20,19 @@ from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
 from go1exp.effects.tolerances import declared
 from go1exp.env.plant import Plant
-from go1exp.gap.comparison import NotComparable, prepare
+from go1exp.gap.answer import name_terms, resampled_values
+from go1exp.gap.comparison import NotComparable, compare, prepare
 from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, slope
 from go1exp.gap.data.windows import averaged
+from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.choice import robot_of
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.hung import HungGo1
 from go1exp.gap.search import tolerances
+from go1exp.gap.search.ledger import LastCheck
+from go1exp.gap.search.stepwise import Search
 from go1exp.gap.stages.explain import explain
 from go1exp.importers import import_recordings
 from go1exp.recording import Meta, Recording, joint_channel
@@ -392,7 +397,33 @@ def test_friction_of_loaded_gears_is_told_from_dry_friction_and_by_its_law(exter
     assert result.named[0].params["coefficient"]["pendulum"] == pytest.approx(0.2, abs=0.02)
     low, high = result.named[0].interval["coefficient"]["pendulum"]
     assert low < 0.2 < high
+    assert "external" not in result.named[0].interval
     assert ("external 1" in result.sentence) == (external == 1.0)
+
+
+@pytest.mark.usefixtures("few")
+def test_a_value_that_is_held_has_no_interval() -> None:
+    """The law of a loaded gear's friction is chosen and held; only the coefficient is fitted, and uncertain."""
+    robot = machine("xl330_pendulum", tolerances={})
+    steps, logs, hidden = np.arange(0.0, 3.0, 0.0005), [], {"coefficient": 0.2, "external": 1.0}
+    for n, speed in enumerate((2.0, 3.0, 5.0)):
+        target = (1.0 * np.sin(speed * steps) + 0.4 * np.sin(2.3 * speed * steps))[:, None]
+        q = played(robot, {"load_friction": hidden}, target, 10)
+        q += 2e-4 * np.random.default_rng(n).standard_normal(q.shape)
+        logs.append(recording(("pendulum",), steps[::10], {"q": q, "q_target": target[::10]}, kp=(3.0,), kd=(0.05,)))
+    logs = [dataclasses.replace(r, meta=dataclasses.replace(r.meta, episode=f"e{n}")) for n, r in enumerate(logs)]
+    rng = np.random.default_rng(0)
+    found = compare(logs, robot, QUICK)
+    search = Search(found.scorer, found.split(rng), found.settings, found.dt, rng, lambda what, share: None)
+    theta: Theta = {("load_friction", name): np.array([value]) for name, value in hidden.items()}
+    search.state = dataclasses.replace(search.state, terms=("load_friction",), theta=theta).settled(1)
+    search.aliases, search.select_chi2 = {"load_friction": ("load_friction",)}, search.state.held_out()
+    fitted, drawn = resampled_values(search)
+    assert fitted["load_friction", "external"] == 1.0
+    assert {name for effect, name in drawn if effect == "load_friction"} == {"coefficient"}
+    (named,) = name_terms(search, fitted, drawn, True, LastCheck(True, math.nan))
+    assert named.params["external"] == {"pendulum": 1.0}
+    assert named.interval.keys() == {"coefficient"}
 
 
 @pytest.mark.usefixtures("few")

@@ -13,7 +13,7 @@ from go1exp.effects.tolerances import DECLARED
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import evidence, places, tolerances
-from go1exp.gap.search.screen import SHARES, Motion, library
+from go1exp.gap.search.screen import SHARES, Motion, Screened, Variant, library, rivals
 from go1exp.gap.search.tolerances import Freedom
 from go1exp.gap.search.trial import _choice
 from go1exp.robot import JOINTS
@@ -116,15 +116,51 @@ def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
     offsets = {("encoder_offset", "offset"): np.full(12, 0.02)}
     tilt = {("base_tilt", "roll"): np.array([0.03]), ("base_tilt", "pitch"): np.array([-0.02])}
     values = [("encoder_offset", offsets), ("base_tilt", tilt)]
-    numbers = np.array([(evidence.count(name, theta, MACHINE), len(theta)) for name, theta in values])
+    numbers = np.array([(evidence.count(name, theta, MACHINE), len(theta)) for name, theta in values], dtype=float)
     gain = np.random.default_rng(0).normal(2.0, 0.1, (2, 60))
     gain[1] = gain[0] - 0.01  # half a per cent less: the same
     all_out, none = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
-    chosen, alias, aside = _choice(gain, all_out, none, numbers, np.random.default_rng(0))
+    chosen, alias, aside = _choice(gain, all_out, none, numbers, none, np.random.default_rng(0))
     assert chosen == 1
     np.testing.assert_array_equal((alias, aside), ([False, True], [True, False]))
     gain[1] = 0.8 * gain[0]  # but it must explain as much
-    assert _choice(gain, all_out, none, numbers, np.random.default_rng(0))[0] == 0
+    assert _choice(gain, all_out, none, numbers, none, np.random.default_rng(0))[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("gains", "numbers", "chosen", "alias"),
+    [
+        ((0.11, 0.12), ((8.0, 1.0), (5.0, 4.0)), 1, (True, True)),  # a load at fewer links, masses at more: a set
+        ((0.11, 0.12), ((1.0, 1.0), (1.0, 4.0)), 0, (True, True)),  # as many: fewer parameters come first
+        ((0.11, 0.25), ((1.0, 1.0), (5.0, 4.0)), 1, (False, True)),  # clearly better
+        ((0.25, 0.11), ((8.0, 1.0), (5.0, 4.0)), 0, (True, False)),  # clearly worse
+    ],
+)
+def test_where_the_gap_is_small_what_is_easily_taken_for_another_is_named_with_it(
+    gains: tuple[float, float],
+    numbers: tuple[tuple[float, float], ...],
+    chosen: int,
+    alias: tuple[bool, bool],
+) -> None:
+    noise = np.random.default_rng(0).normal(0.0, 0.01, 60)
+    gain = np.array(gains)[:, None] + noise
+    all_out, none, second = np.ones(2, dtype=bool), np.zeros(2, dtype=bool), np.array([False, True])
+    found = _choice(gain, all_out, none, np.array(numbers), second, np.random.default_rng(0))
+    assert found[0] == chosen
+    np.testing.assert_array_equal(found[1], alias)
+
+
+def test_what_one_that_strains_is_easily_taken_for_is_tried_in_the_way_that_relieves_most() -> None:
+    def way(effect: str, relief: float, **shape: float) -> Screened:
+        shapes = {(effect, name): np.array([value]) for name, value in shape.items()}
+        return Screened(Variant(effect, (), shapes), {}, 0.1, relief, 1.0)
+
+    ways = [way("point_load", 0.05, z=0.1), way("link_mass", 0.07), way("point_load", 0.11, z=-0.2)]
+    ways += [way("soft_mount", 0.02), way("cogging", 0.2), way("encoder_offset", 0.2), way("link_com", 0.09)]
+    nominal = ("link_mass", "link_com", "encoder_offset")
+    (found,) = rivals(ways, ["link_com", "link_mass"], nominal)
+    assert found is ways[2]  # a soft mount relieves too little, cogging is not taken for a mass
+    assert rivals(ways, ["viscous"], nominal) == []
 
 
 @pytest.mark.parametrize("demand", [0.2, 0.5, 1.4])

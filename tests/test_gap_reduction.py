@@ -57,7 +57,8 @@ def search(state: Known, *rivals: Any) -> Any:
         nominal=NONE,
         rivals=list(rivals),
         select_chi2=state.held_out(),
-        aliases={},
+        aliases={name: (name,) for name in state.terms},
+        strained=False,
         shares=dict.fromkeys(state.terms, 1.0),
         returned={},
         steps=[],
@@ -86,6 +87,25 @@ def test_friction_that_is_equal_both_ways_is_dry_friction(
     reduction.symmetrical(asked)
     assert asked.state.terms == (name,)
     assert (name == "coulomb") == bool(asked.steps)
+
+
+@pytest.mark.parametrize(
+    ("strained", "alias", "name"),
+    [
+        (False, (), "coulomb"),
+        (True, (), "coulomb"),
+        (False, ("coulomb",), "coulomb"),
+        (True, ("coulomb",), "asymmetric_friction"),
+    ],
+)
+def test_a_simpler_effect_that_is_named_in_the_set_of_a_small_gap_takes_no_place(
+    strained: bool, alias: tuple[str, ...], name: str
+) -> None:
+    friction = {("asymmetric_friction", way): np.full(12, 0.4) for way in ("forward", "backward")}
+    asked = search(Known(lambda terms: 1.0, ("asymmetric_friction",), friction))
+    asked.strained, asked.aliases = strained, {"asymmetric_friction": ("asymmetric_friction", *alias)}
+    reduction.simplify(asked)
+    assert asked.state.terms == (name,)
 
 
 @pytest.mark.parametrize(("alone", "names"), [(1.01, ("payload",)), (2.0, ("strength", "link_mass"))])

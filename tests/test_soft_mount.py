@@ -35,7 +35,6 @@ from go1exp.gap.score.angle_errors import unexplained
 from go1exp.gap.score.likelihood import state_probes
 from go1exp.gap.search.fit import stacked
 from go1exp.gap.stages.explain import explain
-from go1exp.physics.mount import MOUNT
 from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
 from go1exp.recording import read_folder
@@ -96,7 +95,7 @@ def released(plant: Plant, at: np.ndarray, steps: int, load: np.ndarray | None =
 # ---------------------------------------------------------------------- closed forms
 
 
-@pytest.mark.parametrize("direction", range(5), ids=MOUNT)
+@pytest.mark.parametrize("direction", range(5), ids=robot.MOUNT)
 def test_a_block_swings_in_each_direction_as_a_mass_on_a_spring(tmp_path: Path, direction: int) -> None:
     """x = x0 exp(-z w t) (cos(v t) + z w / v sin(v t)), w = 1 / sqrt(compliance inertia), v = w sqrt(1 - z^2)."""
     dt, first = 0.0002, np.zeros(5)

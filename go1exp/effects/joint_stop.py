@@ -49,6 +49,8 @@ class JointStop(Effect):
             *({name: shift} for name in ("lower", "upper") for shift in (-0.1, -0.04, 0.04, 0.1)),
         ),
         excitation="steps",
+        confounded=("encoder_offset",),
+        told_apart_by="record steps that reach the stops, and slow_ramps that do not",
     )
     fields = ("jnt_solref", "jnt_range")
     time_constant: Tensor

@@ -10,14 +10,12 @@ import torch
 from go1exp.drive import DriveSetup, ModelFields
 from go1exp.effects.base import Effect, Param
 from go1exp.effects.identification import Identification
+from go1exp.robot import MOUNT, MOUNT_SLIDES
 from go1exp.schema.joint_values import JointValues
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-AXES = 5
-"""Directions in which a mount may yield."""
 
 BOLT = "record a chirp with the trunk bolted to something heavy"
 
@@ -81,7 +79,7 @@ class SoftMount(Effect):
 
     @property
     def compliance(self) -> Tensor:
-        """(N, 5) in the order of ``physics/mount.py``, m/N and rad/(N m)."""
+        """(N, 5) in the order of ``robot.MOUNT``, m/N and rad/(N m)."""
         return torch.cat([self.sway, self.sway, self.heave, self.roll, self.pitch], dim=1)
 
     def edit_model(self, model: ModelFields) -> None:
@@ -92,11 +90,12 @@ class SoftMount(Effect):
         dt, soft = self.setup.physics_dt, self.compliance > 0.0
         k = torch.where(soft, 1.0 / self.compliance, 0.0)
         whole = model.nominal("dof_M0").to(k)
-        inertia, legs = whole[:, :AXES], whole[:, AXES:].sum()
+        mount, slides = slice(len(MOUNT)), slice(len(MOUNT_SLIDES))
+        inertia, legs = whole[:, mount], whole[:, len(MOUNT) :].sum()
         added = torch.where(soft, (k * dt**2 / RESOLVED - inertia).clamp(min=0.0), BOLTED)
-        stiffness[:, :AXES], armature[:, :AXES] = k, added
-        damping[:, :AXES] = 2.0 * self.damping * torch.sqrt(k * (inertia + added))
+        stiffness[:, mount], armature[:, mount] = k, added
+        damping[:, mount] = 2.0 * self.damping * torch.sqrt(k * (inertia + added))
         # The engine solves friction and stops to a tolerance in units of all inertia, and the legs' is what counts.
         model.field("opt.tolerance").mul_(legs / (legs + (inertia + added).sum(1)))
         weight = model.field("body_mass").sum(1, keepdim=True) * model.field("opt.gravity")
-        model.field("qpos_spring")[:, :3] = -self.compliance[:, :3] * weight
+        model.field("qpos_spring")[:, slides] = -self.compliance[:, slides] * weight

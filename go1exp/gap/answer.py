@@ -140,7 +140,8 @@ def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
     """Fit once more, on all windows but those for the last check, and bootstrap the fit; nothing to do without terms.
 
     Returns:
-        The values, and by parameter of the terms their resampled values (B, J) or (B, 1).
+        The values, and by fitted parameter of the terms their resampled values (B, J) or (B, 1). A value that is held,
+        such as that of a law, has none.
     """
     scorer, machine = search.state.scorer, search.state.machine
     if not search.state.terms:
@@ -155,17 +156,18 @@ def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
     episode = scorer.windows.episode[fitted]
     drawn: dict[Key, list[np.ndarray]] = {}
     spread = 1.0 / np.sqrt(limits.weight)
+    of_terms = [key for key in search.state.keys if key[0] in search.state.terms]
     for _ in range(max(search.settings.bootstraps, FEWEST_BOOTSTRAPS)):
         matrix, right = layout.total(grams[significance.resampled(episode, search.rng)])
         # The nominal values are themselves uncertain by their tolerances, and motion fixes many of them only relative
         # to each other: drawing where they lie puts that uncertainty into the interval.
         centre = limits.centre + spread * search.rng.standard_normal(layout.size)
         x = tolerances.solve(matrix, right, replace(limits, centre=centre))
-        for key, value in tolerances.moved(search.state.theta, layout, linear.probes, x, machine).items():
-            if key[0] in search.state.terms:
-                null = search.state.tolerances.param(key).null
-                law = 1.0 + LAW * search.rng.standard_normal(value.shape)
-                drawn.setdefault(key, []).append(null + (value - null) * law)
+        values = tolerances.moved(search.state.theta, layout, linear.probes, x, machine)
+        for key in of_terms:
+            null = search.state.tolerances.param(key).null
+            law = 1.0 + LAW * search.rng.standard_normal(values[key].shape)
+            drawn.setdefault(key, []).append(null + (values[key] - null) * law)
     return best.theta, {key: np.stack([np.ravel(v) for v in values]) for key, values in drawn.items()}
 
 
@@ -192,8 +194,9 @@ def name_terms(
         params: dict[str, dict[str, float]] = {}
         interval: dict[str, dict[str, tuple[float, float]]] = {}
         for key in (key for key in theta if key[0] == effect):
-            samples = drawn.get(key, np.ravel(theta[key])[None])
-            params[key[1]], interval[key[1]] = _by_joint(key, theta[key], samples, joints, at)
+            params[key[1]] = _by_joint(key, theta[key], joints, at)
+            if key in drawn:
+                interval[key[1]] = _intervals(key, theta[key], drawn[key], joints, at)
         status: Literal["certified", "compensating"] = "compensating" if reason else "certified"
         share = search.share_of(effect)
         named.append(NamedEffect(effect, at, params, interval, search.aliases[effect], status, reason, share))
@@ -256,16 +259,28 @@ def _strongest(keys: Sequence[Key], theta: Theta, joints: Sequence[str], known: 
     return joints[int(np.max(away, axis=0).argmax())]
 
 
-def _by_joint(
+def _named_places(key: Key, joints: Sequence[str], at: Sequence[str]) -> tuple[int, dict[int, str]]:
+    """Return how many values a parameter has, and under which name each that counts is written down, by number."""
+    if declared(key).per != "joint":
+        return 1, {0: "robot"}
+    return len(joints), {k: name for k, name in enumerate(joints) if name in at}
+
+
+def _by_joint(key: Key, value: np.ndarray, joints: Sequence[str], at: Sequence[str]) -> dict[str, float]:
+    """Return the values of a parameter by joint (those of ``at``), or by ``robot``."""
+    count, kept = _named_places(key, joints, at)
+    values = np.broadcast_to(np.ravel(value), count)
+    return {name: float(values[k]) for k, name in kept.items()}
+
+
+def _intervals(
     key: Key, value: np.ndarray, samples: np.ndarray, joints: Sequence[str], at: Sequence[str]
-) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-    """Return the values and the 95 % intervals of a parameter by joint (those of ``at``), or by ``robot``."""
-    names = joints if declared(key).per == "joint" else ("robot",)
-    values = np.broadcast_to(np.ravel(value), len(names))
-    low, high = (np.broadcast_to(v, len(names)) for v in np.quantile(samples, QUANTILES, axis=0))
-    kept = [k for k, n in enumerate(names) if n == "robot" or n in at]
-    intervals = {names[k]: (float(min(low[k], values[k])), float(max(high[k], values[k]))) for k in kept}
-    return {names[k]: float(values[k]) for k in kept}, intervals
+) -> dict[str, tuple[float, float]]:
+    """Return the 95 % intervals of a parameter by joint (those of ``at``), or by ``robot``; each holds the value."""
+    count, kept = _named_places(key, joints, at)
+    values = np.broadcast_to(np.ravel(value), count)
+    low, high = (np.broadcast_to(v, count) for v in np.quantile(samples, QUANTILES, axis=0))
+    return {name: (float(min(low[k], values[k])), float(max(high[k], values[k]))) for k, name in kept.items()}
 
 
 def decide(search: Search, first: float, final: float, accepted: bool) -> Verdict:

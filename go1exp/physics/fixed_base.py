@@ -7,8 +7,9 @@ from pathlib import Path
 
 import mujoco
 
-from go1exp.physics.mount import MOUNT, add_mount
+from go1exp.physics.mount import add_mount
 from go1exp.physics.scene import RIGID, Sensors
+from go1exp.robot import MOUNT
 from go1exp.schema.registry import Expected
 
 BASE = "trunk"

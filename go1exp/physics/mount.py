@@ -10,23 +10,20 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-MOUNT = ("mount_x", "mount_y", "mount_z", "mount_roll", "mount_pitch")
-"""The mount's joints, the model's first: slides along the axes of the world, then hinges about those of the trunk.
-
-None about z: legs that hang hardly turn a trunk that way, and a fit gets lost in what else it might explain.
-"""
+from go1exp.robot import MOUNT_HINGES, MOUNT_SLIDES
 
 
 def add_mount(trunk: mujoco.MjsBody) -> None:
     """Let a held trunk move: three slides and two hinges, none of which has a spring or a damper yet.
 
+    The slides are along the axes of the world, the hinges about those of the trunk.
+
     Args:
         trunk: body of the trunk, a child of the world, with its attitude set and without joints.
     """
     back = Rotation.from_quat(trunk.quat, scalar_first=True).inv().as_matrix()
-    for k, name in enumerate(MOUNT):
-        turns = k >= 3
+    slides = [(name, mujoco.mjtJoint.mjJNT_SLIDE, back[:, k]) for k, name in enumerate(MOUNT_SLIDES)]
+    hinges = [(name, mujoco.mjtJoint.mjJNT_HINGE, np.eye(3)[k]) for k, name in enumerate(MOUNT_HINGES)]
+    for name, kind, axis in (*slides, *hinges):
         joint = trunk.add_joint()
-        joint.name = name
-        joint.type = mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE
-        joint.axis = list(np.eye(3)[k - 3]) if turns else list(back[:, k])
+        joint.name, joint.type, joint.axis = name, kind, list(axis)

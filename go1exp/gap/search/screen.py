@@ -268,6 +268,26 @@ def outside(screened: Sequence[Screened], within: Collection[str]) -> list[Scree
     return [s for s in order if s.relief > order[0].relief / strain.LEAD]
 
 
+def rivals(screened: Sequence[Screened], straining: Collection[str], within: Collection[str]) -> list[Screened]:
+    """Return how effects could be missing that one which strains against its tolerance is easily taken for.
+
+    Only those that have no tolerance to move in, since all others strain for themselves, and that would relieve the
+    model nearly as much as the first that strains: of each the way that would do so most.
+
+    Args:
+        screened: what the linear model says of every effect.
+        straining: effects that would leave their tolerance.
+        within: effects that move within their tolerances already.
+    """
+    most = max((s.relief for s in screened if s.variant.effect in straining), default=0.0)
+    best: dict[str, Screened] = {}
+    for s in sorted(screened, key=lambda s: -s.relief):
+        name = s.variant.effect
+        if name not in within and any(tolerances.confounded(name, one) for one in straining):
+            best.setdefault(name, s)
+    return [s for s in best.values() if s.relief > most / strain.LEAD]
+
+
 def _start(
     theta: Theta, variant: Variant, known: Sequence[Probe], layout: Layout, x: np.ndarray, machine: Machine
 ) -> Theta:

@@ -13,7 +13,7 @@ from go1exp.gap.score.robust import excess
 from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, tolerances
 from go1exp.gap.search.fit import Model, fit, misfit
 from go1exp.gap.search.ledger import Ledger
-from go1exp.gap.search.screen import Screened, library, motion, outside, screen
+from go1exp.gap.search.screen import Screened, free_shapes, library, motion, outside, rivals, screen
 from go1exp.gap.search.state import State
 from go1exp.gap.search.trial import Trial, tried
 
@@ -23,17 +23,15 @@ SILENT = 0.02
 SCREENED = 20
 """Windows in which candidates are screened, at most."""
 
+RIVAL_ROUNDS = 4
+"""Rounds of fitting, at most, of an effect that one which strains may be taken for: it begins at a small part of its
+size, which is all that the linear model has left to it, and its place must be found as well."""
+
 RIVALS = 2
 """Candidates beside the first term that are tried in the place of several terms."""
 
 LOOSENED = 3
 """Most effects that join the tolerance box because the data ask for some of them, within their tolerances."""
-
-
-def _confounded(one: str, other: str) -> bool:
-    """Return whether an effect is easily taken for another; for none (""), it is not."""
-    how = tolerances.identification
-    return bool(other) and (other in how(one).confounded or one in how(other).confounded)
 
 
 @dataclass
@@ -105,17 +103,23 @@ class Search(Ledger):
             self.progress(f"screening for term {term}", share)
             screened = self._screened()
             self._note_signals(screened)
-        straining: list[str] = []
-        if small:
-            relief = strain.relief(self.state.scorer, self.state.table, self.state.may)
-            values = strain.values(self.state.scorer, self.state.table)
-            straining = strain.straining(relief, values, [*self.state.terms, *self._unasked()])
-            screened = outside(screened, tolerances.nominal(self.state.machine))
-            if not straining and not screened:
-                self._note_absorbed(relief)
-                return []
+        if not small:
+            self.progress(f"fitting candidates for term {term}", share + 0.06)
+            return self._fitted(screened)
+        within = tolerances.nominal(self.state.machine)
+        relief = strain.relief(self.state.scorer, self.state.table, self.state.may)
+        values = strain.values(self.state.scorer, self.state.table)
+        straining = strain.straining(relief, values, [*self.state.terms, *self._unasked()])
+        missing = outside(screened, within)
+        if not straining and not missing:
+            self._note_absorbed(relief)
+            return []
         self.progress(f"fitting candidates for term {term}", share + 0.06)
-        return [self._given_back(effect, self.state.theta) for effect in straining] or self._fitted(screened)
+        if not straining:
+            return self._fitted(missing)
+        given_back = [self._given_back(effect, self.state.theta) for effect in straining]
+        taken_for = rivals(screened or self._screened(), straining, within)
+        return given_back + [self._given_back(s.variant.effect, s.theta, RIVAL_ROUNDS) for s in taken_for]
 
     def _accept(self, model: Model) -> bool:
         """Make a candidate a term, unless the model is worse with all else fitted again; return whether it is one."""
@@ -197,7 +201,7 @@ class Search(Ledger):
         model = Model(effect, self.state.theta, self.state.may.also(effect), sizes(effect))
         return fit(self.state.scorer, [model], self.state.table, self.settings.iterations, self.dt)[0]
 
-    def _given_back(self, effect: str, theta: Theta) -> Model:
+    def _given_back(self, effect: str, theta: Theta, rounds: int = 2) -> Model:
         """Return the model in which an effect may leave its tolerance, and the others begin at their nominal values.
 
         Several effects within their tolerances make up for it together, at next to no cost: from there a fit of few
@@ -206,11 +210,13 @@ class Search(Ledger):
         Args:
             effect: the candidate.
             theta: values of which those of the candidate and of the terms are kept.
+            rounds: of fitting, at most.
         """
         terms = (*self.state.terms, effect)
         kept = {key: value for key, value in theta.items() if key[0] in (*terms, *self.state.loosened)}
-        state = replace(self.state, terms=terms, theta=kept).settled(2)
-        return Model(effect, state.theta, state.may, sizes(effect), state.train_chi2, state.table.residual)
+        state = replace(self.state, terms=terms, theta=kept).settled(rounds)
+        keys = (*sizes(effect), *free_shapes(effect))
+        return Model(effect, state.theta, state.may, keys, state.train_chi2, state.table.residual)
 
     def _fitted(self, screened: Sequence[Screened]) -> list[Model]:
         """Return models of the best candidates, fitted.
@@ -233,7 +239,8 @@ class Search(Ledger):
         better = [min(pair, key=misfit) for pair in zip(fitted, again, strict=True)]
         best = min(better, key=misfit).name if better else ""
         return [
-            min(m, self._given_back(m.name, m.theta), key=misfit) if _confounded(m.name, best) else m for m in better
+            min(m, self._given_back(m.name, m.theta), key=misfit) if tolerances.confounded(m.name, best) else m
+            for m in better
         ]
 
     # ------------------------------------------------------------------ judgement

@@ -37,6 +37,11 @@ def identification(effect: str) -> Identification:
     return effect_class(effect).identification
 
 
+def confounded(one: str, other: str) -> bool:
+    """Return whether an effect is easily taken for another; for none (""), it is not."""
+    return bool(other) and (other in identification(one).confounded or one in identification(other).confounded)
+
+
 def felt(machine: Machine) -> tuple[str, ...]:
     """Return the registered effects that a robot can feel; one whose trunk is held has no use for ground."""
     free = bool(machine.base_probe)

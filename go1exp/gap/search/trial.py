@@ -128,14 +128,22 @@ def tried(
     helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
     outside = helps & (sizes > (CLEAR if small else 1.0))
     machine = scorer.replayer.machine
-    numbers = np.array([(evidence.count(m.name, m.theta, machine), evidence.parameters(m)) for m in fitted])
-    chosen, alias, aside = _choice(gain, outside, helps & (sizes <= 1.0), numbers, rng)
-    names = [m.name for m in fitted]
+    numbers = np.array(
+        [(evidence.count(m.name, m.theta, machine), evidence.parameters(m)) for m in fitted], dtype=float
+    )
+    names, within = [m.name for m in fitted], tolerances.nominal(machine)
+    unclear = [small and a not in within and any(tolerances.confounded(a, b) for b in names) for a in names]
+    chosen, alias, aside = _choice(gain, outside, helps & (sizes <= 1.0), numbers, np.array(unclear), rng)
     return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, aside, chosen)
 
 
 def _choice(
-    gain: np.ndarray, outside: np.ndarray, inside: np.ndarray, numbers: np.ndarray, rng: np.random.Generator
+    gain: np.ndarray,
+    outside: np.ndarray,
+    inside: np.ndarray,
+    numbers: np.ndarray,
+    unclear: np.ndarray,
+    rng: np.random.Generator,
 ) -> tuple[int | None, np.ndarray, np.ndarray]:
     """Return the candidate to accept (or None), which do as well (M,), and which do so with more numbers (M,).
 
@@ -144,6 +152,8 @@ def _choice(
         outside: (M,) which help and leave their tolerances.
         inside: (M,) which help within their tolerances.
         numbers: (M, 2) how many values of each leave their tolerance, and how many parameters it uses.
+        unclear: (M,) which are easily taken for another where the gap is so small that what means the same (``SAME``)
+            is much of it: more numbers do not set them aside; which has fewer decides what comes first.
         rng: of the tests.
     """
     none = np.zeros(len(gain), dtype=bool)
@@ -154,11 +164,15 @@ def _choice(
     alias = significance.equals(gain, best, rng) & outside
     # What explains the same with more numbers is no rival: a tilt is two, the offsets that imitate it are twelve.
     equal = alias & (mean >= mean[best] - significance.same(mean[best]))
-    many = equal & (numbers[:, 0] >= MANY * numbers[equal, 0].min())
-    rest = alias & ~many
-    aside = many | (rest & (numbers[:, 1] > numbers[rest, 1].min()))
+    clear = alias & ~unclear
+    many = clear & equal & (numbers[:, 0] >= MANY * numbers[clear & equal, 0].min(initial=math.inf))
+    rest = clear & ~many
+    aside = many | (rest & (numbers[:, 1] > numbers[rest, 1].min(initial=math.inf)))
     alias &= ~aside
-    chosen = int(max(np.flatnonzero(alias), key=lambda k: mean[k]))
+    order = sorted(np.flatnonzero(alias).tolist(), key=lambda k: -mean[k])
+    if (alias & unclear).any():
+        order.sort(key=lambda k: (numbers[k, 0], numbers[k, 1]))  # of equals the better one comes first
+    chosen = int(order[0])
     if inside.any() and mean[inside].max() >= mean[chosen] - significance.same(mean[chosen]):
         return None, none, aside  # a tolerance does as well: nothing must leave its tolerance
     return chosen, alias, aside
