@@ -13,7 +13,7 @@ from go1exp.gap.score.robust import excess
 from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, tolerances
 from go1exp.gap.search.fit import Model, fit, misfit
 from go1exp.gap.search.ledger import Ledger
-from go1exp.gap.search.screen import Screened, free_shapes, library, motion, outside, rivals, screen
+from go1exp.gap.search.screen import Screened, library, motion, outside, rivals, screen
 from go1exp.gap.search.state import State
 from go1exp.gap.search.trial import Trial, tried
 
@@ -119,7 +119,8 @@ class Search(Ledger):
             return self._fitted(missing)
         given_back = [self._given_back(effect, self.state.theta) for effect in straining]
         taken_for = rivals(screened or self._screened(), straining, within)
-        return given_back + [self._given_back(s.variant.effect, s.theta, RIVAL_ROUNDS) for s in taken_for]
+        fitted = [self._given_back(s.variant.effect, s.theta, RIVAL_ROUNDS) for s in taken_for]
+        return given_back + [replace(m, keys=s.variant.free) for m, s in zip(fitted, taken_for, strict=True)]
 
     def _accept(self, model: Model) -> bool:
         """Make a candidate a term, unless the model is worse with all else fitted again; return whether it is one."""
@@ -215,8 +216,7 @@ class Search(Ledger):
         terms = (*self.state.terms, effect)
         kept = {key: value for key, value in theta.items() if key[0] in (*terms, *self.state.loosened)}
         state = replace(self.state, terms=terms, theta=kept).settled(rounds)
-        keys = (*sizes(effect), *free_shapes(effect))
-        return Model(effect, state.theta, state.may, keys, state.train_chi2, state.table.residual)
+        return Model(effect, state.theta, state.may, sizes(effect), state.train_chi2, state.table.residual)
 
     def _fitted(self, screened: Sequence[Screened]) -> list[Model]:
         """Return models of the best candidates, fitted.
