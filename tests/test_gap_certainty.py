@@ -14,7 +14,7 @@ from go1exp.effects.tolerances import DECLARED, declared
 from go1exp.gap.answer import Answer, weak_joints
 from go1exp.gap.certainty import doubt
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
-from go1exp.gap.search.ledger import LastCheck
+from go1exp.gap.search.ledger import LastCheck, Ledger
 from go1exp.gap.sentence import sentence
 
 JOINTS = ("a_hip", "a_thigh", "b_hip", "b_thigh")
@@ -38,7 +38,7 @@ class Stub:
         )
     )
 
-    def share_of(self, term: str) -> float:
+    def removes(self, term: str) -> float:
         return self.own
 
 
@@ -59,8 +59,27 @@ def test_a_term_that_took_most_of_a_gap_is_certain_though_some_remains() -> None
 
 @pytest.mark.parametrize("own", [0.4, math.nan])
 def test_a_term_is_judged_by_what_it_took_itself_not_by_what_all_took(own: float) -> None:
-    assert "a gap remains, of which it alone removes" in why(Stub(own=own))
+    assert "a gap remains, and of what there is without it, it removes only" in why(Stub(own=own))
     assert why(Stub(own=own), adequate=True) == ""
+
+
+@pytest.mark.parametrize(
+    ("returned", "left", "share"),
+    [
+        (0.06, 2.0, 0.75),  # 6 of 100 come back without it, and 2 are left with it
+        (0.66, 2.0, 66 / 68),
+        (0.06, 18.0, 0.25),
+        (0.0, 2.0, 0.0),
+        (0.06, -0.1, 1.0),  # below the floor counts as nothing
+        (math.nan, 2.0, math.nan),
+    ],
+)
+def test_beside_a_large_effect_a_small_one_is_judged_by_what_is_left_without_it(
+    returned: float, left: float, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("go1exp.gap.search.ledger.excess", lambda chi2: chi2)
+    search: Any = SimpleNamespace(first=100.0, select_chi2=left, share_of=lambda term: returned)
+    assert Ledger.removes(search, "torque_delay") == pytest.approx(share, nan_ok=True)
 
 
 def test_a_value_on_its_bound_is_no_certain_one() -> None:

@@ -12,7 +12,7 @@ from go1exp.gap.replay.rows import Theta
 from go1exp.gap.search.ledger import LastCheck, Ledger
 
 MOST = 0.75
-"""Share of the excess that a term must remove by itself to be certified although a gap remains."""
+"""Share of the excess that is there without a term, and that it must remove, to be certified although a gap remains."""
 
 HALF = 0.5
 """Share of the excess that is most of it: what removes more is not withdrawn, and must remove as much on the last check
@@ -58,7 +58,7 @@ def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adeq
         adequate: whether the model with all terms counts as right.
         check: what the terms do on the last check.
     """
-    stable, alone = search.shares.get(effect, 0.0), search.share_of(effect)
+    stable, alone = search.shares.get(effect, 0.0), search.removes(effect)
     rivals = [name for name in search.aliases.get(effect, ()) if name != effect]
     if not check.helps:
         return "the last check does not bear it out"
@@ -73,5 +73,6 @@ def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adeq
     if adequate:
         return ""
     if not alone > MOST:  # NaN too
-        return f"a gap remains, of which it alone removes {'less' if math.isnan(alone) else f'{max(alone, 0.0):.0%}'}"
+        share = "less" if math.isnan(alone) else f"{max(alone, 0.0):.0%}"
+        return f"a gap remains, and of what there is without it, it removes only {share}"
     return f"a gap remains, and {' and '.join(rivals)} would do as well" if rivals else ""

@@ -98,6 +98,15 @@ class Ledger:
             return removed(self.first, excess(self.select_chi2))
         return self.returned.get(term, math.nan)
 
+    def removes(self, term: str) -> float:
+        """Return which share of the excess that is there without a term goes with it; NaN if nobody looked.
+
+        Beside a large effect a small one has little of the whole excess, and may still be all that is left without it.
+        """
+        back = self.share_of(term) * self.first
+        without = back + max(excess(self.select_chi2), 0.0)
+        return back / without if without > 0.0 else math.nan
+
     def withdraw(self, why: str) -> None:
         """Take back all terms."""
         self.reject(self.state.terms, why)
