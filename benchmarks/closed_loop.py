@@ -244,8 +244,8 @@ def searched(place: Place, name: str, support: str) -> dict[str, Any]:
 
 def named_effects(place: Place, name: str) -> dict[str, Any]:
     """Return what ``go1exp gap`` says by the hung logs, or by those on its feet if the hung ones give no effect."""
-    hung = searched(place, name, "hung")
-    return hung if hung["certain"] else searched(place, name, "ground")
+    verdict = searched(place, name, "hung")
+    return verdict if verdict["certain"] else searched(place, name, "ground")
 
 
 def fitted_net(place: Place, name: str) -> Path:
