@@ -27,7 +27,7 @@ from go1exp.gap.report import localisation_text, text, words, write_report
 from go1exp.gap.report.figures import shown_joints, split_channel
 from go1exp.gap.report.html import page
 from go1exp.gap.report.tables import Cell, heat_maps, short
-from go1exp.gap.result import Candidate, Floors, GapResult, Localisation, NamedEffect, Overlay, Verdict
+from go1exp.gap.result import Candidate, ClockChoice, Floors, GapResult, Localisation, NamedEffect, Overlay, Verdict
 from go1exp.schema.registry import bind, members
 
 CALVES = tuple(j for j in robot.JOINTS if j.endswith("calf"))
@@ -297,6 +297,31 @@ def test_a_page_copes_with_an_answer_that_says_nothing() -> None:
         empty = GapResult(verdict, "")  # type: ignore[arg-type]
         assert set(Reader(page(empty)).ids) >= SECTIONS
         assert text(empty).startswith(verdict.upper())
+
+
+def test_two_clocks_have_a_card_with_the_figures_of_both() -> None:
+    choice = ClockChoice(
+        taken="speeds",
+        decided=True,
+        rate_hz={"recorded": (90.0, 91.5), "speeds": (100.0, 100.0)},
+        windows=47,
+        nominal_errors={"recorded": 0.0211, "speeds": 0.0133},
+        errors={"recorded": 0.0094, "speeds": 0.0031},
+        terms={"recorded": ("coulomb", "armature"), "speeds": ()},
+        gain=0.52,
+        interval=(0.31, 0.74),
+        p=0.002,
+    )
+    text = Reader(page(replace(answer("explained"), clock=choice))).text
+    assert "The times from the speeds are taken: log χ² of 47 held-out windows differs by 0.52 (0.31 to 0.74)" in text
+    assert re.search(r"written times\s+90 to 91.5\s+21.1\s+9.4\s+coulomb, armature", text)
+    assert re.search(r"times from the speeds\s+100\s+13.3\s+3.1\s+–", text)
+    assert "time between rows" not in Reader(page(answer("explained"))).text
+    alone = ClockChoice("recorded", False, "1 of 4 recordings have no speeds, so there is one clock only")
+    assert (
+        f"Not decided: {alone.reason}. The written times are taken."
+        in Reader(page(replace(answer("explained"), clock=alone))).text
+    )
 
 
 def test_a_page_copes_with_numbers_that_are_none() -> None:

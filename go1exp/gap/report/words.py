@@ -14,7 +14,8 @@ import go1exp.effects
 import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
 from go1exp.effects.base import Param
 from go1exp.effects.tolerances import DECLARED, Tolerances
-from go1exp.gap.result import AngleErrors, GapResult, GapSettings, Localisation, NamedEffect
+from go1exp.gap.result import AngleErrors, Clock, ClockChoice, GapResult, GapSettings, Localisation, NamedEffect
+from go1exp.gap.search.clocks import OF_CLOCK, span
 from go1exp.gap.sentence import where
 from go1exp.schema.registry import members
 
@@ -88,6 +89,29 @@ def angle_rows(errors: AngleErrors, most: int | None = None) -> list[tuple[str, 
         episodes = sorted(episodes, key=lambda item: -item[1][1])[:most]  # type: ignore[assignment]
     both = [*errors.by_joint.items(), *episodes]
     return [(name, *(number(1e3 * value) for value in pair)) for name, pair in both]  # type: ignore[misc]
+
+
+def clock_rows(choice: ClockChoice) -> list[tuple[str, str, str, str, str]]:
+    """Return (clock, rate of rows in Hz, error within the tolerances and with the first terms in mrad, these terms)."""
+
+    def milli(errors: Mapping[Clock, float], clock: Clock) -> str:
+        return number(1e3 * errors[clock]) if clock in errors else "–"
+
+    rows = []
+    for clock, name in OF_CLOCK.items():
+        rate = span(*choice.rate_hz[clock]) if clock in choice.rate_hz else "–"
+        terms = ", ".join(choice.terms.get(clock, ())) or "–"
+        rows.append((name, rate, milli(choice.nominal_errors, clock), milli(choice.errors, clock), terms))
+    return rows
+
+
+def clock_why(choice: ClockChoice) -> str:
+    """Return why a clock was taken, in one sentence."""
+    if not choice.decided:
+        return f"Not decided: {choice.reason}. The {OF_CLOCK[choice.taken]} are taken."
+    low, high = choice.interval
+    by = f"log χ² of {choice.windows} held-out windows differs by {choice.gain:.2g} ({low:.2g} to {high:.2g})"
+    return f"The {OF_CLOCK[choice.taken]} are taken: {by}, p = {choice.p:.2g}."
 
 
 def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | None:

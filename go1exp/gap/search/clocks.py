@@ -199,7 +199,7 @@ def details(choice: ClockChoice) -> str:
     """Return that sentence, and what it rests on."""
     sentences = [sentence(choice)]
     if choice.rate_hz:
-        rates = [f"{_span(*rate)} Hz by {OF_CLOCK[name]}" for name, rate in choice.rate_hz.items()]
+        rates = [f"{span(*rate)} Hz by {OF_CLOCK[name]}" for name, rate in choice.rate_hz.items()]
         sentences.append(f"Rows come at {' and '.join(rates)}.")
     low, high = choice.steps
     if high - low > UNEVEN:
@@ -219,5 +219,6 @@ def _by_clock(errors: Mapping[Clock, float]) -> str:
     return " and ".join(f"{1e3 * value:.3g} mrad with {OF_CLOCK[name]}" for name, value in errors.items())
 
 
-def _span(low: float, high: float) -> str:
+def span(low: float, high: float) -> str:
+    """Return a range in words, one number if both ends read alike."""
     return f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
