@@ -15,7 +15,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks import commands
 from benchmarks.gap import hidden, logger
 from benchmarks.gap.walking import Ground, Policy
 from benchmarks.results import write_results
@@ -141,9 +141,6 @@ SIZES = {
 POLICIES = ("before", "plain", "net", "effects")
 """As trained; fine-tuned on the plain model, with the actuator net, and with the named effects."""
 
-VERDICTS = (0, 10, 11, 12, 13, 15)
-"""Exit statuses of ``go1exp gap`` that tell something of the robot, not of the logs."""
-
 DONE = "done.json"
 """In the folder of a step that is finished."""
 
@@ -171,19 +168,6 @@ class Place:
         return self.out.joinpath(*parts)
 
 
-def go1exp(*words: str, allowed: Sequence[int] = (0,)) -> int:
-    """Run a command as a user would and return its exit status.
-
-    Raises:
-        SystemExit: if that is not one of ``allowed``.
-    """
-    print("$ go1exp", *words, flush=True)
-    status = subprocess.run([sys.executable, "-m", "go1exp.cli", *words]).returncode
-    if status not in allowed:
-        raise SystemExit(f"go1exp {' '.join(words)}: exit status {status}")
-    return status
-
-
 def finished(folder: Path) -> bool:
     """Return whether the step of this folder was done before."""
     return (folder / DONE).is_file()
@@ -204,9 +188,9 @@ def trained(place: Place, run: Path, *words: str) -> Path:
     """Train into a run folder, or go on with what is there; return it."""
     if not finished(run):
         if list((run / "checkpoints").glob("*.pt")):
-            go1exp("train", f"resume={run}")
+            commands.run("train", f"resume={run}")
         else:
-            go1exp("train", *place.size.task, *words, f"seed={place.seed}", f"hydra.run.dir={run}")
+            commands.run("train", *place.size.task, *words, f"seed={place.seed}", f"hydra.run.dir={run}")
         finish(run)
     return run
 
@@ -233,7 +217,7 @@ def searched(place: Place, name: str, support: str) -> dict[str, Any]:
         begun = time.monotonic()
         where = (f"logs={logs}", f"out={out}", f"train_dt={place.size.physics_dt}")
         search = ("search.overlays=0", f"search.threads={place.threads}", *place.size.search)
-        status = go1exp("gap", *where, *search, allowed=VERDICTS)
+        status = commands.run("gap", *where, *search, allowed=commands.VERDICTS)
         answer = json.loads((out / "verdict.json").read_text())
         names = [f"{n['effect']} ({n['status']})" for n in answer["named"]]
         certain = any(n["status"] == "certified" for n in answer["named"])
@@ -253,7 +237,7 @@ def fitted_net(place: Place, name: str) -> Path:
     out, logs = place.named(name, "net_fit"), place.named(name, "hung_for_net")
     if not finished(out):
         record(place, name, logs)
-        go1exp("fit-actuator", f"recordings={logs}", f"out={out}", *place.size.net)
+        commands.run("fit-actuator", f"recordings={logs}", f"out={out}", *place.size.net)
         finish(out)
     return out / "net.npz"
 

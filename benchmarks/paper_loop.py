@@ -9,12 +9,12 @@ ideal PD drives and for the net.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks import commands
 from go1exp.cli.record import RIG
 from go1exp.compose import compose
 from go1exp.config import parse_parts
@@ -34,12 +34,6 @@ HIDDEN = [
 MOTIONS = ("multisine", "gait", "steps", "chirp")
 SEEDS = (101, 102)
 PERFECT = Channel(0.0, 0.0)
-
-
-def command(*arguments: str) -> None:
-    """Run a command as a user would."""
-    print("$ go1exp", *arguments, flush=True)
-    subprocess.run([sys.executable, "-m", "go1exp.cli", *arguments], check=True)
 
 
 def trajectories(overrides: list[str]) -> dict[str, np.ndarray]:
@@ -62,11 +56,13 @@ def main() -> None:
     out, run, seconds = Path(given.get("out", "runs/paper_loop")), given["run"], given.get("seconds", "15")
     common = [*HIDDEN, f"seconds={seconds}", "physics_dt=0.001", f"out={out / 'recordings'}"]
     walk = ["excitation=[policy]", f"run={run}", "support=hung", "episodes=4"]
-    command("record", *common, *walk)
-    command("record", *common, "excitation=[multisine,steps,chirp,slow_ramps]", "seeds=[1,2,3,4,5]")
+    commands.run("record", *common, *walk)
+    commands.run("record", *common, "excitation=[multisine,steps,chirp,slow_ramps]", "seeds=[1,2,3,4,5]")
     taps = ["history=8", "period=0.004", "smoothing=0.02", "epochs=40", "half_net=false", "plots=false"]
     for target in ("tau_est", "joint_torque"):
-        command("fit-actuator", f"recordings={out / 'recordings'}", f"target={target}", f"out={out / target}", *taps)
+        commands.run(
+            "fit-actuator", f"recordings={out / 'recordings'}", f"target={target}", f"out={out / target}", *taps
+        )
     hidden = trajectories(HIDDEN)
     results = {"pd": trajectories([])}
     for target in ("tau_est", "joint_torque"):

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import closed_loop
+from benchmarks import closed_loop, commands
 from benchmarks.closed_loop import SIZES, Place, Walks
 from benchmarks.gap import hidden
 from benchmarks.gap.motions import RATE
@@ -276,7 +276,7 @@ def test_an_interrupted_training_goes_on_and_a_finished_one_is_left(
         asked.append(words)
         return 0
 
-    monkeypatch.setattr(closed_loop, "go1exp", listening)
+    monkeypatch.setattr(commands, "run", listening)
     place, run = Place(tmp_path, SIZES["tiny"], seed=3, jobs=1, threads=1), tmp_path / "plain"
     (run / "checkpoints").mkdir(parents=True)
     closed_loop.tuned(place, run)
@@ -306,7 +306,7 @@ def test_the_feet_are_asked_only_where_hung_logs_give_no_effect(
         (Path(given["out"]) / "verdict.json").write_text(json.dumps(answer))
         return 10
 
-    monkeypatch.setattr(closed_loop, "go1exp", answering)
+    monkeypatch.setattr(commands, "run", answering)
     monkeypatch.setattr(closed_loop, "record", lambda place, name, folder: None)
     place = Place(tmp_path, SIZES["tiny"], seed=0, jobs=1, threads=1)
     for name, support, named in (("friction", "hung", "coulomb"), ("payload", "ground", "payload")):
@@ -360,7 +360,7 @@ def test_the_whole_loop_at_its_smallest_goes_on_where_it_was_stopped(
 ) -> None:
     """Stopped before the last fine-tuning; the second start makes that alone, and the figures."""
     arguments, asked = [f"out={tmp_path}", "size=tiny", "threads=1"], list[str]()
-    command = closed_loop.go1exp
+    command = commands.run
 
     def stopping(*words: str, allowed: tuple[int, ...] = (0,)) -> int:
         if any(word.startswith("effect=") for word in words):
@@ -371,11 +371,11 @@ def test_the_whole_loop_at_its_smallest_goes_on_where_it_was_stopped(
         asked.append(words[0])
         return command(*words, allowed=allowed)
 
-    monkeypatch.setattr(closed_loop, "go1exp", stopping)
+    monkeypatch.setattr(commands, "run", stopping)
     with pytest.raises(KeyboardInterrupt):
         closed_loop.main(arguments)
     assert not (tmp_path / "robots.json").exists()
-    monkeypatch.setattr(closed_loop, "go1exp", counting)
+    monkeypatch.setattr(commands, "run", counting)
     closed_loop.main(arguments)
     assert asked == ["train"]
     (row,) = json.loads((tmp_path / "robots.json").read_text())
