@@ -1,26 +1,33 @@
 """Robot seconds until two effects that look alike are told apart: by ``gap next``, standard recordings, random designs.
 
-    python -m benchmarks.gap_next [out=FILE.json] [pairs=tilt,kd] [n=2] [designs=24] [most=6]
+    python -m benchmarks.gap_next out=DIR [pairs=tilt,kd] [strategies=next,standard] [n=2] [designs=24] [most=6]
+        [search=true] [jobs=1]
 
 A simulated Go1 has one effect of a pair, whose size is taken as known. It is first recorded in slow ramps, 2 x 3 s.
 Recordings of 6 s are added one by one until the rival, fitted to all of them, is told apart with a power of 80 %. The
-power is computed on the windows of the recordings, not of the rehearsals. No search is run, so false names are not
-counted.
+power is computed on the windows of the recordings, not of the rehearsals. With ``search``, ``go1exp gap`` is then asked
+what it makes of them, with no knowledge of the pair: whether the hidden effect is named, with how many equals, and
+whether a certified name is wrong. Writes ``OUT/next.json``, a row for each pair, strategy and seed, and figures to
+``OUT/gap.json``; rows that are there are not made again.
 """
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
+from benchmarks.results import write_results
 from go1exp.compose import compose
 from go1exp.config import parse_parts
 from go1exp.gap.comparison import Comparison, compare
@@ -34,12 +41,14 @@ from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.robots.protocol import Robot
+from go1exp.gap.stages.explain import explain
 from go1exp.record.plan import Episode, make_motion
 from go1exp.record.sensors import SensorConfig
 from go1exp.record.simulate import Rig, held_quat, play
 from go1exp.recording import Recording
 from go1exp.schema.registry import bind
 from go1exp.schema.settings import parse
+from go1exp.statistics.intervals import bootstrap_interval
 from go1exp.tensors.threads import one_thread
 
 SECONDS, FIRST_SECONDS = 6.0, 3.0
@@ -48,6 +57,10 @@ GAINS = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))
 
 KINDS = ("chirp", "steps", "slow_ramps")
 STRATEGIES = ("next", "standard", "random")
+TOLD_APART = "told apart"
+
+Row = dict[str, Any]
+"""What one strategy took for one pair and seed."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +84,8 @@ CASES = {
     "kd": Case("viscous", "damping", 0.2, "kd_scale"),
     "delay": Case("torque_delay", "delay", 0.004, "lag"),
     "strength": Case("strength", "scale", 0.85, "armature"),
+    "load": Case("strength", "scale", 0.85, "link_mass"),
+    "spring": Case("flexibility", "compliance", 0.002, "lag"),
 }
 
 
@@ -111,6 +126,17 @@ class Bench:
         pair = Pair(case.truth, case.rival, case.theta, {}, (case.rival,), 0.0, 0.02)
         judge = Judge(pair, comparison.scorer, comparison.settings, COARSE * comparison.dt)
         return comparison, judge, judge.worth(judge.at_hand).power
+
+    def searched(self) -> Row:
+        """Return what ``go1exp gap`` makes of the recordings, which knows nothing of the pair."""
+        nominal = parse_parts(compose("gap", ["logs=none"]), ("robot",))[0]["robot"]
+        result = explain(self.recordings, nominal, replace(self.settings, overlays=0))
+        right = [named for named in result.named if self.case.truth in named.alias_set]
+        wrong = [n for n in result.named if n.status == "certified" and self.case.truth not in n.alias_set]
+        names = [f"{' or '.join(n.alias_set)} ({n.status})" for n in result.named]
+        equals = len(right[0].alias_set) if right else 0
+        judged = {"named": bool(right), "equals": equals, "false": len(wrong)}
+        return judged | {"answer": ", ".join([result.verdict, *names])}
 
     def stage(self, comparison: Comparison, settings: DesignSettings) -> Stage:
         """Return where designs are rehearsed."""
@@ -153,7 +179,9 @@ def _usual() -> Iterator[tuple[str, tuple[float, float]]]:
         yield from ((kind, gains) for gains in GAINS for kind in KINDS)
 
 
-def run(case: Case, strategy: str, seed: int, most: int, settings: DesignSettings, threads: int) -> dict[str, Any]:
+def run(
+    case: Case, strategy: str, seed: int, most: int, settings: DesignSettings, threads: int, search: bool = False
+) -> Row:
     """Add recordings until the pair is told apart; return what it took."""
     bench, usual, begun = Bench(case, seed, threads), _usual(), time.perf_counter()
     powers: list[float] = []
@@ -162,7 +190,7 @@ def run(case: Case, strategy: str, seed: int, most: int, settings: DesignSetting
         comparison, judge, power = bench.judged()
         powers.append(power)
         if power >= ENOUGH:
-            ended = "told apart"
+            ended = TOLD_APART
             break
         if turn == most:
             break
@@ -180,29 +208,89 @@ def run(case: Case, strategy: str, seed: int, most: int, settings: DesignSetting
         bench.add(episode)
     added = len(bench.recordings) - 2
     about = {"truth": case.truth, "rival": case.rival, "strategy": strategy, "seed": seed, "ended": ended}
-    return about | {"seconds": SECONDS * added, "powers": powers, "wall_s": round(time.perf_counter() - begun, 1)}
+    about |= {"seconds": SECONDS * added, "powers": powers, "wall_s": round(time.perf_counter() - begun, 1)}
+    return about | (bench.searched() if search else {})
+
+
+# ---------------------------------------------------------------------- what came of it
+
+
+def ratios(rows: Sequence[Row], most: int) -> list[float]:
+    """Return, for each pair and seed, the robot seconds of ``next`` over those of the standard recordings.
+
+    What was not told apart took one recording more than the most that were made. That is too little, so a ratio to
+    standard recordings that did not tell the two apart is too large. Pairs that neither told apart have no ratio.
+    """
+    seconds: dict[tuple[str, str, int], dict[str, float | None]] = {}
+    for row in rows:
+        told = row["seconds"] if row["ended"] == TOLD_APART else None
+        seconds.setdefault((row["truth"], row["rival"], row["seed"]), {})[row["strategy"]] = told
+    late = SECONDS * (most + 1)
+    pairs = [(each.get("next"), each.get("standard")) for each in seconds.values() if {"next", "standard"} <= {*each}]
+    return [(a or late) / (b or late) for a, b in pairs if a is not None or b is not None]
+
+
+def figures(rows: Sequence[Row], most: int) -> dict[str, float | int | str | None]:
+    """Return the figures that a file of results holds."""
+    each = np.array(ratios(rows, most))
+    flat: dict[str, float | int | str | None] = {}
+    if len(each):
+        middle = bootstrap_interval(lambda picked: float(np.median(each[picked])), len(each))
+        flat |= {"next_over_standard": middle.estimate, "next_over_standard_n": middle.n}
+        flat |= {"next_over_standard_low": middle.low, "next_over_standard_high": middle.high}
+    for strategy in dict.fromkeys(row["strategy"] for row in rows):
+        asked = [row for row in rows if row["strategy"] == strategy and "named" in row]
+        if asked:
+            alone = sum(row["named"] and row["equals"] == 1 for row in asked)
+            flat |= {f"{strategy}_one_name": alone, f"{strategy}_false_names": sum(row["false"] for row in asked)}
+            flat[f"{strategy}_searches"] = len(asked)
+    return flat
+
+
+def line_of(row: Row) -> str:
+    """Return a row of the table."""
+    powers = " ".join(f"{p:.0%}" for p in row["powers"])
+    line = f"{row['truth']}/{row['rival']:17} {row['strategy']:9} {row['seed']:4d} {row['seconds']:8.0f}  {powers}"
+    searched = f"; {row['answer']}" if "answer" in row else ""
+    return f"{line} ({row['ended']}{searched})"
+
+
+Task = tuple[str, int, str]
+"""Key of a pair, seed, strategy."""
+
+
+def _made(task: Task, most: int, settings: DesignSettings, search: bool, threads: int) -> Row:
+    name, seed, strategy = task
+    with one_thread():
+        return run(CASES[name], strategy, seed, most, settings, threads, search)
 
 
 def main(arguments: list[str]) -> None:
     """Run all pairs with all strategies and print a table."""
-    given = dict(word.split("=", 1) for word in arguments)
-    settings = DesignSettings(seconds=SECONDS, designs=int(given.get("designs", 24)), refine=1)
-    most, threads = int(given.get("most", 6)), int(given.get("threads", 1))
-    rows = []
+    given = dict(word.split("=", 1) for word in arguments if "=" in word)
+    usual = {"pairs": ",".join(CASES), "strategies": ",".join(STRATEGIES), "n": "1", "designs": "24", "most": "6"}
+    usual |= {"search": "false", "jobs": "1", "threads": "1"}
+    if not {"out"} <= set(given) <= {"out", *usual} or len(given) != len(arguments):
+        raise SystemExit(__doc__)
+    usual |= given
+    settings = DesignSettings(seconds=SECONDS, designs=int(usual["designs"]), refine=1)
+    most, search, file = int(usual["most"]), usual["search"] == "true", Path(usual["out"]) / "next.json"
+    rows: list[Row] = json.loads(file.read_text()) if file.is_file() else []
+    have = {(row["truth"], row["rival"], row["seed"], row["strategy"]) for row in rows}
+    every = product(usual["pairs"].split(","), range(int(usual["n"])), usual["strategies"].split(","))
+    todo = [t for t in every if (CASES[t[0]].truth, CASES[t[0]].rival, t[1], t[2]) not in have]
+    work = partial(_made, most=most, settings=settings, search=search, threads=int(usual["threads"]))
+    file.parent.mkdir(parents=True, exist_ok=True)
     print(f"{'pair':28} {'strategy':9} {'seed':>4} {'robot s':>8}  powers")
-    with one_thread():
-        for name in given.get("pairs", ",".join(CASES)).split(","):
-            for seed in range(int(given.get("n", 1))):
-                for strategy in given.get("strategies", ",".join(STRATEGIES)).split(","):
-                    row = run(CASES[name], strategy, seed, most, settings, threads)
-                    rows.append(row)
-                    powers = " ".join(f"{p:.0%}" for p in row["powers"])
-                    pair = f"{row['truth']}/{row['rival']}"
-                    print(
-                        f"{pair:28} {strategy:9} {seed:4d} {row['seconds']:8.0f}  {powers} ({row['ended']})", flush=True
-                    )
-                    if "out" in given:
-                        Path(given["out"]).write_text(json.dumps(rows, indent=1))
+    with multiprocessing.get_context("spawn").Pool(int(usual["jobs"]), maxtasksperchild=1) as pool:
+        for row in pool.imap_unordered(work, todo):
+            rows.append(row)
+            print(line_of(row), flush=True)
+            file.write_text(json.dumps(rows, indent=1))
+    flat = figures(rows, most)
+    words = " ".join(f"{key}={value}" for key, value in usual.items() if key not in ("out", "jobs", "threads"))
+    write_results(file.with_name("gap.json"), f"python -m benchmarks.gap_next {words}", flat)
+    print(json.dumps(flat, indent=1))
 
 
 if __name__ == "__main__":
