@@ -33,6 +33,10 @@ HELP = """usage: go1exp VERB [key=value ...]
 """
 
 
+READER_LEFT = 141
+"""Exit status of a closed pipe, 128 + 13 as shells count."""
+
+
 def main() -> int:
     """Run the verb on the command line; return the exit status.
 
@@ -47,7 +51,12 @@ def main() -> int:
 
     try:
         with signals.handled(interrupt):
-            return _run(arguments)
+            status = _run(arguments)
+            sys.stdout.flush()
+            return status
+    except BrokenPipeError:  # who read our output has left, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return READER_LEFT
     except BaseException as error:
         # A library that is interrupted while it is loaded may raise something else.
         if not heard and not isinstance(error, KeyboardInterrupt):

@@ -33,9 +33,9 @@ from go1exp.compose import as_container, as_hydra_takes_them, composition_proble
 from go1exp.config_source import seen_by
 from go1exp.schema.registry import ConfigError, Expected
 
-BAD_CONFIG, FAILED, READER_LEFT = 2, 1, 141
-"""Exit statuses: configuration refused before anything was built; the work failed; that of a closed pipe, 128 + 13 as
-shells count. What a signal ended has ``go1exp.signals.STOPPED``."""
+BAD_CONFIG, FAILED = 2, 1
+"""Exit statuses: configuration refused before anything was built; the work failed. What a signal ended has
+``go1exp.signals.STOPPED``."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,8 @@ class App:
             if failure:
                 raise failure[0]
             sys.stdout.flush()
-        except BrokenPipeError:  # who read our output has left, as `| head` does
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return READER_LEFT
+        except BrokenPipeError:  # the command line's to answer
+            raise
         except (Exception, Refused) as caught:
             error = caught.error if isinstance(caught, Refused) else caught
             if wants_traceback:
