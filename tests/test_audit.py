@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -18,7 +19,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from go1exp import data_root, excitations
-from go1exp.audit import AuditReport, audit, audit_file, signals
+from go1exp.audit import AuditReport, audit, audit_file, clock_flaws, signals
+from go1exp.cli import record_audit
 from go1exp.recording import Meta, Recording, RecordingError, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
 from go1exp.schema import registry
@@ -308,6 +310,23 @@ def test_an_angle_that_stops_being_read_is_named() -> None:
     assert not [f for f in audit(recording).findings if f.check == "frozen"]
 
 
+def small(recording: Recording, joint: str, share: float) -> Recording:
+    """A recording of which one joint moves by a share of what it did."""
+    names = (f"q_{joint}", f"q_target_{joint}")
+    middle = {name: recording.channels[name].mean() for name in names}
+    return with_(recording, **{n: m + share * (recording.channels[n] - m) for n, m in middle.items()})
+
+
+def test_an_angle_that_rests_but_once_is_frozen_though_its_target_moves_little() -> None:
+    recording = small(realistic(made("multisine")), "RR_thigh", 0.3)
+    q = recording.channels["q_RR_thigh"].copy()
+    assert 0.15 < np.ptp(recording.channels["q_target_RR_thigh"][ROWS // 2 :]) < 0.5
+    q[ROWS // 2 :] = q[ROWS // 2]
+    assert ("frozen", "q_RR_thigh", "bad") in flaws(audit(with_(recording, q_RR_thigh=q)))
+    sticking = np.repeat(q[:: ROWS // 12], ROWS // 12 + 1)[:ROWS]  # as a soft servo with a coarse encoder
+    assert not [f for f in audit(with_(recording, q_RR_thigh=sticking)).findings if f.check == "frozen"]
+
+
 def test_a_joint_that_leans_on_its_stop_is_not_called_frozen() -> None:
     recording = made("multisine")
     q = recording.channels["q_RR_thigh"]
@@ -552,6 +571,58 @@ def test_where_the_delay_cannot_be_told_none_is_given() -> None:
     report = audit(made("drop"))
     assert all(c.delay_ms is None for c in report.channels)
     assert report.by_check("delay") == []
+
+
+# ---------------------------------------------------------------------- several recordings together
+
+
+def shifted(*rows: int) -> list[AuditReport]:
+    """Reports of recordings whose commands were logged so many rows late, of two motions in turn."""
+    reports = []
+    for k, late in enumerate(rows):
+        sound = made(("steps", "multisine")[k % 2])
+        moved = {c: np.roll(v, late) for c, v in sound.channels.items() if c.startswith("q_target")}
+        one = with_(sound, **moved)
+        reports.append(audit(Recording(replace(one.meta, episode=f"e{k}"), one.channels)))
+    return reports
+
+
+def test_recordings_of_one_clock_are_sound_whatever_their_delay() -> None:
+    assert clock_flaws(shifted(0, 0, 0, 0)) == {}
+    assert (
+        clock_flaws([audit(replace_episode(made(name, 0.02), name)) for name in ("steps", "multisine", "drop")]) == {}
+    )
+    assert clock_flaws([audit(made("drop"))]) == {}
+    assert clock_flaws([]) == {}
+
+
+def replace_episode(recording: Recording, name: str) -> Recording:
+    return Recording(replace(recording.meta, episode=name), recording.channels)
+
+
+def test_a_recording_whose_commands_have_another_clock_is_named_if_most_agree() -> None:
+    flaws = clock_flaws(shifted(0, 0, 10, 0))
+    assert list(flaws) == ["e2"]
+    assert re.match(r"joints answer their commands after -2\d.* \(e2\), -?\d.* ms in the others: ", flaws["e2"])
+
+
+def test_all_recordings_are_named_if_each_has_a_clock_of_its_own() -> None:
+    flaws = clock_flaws([*shifted(-20, 0, 15, -8), audit(replace_episode(made("drop"), "e4"))])
+    assert list(flaws) == ["e0", "e1", "e2", "e3", "e4"]
+    assert all("(e2) to" in line and line.endswith("have clocks of their own") for line in flaws.values())
+
+
+def test_commands_that_are_late_in_every_recording_are_named() -> None:
+    assert list(clock_flaws(shifted(10, 10, 10))) == ["e0", "e1", "e2"]
+
+
+def test_audit_of_a_folder_tells_of_clocks_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for k, late in enumerate((0, 0, 20, 0)):
+        sound = replace_episode(made(("steps", "multisine")[k % 2]), f"e{k}")
+        moved = {c: np.roll(v, late) for c, v in sound.channels.items() if c.startswith("q_target")}
+        write(tmp_path / f"e{k}.parquet", with_(sound, **moved))
+    assert record_audit.APP.run([f"files=[{tmp_path}]"]) == 4
+    assert "e2: bad: joints answer their commands after -4" in capsys.readouterr().out
 
 
 # ---------------------------------------------------------------------- the report

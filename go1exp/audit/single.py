@@ -154,7 +154,8 @@ def dead(log: Log) -> Iterator[Finding]:
 def frozen(log: Log) -> Iterator[Finding]:
     """Find joint angles that stop changing although their target still moves.
 
-    An angle at the end of its range is left out: the joint may be pressed against a stop.
+    An angle at the end of its range is left out: the joint may be pressed against a stop. Where an angle rests for
+    moments only but for once, a smaller motion of the target is enough: it does not stick, it is not read.
     """
     if not (log.recording.has("q") and log.recording.has("q_target")):
         return
@@ -162,11 +163,13 @@ def frozen(log: Log) -> Iterator[Finding]:
     for j, joint in enumerate(log.joints):
         ends = q[:, j].min(), q[:, j].max()
         runs = signals.stretches(np.append(log.on[1:] & (np.diff(q[:, j]) == 0.0), False))
+        longest, second = sorted((*(log.t[last] - log.t[first] for first, last in runs), 0.0, 0.0))[:-3:-1]
+        moved = limits.FROZEN_ANGLE if longest < limits.FROZEN_ONCE * second else limits.FROZEN_ONCE_ANGLE
         caught = [
             (first, last)
             for first, last in runs
             if log.t[last] - log.t[first] > limits.FROZEN_TIME
-            and np.ptp(target[first : last + 1, j]) > limits.FROZEN_ANGLE
+            and np.ptp(target[first : last + 1, j]) > moved
             and min(abs(q[first, j] - end) for end in ends) > limits.STILL_ANGLE
         ]
         if caught:

@@ -19,9 +19,10 @@ def _task(container: dict[str, Any]) -> int:
 
     settings = parse(AuditSettings, container)
 
-    from go1exp.audit import audit_file
+    from go1exp.audit import AuditReport, audit_file, clock_flaws
 
     reports: dict[str, Any] = {}
+    folders: dict[Path, list[AuditReport]] = {}
     unreadable: list[str] = []
     status = 0
     for file in files_of(settings.files):
@@ -33,7 +34,12 @@ def _task(container: dict[str, Any]) -> int:
             continue
         print(f"{file}\n{report.text()}\n")
         reports[str(file)] = report.as_dict()
+        folders.setdefault(file.parent, []).append(report)
         status = max(status, STATUS[report.verdict])
+    for folder, together in folders.items():
+        for episode, flaw in clock_flaws(together).items():
+            print(f"{folder}: {episode}: bad: {flaw}")
+            status = max(status, STATUS["bad"])
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)

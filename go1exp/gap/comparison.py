@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 
-from go1exp.audit import audit
+from go1exp.audit import audit, clock_flaws
 from go1exp.errors import Expected
 from go1exp.gap.data.clocks import rows_of, same_rows
 from go1exp.gap.data.cutting import Place
@@ -119,7 +119,11 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
     """
     robot = robot.suited(recordings, settings.phase)
     reports = [audit(r) for r in recordings]
-    flaws = [robot.flaws(r, report) for r, report in zip(recordings, reports, strict=True)]
+    clocks = clock_flaws(reports)
+    flaws = [
+        robot.flaws(r, report) + [f"{name}: {clocks[name]}" for name in [r.meta.episode] if name in clocks]
+        for r, report in zip(recordings, reports, strict=True)
+    ]
     good = [k for k, lines in enumerate(flaws) if not lines]
     lines = tuple(line for each in flaws for line in each)
     if not good or (lines and (len(good) < FEWEST_RECORDINGS or 2 * len(good) < len(recordings))):
