@@ -1,14 +1,14 @@
 """Robot seconds until two effects that look alike are told apart: by ``gap next``, standard recordings, random designs.
 
     python -m benchmarks.gap_next out=DIR [pairs=tilt,kd] [strategies=next,standard] [n=2] [designs=24] [most=6]
-        [search=true] [jobs=1]
+        [seconds=6] [search=true] [jobs=1]
 
 A simulated Go1 has one effect of a pair, whose size is taken as known. It is first recorded in slow ramps, 2 x 3 s.
-Recordings of 6 s are added one by one until the rival, fitted to all of them, is told apart with a power of 80 %. The
-power is computed on the windows of the recordings, not of the rehearsals. With ``search``, ``go1exp gap`` is then asked
-what it makes of them, with no knowledge of the pair: whether the hidden effect is named, with how many equals, and
-whether a certified name is wrong. Writes ``OUT/next.json``, a row for each pair, strategy and seed, and figures to
-``OUT/gap.json``; rows that are there are not made again.
+Recordings of ``seconds`` are added one by one until the rival, fitted to all of them, is told apart with a power of
+80 %. The power is computed on the windows of the recordings, not of the rehearsals. With ``search``, ``go1exp gap`` is
+then asked what it makes of them, with no knowledge of the pair: whether the hidden effect is named, with how many
+equals, and whether a certified name is wrong. Writes ``OUT/next.json``, a row for each pair, strategy and seed, and
+figures to ``OUT/gap.json``; rows that are there are not made again.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from go1exp.schema.settings import parse
 from go1exp.statistics.intervals import bootstrap_interval
 from go1exp.tensors.threads import one_thread
 
-SECONDS, FIRST_SECONDS = 6.0, 3.0
+FIRST_SECONDS = 3.0
 GAINS = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))
 """Of the standard recordings (docs/gap.md), one set after the other; the first are those at hand."""
 
@@ -142,7 +142,7 @@ class Bench:
         """Return where designs are rehearsed."""
         targets = [r.joint("q_target") for r in comparison.recordings]
         limits: Limits = limits_of(self.robot, comparison.windows, targets, settings.limits)
-        return Stage(comparison, limits, self.case.theta, SECONDS)
+        return Stage(comparison, limits, self.case.theta, settings.seconds)
 
 
 def _attitudes(settings: DesignSettings) -> list[Attitude]:
@@ -196,7 +196,7 @@ def run(
             break
         if strategy == "standard":
             kind, gains = next(usual)
-            bench.add(bench.standard(kind, SECONDS, gains, 100 * seed + 10 + turn))
+            bench.add(bench.standard(kind, settings.seconds, gains, 100 * seed + 10 + turn))
             continue
         if strategy == "next":
             episode = _designed(bench, comparison, judge, settings)
@@ -208,14 +208,14 @@ def run(
         bench.add(episode)
     added = len(bench.recordings) - 2
     about = {"truth": case.truth, "rival": case.rival, "strategy": strategy, "seed": seed, "ended": ended}
-    about |= {"seconds": SECONDS * added, "powers": powers, "wall_s": round(time.perf_counter() - begun, 1)}
+    about |= {"seconds": settings.seconds * added, "powers": powers, "wall_s": round(time.perf_counter() - begun, 1)}
     return about | (bench.searched() if search else {})
 
 
 # ---------------------------------------------------------------------- what came of it
 
 
-def ratios(rows: Sequence[Row], most: int) -> list[float]:
+def ratios(rows: Sequence[Row], most: int, seconds_each: float) -> list[float]:
     """Return, for each pair and seed, the robot seconds of ``next`` over those of the standard recordings.
 
     What was not told apart took one recording more than the most that were made. That is too little, so a ratio to
@@ -225,14 +225,14 @@ def ratios(rows: Sequence[Row], most: int) -> list[float]:
     for row in rows:
         told = row["seconds"] if row["ended"] == TOLD_APART else None
         seconds.setdefault((row["truth"], row["rival"], row["seed"]), {})[row["strategy"]] = told
-    late = SECONDS * (most + 1)
+    late = seconds_each * (most + 1)
     pairs = [(each.get("next"), each.get("standard")) for each in seconds.values() if {"next", "standard"} <= {*each}]
     return [(a or late) / (b or late) for a, b in pairs if a is not None or b is not None]
 
 
-def figures(rows: Sequence[Row], most: int) -> dict[str, float | int | str | None]:
+def figures(rows: Sequence[Row], most: int, seconds_each: float) -> dict[str, float | int | str | None]:
     """Return the figures that a file of results holds."""
-    each = np.array(ratios(rows, most))
+    each = np.array(ratios(rows, most, seconds_each))
     flat: dict[str, float | int | str | None] = {}
     if len(each):
         middle = bootstrap_interval(lambda picked: float(np.median(each[picked])), len(each))
@@ -269,11 +269,11 @@ def main(arguments: list[str]) -> None:
     """Run all pairs with all strategies and print a table."""
     given = dict(word.split("=", 1) for word in arguments if "=" in word)
     usual = {"pairs": ",".join(CASES), "strategies": ",".join(STRATEGIES), "n": "1", "designs": "24", "most": "6"}
-    usual |= {"search": "false", "jobs": "1", "threads": "1"}
+    usual |= {"seconds": "6", "search": "false", "jobs": "1", "threads": "1"}
     if not {"out"} <= set(given) <= {"out", *usual} or len(given) != len(arguments):
         raise SystemExit(__doc__)
     usual |= given
-    settings = DesignSettings(seconds=SECONDS, designs=int(usual["designs"]), refine=1)
+    settings = DesignSettings(seconds=float(usual["seconds"]), designs=int(usual["designs"]), refine=1)
     most, search, file = int(usual["most"]), usual["search"] == "true", Path(usual["out"]) / "next.json"
     rows: list[Row] = json.loads(file.read_text()) if file.is_file() else []
     have = {(row["truth"], row["rival"], row["seed"], row["strategy"]) for row in rows}
@@ -287,7 +287,7 @@ def main(arguments: list[str]) -> None:
             rows.append(row)
             print(line_of(row), flush=True)
             file.write_text(json.dumps(rows, indent=1))
-    flat = figures(rows, most)
+    flat = figures(rows, most, settings.seconds)
     words = " ".join(f"{key}={value}" for key, value in usual.items() if key not in ("out", "jobs", "threads"))
     write_results(file.with_name("gap.json"), f"python -m benchmarks.gap_next {words}", flat)
     print(json.dumps(flat, indent=1))

@@ -18,17 +18,17 @@ def row(strategy: str, seconds: float | None, seed: int = 0, **searched: object)
 
 
 def test_a_ratio_needs_one_of_the_two_to_tell_the_pair_apart() -> None:
-    assert ratios([row("next", 6.0), row("standard", 24.0)], MOST) == [0.25]
-    assert ratios([row("next", 6.0), row("standard", None)], MOST) == [0.2]
-    assert ratios([row("next", None), row("standard", 12.0)], MOST) == [2.5]
-    assert ratios([row("next", None), row("standard", None)], MOST) == []
-    assert ratios([row("next", 6.0), row("standard", 24.0, seed=1)], MOST) == []
+    assert ratios([row("next", 6.0), row("standard", 24.0)], MOST, 6.0) == [0.25]
+    assert ratios([row("next", 6.0), row("standard", None)], MOST, 6.0) == [0.2]
+    assert ratios([row("next", None), row("standard", 12.0)], MOST, 6.0) == [2.5]
+    assert ratios([row("next", None), row("standard", None)], MOST, 6.0) == []
+    assert ratios([row("next", 6.0), row("standard", 24.0, seed=1)], MOST, 6.0) == []
 
 
 def test_the_ratio_is_a_median_over_pairs_and_seeds_with_an_interval() -> None:
     rows = [row(s, t, seed) for seed, t in enumerate((6.0, 12.0, 24.0)) for s in ("next",)]
     rows += [row("standard", 24.0, seed) for seed in range(3)]
-    flat = figures(rows, MOST)
+    flat = figures(rows, MOST, 6.0)
     assert flat["next_over_standard"] == 0.5
     assert flat["next_over_standard_n"] == 3
     assert (flat["next_over_standard_low"], flat["next_over_standard_high"]) == (0.25, 1.0)
@@ -38,7 +38,7 @@ def test_searches_count_where_one_name_is_left_and_where_a_certified_one_is_wron
     right = row("next", 6.0, named=True, equals=1, false=0, answer="explained, viscous (certified)")
     several = row("next", 6.0, seed=1, named=True, equals=2, false=0, answer="")
     wrong = row("next", 6.0, seed=2, named=False, equals=0, false=1, answer="")
-    flat = figures([right, several, wrong], MOST)
+    flat = figures([right, several, wrong], MOST, 6.0)
     assert (flat["next_one_name"], flat["next_false_names"], flat["next_searches"]) == (1, 1, 3)
     assert "next_over_standard" not in flat
     assert line_of(right).endswith("10% 90% (told apart; explained, viscous (certified))")
