@@ -128,6 +128,26 @@ def test_a_tilt_is_simpler_than_the_twelve_offsets_that_imitate_it() -> None:
 
 
 @pytest.mark.parametrize(
+    ("gains", "numbers", "chosen"),
+    [
+        ((0.523, 0.512), (8.0, 4.0), 1),  # the same: fewer joints come first
+        ((0.523, 0.512), (4.0, 4.0), 0),  # as many: the better one
+        ((0.523, 0.490), (8.0, 4.0), 0),  # an equal that does not mean the same
+    ],
+)
+def test_of_equals_that_mean_the_same_the_one_at_fewer_joints_comes_first(
+    gains: tuple[float, float], numbers: tuple[float, float], chosen: int
+) -> None:
+    gain = np.array(gains)[:, None] + np.random.default_rng(0).normal(0.0, 0.2, (2, 60))
+    gain += np.array(gains)[:, None] - gain.mean(axis=1, keepdims=True)
+    all_out, none = np.ones(2, dtype=bool), np.zeros(2, dtype=bool)
+    counts = np.array([(count, 1.0) for count in numbers])
+    first, alias, aside = _choice(gain, all_out, none, counts, none, np.random.default_rng(0))
+    assert first == chosen
+    np.testing.assert_array_equal((alias, aside), ([True, True], [False, False]))
+
+
+@pytest.mark.parametrize(
     ("gains", "numbers", "chosen", "alias"),
     [
         ((0.11, 0.12), ((8.0, 1.0), (5.0, 4.0)), 1, (True, True)),  # a load at fewer links, masses at more: a set

@@ -169,9 +169,12 @@ def _choice(
     rest = clear & ~many
     aside = many | (rest & (numbers[:, 1] > numbers[rest, 1].min(initial=math.inf)))
     alias &= ~aside
-    order = sorted(np.flatnonzero(alias).tolist(), key=lambda k: -mean[k])
-    if (alias & unclear).any():
-        order.sort(key=lambda k: (numbers[k, 0], numbers[k, 1]))  # of equals the better one comes first
+    # Of those that mean the same the one with the fewest values comes first: four lighter links imitate one rotor.
+    same = equal if not (alias & unclear).any() else alias
+    order = sorted(
+        np.flatnonzero(alias).tolist(),
+        key=lambda k: (0, *numbers[k], -mean[k]) if same[k] else (1, 0, 0, -mean[k]),
+    )
     chosen = int(order[0])
     if inside.any() and mean[inside].max() >= mean[chosen] - significance.same(mean[chosen]):
         return None, none, aside  # a tolerance does as well: nothing must leave its tolerance
