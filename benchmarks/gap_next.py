@@ -221,13 +221,14 @@ def ratios(rows: Sequence[Row], most: int, seconds_each: float) -> list[float]:
     What was not told apart took one recording more than the most that were made. That is too little, so a ratio to
     standard recordings that did not tell the two apart is too large. Pairs that neither told apart have no ratio.
     """
-    seconds: dict[tuple[str, str, int], dict[str, float | None]] = {}
-    for row in rows:
-        told = row["seconds"] if row["ended"] == TOLD_APART else None
-        seconds.setdefault((row["truth"], row["rival"], row["seed"]), {})[row["strategy"]] = told
     late = seconds_each * (most + 1)
-    pairs = [(each.get("next"), each.get("standard")) for each in seconds.values() if {"next", "standard"} <= {*each}]
-    return [(a or late) / (b or late) for a, b in pairs if a is not None or b is not None]
+    seconds: dict[tuple[str, str, int], dict[str, float]] = {}
+    for row in rows:
+        pair = seconds.setdefault((row["truth"], row["rival"], row["seed"]), {})
+        pair[row["strategy"]] = row["seconds"] if row["ended"] == TOLD_APART else late
+    both = [(each["next"], each["standard"]) for each in seconds.values() if {"next", "standard"} <= {*each}]
+    # Nor has a pair that the recordings at hand tell apart.
+    return [a / b for a, b in both if min(a, b) < late and b > 0.0]
 
 
 def figures(rows: Sequence[Row], most: int, seconds_each: float) -> dict[str, float | int | str | None]:
@@ -273,6 +274,10 @@ def main(arguments: list[str]) -> None:
     if not {"out"} <= set(given) <= {"out", *usual} or len(given) != len(arguments):
         raise SystemExit(__doc__)
     usual |= given
+    if unknown := sorted({*usual["pairs"].split(",")} - {*CASES}):
+        raise SystemExit(f"pairs={unknown[0]}: there are {', '.join(CASES)}")
+    if unknown := sorted({*usual["strategies"].split(",")} - {*STRATEGIES}):
+        raise SystemExit(f"strategies={unknown[0]}: there are {', '.join(STRATEGIES)}")
     settings = DesignSettings(seconds=float(usual["seconds"]), designs=int(usual["designs"]), refine=1)
     most, search, file = int(usual["most"]), usual["search"] == "true", Path(usual["out"]) / "next.json"
     rows: list[Row] = json.loads(file.read_text()) if file.is_file() else []

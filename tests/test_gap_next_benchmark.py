@@ -23,6 +23,8 @@ def test_a_ratio_needs_one_of_the_two_to_tell_the_pair_apart() -> None:
     assert ratios([row("next", None), row("standard", 12.0)], MOST, 6.0) == [2.5]
     assert ratios([row("next", None), row("standard", None)], MOST, 6.0) == []
     assert ratios([row("next", 6.0), row("standard", 24.0, seed=1)], MOST, 6.0) == []
+    at_hand = {"ended": TOLD_APART, "seconds": 0.0}
+    assert ratios([row("next", None) | at_hand, row("standard", None) | at_hand], MOST, 6.0) == []
 
 
 def test_the_ratio_is_a_median_over_pairs_and_seeds_with_an_interval() -> None:
@@ -48,6 +50,15 @@ def test_pairs_are_of_registered_effects_that_look_alike() -> None:
     for case in CASES.values():
         assert {case.truth, case.rival} <= {*members("effect")}
     assert all(confounded(CASES[name].truth, CASES[name].rival) for name in {*CASES} - {"spring"})
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["out=x", "pairs=kd,tilts"], "pairs=tilts: there are tilt"), (["out=x", "strategies=best"], "strategies=best: ")],
+)
+def test_an_unknown_pair_or_strategy_is_named(words: list[str], message: str) -> None:
+    with pytest.raises(SystemExit, match=message):
+        main(words)
 
 
 @pytest.mark.parametrize("words", [["n=2"], ["out=x", "most"], ["out=x", "strategy=next"]])
