@@ -621,8 +621,10 @@ def test_audit_of_a_folder_tells_of_clocks_apart(tmp_path: Path, capsys: pytest.
         sound = replace_episode(made(("steps", "multisine")[k % 2]), f"e{k}")
         moved = {c: np.roll(v, late) for c, v in sound.channels.items() if c.startswith("q_target")}
         write(tmp_path / f"e{k}.parquet", with_(sound, **moved))
-    assert record_audit.APP.run([f"files=[{tmp_path}]"]) == 4
-    assert "e2: bad: joints answer their commands after -4" in capsys.readouterr().out
+    out = tmp_path / "reports" / "audit.json"
+    assert record_audit.APP.run([f"files=[{tmp_path}]", f"out={out}"]) == 4
+    assert [Path(file).stem for file, report in json.loads(out.read_text()).items() if "clocks" in report] == ["e2"]
+    assert "e2.parquet: bad: joints answer their commands after -4" in capsys.readouterr().out
 
 
 # ---------------------------------------------------------------------- the report

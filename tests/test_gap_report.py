@@ -313,13 +313,13 @@ def test_two_clocks_have_a_card_with_the_figures_of_both() -> None:
         p=0.002,
     )
     text = Reader(page(replace(answer("explained"), clock=choice))).text
-    assert "The times from the speeds are taken: log χ² of 47 held-out windows differs by 0.52 (0.31 to 0.74)" in text
+    assert "The times from the speeds are taken: in the median of 47 held-out windows" in text
     assert re.search(r"written times\s+90 to 91.5\s+21.1\s+9.4\s+coulomb, armature", text)
     assert re.search(r"times from the speeds\s+100\s+13.3\s+3.1\s+–", text)
     assert "time between rows" not in Reader(page(answer("explained"))).text
     alone = ClockChoice("recorded", False, "1 of 4 recordings have no speeds, so there is one clock only")
     assert (
-        f"Not decided: {alone.reason}. The written times are taken."
+        f"The clocks could not be compared: {alone.reason}. The written times are taken."
         in Reader(page(replace(answer("explained"), clock=alone))).text
     )
 

@@ -163,7 +163,7 @@ def frozen(log: Log) -> Iterator[Finding]:
     for j, joint in enumerate(log.joints):
         ends = q[:, j].min(), q[:, j].max()
         runs = signals.stretches(np.append(log.on[1:] & (np.diff(q[:, j]) == 0.0), False))
-        longest, second = sorted((*(log.t[last] - log.t[first] for first, last in runs), 0.0, 0.0))[:-3:-1]
+        second, longest = sorted((0.0, 0.0, *(log.t[last] - log.t[first] for first, last in runs)))[-2:]
         moved = limits.FROZEN_ANGLE if longest < limits.FROZEN_ONCE * second else limits.FROZEN_ONCE_ANGLE
         caught = [
             (first, last)

@@ -66,9 +66,6 @@ def clock_flaws(reports: Sequence[AuditReport]) -> dict[str, str]:
     if len(agreeing) >= EXCEPTION * len(apart):
         usual = f"{1e3 * float(np.median([one.time for one in agreeing])):.1f} ms in the others"
         return {one.episode: f"joints answer their commands after {one}, {usual}: {why}" for one in apart}
-    ends = " to ".join(map(str, sorted({min(known, key=_time), max(known, key=_time)}, key=_time)))
+    ordered = sorted(known, key=lambda one: one.time)
+    ends = " to ".join(str(one) for one in dict.fromkeys((ordered[0], ordered[-1])))
     return {report.episode: f"joints answer their commands after {ends}: {why}" for report in reports}
-
-
-def _time(one: CommandDelay) -> float:
-    return one.time

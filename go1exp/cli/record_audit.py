@@ -22,7 +22,7 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.audit import AuditReport, audit_file, clock_flaws
 
     reports: dict[str, Any] = {}
-    folders: dict[Path, list[AuditReport]] = {}
+    folders: dict[Path, dict[Path, AuditReport]] = {}
     unreadable: list[str] = []
     status = 0
     for file in files_of(settings.files):
@@ -34,12 +34,15 @@ def _task(container: dict[str, Any]) -> int:
             continue
         print(f"{file}\n{report.text()}\n")
         reports[str(file)] = report.as_dict()
-        folders.setdefault(file.parent, []).append(report)
+        folders.setdefault(file.parent, {})[file] = report
         status = max(status, STATUS[report.verdict])
-    for folder, together in folders.items():
-        for episode, flaw in clock_flaws(together).items():
-            print(f"{folder}: {episode}: bad: {flaw}")
-            status = max(status, STATUS["bad"])
+    for together in folders.values():
+        flaws = clock_flaws(list(together.values()))
+        for file, report in together.items():
+            if report.episode in flaws:
+                print(f"{file}: bad: {flaws[report.episode]}")
+                reports[str(file)] |= {"verdict": "bad", "clocks": flaws[report.episode]}
+                status = max(status, STATUS["bad"])
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -121,7 +121,7 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
     reports = [audit(r) for r in recordings]
     clocks = clock_flaws(reports)
     flaws = [
-        robot.flaws(r, report) + [f"{name}: {clocks[name]}" for name in [r.meta.episode] if name in clocks]
+        robot.flaws(r, report) + ([f"{report.episode}: {clocks[report.episode]}"] if report.episode in clocks else [])
         for r, report in zip(recordings, reports, strict=True)
     ]
     good = [k for k, lines in enumerate(flaws) if not lines]

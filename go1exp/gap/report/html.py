@@ -13,6 +13,7 @@ import go1exp.gap.report.tables as tables
 import go1exp.gap.report.words as words
 from go1exp.files import write_text
 from go1exp.gap.result import GapResult
+from go1exp.gap.search import clocks
 
 MOST_WINDOWS = 6
 """Windows that are drawn, so that the page stays small; the file of numbers has all."""
@@ -52,6 +53,7 @@ def _context(result: GapResult) -> dict[str, Any]:
     return {
         "result": result,
         "words": words,
+        "clock": clocks.sentence(result.clock) if result.clock else "",
         "cards": [
             {
                 "named": n,

@@ -105,15 +105,6 @@ def clock_rows(choice: ClockChoice) -> list[tuple[str, str, str, str, str]]:
     return rows
 
 
-def clock_why(choice: ClockChoice) -> str:
-    """Return why a clock was taken, in one sentence."""
-    if not choice.decided:
-        return f"Not decided: {choice.reason}. The {OF_CLOCK[choice.taken]} are taken."
-    low, high = choice.interval
-    by = f"log χ² of {choice.windows} held-out windows differs by {choice.gain:.2g} ({low:.2g} to {high:.2g})"
-    return f"The {OF_CLOCK[choice.taken]} are taken: {by}, p = {choice.p:.2g}."
-
-
 def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | None:
     """Return the declaration of a parameter, None for one that is not registered (any more)."""
     entry = members("effect").get(effect)

@@ -170,7 +170,7 @@ def _choice(
     aside = many | (rest & (numbers[:, 1] > numbers[rest, 1].min(initial=math.inf)))
     alias &= ~aside
     # Of those that mean the same the one with the fewest values comes first: four lighter links imitate one rotor.
-    same = equal if not (alias & unclear).any() else alias
+    same = alias if (alias & unclear).any() else equal
     order = sorted(
         np.flatnonzero(alias).tolist(),
         key=lambda k: (0, *numbers[k], -mean[k]) if same[k] else (1, 0, 0, -mean[k]),
