@@ -95,6 +95,21 @@ def test_visible_effects_are_counted_apart() -> None:
     assert (value(found, "first"), value(found, "first_visible")) == (0.5, 1.0)
 
 
+def test_effects_that_the_tolerances_make_up_for_are_counted_apart() -> None:
+    answers = {name: answer("single", effect("coulomb", bound=0.2)) for name in ("gap", "missed", "made_up", "silent")}
+    found = score.judge(
+        answers,
+        {
+            "gap": {**result("explained", named("coulomb")), "excess": {"box": 3.0}},
+            "missed": {**result("no gap"), "excess": {"box": 0.11}},
+            "made_up": {**result("no gap"), "excess": {"box": 0.09}},
+            "silent": result("bad log"),
+        },
+    )
+    assert found.figures["in_set_material"][::3] == (0.5, 2)
+    assert found.figures["in_set"][::3] == (0.25, 4)
+
+
 def test_null_cases() -> None:
     answers = {
         "good": answer("null"),

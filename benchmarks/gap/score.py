@@ -7,6 +7,7 @@
                 "params": {parameter: {joint or "robot": value}},
                 "interval": {parameter: {joint or "robot": [low, high]}}}],
      "candidates": [{"effect": NAME}],   # best first; ranks the effects of a case in which nothing is named
+     "excess": {"box": held-out excess of the model within its tolerances},
      "closed": share of the held-out excess error that was removed,
      "seconds": wall time}
 
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -35,6 +37,10 @@ from benchmarks.gap.intervals import median, share
 
 VISIBLE = 1.0
 """``first_visible`` counts effects that change the angles by at least this many times their noise, RMS."""
+
+MATERIAL = 0.1
+"""``in_set_material`` counts single effects whose held-out excess, all else within its tolerances, is above this
+(``material`` of :class:`~go1exp.gap.result.GapSettings`, ``excess.box`` of a result): the tolerances do not suffice."""
 
 VERDICTS = ("no gap", "explained", "partly explained", "unexplained", "not excited", "bad log")
 LOWEST = 2.0
@@ -171,7 +177,9 @@ def judge(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
     visible = [c for c in singles if c.answer.get("signal", 0.0) >= VISIBLE]
     score.rate("first_visible", ((c, bool(c.ranking()) and c.ranking()[0] in c.families()) for c in visible))
     score.rate("first_exact", ((c, c.ranking()[:1] == c.true) for c in singles))
-    score.rate("in_set", ((c, bool(_sets(c) & set(c.true)) or _equivalent(c)) for c in singles))
+    in_set = [(c, bool(_sets(c) & set(c.true)) or _equivalent(c)) for c in singles]
+    score.rate("in_set", in_set)
+    score.rate("in_set_material", ((c, good) for c, good in in_set if _within(c) > MATERIAL))
     sets = [len({n["effect"], *n.get("alias_set", [])}) for c in singles for n in c.named]
     score.figures["set_size"] = median(sets, np.mean)
     score.rate("joints_exact", ((c, right) for c in singles for right in _right_joints(c)))
@@ -225,6 +233,11 @@ def _misses(score: Score, name: str, cases: list[tuple[Judged, bool]]) -> None:
     """Enter the share of cases in which something bad happened, and list them."""
     score.figures[name] = share([bad for _, bad in cases])
     score.failures[name] = [_line(case) for case, bad in cases if bad]
+
+
+def _within(case: Judged) -> float:
+    """Return the held-out excess of the model within its tolerances; -inf where a result does not say."""
+    return float(((case.result or {}).get("excess") or {}).get("box", -math.inf))
 
 
 def _sets(case: Judged) -> set[str]:
