@@ -263,6 +263,8 @@ def test_an_effect_file_may_be_called_anything(given: str, tmp_path: Path) -> No
             "out takes a plus: '+observation.joint_position.history=5'",
         ),
         ("reward.foot_slip.wieght=-1", "no such key 'reward.foot_slip.wieght'; did you mean 'reward.foot_slip.weight'"),
+        ("+seed=3", "+seed=3: 'seed' exists already; leave out the plus: 'seed=3'"),
+        ("+reward.gait.weight=3", "'reward.gait.weight' exists already; leave out the plus: 'reward.gait.weight=3'"),
         ("terrain=hilly", "terrain=hilly: unknown choice of terrain 'hilly'; known: flat, rough"),
     ],
 )

@@ -476,6 +476,15 @@ def test_every_command_is_one_that_record_takes() -> None:
     ]
 
 
+def test_a_robot_that_record_cannot_move_is_given_designs_of_its_own() -> None:
+    result = replace(answer("explained"), provenance={"robot": "my_arm"})
+    commands = [todo.command for todo in words.next_recordings(result)]
+    assert commands
+    for line in commands:
+        assert shlex.split(line, comments=True)[:3] == ["go1exp", "gap", "next"], line
+    assert "steps, slow_ramps" in commands[2]
+
+
 def test_what_would_change_the_verdict_holds_its_limits() -> None:
     said = {verdict: " ".join(words.would_change(answer(verdict))) for verdict in VERDICTS}
     assert all(said.values())

@@ -125,10 +125,26 @@ def test_a_threshold_between_two_levels_is_between_them_and_none_is_none() -> No
 
 def test_the_bootstrap_agrees_with_students_interval() -> None:
     each = np.random.default_rng(1).normal(size=200)
-    found = paired_mean_interval(each)
+    found = bootstrap_interval(lambda robots: float(each[robots].mean()), 200, draws=2000)
     known = stats.t.interval(0.95, 199, each.mean(), stats.sem(each))
     np.testing.assert_allclose((found.low, found.high), known, atol=0.02)
     assert math.isnan(bootstrap_interval(lambda r: 1.0, 1).low)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 8, 40])
+def test_of_equal_pairs_one_in_twenty_is_told_apart_by_chance(n: int) -> None:
+    rng = np.random.default_rng(n)
+    told = sum(word(paired_mean_interval(rng.normal(size=n)), "lower") != "not told apart" for _ in range(2000))
+    assert stats.binomtest(told, 2000, 0.05).pvalue > 0.001
+
+
+def test_pairs_that_all_differ_alike_tell_nothing_and_equal_pairs_are_equal() -> None:
+    same = paired_mean_interval([0.41 - 0.35, 0.43 - 0.37])  # kicks are timed by the policy's period
+    assert same.estimate == pytest.approx(0.06)
+    assert word(same, "lower") == "not told apart"
+    assert pairs_needed([0.41 - 0.35, 0.43 - 0.37]) is None
+    none = paired_mean_interval([0.0, 0.0, 0.0])
+    assert (none.estimate, none.low, none.high) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("n", [10, 40, 400])

@@ -91,7 +91,11 @@ def test_a_run_that_has_a_checkpoint_goes_on_from_that(first: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("~observation.projected_gravity", "observation is .* here and .*'projected_gravity'.* there"),
+        ("~observation.projected_gravity", "observation is .* here and .*'projected_gravity.* there"),
+        (
+            "+observation.joint_velocity.history=3",
+            r"joint_velocity \(12 x 3 steps\).* here and .*joint_velocity \(12\)",
+        ),
         ("ppo.hidden=[16,16]", r"ppo.hidden is \[16, 16\] here and \[16\] there"),
         ("ppo.activation=relu", "ppo.activation is relu here and elu there"),
     ],
@@ -111,6 +115,11 @@ def test_from_the_command_line(
     assert json.loads((tmp_path / "tuned/start.json").read_text())["num_timesteps"] > 1e8
     assert "starting from" in capsys.readouterr().out
     assert parse_train(run_folder.read_config(tmp_path / "tuned")).process.start_from == "hop"
+
+    assert APP.run(["resume=tuned", "ppo.iterations=2"]) == 0
+    for wanted, told in ((2, "tuned has 2 iterations already; now"), (1, "already, more than the 1 asked for; now")):
+        assert APP.run(["resume=tuned", f"ppo.iterations={wanted}"]) == 0
+        assert told in capsys.readouterr().out
 
     run = tmp_path / "hop"  # a run folder goes before a shipped policy of its name
     train_here(run, "ppo.hidden=[512,256,128]")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -45,12 +46,16 @@ def _task(container: dict[str, Any]) -> int:
 
     from go1exp.cli.logs import long_enough, read_all, writable
     from go1exp.gap import files
+    from go1exp.gap.result import EXIT_CODES
 
     if settings.stage == "report":
         return _report(files.load(out), out)
     if settings.stage == "view":
         return _view(settings, parts, where)
     recordings = long_enough(read_all(settings.logs), settings.search.window_s + settings.search.burn_s)
+    if not recordings:
+        print("BAD LOG: none of these recordings can be compared")
+        return EXIT_CODES["bad log"]
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
 
@@ -65,18 +70,18 @@ def _task(container: dict[str, Any]) -> int:
         return _replay(recordings, robot, settings)
     if settings.stage == "apply":
         result = files.load(out)
-        return _apply(result, recordings, robot, settings) or result.exit_code
+        _apply(result, recordings, robot, settings)
+        return _status(result, out)
 
     from go1exp.gap.stages.explain import explain
 
     result = explain(recordings, robot, settings.search, _progress())
+    if older := files.remove_older(out):
+        print(f"\nremoved, of the earlier answer in {out}: {', '.join(older)}")
     print(f"\n{result.sentence}\n\nwritten to {files.save(result, out)}")
-    status = result.exit_code
     if settings.stage == "all" and result.verdict != "bad log":
-        status = _apply(result, recordings, robot, settings) or status
-    if settings.stage == "all":
-        _report(result, out)
-    return status
+        _apply(result, recordings, robot, settings)
+    return _report(result, out) if settings.stage == "all" else result.exit_code
 
 
 def _view(settings: GapVerb, parts: dict[str, Any], where: tuple[str, int]) -> int:
@@ -150,7 +155,7 @@ def _replay(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int
     return 0
 
 
-def _apply(result: GapResult, recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
+def _apply(result: GapResult, recordings: list[Recording], robot: Robot, settings: GapVerb) -> None:
     """Write the effect files, read them back as training does, and score them at training's step."""
     from go1exp.gap.stages import apply
 
@@ -169,9 +174,16 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
         better = "in the search it was" if proof.after <= proof.before else "the model as it is has"
         least = proof.reported if proof.after <= proof.before else proof.before
         print(f"NOT applied: the error is {1 + proof.after:.3g} with the files at this step; {better} {1 + least:.3g}")
-        return DOES_NOT_HOLD
+        return
     _print_next(contents[apply.EFFECT], robot, out / apply.EFFECT)  # type: ignore[arg-type]
-    return 0
+
+
+def _status(result: GapResult, out: Path) -> int:
+    """Return the exit status of an answer and what was applied of it: what is certified may not hold in training."""
+    applied = out / "applied.json"
+    proof = json.loads(applied.read_text()) if applied.is_file() else {"holds": True}
+    certified = any(named.status == "certified" for named in result.named)
+    return DOES_NOT_HOLD if certified and not proof["holds"] else result.exit_code
 
 
 def _print_next(lacking: dict[str, Any], robot: Robot, file: Path) -> None:
@@ -188,9 +200,10 @@ def _report(result: GapResult, out: Path) -> int:
     """Write the report."""
     from go1exp.gap.report import text, write_report
 
-    print(f"\n{text(result)}")
+    status = _status(result, out)
+    print(f"\n{text(result, status)}")
     print(f"\nwritten to {', '.join(str(path) for path in write_report(result, out))}")
-    return result.exit_code
+    return status
 
 
 APP = App("gap", _task)

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from go1exp.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.recording import Recording
+
+FEWEST_ROWS = 4
+"""Rows that a window must have."""
 
 
 def files_of(places: str | Sequence[str]) -> list[Path]:
@@ -55,28 +63,58 @@ def remove_empty(folder: Path) -> None:
 
 
 def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
-    """Return the recordings of at least ``least`` s, and say which are left out.
-
-    Raises:
-        go1exp.recording.RecordingError: if there is none.
-    """
-    from go1exp.recording import RecordingError
-
-    lengths = [float(r.t[-1] - r.t[0]) for r in recordings]
-    short = [
-        f"{r.meta.episode}: {len(r.t)} rows, {length:g} s: too short; windows take {least:g} s"
-        for r, length in zip(recordings, lengths, strict=True)
-        if length < least
-    ]
-    if len(short) == len(recordings):
-        raise RecordingError("\n".join(short))
-    for line in short:
-        print(f"left out: {line}")
-    return [r for r, length in zip(recordings, lengths, strict=True) if length >= least]
+    """Return the recordings that windows of ``least`` s can be cut from, and say which are left out and why."""
+    fit = []
+    for recording in recordings:
+        t, name = recording.t, recording.meta.episode
+        length, step = float(t[-1] - t[0]), float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+        if length < least:
+            print(f"left out: {name}: {len(t)} rows, {length:g} s: too short; windows take {least:g} s")
+        elif step > least / FEWEST_ROWS:
+            why = f"t steps by {step:g} s; windows take {least:g} s. Is it in milliseconds?"
+            print(f"left out: {name}: {why}")
+        else:
+            fit.append(recording)
+    return fit
 
 
 def read_all(places: str | Sequence[str]) -> list[Recording]:
-    """Read the recordings of folders and files; raise RecordingError if one is missing or damaged."""
-    from go1exp.recording import read
+    """Read the recordings of folders and files, each under a name of its own.
 
-    return [read(path) for path in files_of(places)]
+    Recordings of one name from several folders are named after those, too: ``day1/run_0``, ``day2/run_0``.
+
+    Raises:
+        go1exp.recording.RecordingError: if one is missing, damaged or given twice, or two in a folder have one name.
+    """
+    from go1exp.recording import RecordingError, read
+
+    files = files_of(places)
+    twice = [str(path) for path, times in Counter(path.resolve() for path in files).items() if times > 1]
+    if twice:
+        raise RecordingError(f"{twice[0]}: given twice")
+    recordings = [read(path) for path in files]
+    shared = {name for name, times in Counter(r.meta.episode for r in recordings).items() if times > 1}
+    if not shared:
+        return recordings
+    folders = _apart([path.resolve().parent for path in files])
+    renamed = [_renamed(r, folder, shared) for r, folder in zip(recordings, folders, strict=True)]
+    first: dict[str, Path] = {}
+    for path, recording in zip(files, renamed, strict=True):
+        if (other := first.setdefault(recording.meta.episode, path)) != path:
+            name = recording.meta.episode.rpartition("/")[2]
+            raise RecordingError(f"{path}: its name is {name!r}, as that of {other} beside it; one of them is a copy")
+    return renamed
+
+
+def _apart(folders: list[Path]) -> list[str]:
+    """Return the ends of paths that tell the folders apart."""
+    parts = next(n for n in count(1) if len({f.parts[-n:] for f in folders}) == len({*folders}))
+    return ["/".join(folder.parts[-parts:]) for folder in folders]
+
+
+def _renamed(recording: Recording, folder: str, shared: Collection[str]) -> Recording:
+    """Return a recording whose name, and that of what it repeats, has its folder in it if others have that name."""
+    meta, repeats = recording.meta, recording.meta.repeat_of
+    episode = f"{folder}/{meta.episode}" if meta.episode in shared else meta.episode
+    repeats = f"{folder}/{repeats}" if repeats in shared else repeats
+    return replace(recording, meta=replace(meta, episode=episode, repeat_of=repeats))

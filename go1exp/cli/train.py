@@ -213,10 +213,14 @@ def _is_finished(job: TrainJob) -> bool:
         run_state.write(job.run, "done")
         print(f"{job.run}: {reason}; now: {command('eval', settings={'run': job.run})}")
         return True
-    if checkpoint.iterations_done(job.run) < wanted or checkpoint.load_latest(job.run)[0]["iteration"] < wanted:
+    if checkpoint.iterations_done(job.run) < wanted:
+        return False
+    done = int(checkpoint.load_latest(job.run)[0]["iteration"])
+    if done < wanted:
         return False
     run_state.write(job.run, "done")
-    print(f"{job.run} has its {wanted} iterations already; now: {command('eval', settings={'run': job.run})}")
+    more = "" if done == wanted else f", more than the {wanted} asked for"
+    print(f"{job.run} has {done} iterations already{more}; now: {command('eval', settings={'run': job.run})}")
     return True
 
 

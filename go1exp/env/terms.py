@@ -13,8 +13,8 @@ from go1exp.env.frames import Frames
 from go1exp.mdp.foot_impacts import impossible
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.schema.backends import WarpBackend
-from go1exp.schema.history import width
-from go1exp.schema.registry import Term
+from go1exp.schema.history import frame_width, width
+from go1exp.schema.registry import ConfigError, Term
 
 Call = Callable[[Snapshot], Tensor]
 
@@ -83,7 +83,7 @@ class StepTerms:
     def terminated(self, s: Snapshot) -> Tensor:
         """(N,) bool, any termination is true."""
         for k, term in enumerate(self._termination_calls):
-            self.failed[:, k] = term(s)
+            self.failed[:, k] = self._shaped("termination", self._terminations[k], term(s))
         return self.failed.any(-1)
 
     def cut_short(self, left_map: Tensor, s: Snapshot) -> Tensor:
@@ -98,7 +98,7 @@ class StepTerms:
     def reward(self, s: Snapshot) -> Tensor:
         """(N,) sum of weight x term x policy period."""
         for k, term in enumerate(self._reward_calls):
-            self.values[:, k] = term(s)
+            self.values[:, k] = self._shaped("reward", self.rewards[k], term(s))
         weighted = self.values * self.weights
         self.sums += weighted.sum(0)
         return weighted.sum(-1)
@@ -112,8 +112,23 @@ class StepTerms:
 
     def observation(self, sensed: Snapshot, s: Snapshot) -> Tensor:
         """(N, F) values of all observations: what the sensors saw, and behind it the critic's, of the truth."""
-        policy = [term(sensed) for term in self._observation_calls]
-        return torch.cat([*policy, *(term(s) for term in self._critic_calls)], dim=-1)
+        values = [*(term(sensed) for term in self._observation_calls), *(term(s) for term in self._critic_calls)]
+        return torch.cat(
+            [self._shaped("observation", t, v) for t, v in zip(self.observed, values, strict=True)], dim=-1
+        )
+
+    def _shaped(self, group: str, term: Term, value: Tensor) -> Tensor:
+        """Return what a term gave, if it is one value, or an observation's ``size``, for each robot.
+
+        Raises:
+            ConfigError: if not. One number for all robots would be spread over them without a word.
+        """
+        size = (frame_width(term),) if group == "observation" else ()
+        if value.shape == (self.values.shape[0], *size):
+            return value
+        wanted = f"(N, {size[0]}) as its size says" if size else "(N,), one value per robot"
+        given = f"gives {tuple(value.shape)} for {self.values.shape[0]} robots"
+        raise ConfigError([f"{group}.{term.key}: {given}, must be {wanted}"])
 
     def reset(self, mask: Tensor) -> None:
         """Begin new episodes in the rows of ``mask`` (N,)."""

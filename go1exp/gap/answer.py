@@ -13,6 +13,8 @@ from go1exp.effects.tolerances import Tolerances, declared, sizes
 from go1exp.gap.certainty import HALF, doubt
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
+from go1exp.gap.robots.fixed_base import FixedBase
+from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score import angle_errors
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.score.robust import excess, removed
@@ -40,8 +42,13 @@ LAW = 0.04
 effects (265 values), widened to it, hold 89 % of the truths; with 2 %, 76 %."""
 
 
+def can_stand(robot: Robot) -> bool:
+    """Whether a robot that these recordings show off its feet has any that a recording could show it on."""
+    return not (robot.on_ground or isinstance(robot, FixedBase))
+
+
 def not_excited(signal: Mapping[str, float], held: bool = True) -> dict[str, str]:
-    """Return effects that these data cannot show, and the excitation that would; ``held``: the trunk is."""
+    """Return effects that these data cannot show, and the excitation that would; ``held``: a trunk is that has feet."""
     silent = [effect for effect, loud in signal.items() if loud < SILENT]
     unfelt = [effect for effect in members("effect") if held and tolerances.identification(effect).needs_ground]
     return {effect: tolerances.identification(effect).excitation for effect in (*silent, *unfelt)}

@@ -31,6 +31,9 @@ from go1exp.schema.registry import Expected
 RESULT = "verdict.json"
 """Name of the file in the output folder."""
 
+MADE_OF_IT = ("effect.yaml", "calibration.yaml", "compensating.yaml", "applied.json", "report.html")
+"""Files that are made of a result, beside it."""
+
 
 class GapFileError(Expected):
     """A result file that is missing or not whole."""
@@ -42,6 +45,14 @@ def save(result: GapResult, folder: Path) -> Path:
     path = folder / RESULT
     write_json(path, result.as_dict(), indent=1)
     return path
+
+
+def remove_older(folder: Path) -> list[str]:
+    """Remove what was made of an earlier result in a folder, and return the names: a new result has others or none."""
+    older = [name for name in MADE_OF_IT if (folder / name).is_file()]
+    for name in older:
+        (folder / name).unlink()
+    return older
 
 
 def load(folder: Path) -> GapResult:

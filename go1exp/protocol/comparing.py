@@ -22,8 +22,8 @@ from go1exp.statistics.intervals import (
     pairs_needed,
 )
 
-DRAWS = 1000
-"""Bootstrap samples of a difference."""
+DRAWS = 200
+"""Bootstrap samples of the difference of a figure of all robots."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def _difference(
     a, b = values(first, column.name), values(other, column.name)
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
-    between = paired_share_interval(a, b) if column.how == "share" else paired_mean_interval(b - a, DRAWS)
+    between = paired_share_interval(a, b) if column.how == "share" else paired_mean_interval(b - a)
     assert column.better is not None
     verdict = word(between, column.better)
     needed = pairs_needed(b - a) if verdict == "not told apart" else None
@@ -103,7 +103,7 @@ def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: S
 
     everyone = np.arange(len(robots))
     between = bootstrap_interval(
-        lambda sample: b.function(drawn(1, sample)) - a.function(drawn(0, sample)), len(robots), DRAWS // 5
+        lambda sample: b.function(drawn(1, sample)) - a.function(drawn(0, sample)), len(robots), DRAWS
     )
     assert a.better is not None
     verdict, needed = word(between, a.better), None

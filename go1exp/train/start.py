@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ from typing import Any
 from go1exp.config import TrainConfig, parse_train
 from go1exp.files import write_json
 from go1exp.schema import plugins
-from go1exp.schema.registry import ConfigError
+from go1exp.schema.history import frame_width, frames_of
+from go1exp.schema.registry import ConfigError, Term
 from go1exp.train import checkpoint, run_folder
 from go1exp.train.ppo import AdaptivePPO
 
@@ -43,8 +45,8 @@ def read(config: TrainConfig, source: Path) -> Weights:
     differ = [
         f"{name} is {new} here and {old} there"
         for name, new, old in (
-            ("observation", *([t.entry.name for t in c.task.observation] for c in (config, theirs))),
-            ("critic", *([t.entry.name for t in c.task.critic] for c in (config, theirs))),
+            ("observation", *(_inputs(c.task.observation) for c in (config, theirs))),
+            ("critic", *(_inputs(c.task.critic) for c in (config, theirs))),
             ("ppo.hidden", list(config.ppo.hidden), list(theirs.ppo.hidden)),
             ("ppo.activation", config.ppo.activation, theirs.ppo.activation),
         )
@@ -61,6 +63,15 @@ def read(config: TrainConfig, source: Path) -> Weights:
         "num_timesteps": state["num_timesteps"] + timesteps_before(source),
     }
     return Weights(state["policy"], about)
+
+
+def _inputs(terms: Sequence[Term]) -> list[str]:
+    """Return what each term gives a policy: its name, and how many numbers of how many steps."""
+    frames = ((t, frame_width(t), frames_of(t)) for t in terms)
+    return [
+        f"{t.entry.name} ({wide} x {steps} steps)" if steps > 1 else f"{t.entry.name} ({wide})"
+        for t, wide, steps in frames
+    ]
 
 
 def timesteps_before(run: Path) -> int:

@@ -28,6 +28,9 @@ MOST_WINDOWS = 360
 MOST_STEPS = 250_000
 """The same as physics steps of all windows, times joints of a group: some minutes of work."""
 
+HINT = "give the robot of the logs: model=NAME or model=FILE.yaml (go1exp list model, docs/own_robot.md)"
+"""What to do where logs are of another robot than the model."""
+
 TELLING = ("delay", "torque")
 """Checks of the audit that a missing effect may fail; they say nothing against the log."""
 

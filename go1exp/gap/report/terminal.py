@@ -17,9 +17,15 @@ MOST_EPISODES = 6
 """Episodes that are listed, those with the largest error left; the page has all."""
 
 
-def text(result: GapResult) -> str:
-    """Return the summary for a terminal: plain text without markup, lines of up to 100 characters but for commands."""
-    lines = [f"{result.verdict.upper()} (exit code {result.exit_code})", *_wrapped(result.sentence), ""]
+def text(result: GapResult, status: int | None = None) -> str:
+    """Return the summary for a terminal: plain text without markup, lines of up to 100 characters but for commands.
+
+    Args:
+        result: to tell.
+        status: exit status of the command, if it is not the result's: what was applied may not hold.
+    """
+    code = result.exit_code if status is None else status
+    lines = [f"{result.verdict.upper()} (exit code {code})", *_wrapped(result.sentence), ""]
     if result.named:
         head = ("effect", "where", "size", "95 % interval", "status", "bootstraps")
         lines += [*_table([head, *_rows(result)]), ""]

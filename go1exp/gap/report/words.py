@@ -15,6 +15,7 @@ import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
 from go1exp.effects.base import Param
 from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.gap.result import AngleErrors, Clock, ClockChoice, GapResult, GapSettings, Localisation, NamedEffect
+from go1exp.gap.robots.go1_logs import GO1
 from go1exp.gap.search.clocks import OF_CLOCK, span
 from go1exp.gap.sentence import where
 from go1exp.schema.registry import members
@@ -290,6 +291,13 @@ def record(names: Sequence[str], *settings: str, out: str) -> str:
     return shlex.join(words)
 
 
+def motions(result: GapResult, names: Sequence[str], *settings: str, out: str) -> str:
+    """Return the command that records excitations; for a robot that ``go1exp record`` does not move, designs others."""
+    if result.provenance.get("robot", GO1) == GO1:
+        return record(names, *settings, out=out)
+    return f"go1exp gap next logs=RECORDINGS model=MODEL out=GAP  # for your robot; like {', '.join(names)}"
+
+
 def next_recordings(result: GapResult) -> list[Next]:
     """Return what to record next: first what tells apart equals, then what shows effects that these logs cannot."""
     known = members("excitation")
@@ -299,7 +307,7 @@ def next_recordings(result: GapResult) -> list[Next]:
         settings = re.findall(r"\b((?:gains|hang)=\[\[[-\d.,\[\]]*\]\])", sentence)
         if names or settings:
             out = f"recordings/apart{len(recordings) + 1 if recordings else ''}"
-            recordings.append(Next(sentence, record(names or ["chirp", "steps"], *settings, out=out)))
+            recordings.append(Next(sentence, motions(result, names or ["chirp", "steps"], *settings, out=out)))
     by_name: dict[str, list[str]] = {}
     for effect, name in result.not_excited.items():
         if name in known:
@@ -309,5 +317,5 @@ def next_recordings(result: GapResult) -> list[Next]:
         if names:
             effects = tuple(effect for name in names for effect in by_name[name])
             why = "Shows what a robot feels only on its feet." if ground else "Shows what these logs cannot."
-            recordings.append(Next(why, record(names, out=out), effects))
+            recordings.append(Next(why, motions(result, names, out=out), effects))
     return recordings

@@ -14,7 +14,7 @@ import numpy as np
 
 from go1exp.audit import AuditReport
 from go1exp.audit.related import SPEED_CHECKS
-from go1exp.gap.data.prepare import TELLING, clock_of_speeds, slope
+from go1exp.gap.data.prepare import HINT, TELLING, clock_of_speeds, slope
 from go1exp.gap.robots.description import ModelConfig
 from go1exp.recording import Recording, joint_channel, joint_channels
 
@@ -24,7 +24,7 @@ def flaws_of(recording: Recording, report: AuditReport, config: ModelConfig) -> 
     meta, name = recording.meta, recording.meta.episode
     flaws = []
     if meta.robot not in config.robots:
-        flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {', '.join(config.robots)}")
+        flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {', '.join(config.robots)}; {HINT}")
     if sorted(meta.joints) != sorted(config.joints):
         flaws.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(config.joints)}")
         return flaws

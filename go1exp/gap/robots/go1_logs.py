@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from go1exp import robot
 from go1exp.audit import AuditReport
-from go1exp.gap.data.prepare import TELLING
+from go1exp.gap.data.prepare import HINT, TELLING
 from go1exp.gap.data.standing import missing
 from go1exp.recording import Recording
 
@@ -28,7 +28,7 @@ def go1_flaws(recording: Recording, report: AuditReport, joints: tuple[str, ...]
     meta, name = recording.meta, recording.meta.episode
     flaws = []
     if meta.robot != GO1:
-        flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}")
+        flaws.append(f"{name}: is of the robot {meta.robot!r}; the model is of {GO1!r}; {HINT}")
     if meta.joints != joints:
         flaws.append(f"{name}: has joints {', '.join(meta.joints)}; the model has {', '.join(joints)}")
         return flaws

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from go1exp.gap.answer import not_excited
+from go1exp.gap.answer import can_stand, not_excited
 from go1exp.gap.comparison import NotComparable, Progress, compare, robot_from
 from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
 from go1exp.gap.robots.protocol import Robot
@@ -99,7 +99,7 @@ def check(
             parts = comparison.split(rng)
             search = Search(score, parts, comparison.settings, comparison.dt, rng, lambda what, share: None)
             search.measure_signals()
-            silent = not_excited(search.signal, held=not comparison.robot.on_ground)
+            silent = not_excited(search.signal, held=can_stand(comparison.robot))
     on_progress("done", 1.0)
     error_of_all = excess(score.chi2(plain, everything))
     return CheckResult((), comparison.floors(), len(everything), error_of_all, where, silent, comparison.ready.warnings)

@@ -12,7 +12,7 @@ import numpy as np
 
 from go1exp import __version__
 from go1exp.effects.tolerances import declared
-from go1exp.gap.answer import Answer, concluded, evidence, not_excited
+from go1exp.gap.answer import Answer, can_stand, concluded, evidence, not_excited
 from go1exp.gap.comparison import FEWEST_WINDOWS, Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.replay.rows import Theta, variants
@@ -146,7 +146,7 @@ def written(
     score, parts, settings, dt = search.state.scorer, search.splits, search.settings, search.dt
     shown = np.sort(np.concatenate([parts.select, parts.confirm]))
     before, after = residuals(score, [{}, search.state.theta], shown, dt)
-    silent = not_excited(search.signal, held=not comparison.robot.on_ground)
+    silent = not_excited(search.signal, held=can_stand(comparison.robot))
     suggestions = advice({n.effect: n.alias_set for n in answer.named})
     named = {n.effect: n for n in answer.named}
     of_clock = [clocks.sentence(comparison.clock)] if comparison.clock else []
@@ -192,6 +192,7 @@ def provenance(
     recordings, episode, parts = comparison.recordings, comparison.windows.episode, search.splits
     kinds = {"train": parts.train, "select": parts.select, "confirm": parts.confirm}
     return {
+        "robot": recordings[0].meta.robot,
         "logs": {r.meta.episode: fingerprint(r) for r in logs},
         "versions": {"go1exp": __version__, "mujoco": version("mujoco-core"), "numpy": np.__version__},
         "settings": asdict(settings),
