@@ -282,8 +282,14 @@ def _left(
             judges.append(judge)
             before.append(worth)
         else:
-            settled.append(f"{pair.name}: {worth.power:.0%}")
+            settled.append(_shown(pair, worth))
     return judges, before
+
+
+def _shown(pair: Pair, worth: Worth) -> str:
+    """Say in words how surely recordings tell a pair apart; what shows in no window alone may in all of them."""
+    alone = "" if pair.rival else f" (twice the tolerance of {pair.truth} shows in no window alone, in all together)"
+    return f"{pair.name}: {worth.power:.0%}{alone}"
 
 
 def _equal(pair: Pair, result: GapResult) -> bool:
