@@ -70,7 +70,7 @@ def test_logs_that_are_all_too_short_are_bad_logs(tmp_path: Path, capsys: pytest
     (recording,) = read_all(str(DEMO[0]))
     write(tmp_path / "short.parquet", replace(recording, channels={k: v[:5] for k, v in recording.channels.items()}))
     assert APP.run([f"logs={tmp_path}", f"out={tmp_path / 'gap'}"]) == EXIT_CODES["bad log"]
-    assert "BAD LOG" in capsys.readouterr().out
+    assert "none of these recordings can be compared" in capsys.readouterr().err
 
 
 def test_what_an_earlier_answer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
@@ -109,3 +109,11 @@ def test_the_status_that_is_printed_is_that_of_the_command(
     status = APP.run(["stage=report", f"out={tmp_path}"])
     assert status == (DOES_NOT_HOLD if certified else EXIT_CODES["explained"])
     assert f"(exit code {status})" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("word", "hint"), [("nxt", "did you mean 'next'?"), ("chek", "'check'")])
+def test_a_stage_that_does_not_exist_is_told_the_nearest(
+    word: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert APP.run([f"stage={word}", "logs=x"]) == 2
+    assert hint in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -26,9 +27,19 @@ DOES_NOT_HOLD = 15
 
 
 def with_logs(container: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings with no logs where none are needed: ``report`` and ``view`` read the answer alone."""
+    """Return the settings with no logs where none are needed: ``report`` and ``view`` read the answer alone.
+
+    Raises:
+        ConfigError: if a stage was meant to be another verb.
+    """
+    from go1exp.cli.completion import STAGES
+    from go1exp.cli.verbs import SUBVERBS
+    from go1exp.schema.registry import ConfigError, nearest, unknown_name
     from go1exp.schema.settings import MISSING
 
+    words, stage = ("all", *STAGES, *SUBVERBS["gap"]), str(container.get("stage", "all"))
+    if stage not in words and nearest(stage, words, 1) in [[verb] for verb in SUBVERBS["gap"]]:
+        raise ConfigError([unknown_name("stage", stage, words, "stage")])  # other words are told with all problems
     if container.get("stage") in ("report", "view") and container.get("logs") == MISSING:
         return {**container, "logs": []}
     return container
@@ -54,7 +65,7 @@ def _task(container: dict[str, Any]) -> int:
         return _view(settings, parts, where)
     recordings = long_enough(read_all(settings.logs), settings.search.window_s + settings.search.burn_s)
     if not recordings:
-        print("BAD LOG: none of these recordings can be compared")
+        print("go1exp gap: none of these recordings can be compared", file=sys.stderr)
         return EXIT_CODES["bad log"]
     if settings.stage in ("all", "replay", "explain", "apply"):
         writable(settings.out)
