@@ -192,8 +192,8 @@ def _refused_override(error: Exception, name: str, overrides: Sequence[str], fol
     except Exception:  # one of the others is wrong too
         known = [k for k in flat_keys(name) if k != key]
     if "Could not append to config" in str(error):
-        there = given.lstrip("+")
-        return f"{given}: {key!r} exists already; leave out the plus: {there!r}"
+        plain = given.lstrip("+")
+        return f"{given}: {key!r} exists already; leave out the plus: {plain!r}"
     close = nearest(key, known) or nearest(key.rsplit(".", 1)[-1], known)
     hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else "see --help"
     term, _, parameter = key.rpartition(".")

@@ -261,7 +261,8 @@ def _clock_problems(t: np.ndarray, rate: float) -> list[str]:
     back = np.flatnonzero(steps <= 0)
     if back.size:
         row = int(back[0]) + 1
-        return [f"t: must increase strictly, but row {row} has {t[row]} s after {t[row - 1]} s ({back.size} such rows)"]
+        rows = "1 such row" if back.size == 1 else f"{back.size} such rows"
+        return [f"t: must increase strictly, but row {row} has {t[row]} s after {t[row - 1]} s ({rows})"]
     if steps.size and not 1 / RATE_FACTOR <= np.median(steps) * rate <= RATE_FACTOR:
         return [f"t: steps by {np.median(steps):.6g} s (median), but rate_hz = {rate:g} says {1 / rate:.6g} s"]
     return []

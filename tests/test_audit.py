@@ -182,6 +182,44 @@ def test_a_clock_in_other_units_is_found(factor: float, unit: str) -> None:
     assert unit in report.by_check("rate")[0].message
 
 
+def stretched(factor: float, *without: str, rate: float = 200.0) -> AuditReport:
+    """The audit of a log whose clock is too slow by a factor, and whose rate_hz an import took from that clock."""
+    sound = made("multisine", rate=rate)
+    channels = {k: v for k, v in sound.channels.items() if not k.startswith((*without, "imu_"))}
+    t = sound.t * factor
+    return audit(Recording(replace(sound.meta, rate_hz=rate / factor), channels | {"t": t}))
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
+def test_a_clock_in_other_units_is_told_by_its_steps_even_if_the_rate_is_its_own(factor: float, unit: str) -> None:
+    report = stretched(factor)
+    assert report.verdict == "bad"
+    (line,) = [f.message for f in report.by_check("rate")]
+    assert f"it is in {unit}, not in seconds (speeds times these steps are about {factor:.0f} times" in line
+    report = stretched(factor, "qd_")
+    assert report.verdict == "bad"
+    (line,) = [f.message for f in report.by_check("rate")]
+    assert f" s (median); a log of joints must step by at most 0.1 s. Is it in {unit}?" in line
+
+
+def test_a_slow_log_is_bad_and_not_taken_for_milliseconds_where_speeds_fit() -> None:
+    t = np.arange(400) * 0.25
+    q, qd = np.sin(0.5 * t), 0.5 * np.cos(0.5 * t)
+    meta = replace(META, robot="arm", joints=("knee",), kp=None, kd=None, tau_limit=None)
+    meta = replace(meta, rate_hz=4.0, base="fixed", base_quat=(1.0, 0.0, 0.0, 0.0))
+    for channels, question in (({"t": t, "q_knee": q, "qd_knee": qd}, False), ({"t": t, "q_knee": q}, True)):
+        report = audit(Recording(meta, channels))
+        (line,) = [f.message for f in report.by_check("rate")]
+        assert (report.verdict, "Is it in milliseconds?" in line) == ("bad", question)
+        assert line.startswith("steps by 0.25 s (median); a log of joints must step by at most 0.1 s")
+
+
+def test_a_single_gap_is_told_in_the_singular() -> None:
+    keep = np.arange(ROWS) != 700
+    report = audit(Recording(made().meta, {k: v[keep] for k, v in made().channels.items()}))
+    assert report.by_check("gaps")[0].message == "1 sample is missing (0.03%) in 1 gap of 4 ms at 1.398 s"
+
+
 def test_jitter_is_found_and_sized() -> None:
     rng = np.random.default_rng(0)
     t = made().t + rng.uniform(-4e-4, 4e-4, ROWS)

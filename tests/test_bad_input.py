@@ -217,15 +217,30 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_hydra_takes_a_path_as_it_is(name: str) -> None:
-    for key in ("run", "out", "actuator.file", "+logs"):
+    for key in ("run", "out", "actuator.file", "+logs", "options", "columns", "folder", "motion", "feet", "plugins"):
         assert OverridesParser.create().parse_override(protected(f"{key}={name}")).value() == name
 
 
 @pytest.mark.parametrize(
-    "text", ["run=null", "run=a,b", "run='a b'", "files=[a,b]", "out=${x}", "seed=1 2", "run=glob(*)"]
+    "text",
+    [
+        "run=null",
+        "run=a,b",
+        "run='a b'",
+        "files=[a,b]",
+        "out=${x}",
+        "seed=1 2",
+        "run=glob(*)",
+        "options={a: 1}",
+        "command=gentle",
+    ],
 )
 def test_what_is_meant_for_hydra_stays(text: str) -> None:
     assert protected(text) == text
+
+
+def test_a_file_of_commands_may_be_called_anything() -> None:
+    assert OverridesParser.create().parse_override(protected("command=lä/a b.csv")).value() == "lä/a b.csv"
 
 
 @pytest.mark.parametrize("name", NAMES)

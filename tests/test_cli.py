@@ -471,8 +471,8 @@ def test_a_recording_is_made_imported_audited_and_refused(tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr
     assert [p.name for p in (tmp_path / "theirs").iterdir()] == ["go2.parquet"]
     again = cli(tmp_path, "record", "import", "go2_in_air", "go2.csv", "options={rate_hz: 4.0}", "out=slow")
-    assert again.stdout.startswith("1 recordings, 2 s, in slow\n"), again.stderr
-    assert done.stdout.startswith("1 recordings, ")
+    assert again.stdout.startswith("1 recording, 2 s, in slow\n"), again.stderr
+    assert done.stdout.startswith("1 recording, ")
     assert "note: " in done.stdout
     file.write_bytes(file.read_bytes()[:1000])
     done = cli(tmp_path, "record", "audit", "logs")

@@ -206,19 +206,105 @@ def test_whatever_is_wrong_is_told_by_its_name(tmp_path: Path, changes: dict[str
 @pytest.mark.parametrize(
     ("row", "said"),
     [
-        ("1200,hot,0,0,12", "column 'angle [deg]': must be numbers, but row 41 has 'hot'"),
-        ("1200,,0,0,12", "column 'angle [deg]': 1 cells are empty or NaN, the first in row 41"),
-        ("1200,inf,0,0,12", "column 'angle [deg]': inf in row 41; every value must be finite"),
-        ("1200,1,0", "Expected 5 columns, got 3"),
-        ("1195,1,0,0,12", "t: must increase strictly, but row 40 has"),
+        ("1200,hot,0,0,12", "column 'angle [deg]': must be numbers, but line 42 has 'hot'"),
+        ("1200,,0,0,12", "column 'angle [deg]': 1 cell is empty or NaN, the first in line 42"),
+        ("1200,inf,0,0,12", "column 'angle [deg]': inf in line 42; every value must be finite"),
+        ("1200,1,0", "line 42 has 3 cells, but line 1 has 5; every line must have as many as the first"),
+        (
+            "1195,1,0,0,12",
+            "column 'stamp' (for t): must increase strictly, but line 42 has 1195 after 1195 (1 such row); leave",
+        ),
     ],
 )
-def test_a_bad_row_is_told_by_column_and_row(tmp_path: Path, row: str, said: str) -> None:
+def test_a_bad_row_is_told_by_column_and_line(tmp_path: Path, row: str, said: str) -> None:
     path = lay(tmp_path / "x.csv")
     path.write_text(path.read_text() + row + "\n")
     message = refusal(path)
     assert message.startswith(str(path))
     assert said in message
+
+
+def test_lines_are_counted_as_an_editor_does(tmp_path: Path) -> None:
+    path = lay(tmp_path / "x.csv", before="made by X\n\n")
+    lines = path.read_text().splitlines()
+    lines[10:10] = ["", ""]
+    for row, problem in (("1200,hot,0,0,12", "line 46 has 'hot'"), ("1200,1", "line 46 has 2 cells, but line 3 has 5")):
+        path.write_text("\n".join([*lines, row]) + "\n")
+        assert problem in refusal(path, skip_lines=2)
+
+
+def test_names_before_which_another_line_stands_are_told(tmp_path: Path) -> None:
+    message = refusal(lay(tmp_path / "x.csv", before="made by X\n"))
+    assert "line 2 has 5 cells, but line 1 has 1" in message
+    assert "give skip_lines" in message
+
+
+@pytest.mark.parametrize(
+    ("encoding", "problem"),
+    [
+        ("latin-1", "x.csv: has characters that are not UTF-8; save it as UTF-8, or give its encoding"),
+        ("utf-16", "x.csv: is UTF-16, not UTF-8; save it as UTF-8, or give encoding: utf-16"),
+    ],
+)
+def test_another_encoding_is_told_and_can_be_given(tmp_path: Path, encoding: str, problem: str) -> None:
+    path = lay(tmp_path / "x.csv")
+    path.write_text(path.read_text().replace("[deg]", "[°]"), encoding=encoding)
+    columns = {**COLUMNS, "q_knee": "angle [°]"}
+    assert problem in refusal(path, columns=columns)
+    r = imported(path, columns=columns, encoding=encoding)
+    np.testing.assert_allclose(r.joint("q")[:, 0], TABLE["angle [deg]"])
+    path.write_text(path.read_text(encoding=encoding) + "1200,hot,0,0,12\n", encoding=encoding)
+    assert "line 42 has 'hot'" in refusal(path, columns=columns, encoding=encoding)
+    assert "importer.csv.encoding = 'utf-99': unknown encoding; utf-8" in refusal(path, encoding="utf-99")
+
+
+def clocked(path: Path, stamps: np.ndarray) -> Path:
+    path.write_text("stamp,q\n" + "".join(f"{t:g},{k}\n" for k, t in enumerate(stamps)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("stamps", "problem"),
+    [
+        (
+            np.round(4.0 * K, -1),
+            "line 3 has 0 after 0 (23 such rows); its times are rounded: take t out of columns ",
+        ),
+        (np.round(4.0 * K, -1), "give rate_hz (about 2"),
+        (4 * K[::-1], "line 3 has 152 after 156 (39 such rows); it runs backward: put the rows in the other order"),
+        (np.where(K == 20, 100, 10 * K), "line 22 has 100 after 190 (1 such row); sort the rows by time, or leave"),
+        (np.where(K == 20, 190, 10 * K), "line 22 has 190 after 190 (1 such row); leave such rows out"),
+        (K[:1], "has 1 row of numbers; at least 2 are needed"),
+    ],
+)
+def test_a_clock_that_does_not_increase_is_told_with_its_remedy(
+    tmp_path: Path, stamps: np.ndarray, problem: str
+) -> None:
+    path = clocked(tmp_path / "x.csv", stamps)
+    columns = {"t": COLUMNS["t"], "q_knee": "q"}
+    for changes in ({}, {"rate_hz": 250.0}):
+        message = refusal(path, columns=columns, kd=0.1, **changes)
+        assert problem in message
+        assert message.startswith(f"{path}: ")
+
+
+def test_a_german_table_is_asked_about_once(tmp_path: Path) -> None:
+    path = lay(tmp_path / "x.csv", ";", ",")
+    both = """; is the delimiter ';', and the decimal ','? Then give delimiter: ";" and decimal: ",\""""
+    assert refusal(path).endswith(both)
+    message = refusal(path, delimiter=";")
+    cell = "must be numbers, but line 3 has '1,997'; is the decimal ','? Then give decimal: "
+    assert message == f"{path}: column 'angle [deg]' and 1 other column: {cell}" + '","'
+    message = refusal(lay(tmp_path / "x.csv", ";"), delimiter=";", decimal=",")
+    assert "is the decimal '.'? Then give decimal: \".\"" in message
+    message = refusal(lay(tmp_path / "x.csv", ";"))
+    assert message.count("is the delimiter ';'? Then give delimiter: \";\"") == 1
+
+
+def test_a_word_among_numbers_with_decimal_commas_is_the_one_that_is_named(tmp_path: Path) -> None:
+    path = lay(tmp_path / "x.csv", ";", ",")
+    path.write_text(path.read_text() + "1200;hot;0;0;12\n")
+    assert "line 42 has 'hot'" in refusal(path, delimiter=";", decimal=",")
 
 
 def test_an_empty_file_and_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -265,3 +351,37 @@ def test_a_wrong_file_of_columns_is_told(tmp_path: Path, text: str | None, said:
     assert done.returncode == 2
     assert said in done.stderr
     assert not (tmp_path / "recordings").exists()
+
+
+ARM = ["record", "import", "csv", "one", "options=lä/arm.yaml"]
+
+
+def test_what_an_import_replaces_is_told_and_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
+    for folder in ("one", "two", "lä"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "lä" / "arm.yaml").write_text("robot: arm\ncolumns: {t: {column: stamp, unit: ms}, q_knee: goal}\n")
+    lay(tmp_path / "one" / "a.csv")
+    lay(tmp_path / "two" / "a.csv")
+    first, again = (run(tmp_path, *ARM, "out=o") for _ in range(2))
+    assert (first.returncode, again.returncode) == (0, 0)
+    assert first.stdout.startswith("1 recording, 0 s, in o\n")
+    assert again.stdout.startswith(
+        "note: o holds a.parquet of an earlier call; new ones replace them (or: out=FOLDER)\n"
+    )
+    both = run(tmp_path, *ARM[:3], ".", ARM[4], "out=both")
+    assert both.returncode != 0
+    assert "two files in it would both be a.parquet" in both.stderr
+    assert not (tmp_path / "both").exists()
+
+
+@pytest.mark.parametrize(("factor", "noted"), [(1000.0, True), (1.0, False)])
+def test_an_import_asks_for_the_unit_of_long_steps(tmp_path: Path, factor: float, noted: bool) -> None:
+    (tmp_path / "lä").mkdir()
+    (tmp_path / "one").mkdir()
+    (tmp_path / "lä" / "arm.yaml").write_text("robot: arm\ncolumns: {t: stamp, q_knee: q}\n")
+    clocked(tmp_path / "one" / "a.csv", factor * 0.004 * K)
+    done = run(tmp_path, *ARM, "out=o")
+    assert done.returncode == 0
+    line = "note: a: t steps by 4 s (median); a log of joints must step by at most 0.1 s. Is it in milliseconds?"
+    assert (line in done.stdout) == noted
+    assert ("unit: ms" in done.stdout) == noted

@@ -44,7 +44,8 @@ def audit(recording: Recording) -> AuditReport:
     off, still = _times(log, ~log.on), _times(log, log.still)
     if off:
         total = sum(b - a for a, b in off)
-        findings.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {len(off)} stretches"))
+        stretches = "1 stretch" if len(off) == 1 else f"{len(off)} stretches"
+        findings.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {stretches}"))
     if (share := float(log.still.mean())) > limits.STILL_SHARE:
         findings.append(
             finding("still", "all", "suspect", share, "", "no joint moves: nothing can be learned from this")

@@ -122,5 +122,7 @@ def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
             trail[joint] = float(np.argmax(match)) * log.dt * 1e3
     if trail:
         low, high = min(trail.values()), max(trail.values())
-        message = f"{', '.join(trail)} trail their targets by {low:.3g} to {high:.3g} ms, delay and drive together; "
+        verb, by = ("trails its target" if len(trail) == 1 else "trail their targets"), f"{low:.3g}"
+        by += f" to {high:.3g}" if f"{high:.3g}" != by else ""
+        message = f"{', '.join(trail)} {verb} by {by} ms, delay and drive together; "
         yield finding("trail", "q", "ok", high, "ms", message + "the motion does not tell them apart")

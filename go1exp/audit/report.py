@@ -118,7 +118,7 @@ class AuditReport:
         lines = [
             f"{self.episode}: {self.verdict}",
             f"{self.samples} samples, {self.duration:.2f} s at {self.rate_hz:.4g} Hz; "
-            + ", ".join(f"{n} channels {v}" for v, n in counts.items() if n),
+            + ", ".join(f"{n} channel{'s' if n > 1 else ''} {v}" for v, n in counts.items() if n),
             *(f"{name}: {_stretches(s)}" for name, s in (("drives off", self.torque_off), ("still", self.still)) if s),
             "",
         ]

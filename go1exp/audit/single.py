@@ -13,15 +13,54 @@ from go1exp.audit.report import Finding
 from go1exp.recording import joint_channel
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
 
+SMALLER = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
+"""How many of them make a second, and their name."""
+SHORTEST_STEP = 2e-4
+"""s; no joint log steps by less (5 kHz)."""
+
+
+def long_steps(log: Log) -> str | None:
+    """Return what is wrong with a clock whose steps are too long for a joint's motion; None if they are short enough.
+
+    Where speeds are recorded, their integral over the clock tells the unit of the clock: it must be the change of the
+    angles.
+    """
+    if log.dt <= limits.LONGEST_GAP:
+        return None
+    ratio = _integral_of_speed(log)
+    for factor, unit in SMALLER:
+        if ratio is not None and abs(ratio / factor - 1) < limits.SCALE[1]:
+            why = f"speeds times these steps are about {factor:.0f} times the change of the angles"
+            return f"steps by {log.dt:g}: it is in {unit}, not in seconds ({why})"
+    message = f"steps by {log.dt:g} s (median); a log of joints must step by at most {limits.LONGEST_GAP:g} s"
+    unit = next((name for f, name in SMALLER if SHORTEST_STEP <= log.dt / f <= limits.LONGEST_GAP), "")
+    in_seconds = ratio is not None and abs(ratio - 1) < limits.SCALE[1]
+    return message + (f". Is it in {unit}?" if unit and not in_seconds else "")
+
+
+def _integral_of_speed(log: Log) -> float | None:
+    """Return how many times the change of the angles the integral of the speeds is; None if they do not tell."""
+    if not (log.recording.has("q") and log.recording.has("qd")):
+        return None
+    first, last = log.windows()
+    q, whole = log.recording.joint("q"), signals.antiderivative(log.t, log.recording.joint("qd"))
+    scales = (signals.scale((q[last] - q[first])[:, j], (whole[last] - whole[first])[:, j]) for j in range(q.shape[1]))
+    factors = [s.factor for s in scales if s is not None and s.correlation > limits.CLEARLY]
+    return float(np.median(factors)) if factors else None
+
 
 def clock(log: Log) -> Iterator[Finding]:
-    """Compare the rate with the metadata; measure jitter and gaps."""
+    """Compare the rate with the metadata, and with what a joint's motion needs; measure jitter and gaps."""
     steps = np.diff(log.t)
     nominal = 1 / log.recording.meta.rate_hz
-    for factor, unit in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")):
+    for factor, unit in SMALLER:
         if 0.9 < log.dt / (factor * nominal) < 1.1:
             yield finding("rate", "t", "bad", log.dt, "s", f"steps by {log.dt:g}: it is in {unit}, not in seconds")
             return
+    if message := long_steps(log):
+        # The rate of the metadata does not help: an import takes it from the same clock.
+        yield finding("rate", "t", "bad", log.dt, "s", message)
+        return
     off = log.dt / nominal - 1
     verdict = graded(abs(off), limits.RATE)
     message = f"{1 / log.dt:.5g} Hz (median step {log.dt * 1e3:.4g} ms)"
@@ -47,10 +86,10 @@ def clock(log: Log) -> Iterator[Finding]:
         share = missing / (len(log.t) + missing)
         verdict = "bad" if longest > limits.LONGEST_GAP else graded(share, limits.GAPS)
         at = float(log.t[int(np.argmax(steps))])
-        message = (
-            f"{missing} samples are missing ({share:.2%}) in {int(long.sum())} gaps, the longest {longest * 1e3:.4g} ms"
-        )
-        yield finding("gaps", "t", verdict, missing, "samples", f"{message} at {at:.3f} s")
+        samples = "1 sample is missing" if missing == 1 else f"{missing} samples are missing"
+        count = int(long.sum())
+        gaps = f"1 gap of {longest * 1e3:.4g} ms" if count == 1 else f"{count} gaps, the longest {longest * 1e3:.4g} ms"
+        yield finding("gaps", "t", verdict, missing, "samples", f"{samples} ({share:.2%}) in {gaps} at {at:.3f} s")
 
 
 def stale(log: Log) -> tuple[list[Finding], dict[str, float]]:

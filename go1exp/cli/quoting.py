@@ -9,9 +9,12 @@ from typing import Any
 
 PATH_KEYS = {
     *("run", "resume", "start_from", "policy", "checkpoint", "logs", "recordings", "files", "file", "path", "bundle"),
-    *("out", "dir", "mjcf", "baseline"),
+    *("out", "dir", "mjcf", "baseline", "folder", "options", "columns", "motion", "feet", "plugins"),
 }
 """Last words of the keys whose value is a file, a folder or a name, which may hold =."""
+
+FILE_OF_COMMANDS = re.compile(r"command=.*\.csv$")
+"""``command`` is a group of choices, too, which must stay without quotes."""
 
 _MEANT_FOR_HYDRA = re.compile(r"""$|null$|['"\[{]|.*\$\{|\w+\(.*\)$""")
 """A value with quotes of its own, a list, an interpolation, a function such as ``glob(*)``."""
@@ -28,7 +31,8 @@ def protected(argument: str) -> str:
     Several paths with commas between them are a sweep, unless there is a file of that very name.
     """
     key, equals, value = argument.partition("=")
-    is_path = equals and not key.startswith("-") and key.lstrip("+").rsplit(".", 1)[-1] in PATH_KEYS
+    names_path = key.lstrip("+").rsplit(".", 1)[-1] in PATH_KEYS or FILE_OF_COMMANDS.match(argument)
+    is_path = equals and not key.startswith("-") and names_path
     if not is_path or _MEANT_FOR_HYDRA.match(value) or ("," in value and not Path(value).exists()):
         return argument
     return f"{key}={quoted(value)}"

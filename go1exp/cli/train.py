@@ -219,8 +219,8 @@ def _is_finished(job: TrainJob) -> bool:
     if done < wanted:
         return False
     run_state.write(job.run, "done")
-    more = "" if done == wanted else f", more than the {wanted} asked for"
-    print(f"{job.run} has {done} iterations already{more}; now: {command('eval', settings={'run': job.run})}")
+    beyond = "" if done == wanted else f", more than the {wanted} asked for"
+    print(f"{job.run} has {done} iterations already{beyond}; now: {command('eval', settings={'run': job.run})}")
     return True
 
 

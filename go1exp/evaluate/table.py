@@ -11,66 +11,87 @@ from go1exp.evaluate.rollout import AXES
 
 HEADER = ("command x, y, yaw", "mean x, y, yaw", "RMSE x, y, yaw", "falls", "mean time s")
 
-Show = Callable[[dict[str, Any]], str]
-"""Writes one cell from the ``measures`` of a command."""
+Show = Callable[[Any], str]
+"""Writes one cell from what a report has of a measure, None included."""
+
+Columns = dict[str, tuple[str, Show]]
+"""Header -> measure and how it is written."""
+
+NO_FIGURE = "-"
+
+FEET = "FR FL RR RL"
+
+WIDTH = 120
+"""Columns of text that a table of further measures may take; more measures get a second one."""
 
 
-def _numbers(name: str, form: str, factor: float = 1.0) -> Show:
+def _numbers(form: str, factor: float = 1.0) -> Show:
     """Return what writes the mean of a measure, or those of the four feet."""
 
-    def show(measures: dict[str, Any]) -> str:
-        entry = measures.get(name)
+    def show(entry: Any) -> str:
         if entry is None:
-            return "-"
+            return NO_FIGURE
         means = entry["mean"] if isinstance(entry["mean"], list) else [entry["mean"]]
         if all(m is None for m in means):
-            return "-"
-        return " ".join("-" if m is None else format(factor * m, form) for m in means)
+            return NO_FIGURE
+        return " ".join(NO_FIGURE if m is None else format(factor * m, form) for m in means)
 
     return show
 
 
-def _phases(measures: dict[str, Any]) -> str:
+def _phases(entry: Any) -> str:
     """Write the phases of FL, RR and RL; that of FR is 0."""
-    return " ".join(_numbers("touchdown_phase", ".2f")(measures).split(" ")[1:]) or "-"
+    return " ".join(_numbers(".2f")(entry).split(" ")[1:]) or NO_FIGURE
 
 
-def _gait(measures: dict[str, Any]) -> str:
-    """Write the gait of most robots."""
-    return next(iter(measures.get("gait") or {}), "-")
+def _most(entry: Any) -> str:
+    """Write the name that most robots have."""
+    return next(iter(entry or {}), NO_FIGURE)
 
 
-GAIT: dict[str, Show] = {
-    "gait": _gait,
-    "error": _numbers("trot_error", ".2f"),
-    "Hz": _numbers("stride_rate", ".1f"),
-    "phase FL RR RL": _phases,
-    "duty FR FL RR RL": _numbers("duty_factor", ".2f"),
-    "fly %": _numbers("flight_share", ".0f", 100.0),
-    "clearance mm": _numbers("clearance", ".0f", 1000.0),
-    "height m": _numbers("trunk_height", ".3f"),
-    "pitch deg": _numbers("trunk_pitch", "+.1f", 180.0 / math.pi),
+def _any(entry: Any) -> str:
+    """Write a measure of whatever kind."""
+    return _numbers(".3g")(entry) if entry is None or "mean" in entry else _most(entry)
+
+
+GAIT: Columns = {
+    "gait": ("gait", _most),
+    "error": ("trot_error", _numbers(".2f")),
+    "Hz": ("stride_rate", _numbers(".1f")),
+    "phase FL RR RL": ("touchdown_phase", _phases),
+    f"duty {FEET}": ("duty_factor", _numbers(".2f")),
+    "fly %": ("flight_share", _numbers(".0f", 100.0)),
+    "clearance mm": ("clearance", _numbers(".0f", 1000.0)),
+    "height m": ("trunk_height", _numbers(".3f")),
+    "pitch deg": ("trunk_pitch", _numbers("+.1f", 180.0 / math.pi)),
 }
 """Columns of the table of gait figures."""
 
-CONTACT: dict[str, Show] = {
-    "heave m/s": _numbers("heave", ".2f"),
-    "load % FR FL RR RL": _numbers("load_share", ".0f", 100.0),
-    "slip %": _numbers("slip_share_all", ".0f", 100.0),
-    "touchdown m/s": _numbers("touchdown_speed_p95", ".2f"),
-    "peak BW": _numbers("peak_force_p95", ".1f"),
-    "step rad": _numbers("target_step_p99", ".2f"),
-    "tau %": _numbers("torque_share_p99", ".0f", 100.0),
-    "qd %": _numbers("joint_speed_share_p99", ".0f", 100.0),
-    "line %": _numbers("envelope_share_p99", ".0f", 100.0),
-    "CoT": _numbers("cost_of_transport", ".2f"),
+CONTACT: Columns = {
+    "heave m/s": ("heave", _numbers(".2f")),
+    f"load % {FEET}": ("load_share", _numbers(".0f", 100.0)),
+    "slip %": ("slip_share_all", _numbers(".0f", 100.0)),
+    "touchdown m/s": ("touchdown_speed_p95", _numbers(".2f")),
+    "peak BW": ("peak_force_p95", _numbers(".1f")),
+    "step rad": ("target_step_p99", _numbers(".2f")),
+    "tau %": ("torque_share_p99", _numbers(".0f", 100.0)),
+    "qd %": ("joint_speed_share_p99", _numbers(".0f", 100.0)),
+    "line %": ("envelope_share_p99", _numbers(".0f", 100.0)),
+    "CoT": ("cost_of_transport", _numbers(".2f")),
 }
 """Columns of the table of contacts and effort."""
 
+FIXED = frozenset(measure for columns in (GAIT, CONTACT) for measure, _ in columns.values())
+"""Measures that these two tables show."""
+
+JSON_ONLY = frozenset({"foot_load", "gait_clarity", "phase_consistency", "sink_p99", "slip_distance", "slip_share"})
+"""Measures of the package that stand in the JSON alone where the report has all of the package's: nobody chose them."""
+
 LEGEND = """error: of the touchdowns to a trot's, phase: after FR, both in cycles; feet: FR FL RR RL; pitch: nose down;
 touchdown and peak (body weights): 95th percentile; step of the target in 20 ms; tau, qd, line: share of peak torque,
-top speed and the motors' torque-speed line; step, tau, qd and line: 99th percentile; CoT: positive work / (m g way).
-Means over n robots; the JSON has intervals and all measures."""
+top speed and the motors' torque-speed line; step, tau, qd and line: 99th percentile; CoT: positive work / (m g way)."""
+
+MEANS = "Means over n robots; the JSON has intervals and all measures."
 
 
 def _triple(values: Any) -> str:
@@ -112,17 +133,51 @@ def _short(command: Any) -> str:
 
 
 def measure_tables(report: dict[str, Any]) -> list[list[tuple[str, ...]]]:
-    """Return the tables of gait and of contact, each a header and one row per command; none without measures."""
-    if not any(c.get("measures") for c in report["commands"]):
-        return []
+    """Return the tables of gait, of contact and of further measures, each a header and one row per command.
+
+    A column of the first two for which no command has a figure is left out, a table without any, too.
+    """
     tables = []
     for columns in (GAIT, CONTACT):
-        lines: list[tuple[str, ...]] = [("command", *columns, "n")]
-        for c in report["commands"]:
-            cells = [show(c["measures"]) for show in columns.values()]
-            lines.append((_short(c["command"]), *cells, str(c["distinct_falls"]["n"])))
-        tables.append(lines)
-    return tables
+        if filled := [column for column in _columns(report, columns) if {*column[1:]} != {NO_FIGURE}]:
+            tables.append(_table(report, filled))
+    return tables + _further(report)
+
+
+def _further(report: dict[str, Any]) -> list[list[tuple[str, ...]]]:
+    """Return tables of the measures that no fixed column shows, such as a user's; one, unless it were too wide."""
+    names = dict.fromkeys(name for c in report["commands"] for name in c.get("measures", ()))
+    hidden = FIXED | JSON_ONLY if names.keys() >= FIXED | JSON_ONLY else FIXED
+    shown: Columns = {_title(report, name): (name, _any) for name in names if name not in hidden}
+    tables: list[list[tuple[str, ...]]] = []
+    taken: list[tuple[str, ...]] = []
+    for column in _columns(report, shown):
+        if taken and len(_laid(_table(report, [*taken, column]))[0]) > WIDTH:
+            tables.append(_table(report, taken))
+            taken = []
+        taken.append(column)
+    return [*tables, _table(report, taken)] if taken else tables
+
+
+def _title(report: dict[str, Any], name: str) -> str:
+    """Return the header of a measure: its name, its unit where it has one, and the order of feet."""
+    unit = report.get("units", {}).get(name, "")
+    entries = [c["measures"].get(name) for c in report["commands"]]
+    feet = any(isinstance(entry, dict) and isinstance(entry.get("mean"), list) for entry in entries)
+    return " ".join([name, *([unit] if unit not in ("", "-", "name") else []), *([FEET] if feet else [])])
+
+
+def _columns(report: dict[str, Any], columns: Columns) -> list[tuple[str, ...]]:
+    """Return each column of a table: its header, and a cell per command."""
+    measures = [c.get("measures", {}) for c in report["commands"]]
+    return [(header, *(show(m.get(name)) for m in measures)) for header, (name, show) in columns.items()]
+
+
+def _table(report: dict[str, Any], columns: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return the rows of a table: the command, the cells of ``columns``, and the number of robots."""
+    commands = ("command", *(_short(c["command"]) for c in report["commands"]))
+    counts = ("n", *(str(c["distinct_falls"]["n"]) for c in report["commands"]))
+    return list(zip(commands, *columns, counts, strict=True))
 
 
 def _falls(report: dict[str, Any]) -> str:
@@ -162,11 +217,13 @@ def bars(report: dict[str, Any]) -> list[str]:
 def text(report: dict[str, Any]) -> str:
     """Return the report as text for a terminal; m/s and rad/s."""
     lines = _laid([HEADER, *rows(report)])
-    for table in measure_tables(report):
+    tables = measure_tables(report)
+    for table in tables:
         lines += ["", *_laid(table)]
     measured = any(c.get("measures") for c in report["commands"])
     if measured:
-        lines += ["", LEGEND]
+        fixed = len(tables) > len(_further(report))
+        lines += ["", *([LEGEND] if fixed else []), MEANS]
     lines += [""] + [
         line(report) for key, line in (("distinct_falls", _falls), ("delay_margin", _delay)) if key in report
     ]

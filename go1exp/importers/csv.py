@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,13 +11,17 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from go1exp.importers.source import LEVEL, files, rate, recording
+from go1exp.importers.source import LEVEL, counted, files, rate, recording
+from go1exp.importers.table import UTF8, Layout, line_of, names, read
 from go1exp.recording import FLAG, FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Quaternion, Recording, RecordingError
 from go1exp.schema.joint_values import JointValues, each_within, spread
 from go1exp.schema.registry import STRICT, ConfigError, Positive, as_json, explain, importer, nearest
 
 PATH = "importer.csv"
 """Where a complaint about an option begins."""
+
+COARSE = 0.1
+"""Share of rows with the time of the row before, from which the clock is rounded; fewer are copies of a row."""
 
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turn": 2 * np.pi}
@@ -105,6 +108,7 @@ def csv(
     skip_lines: Annotated[int, Field(ge=0)] = 0,
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ",",
     decimal: Literal[".", ","] = ".",
+    encoding: str = UTF8,
 ) -> list[Recording]:
     """Any CSV of any robot: ``columns`` says which column is which channel, with unit, sign and offset.
 
@@ -127,6 +131,7 @@ def csv(
         skip_lines: lines before that.
         delimiter: what stands between two columns.
         decimal: decimal point, or comma.
+        encoding: how characters are written as bytes, such as latin-1 or utf-16.
 
     Raises:
         ConfigError: if a channel, joint or unit does not exist, or a gain is missing; with every such problem.
@@ -134,14 +139,17 @@ def csv(
     """
     mapping, wrong = _columns(columns or {})
     tables = files(path, "*.csv")
-    names = joints or tuple(c.removeprefix("q_") for c in mapping if _quantity(c) == "q")
+    if not _is_encoding(encoding):
+        wrong.append(f"{PATH}.encoding = {encoding!r}: unknown encoding; utf-8, latin-1 or utf-16 will do")
+        raise ConfigError(wrong)
+    called = joints or tuple(c.removeprefix("q_") for c in mapping if _quantity(c) == "q")
     given = {"kp": kp, "kd": kd, "tau_limit": tau_limit}
-    layout = {"header": header, "skip_lines": skip_lines, "delimiter": delimiter, "decimal": decimal}
-    wrong = wrong or (_problems(mapping, names, rate_hz) if mapping else [_without_columns(tables[0], layout)])
-    per_joint, missing = _per_joint(given, names)
+    layout = Layout(header, skip_lines, delimiter, decimal, encoding)
+    wrong = wrong or (_problems(mapping, called, rate_hz) if mapping else [_without_columns(tables[0], layout)])
+    per_joint, missing = _per_joint(given, called)
     if wrong or missing:
         raise ConfigError([*wrong, *missing])
-    about = {"robot": robot, "joints": names, "base": base, "excitation": excitation} | per_joint
+    about = {"robot": robot, "joints": called, "base": base, "excitation": excitation} | per_joint
     about["base_quat"] = base_quat or (LEVEL if base == "fixed" else None)
     about["source"] = "measured" if measured else "simulated"
     return [_one(file, mapping, rate_hz, about, notes, layout) for file in tables]
@@ -153,10 +161,13 @@ def _one(
     rate_hz: float | None,
     about: Mapping[str, Any],
     notes: str,
-    layout: Mapping[str, Any],
+    layout: Layout,
 ) -> Recording:
     """Return one file as a recording."""
-    table, unused = _read(path, mapping, layout)
+    wanted: dict[str, str] = {}
+    for name, source in mapping.items():
+        wanted[source.column] = ", ".join(filter(None, (wanted.get(source.column), name)))
+    table, unused = read(path, wanted, layout)
     channels = {name: _channel(path, name, table[c.column], c) for name, c in mapping.items()}
     remarks = [notes] if notes else []
     rows = len(next(iter(channels.values())))
@@ -164,6 +175,7 @@ def _one(
         # Stamps may be seconds since 1970, of which float64 holds no more than parts of a microsecond.
         column, start = mapping["t"], table[mapping["t"].column][0]
         channels["t"] = _channel(path, "t", table[column.column] - start, column) - column.offset
+        _check_clock(path, channels["t"], table[column.column], column.column, layout)
         remarks.append(f"t = 0 is {start} in the column {column.column!r}.")
     else:
         assert rate_hz is not None  # checked with the mapping
@@ -250,118 +262,43 @@ def _per_joint(given: Mapping[str, Any], joints: tuple[str, ...]) -> tuple[dict[
     return values, wrong
 
 
-def _without_columns(path: Path, layout: Mapping[str, Any]) -> str:
-    names = _names(path, layout)
+def _is_encoding(name: str) -> bool:
+    try:
+        b"abc".decode(name, "replace")  # of no bytes, Python does not look at the name
+    except LookupError:
+        return False
+    return True
+
+
+def _without_columns(path: Path, layout: Layout) -> str:
     return (
-        f"{PATH}.columns: required, but not given; {path} has the columns {', '.join(names)}; "
+        f"{PATH}.columns: required, but not given; {path} has the columns {', '.join(names(path, layout))}; "
         "such as columns={t: time, q_knee: {column: pos, unit: deg}, q_target_knee: goal} or columns=FILE.yaml"
     )
 
 
-# ---------------------------------------------------------------------- the file
+# ---------------------------------------------------------------------- the numbers
 
 
-def _names(path: Path, layout: Mapping[str, Any]) -> list[str]:
-    """Return the names of the columns: those of the first line, or 1, 2, 3."""
-    table = _table(path, layout)
-    return list(table.column_names)
-
-
-def _table(path: Path, layout: Mapping[str, Any]) -> Any:
-    """Return the file as a table of Arrow, whose names have no blanks round them.
-
-    Raises:
-        RecordingError: if it is no table, or two columns have one name.
-    """
-    import pyarrow as pa
-    from pyarrow import csv as arrow_csv
-
-    # One block, so that Arrow sees the whole column before it chooses a type: 0 in the first rows may be 0.5 later.
-    block = min(max(path.stat().st_size + 1, 2**20), 2**31 - 1)
-    read = arrow_csv.ReadOptions(
-        use_threads=False,
-        block_size=block,
-        skip_rows=layout["skip_lines"],
-        autogenerate_column_names=not layout["header"],
-    )
-    parse = arrow_csv.ParseOptions(delimiter=layout["delimiter"])
-    convert = arrow_csv.ConvertOptions(decimal_point=layout["decimal"])
-    try:
-        table = arrow_csv.read_csv(path, read, parse, convert)
-    except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{path}: not a table of numbers ({str(error).splitlines()[0]})") from error
-    if not layout["header"]:
-        table = table.rename_columns([str(k + 1) for k in range(table.num_columns)])
-    stripped = [name.strip() for name in table.column_names]
-    twice = sorted({name for name in stripped if stripped.count(name) > 1})
-    if twice:
-        raise RecordingError(f"{path}: two columns are called {', '.join(map(repr, twice))}; names must differ")
-    if table.num_rows == 0:
-        raise RecordingError(f"{path}: has no rows of numbers")
-    return table.rename_columns(stripped)
-
-
-def _read(
-    path: Path, mapping: Mapping[str, Column], layout: Mapping[str, Any]
-) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the columns that are asked for, (T,) each, and the names of the others."""
-    table = _table(path, layout)
-    names = table.column_names
-    wanted = dict.fromkeys(column.column for column in mapping.values())
-    wrong = [_missing(path, mapping, name, names, layout) for name in wanted if name not in names]
-    values: dict[str, np.ndarray] = {}
-    for name in wanted:
-        if name not in names:
-            continue
-        try:
-            values[name] = _numbers(table.column(name))
-        except ValueError as error:
-            wrong.append(f"{path}: column {name!r}: {error}")
-    if wrong:
-        raise RecordingError("\n".join(wrong))
-    return values, [name for name in names if name not in wanted]
-
-
-def _missing(
-    path: Path, mapping: Mapping[str, Column], name: str, names: Iterable[str], layout: Mapping[str, Any]
-) -> str:
-    """Word the complaint about a column that the file does not have."""
-    channels = ", ".join(channel for channel, column in mapping.items() if column.column == name)
-    lower = {other.lower(): other for other in names}
-    close = [lower[n] for n in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.5)]
-    hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
-    line = f"{path}: no column {name!r} (for {channels}); {hint}it has {', '.join(names)}"
-    other = next((d for d in ",;\t|" if d != layout["delimiter"] and any(d in n for n in names)), None)
-    return f"{line}; is the delimiter {other!r}?" if other else line
-
-
-def _numbers(column: Any) -> np.ndarray:
-    """Return a column of Arrow (T,), float64 or whole numbers.
-
-    Raises:
-        ValueError: if a cell is empty or is no finite number; with the first such row, counted from 1 below the names.
-    """
-    import pyarrow as pa
-
-    if pa.types.is_boolean(column.type) or pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
-        empty = np.flatnonzero(column.is_null().to_numpy())
-        if empty.size:
-            raise ValueError(
-                f"{empty.size} cells are empty or NaN, the first in row {empty[0] + 1}; leave such rows out"
-            )
-        if pa.types.is_boolean(column.type):
-            column = column.cast(pa.uint8())
-        numbers: np.ndarray = column.to_numpy()  # whole numbers stay whole: float64 cannot hold ns since 1970
-        strange = np.flatnonzero(~np.isfinite(numbers))
-        if strange.size:
-            raise ValueError(f"{numbers[strange[0]]} in row {strange[0] + 1}; every value must be finite")
-        return numbers
-    for row, cell in enumerate(column.to_pylist(), 1):
-        try:
-            float(cell)
-        except (TypeError, ValueError):
-            raise ValueError(f"must be numbers, but row {row} has {cell!r}") from None
-    raise ValueError(f"must be numbers, but is read as {column.type}")
+def _check_clock(path: Path, t: np.ndarray, cells: np.ndarray, column: str, layout: Layout) -> None:
+    """Raise RecordingError if the time ``t`` (T,), s, does not increase; with the line, its cell, and what to do."""
+    if len(t) < 2:
+        raise RecordingError(f"{path}: has {counted(len(t), 'row')} of numbers; at least 2 are needed")
+    steps = np.diff(t)
+    back = np.flatnonzero(steps <= 0)
+    if not back.size:
+        return
+    k = int(back[0])
+    line = f"line {line_of(path, k + 1, layout)} has {cells[k + 1]} after {cells[k]} ({counted(back.size, 'such row')})"
+    where = f"{path}: column {column!r} (for t): must increase strictly, but {line}"
+    if steps.max() <= 0 and t[-1] < t[0]:
+        raise RecordingError(f"{where}; it runs backward: put the rows in the other order")
+    if steps.min() < 0:
+        raise RecordingError(f"{where}; sort the rows by time, or leave such rows out")
+    if back.size < COARSE * len(steps) or t[-1] <= t[0]:
+        raise RecordingError(f"{where}; leave such rows out")
+    hz = (len(t) - 1) / (t[-1] - t[0])
+    raise RecordingError(f"{where}; its times are rounded: take t out of columns and give rate_hz (about {hz:.3g})")
 
 
 def _channel(path: Path, name: str, values: np.ndarray, column: Column) -> np.ndarray:

@@ -24,6 +24,11 @@ RATE_DIGITS = 6
 """Significant digits of a rate taken from time stamps."""
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: ``1 row``, ``2 rows``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def files(path: Path, pattern: str) -> list[Path]:
     """Return ``path`` itself, or the files below the folder ``path`` that match ``pattern``, by name.
 
@@ -100,9 +105,18 @@ def rate(path: Path, t: np.ndarray) -> float:
     Raises:
         RecordingError: if there are fewer than two time stamps, or they do not advance.
     """
-    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    if len(t) < 2:
+        raise RecordingError(f"{path}: t: has {counted(len(t), 'stamp')}; at least 2 are needed")
+    steps = np.diff(t)
+    step = float(np.median(steps))
     if not (np.isfinite(step) and step > 0):
-        raise RecordingError(f"{path}: time must have at least two stamps and advance")
+        back = np.flatnonzero(~(steps > 0))
+        row = int(back[0]) + 1
+        rows = counted(back.size, "such row")
+        raise RecordingError(
+            f"{path}: t: must increase strictly, but row {row} (from 0) has {t[row]} s after {t[row - 1]} s ({rows}); "
+            "the times are rounded, or the rows are in another order"
+        )
     return float(f"{1 / step:.{RATE_DIGITS}g}")
 
 
