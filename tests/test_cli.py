@@ -523,6 +523,41 @@ def test_eval_prints_a_table_and_writes_the_same_as_json(run: Path, tmp_path: Pa
     assert [p.name for p in tmp_path.iterdir()] == ["sub"]
 
 
+def test_a_measure_of_a_users_own_is_printed(run: Path, tmp_path: Path) -> None:
+    text = (
+        "import numpy as np\nfrom go1exp.terms import Trace, measure\n\n"
+        "@measure('three', unit='rad')\ndef three(trace: Trace):\n"
+        "    '''Three.'''\n    return np.full(trace.counts.shape[1], 3.0)\n"
+    )
+    (tmp_path / "mine.py").write_text(text)
+    done = cli(tmp_path, "eval", f"run={run}", *GRID, "plugins=[mine.py]", "measures=[three]", "out=report.json")
+    assert done.returncode == 0, done.stderr
+    lines = [line.split() for line in done.stdout.splitlines()]
+    place = lines.index(["command", "three", "rad", "n"])
+    assert lines[place + 1] == ["+0.0", "+0.0", "+0.0", "3", "1"]
+    assert "gait" not in done.stdout.split("bars for a policy")[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        (("eval", "out=file/x.json"), "out = 'file/x.json': its folder"),
+        (("eval", "protocol=sinusoid", "folder=file/x"), "folder = 'file/x':"),
+        (("play", "viewer=clip", "out=file/x.mp4"), "out = 'file/x.mp4': its folder"),
+        (("compare", "protocol=sinusoid", "folder=file/x"), "folder = 'file/x':"),
+    ],
+)
+def test_a_place_for_results_that_cannot_be_written_to_is_refused_before_the_work(
+    words: tuple[str, ...], key: str, run: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    subject = "subjects=[paper,hop]" if words[0] == "compare" else f"run={run}"
+    done = cli(tmp_path, words[0], subject, *words[1:])
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith(f"go1exp {words[0]}: {key} cannot be written to (")
+
+
 def test_a_checkpoint_is_named_as_a_file_in_the_run_folder(run: Path, tmp_path: Path) -> None:
     """``checkpoint: null  # file in it``, says conf/eval.yaml of the run folder."""
     done = cli(tmp_path, "eval", f"run={run}", *GRID, "out=report.json", "checkpoint=checkpoints/000002.pt")

@@ -202,9 +202,55 @@ def test_the_tables_fit_a_terminal_and_say_n_and_what_does_not_count(task: TaskC
     assert [row[-1] for row in tables[0]] == ["n", "1", "1"]
 
 
-def test_a_column_whose_measure_was_not_asked_for_stays_empty(task: TaskConfig) -> None:
+def test_columns_and_tables_without_a_figure_are_left_out(task: TaskConfig) -> None:
     chosen = [t for t in every_measure() if t.key in ("trunk_height", "gait")]
     report = evaluate(task, stand, QUIET, measures=chosen)
-    gait, contact = table.measure_tables(report)
-    assert gait[1][gait[0].index("height m")].startswith("0.")
-    assert set(contact[1][1:-1]) == {"-"}
+    [gait] = table.measure_tables(report)
+    assert gait[0] == ("command", "height m", "n")  # a robot that stands has no gait
+    assert [row[1][:2] for row in gait[1:]] == ["0.", "0."]
+
+
+def with_measures(units: dict[str, str], *of_commands: dict[str, Any]) -> dict[str, Any]:
+    """What ``measure_tables`` reads of a report."""
+    commands = [
+        {"command": [float(k), 0.0, 0.0], "distinct_falls": {"n": k + 3}, "measures": measures}
+        for k, measures in enumerate(of_commands)
+    ]
+    return {"commands": commands, "units": units}
+
+
+def test_measures_of_a_users_own_have_a_table_of_their_own() -> None:
+    units = {"widest_step": "rad", "style": "name", "ease": "-", "drag": "N", "flight_share": "-"}
+    report = with_measures(
+        units,
+        {"widest_step": {"mean": 0.123456}, "style": {"proud": 2}, "ease": None, "drag": {"mean": [1.0, 2.0, None, 4]}},
+        {"widest_step": {"mean": None}, "style": {}, "ease": {"mean": 2e-5}, "drag": {"mean": [None] * 4}},
+    )
+    assert table.measure_tables(report) == [
+        [
+            ("command", "widest_step rad", "style", "ease", "drag N FR FL RR RL", "n"),
+            ("+0.0 +0.0 +0.0", "0.123", "proud", "-", "1 2 - 4", "3"),
+            ("+1.0 +0.0 +0.0", "-", "-", "2e-05", "-", "4"),
+        ]
+    ]
+    for command in report["commands"]:
+        command["measures"] = {"flight_share": {"mean": 0.25}, **command["measures"]}
+    fixed, further = table.measure_tables(report)
+    assert fixed[1] == ("+0.0 +0.0 +0.0", "25", "3")
+    assert further[0][1] == "widest_step rad"
+
+
+def test_further_measures_that_are_too_wide_for_a_line_have_a_second_table() -> None:
+    names = [f"{'long' * 10}_{k}" for k in range(5)]
+    tables = table.measure_tables(with_measures({}, {name: {"mean": 1.0} for name in names}))
+    assert [header[1:-1] for header, _ in tables] == [(names[0], names[1]), (names[2], names[3]), (names[4],)]
+
+
+def test_each_measure_of_the_package_is_in_a_column_or_for_the_json_alone_unless_it_was_chosen() -> None:
+    keys = {term.key for term in every_measure()}
+    assert keys == table.FIXED | table.JSON_ONLY
+    assert not table.FIXED & table.JSON_ONLY
+    every = with_measures({}, {key: {} if key == "gait" else {"mean": 1.0} for key in keys})
+    assert len(table.measure_tables(every)) == 2
+    chosen = with_measures({}, {"slip_distance": {"mean": 1.0}})
+    assert table.measure_tables(chosen)[0][0] == ("command", "slip_distance", "n")

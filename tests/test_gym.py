@@ -183,6 +183,47 @@ def test_a_fault_stops_the_single_environment_until_it_is_reset(elsewhere: None)
     assert np.isfinite(env.reset(seed=0)[0]).all()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs = 0: must be a whole number, 1 or more"),
+        ({"num_envs": 2.5}, "num_envs = 2.5: must be a whole number, 1 or more"),
+        ({"num_envs": True}, "num_envs = True: must be a whole number, 1 or more"),
+        ({"num_envs": 2, "seed": -1}, "seed = -1: must be a whole number, 0 or more"),
+        (
+            {"overrides": "reward=paper"},
+            "overrides = 'reward=paper': must be a list of texts, such as ['reward=paper']",
+        ),
+        ({"overrides": [3]}, "overrides = [3]: must be a list of texts, such as ['reward=paper']"),
+        ({"overrides": 3}, "overrides = 3: must be a list of texts, such as ['reward=paper']"),
+    ],
+)
+def test_an_argument_of_make_that_cannot_be_is_named(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        go1exp.make(**arguments)
+    assert str(refused.value) == message
+
+
+def test_numbers_of_numpy_are_whole_numbers_too() -> None:
+    numbers: dict[str, Any] = {"num_envs": np.int64(2), "seed": np.uint8(3)}
+    assert go1exp.make(QUIET, **numbers).reset().shape == (2, 48)
+
+
+def test_arguments_of_the_single_environment_that_cannot_be_are_named(registered: None) -> None:
+    with pytest.raises(ConfigError, match=r"^overrides = 'reward=paper': must be a list of texts"):
+        gymnasium.make("Go1-v0", overrides="reward=paper")
+    with pytest.raises(ConfigError, match=r"^env_index = -1: must be a whole number, 0 or more"):
+        Go1Env(QUIET, env_index=-1)
+
+
+@pytest.mark.parametrize("shape", [(11,), (1, 12), ()])
+def test_an_action_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    env = Go1Env(QUIET)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^action: has shape \(.*\); must be \(12,\)"):
+        env.step(np.zeros(shape, np.float32))
+
+
 # Stable-Baselines3
 
 

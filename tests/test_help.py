@@ -97,6 +97,42 @@ def test_help_shows_what_was_chosen_and_stands_wrong_choices() -> None:
     assert "episodes=16" in helped("eval", "episode=3", "--help")
 
 
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("train --help rewardd", "go1exp train: no group or key 'rewardd'; did you mean 'reward' or "),
+        ("train epsodes --help", "go1exp train: no group or key 'epsodes'; "),
+        ("train --help ppo.learning_rat", "did you mean 'ppo.learning_rate' or "),
+        ("train --help xyzzy", "go1exp train: no group or key 'xyzzy'; go1exp train --help lists them"),
+        ("deploy walk.zip --help comand", "go1exp deploy: no group or key 'comand'; did you mean 'command'"),
+    ],
+)
+def test_a_word_that_there_is_no_help_for_is_refused_with_what_looks_like_it(
+    line: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with mock.patch.object(sys, "argv", ["go1exp", *line.split()]), pytest.raises(SystemExit) as left:
+        main()
+    printed = capsys.readouterr()
+    assert (left.value.code, printed.out) == (2, "")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "first"),
+    [
+        ("train --help ppo.learning_rate", "go1exp train: group ppo"),
+        ("eval --help episodes", "go1exp eval: "),
+        ("eval --help grid", "go1exp eval: "),
+        ("deploy walk.zip --help", "go1exp deploy: "),
+        ("report runs/a runs/b --help", "go1exp report: "),
+        ("record --help audit", "go1exp record audit: "),
+    ],
+)
+def test_help_for_a_key_a_subverb_or_beside_a_file_is_that_of_where_it_stands(line: str, first: str) -> None:
+    assert helped(*line.split()).startswith(first)
+
+
 def test_the_words_of_deploy_are_those_of_its_configuration() -> None:
     chosen = compose("deploy", ["robot=go1", "command=sinusoid"])
     assert (chosen["robot"], chosen["command"]) == ("go1", "sinusoid")

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from go1exp import robot
 from go1exp.deploy.estimate import LONGEST_AHEAD, KalmanEstimator, acceleration
 from go1exp.deploy.go1_fields import PERIOD
+from go1exp.deploy.job import summary_lines
 from go1exp.deploy.messages import OVERTAKEN_S, LowState
-from go1exp.deploy.packet_delay import WINDOW_S, PacketDelay, delays, spread
+from go1exp.deploy.packet_delay import MOST_SLIP, WINDOW_S, PacketDelay, delays, slip, spread
 from go1exp.estimation import Status, go1, make_filter, sample
 
 
@@ -30,6 +31,33 @@ def test_delays_are_those_beyond_the_fastest_of_the_last_second() -> None:
     # What is told after a second is the true way less the fastest one, but for the clocks' drift within the window.
     off = delays(arrived, clock) - (way[order] - way.min())
     assert np.abs(off[500:]).max() < 3e-4 * WINDOW_S + 1e-4
+
+
+@pytest.mark.parametrize("share", [0.14, -0.02, 0.0])
+def test_the_slip_of_the_robots_clock_is_told_apart_from_delays(share: float) -> None:
+    """A robot that is 14 % slow makes all packets of a second up to 140 ms late, by its clock."""
+    rng = np.random.default_rng(4)
+    sent = np.arange(0.0, 6.0, PERIOD)
+    arrived = np.sort(sent + 0.0007 + rng.exponential(0.02, len(sent)))
+    ticks = np.floor(1e3 * (1.0 - share) * sent) / 1e3
+    assert slip(arrived, ticks) == pytest.approx(share, abs=MOST_SLIP)
+    assert slip(arrived, np.full(len(sent), math.nan)) is None
+    assert slip(arrived[: round(1.0 / PERIOD)], ticks[: round(1.0 / PERIOD)]) is None  # too short to tell
+    if share > 0.0:
+        late = spread(delays(arrived, ticks))
+        assert late is not None
+        assert late["p50"] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("share", "words"), [(0.14, "ran 14 % slow"), (-0.0021, "ran 0.21 % fast"), (5e-4, None), (None, None)]
+)
+def test_delays_of_a_clock_that_slips_are_reported_with_a_note(share: float | None, words: str | None) -> None:
+    times = {"p50": 0.1379, "p99": 0.282, "worst": 0.3}
+    first, *notes = summary_lines({"packets": {"delay": times, "age": times, "clock_slip": share}})
+    assert first.startswith("packets, beyond the fastest way: delay p50 137.9")
+    assert len(notes) == (words is not None)
+    assert words is None or words in notes[0]
 
 
 def test_the_age_counts_from_the_measurement_less_the_fastest_way() -> None:

@@ -37,6 +37,7 @@ def _task(container: dict[str, Any]) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {settings.folder!r}: is a file"])
 
+    from go1exp.cli.logs import writable
     from go1exp.cli.protocols import note_replaced, refuse
     from go1exp.protocol.playing import Rates, play
 
@@ -46,6 +47,7 @@ def _task(container: dict[str, Any]) -> None:
     of_each = [_with(protocols, how.trunk_velocity) for _, how in subjects]
     for theirs, drives in zip(of_each, drivers, strict=True):
         refuse(theirs, drives)
+    writable(settings.folder, "folder")
     note_replaced(folder, ["compare.json"])
     plays: dict[str, list[Result]] = {}
     origin = {"robot": other_robot.described(other), "robot_of": settings.subjects[0] if robot_of else "each its own"}

@@ -58,6 +58,7 @@ def _protocols(settings: Any, protocols: list[Any], judged: _Judged) -> None:
 def _task(container: dict[str, Any]) -> None:
     from go1exp.choices import config_folder, load
     from go1exp.cli.protocols import chosen as protocols_chosen
+    from go1exp.cli.protocols import writable_file
     from go1exp.cli.settings import EvalSettings, parse
 
     judge, container = engine.split(container)
@@ -74,6 +75,8 @@ def _task(container: dict[str, Any]) -> None:
     if grid_too:
         _check_grid(settings)
     subject = _of_grid(settings, judged.controller) if grid_too else None
+    if subject:
+        writable_file(subject[2])
     if protocols:
         _protocols(settings, protocols, judged)
     if subject:

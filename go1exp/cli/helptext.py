@@ -6,25 +6,69 @@ verb does and its examples from ``hydra.help`` in ``conf/VERB.yaml``.
 
 from __future__ import annotations
 
+import math
 import shutil
+import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from go1exp.choices import about, choice_files, config_folder, given_folders, groups_of, load
+from go1exp.cli.verbs import LISTS, POSITIONAL, SUBVERBS, VALUED
 
 KEY_WIDTH = 34
 """Columns of ``key=value`` before the text beside it."""
 
+NO_SUCH_WORD = 2
+"""Exit status, that of a refused configuration."""
+
 
 def show(verb: str, title: str, arguments: Sequence[str]) -> None:
-    """Print the help of a verb, or of the group that is named among the arguments."""
+    """Print the help of a verb, or of the group that is named among the arguments.
+
+    Raises:
+        SystemExit: if a word among them names nothing that there is help for.
+    """
+    words = _words(arguments)
+    if subverb := next((word for word in words if word in SUBVERBS.get(verb, ())), None):
+        show(f"{verb}_{subverb}", f"{title} {subverb}", [word for word in arguments if word != subverb])
+        return
     folders = given_folders(arguments)
     groups = groups_of(verb)
     container = _composed(verb, arguments, folders[1:])
-    named = next((word for word in arguments if word in groups), None)
+    keys = _flat(container)
+    sections = {key.rpartition(".")[0] for key in keys}
+    strange = [word for word in words if word not in {*groups, *keys, *sections}]
+    if len(strange) > _positions(verb):
+        _refuse(title, strange[-1], [*groups, *keys])
+    named = next((group for word in words if (group := word.partition(".")[0]) in groups), None)
     print("\n".join(_group_page(title, named, groups, container, folders) if named else _page(verb, title, container)))
+
+
+def _words(arguments: Sequence[str]) -> list[str]:
+    """Return the words that are no option, no option's value and no override."""
+    return [
+        word
+        for before, word in zip(["", *arguments], arguments, strict=False)
+        if before not in VALUED and not word.startswith(("-", "~")) and "=" not in word
+    ]
+
+
+def _positions(verb: str) -> float:
+    """Return how many words may stand for themselves, as the file in ``go1exp deploy walk.zip --help`` does."""
+    keys = POSITIONAL.get(verb, ())
+    return math.inf if {*keys} & {*LISTS} else len(keys)
+
+
+def _refuse(title: str, word: str, known: Sequence[str]) -> None:
+    """Say that there is no help for a word, and which ones look like it; leave."""
+    from go1exp.schema.registry import nearest
+
+    close = " or ".join(repr(name) for name in nearest(word, known))
+    hint = f"did you mean {close}?" if close else f"{title} --help lists them"
+    print(f"{title}: no group or key {word!r}; {hint}", file=sys.stderr)
+    raise SystemExit(NO_SUCH_WORD)
 
 
 def _composed(verb: str, arguments: Sequence[str], folders: Sequence[Path]) -> dict[str, Any]:

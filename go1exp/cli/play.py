@@ -48,6 +48,12 @@ def _task(container: dict[str, Any]) -> None:
         walk(subject, other, ground, judge, settings, where)
         return
 
+    live = settings.viewer == "live" or (settings.viewer == "auto" and _has_display())
+    if not live:
+        from go1exp.cli.protocols import writable_file
+
+        writable_file(out)
+
     from go1exp.cli.subjects import driver
     from go1exp.env.core import Go1Core
     from go1exp.evaluate.engine import require_agreement
@@ -61,7 +67,7 @@ def _task(container: dict[str, Any]) -> None:
         shown_task = dataclasses.replace(shown_task, terrain=ground)
     require_agreement(shown_task)
     core = Go1Core(shown_task, 1, settings.seed, noise=settings.noise, imu=drives.senses)
-    _show(core, drives.begin(core, "exact", settings.seed), settings, out)
+    _show(core, drives.begin(core, "exact", settings.seed), settings, None if live else out)
 
 
 def _ground(given: Any) -> TerrainConfig | None:
@@ -102,13 +108,13 @@ def _subject(settings: PlaySettings) -> Named:
     return driven(controller, settings.run, settings.policy, settings.bundle, "play.mp4")
 
 
-def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path) -> None:
-    """Open the live viewer, or write clip and picture."""
+def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path | None) -> None:
+    """Write clip and picture, or open the live viewer if there is no file for them."""
     from go1exp.evaluate import video
     from go1exp.evaluate.camera import RenderingUnavailable
     from go1exp.evaluate.stick import picture
 
-    if settings.viewer == "live" or (settings.viewer == "auto" and _has_display()):
+    if out is None:
         video.live(core, policy)
         return
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)

@@ -91,6 +91,23 @@ def playable(protocols: Sequence[Chosen], driver: Driver) -> list[Chosen]:
     return list(protocols)
 
 
+def writable_file(out: Path) -> None:
+    """Make the folder of a file for results, before the work begins; ``/dev/stdout`` and pipes are taken as they are.
+
+    Raises:
+        ConfigError: if nothing can be written there.
+    """
+    from go1exp.cli.logs import writable
+
+    if out.exists() and not out.is_file():
+        return
+    try:
+        writable(str(out.resolve().parent))
+    except ConfigError as error:
+        reason = error.problems[0].partition(": ")[2]
+        raise ConfigError([f"out = {str(out)!r}: its folder {reason}"]) from None
+
+
 def note_replaced(folder: Path, files: Sequence[str]) -> None:
     """Say which results of an earlier call the new ones will replace."""
     present = [name for name in files if (folder / name).exists()]
@@ -100,6 +117,7 @@ def note_replaced(folder: Path, files: Sequence[str]) -> None:
 
 def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[str, Any], rates: Rates) -> None:
     """Play protocols one after the other, write what came of each, and print the verdicts."""
+    from go1exp.cli.logs import writable
     from go1exp.cli.subjects import driver
     from go1exp.protocol.playing import play as played
     from go1exp.protocol.report.writing import write
@@ -107,6 +125,7 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
     drives = driver(subject, other)
     refuse(protocols, drives)
     protocols = playable(protocols, drives)
+    writable(str(folder), "folder")
     note_replaced(folder, [f"{c.key}.json" for c in protocols])
     for k, c in enumerate(protocols):
         show = spinner(1, f"{c.key} ({k + 1} of {len(protocols)})")

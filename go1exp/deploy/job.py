@@ -25,6 +25,7 @@ from go1exp.deploy.go1_wire import gains_on_wire
 from go1exp.deploy.launch import RefusedError, RobotError, SimulatedRobot
 from go1exp.deploy.log import About
 from go1exp.deploy.messages import Link
+from go1exp.deploy.packet_delay import MOST_SLIP
 from go1exp.deploy.udp import HOST, SIMULATED_TICK_S, Go1Link, UdpLink
 from go1exp.deploy.walk import STATUS, Outcome, Plan, account, interruptible, save, velocity_errors, walk
 from go1exp.estimation.feet import LEGS, FootCalibration
@@ -302,6 +303,10 @@ def summary_lines(content: Mapping[str, Any]) -> list[str]:
             ", ".join(f"{name} {1e3 * value:.1f}" for name, value in packets[part].items()) for part in ("delay", "age")
         )
         lines.append(f"packets, beyond the fastest way: delay {late} ms; age of the newest at a cycle {age} ms")
+        slow = packets.get("clock_slip")
+        if slow is not None and abs(slow) > MOST_SLIP:
+            how = f"{100 * abs(slow):.2g} % {'slow' if slow > 0 else 'fast'}"
+            lines.append(f"note: the robot's clock ran {how} against this computer's; delays and ages include that")
     if robot := content.get("simulated_robot"):
         timing = robot["timing"]
         lines.append(

@@ -16,6 +16,16 @@ WINDOW_S = 1.0
 """Time in which the fastest packet is looked for, s: 500 packets, and clocks that are 100 ppm apart move by 0.1 ms."""
 
 
+MOST_SLIP = 1e-3
+"""Share by which clocks may differ before delays are not told alone: within ``WINDOW_S`` that makes 1 ms of delay."""
+
+SHORTEST_S = 2.0
+"""Time over which clocks are compared at least, s: those that tick in ms make an error of 1 ms in half of it."""
+
+FEWEST = 8
+"""Packets that this takes at least."""
+
+
 class PacketDelay:
     """Delays of packets beyond the fastest of the last ``WINDOW_S``."""
 
@@ -51,6 +61,21 @@ def delays(arrived: Iterable[float], clock: Iterable[float]) -> np.ndarray:
     """Return the delays (T,), s, of packets in the order of arrival; arguments as those of ``PacketDelay.note``."""
     way = PacketDelay()
     return np.array([way.note(float(t), float(c)) for t, c in zip(arrived, clock, strict=True)])
+
+
+def slip(arrived: np.ndarray, clock: np.ndarray) -> float | None:
+    """Return by what share of our time the robot's clock, both (T,), s, runs slow, negative if it runs fast.
+
+    By the fastest packets of the first and of the last quarter, so that a delay that varies is no slip. None without a
+    clock, and over less than ``SHORTEST_S``, where its resolution would count.
+    """
+    known = np.isfinite(clock)
+    arrived, offset = arrived[known], (arrived - clock)[known]
+    if len(arrived) < FEWEST or arrived[-1] - arrived[0] < SHORTEST_S:
+        return None
+    quarter = len(arrived) // 4
+    first, last = int(np.argmin(offset[:quarter])), len(arrived) - quarter + int(np.argmin(offset[-quarter:]))
+    return float((offset[last] - offset[first]) / (arrived[last] - arrived[first]))
 
 
 def spread(values: np.ndarray) -> Mapping[str, float] | None:

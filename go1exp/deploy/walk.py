@@ -24,7 +24,7 @@ from go1exp.deploy.estimate import BOTH, TORQUE, KalmanEstimator, NoEstimator, s
 from go1exp.deploy.log import About, Log, write_cycles
 from go1exp.deploy.loop import MonotonicClock, Timing, run
 from go1exp.deploy.messages import Link
-from go1exp.deploy.packet_delay import delays, spread
+from go1exp.deploy.packet_delay import delays, slip, spread
 from go1exp.deploy.safety import RULES, Fault, Safety, SafetyConfig
 from go1exp.estimation.feet import FootCalibration
 from go1exp.files import write_json
@@ -317,11 +317,15 @@ def packet_delays(log: Log) -> dict[str, Any] | None:
 
     Returns:
         ``delay`` of the states that are kept, and ``age`` at the cycles: each with p50, p99 and worst, both without the
-        time that the fastest packet takes, which is not known.
+        time that the fastest packet takes, which is not known; and ``clock_slip``, the share by which the robot's clock
+        ran slow, None where that is not known.
     """
-    late = spread(delays(log.states.part("t"), log.states.part("clock")))
+    arrived, clock = log.states.part("t"), log.states.part("clock")
+    late, slow = spread(delays(arrived, clock)), slip(arrived, clock)
     age = spread(log.cycles.part("age"))
-    return None if late is None or age is None else {"delay": dict(late), "age": dict(age)}
+    if late is None or age is None:
+        return None
+    return {"delay": dict(late), "age": dict(age), "clock_slip": slow}
 
 
 def save(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from go1exp.compose import compose
 from go1exp.config import parse_task
+from go1exp.env.arguments import listed, whole
 from go1exp.env.core import Go1Core
 
 
@@ -30,6 +31,8 @@ def make(
         spread_starts: let first episodes begin at random times, so that not all end together.
 
     Raises:
-        go1exp.schema.registry.ConfigError: if an override does not fit.
+        go1exp.schema.registry.ConfigError: if an override does not fit, or a number cannot be one of robots or a seed.
     """
-    return Go1Core(parse_task(compose("train", overrides)), num_envs, seed, noise=noise, spread_starts=spread_starts)
+    num_envs, seed = whole("num_envs", num_envs, 1), whole("seed", seed, 0)
+    task = parse_task(compose("train", listed(overrides)))
+    return Go1Core(task, num_envs, seed, noise=noise, spread_starts=spread_starts)

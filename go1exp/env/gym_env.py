@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from go1exp.config import TaskConfig
+from go1exp.env.arguments import listed, whole
 from go1exp.env.core import Go1Core
 from go1exp.env.sb3_env import spaces
 
@@ -31,6 +32,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
 
     Raises:
         go1exp.schema.registry.ConfigError: if an override does not fit.
+        ValueError: from ``step`` for an action of another shape.
         go1exp.env.faults.NumericalFault: from ``step`` when a value is not finite.
     """
 
@@ -49,8 +51,8 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
             from go1exp.compose import compose_checked
             from go1exp.config import parse_task
 
-            task = parse_task(compose_checked("train", overrides))
-        self.core = Go1Core(task, 1, first_env=env_index, noise=noise)
+            task = parse_task(compose_checked("train", listed(overrides)))
+        self.core = Go1Core(task, 1, first_env=whole("env_index", env_index, 0), noise=noise)
         self.observation_space, self.action_space = spaces(self.core)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / task.sim.policy_dt)}
         self.render_mode = render_mode
@@ -65,7 +67,10 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply an action (12,) for one policy period."""
-        result = self.core.step(torch.as_tensor(action, dtype=torch.float32).unsqueeze(0))
+        given = torch.as_tensor(action, dtype=torch.float32)
+        if given.shape != self.action_space.shape:
+            raise ValueError(f"action: has shape {tuple(given.shape)}; must be {self.action_space.shape}")
+        result = self.core.step(given.unsqueeze(0))
         self.core.check(result)
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         last = result.final_observation if terminated or truncated else result.observation
