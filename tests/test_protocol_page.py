@@ -57,7 +57,12 @@ def rate(error: float) -> Callable[[Any], list[dict[str, Any]]]:
     def rows(protocol: Any) -> list[dict[str, Any]]:
         return [
             {"velocity": velocity, "rate_hz": hz, "delay_ms": delay, "robot": n, "fell": False, "left_map": False}
-            | {"moving_s": 5.0, "fingerprint": float(n), "rmse_xy": error * (1.0 + 0.02 * n) + 0.01 * n, "rmse_yaw": 0.1 - 0.01 * n}
+            | {
+                "moving_s": 5.0,
+                "fingerprint": float(n),
+                "rmse_xy": error * (1.0 + 0.02 * n) + 0.01 * n,
+                "rmse_yaw": 0.1 - 0.01 * n,
+            }
             | {"target_rate": 5.0 + n, "torque_rms": 4.0 + n}
             for velocity in protocol.velocities
             for hz in protocol.rates_hz

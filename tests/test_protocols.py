@@ -189,14 +189,18 @@ def test_robots_of_the_nominal_protocol_count_once(driver: PolicyDriver) -> None
 def test_a_better_subject_is_called_better_and_a_worse_one_worse(
     driver: PolicyDriver, results: dict[str, Result]
 ) -> None:
-    """Rows whose difference is known: every error is 0.1 less, one of which robots is missing."""
+    """Rows whose difference is known: every error is 0.1 less, hardly more for some, one of which robots is missing."""
     one = result("gait", driver, results)
-    rows = [{**row, "rmse_x": row["rmse_x"] - 0.1, "fell": True} for row in one.played.rows if row[ROBOT] < 99]
+    rows = [
+        {**row, "rmse_x": row["rmse_x"] - 0.1 - 1e-4 * row[ROBOT], "fell": True}
+        for row in one.played.rows
+        if row[ROBOT] < 99
+    ]
     other = dataclasses.replace(one, label="other", played=dataclasses.replace(one.played, rows=rows[:-1]))
     found = {(d.quantity, tuple(d.condition.values())): d for d in comparing.compared(one, other)}
     d = found["rmse_x", (0.5, 0.0, 0.0)]
     assert (d.word, d.difference.n) == ("better", 2)
-    assert d.difference.estimate == pytest.approx(-0.1)
+    assert d.difference.estimate == pytest.approx(-0.1, abs=1e-3)
     assert found["rmse_x", (1.0, 0.0, 0.0)].difference.n == 1
     assert found["rmse_x", (1.0, 0.0, 0.0)].word == "not told apart"
 
