@@ -186,14 +186,14 @@ def _refused_override(error: Exception, name: str, overrides: Sequence[str], fol
         return " ".join(line.strip() for line in cause.splitlines() if line.strip())
     key = match.group(1)
     given = next((o for o in overrides if o.lstrip("+~").split("=")[0].split("@")[0] == key), key)
+    if "Could not append to config" in str(error):
+        plain = given.lstrip("+")
+        return f"{given}: {key!r} exists already; leave out the plus: {plain!r}"
     groups = [o for o in overrides if re.match(r"[a-z_]+=[a-z]", o) and o != given]
     try:
         known = [k for k in flat_keys(name, groups, folders) if k != key]
     except Exception:  # one of the others is wrong too
         known = [k for k in flat_keys(name) if k != key]
-    if "Could not append to config" in str(error):
-        plain = given.lstrip("+")
-        return f"{given}: {key!r} exists already; leave out the plus: {plain!r}"
     close = nearest(key, known) or nearest(key.rsplit(".", 1)[-1], known)
     hint = f"did you mean {' or '.join(repr(c) for c in close)}?" if close else "see --help"
     term, _, parameter = key.rpartition(".")
