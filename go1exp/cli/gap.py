@@ -168,6 +168,7 @@ def _replay(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int
 
 def _apply(result: GapResult, recordings: list[Recording], robot: Robot, settings: GapVerb) -> None:
     """Write the effect files, read them back as training does, and score them at training's step."""
+    from go1exp.gap.files import APPLIED
     from go1exp.gap.stages import apply
 
     out = Path(settings.out)
@@ -175,7 +176,7 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
     contents = {path.name: OmegaConf.to_container(OmegaConf.load(path)) for path in written}
     proof = apply.prove(recordings, robot, settings.search, result, contents, settings.train_dt)  # type: ignore[arg-type]
     about = {**asdict(proof), "files": [path.name for path in written]}
-    write_json(out / "applied.json", about)
+    write_json(out / APPLIED, about)
     print(f"\nwritten to {', '.join(str(path) for path in written)}")
     print(
         f"at training's step of {1e3 * proof.physics_dt:g} ms the held-out error is {1 + proof.after:.3g} times the "
@@ -191,7 +192,9 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
 
 def _status(result: GapResult, out: Path) -> int:
     """Return the exit status of an answer and what was applied of it: what is certified may not hold in training."""
-    applied = out / "applied.json"
+    from go1exp.gap.files import APPLIED
+
+    applied = out / APPLIED
     proof = json.loads(applied.read_text()) if applied.is_file() else {"holds": True}
     certified = any(named.status == "certified" for named in result.named)
     return DOES_NOT_HOLD if certified and not proof["holds"] else result.exit_code

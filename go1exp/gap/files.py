@@ -31,7 +31,13 @@ from go1exp.schema.registry import Expected
 RESULT = "verdict.json"
 """Name of the file in the output folder."""
 
-MADE_OF_IT = ("effect.yaml", "calibration.yaml", "compensating.yaml", "applied.json", "report.html")
+EFFECT, CALIBRATION, COMPENSATING = "effect.yaml", "calibration.yaml", "compensating.yaml"
+"""What is missing; the nominal parameters within their tolerances; what only makes up for something unknown."""
+
+APPLIED = "applied.json"
+"""What the written files do at the step of training."""
+
+MADE_OF_IT = (EFFECT, CALIBRATION, COMPENSATING, APPLIED, "report.html", "report.json")
 """Files that are made of a result, beside it."""
 
 

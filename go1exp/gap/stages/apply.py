@@ -17,7 +17,7 @@ from go1exp.effects.tolerances import Tolerances
 from go1exp.files import write_text
 from go1exp.gap.comparison import Comparison, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
-from go1exp.gap.files import GapFileError
+from go1exp.gap.files import CALIBRATION, COMPENSATING, EFFECT, GapFileError
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.fixed_base import FixedBase
@@ -29,9 +29,6 @@ from go1exp.robot import RobotConfig
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term, members
 from go1exp.tensors.threads import one_thread
-
-EFFECT, CALIBRATION, COMPENSATING = "effect.yaml", "calibration.yaml", "compensating.yaml"
-"""What is missing; the nominal parameters within their tolerances; what only makes up for something unknown."""
 
 ROBOT = "robot"
 """Key of a value that belongs to no joint."""
