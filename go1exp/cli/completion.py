@@ -196,8 +196,9 @@ def _listed(folders: Sequence[Path]) -> list[str]:
 
 
 def _importers() -> list[str]:
-    """Return the names of the importers, which are those of their files."""
-    return [file.stem for file in (data_root() / "go1exp/importers").glob("[a-z]*.py") if file.stem != "source"]
+    """Return the names of the importers, which are those of their files, but for the two that all of them share."""
+    files = (data_root() / "go1exp/importers").glob("[a-z]*.py")
+    return [file.stem for file in files if file.stem not in ("source", "table")]
 
 
 # ---------------------------------------------------------------------- values
