@@ -434,7 +434,7 @@ def test_list_prints_every_registered_term_with_its_first_line_and_every_choice(
 @pytest.mark.parametrize(("words", "first"), [("list", "actuator"), ("gap --help", "go1exp gap: compare recordings")])
 def test_a_reader_may_leave(words: str, first: str, tmp_path: Path) -> None:
     """``go1exp list | head -1``: no complaint, and the status of a closed pipe."""
-    script = f"set -o pipefail; PYTHONUNBUFFERED=1 {sys.executable} -m go1exp.cli {words} | head -n 1"
+    script = f"set -o pipefail; PYTHONUNBUFFERED=1 {sys.executable} -m go1exp {words} | head -n 1"
     done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.startswith(first)
     assert done.stderr == ""

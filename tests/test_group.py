@@ -86,7 +86,7 @@ def test_two_gpus_train_as_one_does(tmp_path: Path) -> None:
         "logger=local",
     )
     for devices in (1, 2):
-        run = [sys.executable, "-m", "go1exp.cli", "train", *task, f"devices={devices}"]
+        run = [sys.executable, "-m", "go1exp", "train", *task, f"devices={devices}"]
         subprocess.run([*run, f"hydra.run.dir={tmp_path / str(devices)}"], timeout=240, check=True)
     one, two = (checkpoint.load_latest(tmp_path / str(devices))[0] for devices in (1, 2))
     for name, value in one["policy"].items():

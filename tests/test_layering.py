@@ -50,6 +50,7 @@ UP = up()
 FORBIDDEN: dict[str, tuple[str, ...]] = {
     # plain descriptions
     "__init__.py": (*FOREIGN, "torch", "numpy", "go1exp.cli", "go1exp.train"),  # `make` is a door to env/
+    "__main__.py": (*FOREIGN, "torch", "numpy", "pydantic", *up("cli")),
     "errors.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "files.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "signals.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),

@@ -41,7 +41,7 @@ def _network_of_its_own() -> None:
 
 @pytest.mark.usefixtures("_network_of_its_own")
 def test_a_node_that_dies_during_a_sweep_costs_nothing_but_time(tmp_path: Path) -> None:
-    train = [sys.executable, "-m", "go1exp.cli", "train", "-m", "seed=1,2,3", *LONGER, "hydra.sweep.dir=sweep"]
+    train = [sys.executable, "-m", "go1exp", "train", "-m", "seed=1,2,3", *LONGER, "hydra.sweep.dir=sweep"]
     launcher = ["hydra/launcher=ray", f"hydra.launcher.address=127.0.0.1:{ray_cluster.PORT}"]
     cluster = [sys.executable, ray_cluster.__file__, str(tmp_path), *train, *launcher]
     with (tmp_path / "output.txt").open("w") as output:

@@ -43,7 +43,7 @@ def start(tmp_path: Path, variables: dict[str, str]) -> Iterator[Callable[..., s
     started = []
 
     def begin(*arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "go1exp.cli", "train", *arguments]
+        command = [sys.executable, "-m", "go1exp", "train", *arguments]
         with (tmp_path / "output.txt").open("w") as output:
             where: dict[str, Any] = {"cwd": tmp_path, "env": environment(**variables)}
             started.append(subprocess.Popen(command, text=True, stdout=output, stderr=subprocess.STDOUT, **where))

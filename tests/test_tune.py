@@ -199,7 +199,7 @@ def test_a_search_that_is_killed_loses_neither_its_trial_nor_its_count(tmp_path:
         "metric=train/kl",
         "out=search",
     )
-    killed = subprocess.Popen([sys.executable, "-m", "go1exp.cli", *line], cwd=tmp_path, env=environment())
+    killed = subprocess.Popen([sys.executable, "-m", "go1exp", *line], cwd=tmp_path, env=environment())
     run = tmp_path / "search/trial-0000"
     try:
         limit = time.monotonic() + 200.0

@@ -29,7 +29,7 @@ def run(container: dict[str, Any], on_round: Callable[[int, int], None]) -> dict
         for number in range(RUNS):
             make_run(study / f"run{number}", container, number, ROWS)
             on_round(number, RUNS + 1)
-        command = [sys.executable, "-m", "go1exp.cli", "report", str(study)]
+        command = [sys.executable, "-m", "go1exp", "report", str(study)]
         start = time.perf_counter()
         child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         _, status, usage = os.wait4(child.pid, 0)

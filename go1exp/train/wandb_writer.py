@@ -124,7 +124,7 @@ class WandbWriter(KVWriter):
 
 def _bundle(run: Path) -> Path | None:
     """Pack the run's policy as ``go1exp export`` does, in a process of its own; None with a remark if it cannot."""
-    command = [sys.executable, "-m", "go1exp.cli", "export", f"run='{run.resolve()}'"]
+    command = [sys.executable, "-m", "go1exp", "export", f"run='{run.resolve()}'"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=EXPORTING)
     except (OSError, subprocess.TimeoutExpired) as error:
