@@ -43,6 +43,7 @@ from go1exp.deploy.commands import (
 )
 from go1exp.deploy.controller import LYING, PHASES, Cycle
 from go1exp.deploy.estimate import BLIND_S, KalmanEstimator, settings
+from go1exp.deploy.go1_fields import JOINTS, MOTOR_NAMES
 from go1exp.deploy.go1_wire import Health
 from go1exp.deploy.job import Job, run_job
 from go1exp.deploy.launch import RefusedError, RobotError
@@ -51,13 +52,14 @@ from go1exp.deploy.messages import Link, LowCmd, LowState
 from go1exp.deploy.safety import RULES
 from go1exp.deploy.udp import UdpLink
 from go1exp.deploy.walk import FAULTS, STATUS, Plan
+from go1exp.errors import Expected
 from go1exp.estimation import from_json, go1, make_filter, sample, to_json
 from go1exp.export.build import build
 from go1exp.gap.robots.hung import hung
 from go1exp.record.plan import make_motion
 from go1exp.record.played import played
 from go1exp.recording import VECTORS
-from go1exp.schema.registry import Term, members
+from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
 from go1exp.sim_robot.server import TRUTH, Network, Server, Truth
@@ -326,6 +328,34 @@ def test_a_robot_obeys_the_first_who_speaks_and_the_newest_command(file: str) ->
     assert wire.unpack_state(data, about, 0.0).in_force == 5
     for opened in (client, other, server):
         opened.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joints": (*robot.JOINTS[3:6], *robot.JOINTS[:3], *robot.JOINTS[6:])}, "has FL_hip at place 1; the motors"),
+        ({"robot": "go2"}, "is for the robot 'go2'; deploy drives a 'go1'"),
+        ({"estimator": {"foot_radus": 1}}, r"estimator\.foot_radus: unknown key"),
+    ],
+    ids=["order", "robot", "estimator"],
+)
+def test_a_bundle_that_is_not_for_a_go1_never_reaches_its_motors(
+    change: dict[str, Any], message: str, file: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    whole = load(file)
+    other = dataclasses.replace(whole, metadata=dataclasses.replace(whole.metadata, **change))
+    monkeypatch.setattr("go1exp.deploy.bundle.load", lambda path: other)
+    said: list[str] = []
+    with pytest.raises((Expected, ConfigError), match=message):
+        run_job(Job(file, "sim", Plan(), str(tmp_path / "out")), said.append)
+    assert said == []
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(sys, "argv", ["go1exp", "export", "check", file])
+    assert cli.main() != 0
+
+
+def test_the_motors_of_the_packets_are_the_joints_of_the_robot() -> None:
+    assert (MOTOR_NAMES, len(MOTOR_NAMES)) == (robot.JOINTS, JOINTS)
 
 
 def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Path]) -> None:
@@ -630,7 +660,8 @@ def test_a_fault_over_the_link_makes_the_drives_brake_and_has_a_name_in_the_log(
     assert done.status == STATUS[name]
     assert done.account["ended"] == name
     assert message in done.account["fault"]["message"]
-    assert done.output[-1].startswith(f"fault: {name} at ")
+    since_start = done.account["fault"]["t"] - min(done.account["phases"].values())
+    assert done.output[-1].startswith(f"fault: {name} at {since_start:.3f} s after the start: ")
     assert 0.49 < done.account["fault"]["t"] - BEGIN < 0.65
     assert done.world.robot.braking
     assert done.world.obeyed[max(done.world.obeyed)].damping

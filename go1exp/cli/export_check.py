@@ -22,8 +22,10 @@ def _task(container: dict[str, Any]) -> None:
     from rich.console import Console
 
     from go1exp.deploy.bundle import load
+    from go1exp.deploy.job import refuse_unfit
 
     bundle = load(Path(settings.file))
+    refuse_unfit(bundle)
     console = Console(highlight=False, emoji=False, markup=False, soft_wrap=False)
     if not console.is_terminal:
         console = Console(width=WIDTH, highlight=False, emoji=False, markup=False)

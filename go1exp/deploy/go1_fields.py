@@ -16,6 +16,9 @@ ROBOT, ROBOT_PORT = "192.168.123.10", 8007
 """Address of the robot's motor board for low-level commands (the SDK's examples)."""
 
 JOINTS, MOTORS, LEGS = 12, 20, 4
+MOTOR_NAMES = tuple(f"{leg}_{kind}" for leg in ("FR", "FL", "RR", "RL") for kind in ("hip", "thigh", "calf"))
+"""Names of the joints that the motors drive, in the order of the packets."""
+
 PERIOD = 0.002
 """Period at which the vendor's client sends, and at which the robot answers, s."""
 

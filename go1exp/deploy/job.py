@@ -20,7 +20,7 @@ from go1exp.deploy.commands import KEYS, make, range_array
 from go1exp.deploy.controller import Mover
 from go1exp.deploy.estimate import settings as estimator_settings
 from go1exp.deploy.go1_check import Looked, Report, calibrate, check
-from go1exp.deploy.go1_fields import TORQUE_NOTE
+from go1exp.deploy.go1_fields import MOTOR_NAMES, TORQUE_NOTE
 from go1exp.deploy.go1_wire import gains_on_wire
 from go1exp.deploy.launch import RefusedError, RobotError, SimulatedRobot
 from go1exp.deploy.log import About
@@ -203,6 +203,7 @@ def run_job(job: Job, say: Say) -> int:
     feet = _calibration(job)
     bundle = bundles.load(job.bundle)
     about, plan = bundle.metadata, job.plan
+    refuse_unfit(bundle)
     if about.kp is None or about.kd is None:
         raise RobotError(f"{job.bundle}: knows no gains of its drives (those of an actuator net that says none)")
     make(
@@ -242,9 +243,37 @@ def run_job(job: Job, say: Say) -> int:
     for line in summary_lines(content):
         say(line)
     say(f"written to {', '.join(map(str, files))}")
-    end = f"until {outcome.asked}" if outcome.asked else "to the end"
-    say(f"fault: {outcome.fault}" if outcome.fault else f"walked for {outcome.walked:.1f} s, {end}")
+    say(_end(outcome))
     return outcome.status
+
+
+def _end(outcome: Outcome) -> str:
+    """Return a line on how a walk ended; a fault with its time since the start, which is the first cycle."""
+    if fault := outcome.fault:
+        began = min(outcome.log.phases.values(), default=fault.t)
+        return f"fault: {fault.name} at {fault.t - began:.3f} s after the start: {fault.message}"
+    end = f"until {outcome.asked}" if outcome.asked else "to the end"
+    return f"walked for {outcome.walked:.1f} s, {end}"
+
+
+def refuse_unfit(bundle: Bundle) -> None:
+    """Refuse a bundle that is whole, but not for a Go1; a packet tells motors by their place, not by their name.
+
+    Raises:
+        RobotError: if it is for another robot, or its joints are others or in another order.
+        go1exp.schema.registry.ConfigError: if its settings of the estimator are wrong.
+    """
+    about = bundle.metadata
+    estimator_settings(about.estimator)
+    if about.robot != "go1":
+        raise RobotError(f"{bundle.source}: is for the robot {about.robot!r}; deploy drives a 'go1'")
+    if about.joints != MOTOR_NAMES:
+        at = next(
+            (k for k, pair in enumerate(zip(about.joints, MOTOR_NAMES, strict=False)) if pair[0] != pair[1]), None
+        )
+        first = f"{len(about.joints)} joints" if at is None else f"{about.joints[at]} at place {at + 1}"
+        wanted = ", ".join(MOTOR_NAMES)
+        raise RobotError(f"{bundle.source}: joints: has {first}; the motors of a Go1 are {wanted}, in this order")
 
 
 BY_TORQUE = "contact of the feet: by the joints' torques alone; feet=FILE, a calibration, adds the foot sensors"

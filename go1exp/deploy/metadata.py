@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from go1exp.deploy.commands import AXES
+
 T = TypeVar("T")
 
 
@@ -120,6 +122,32 @@ class Metadata:
         for name in ("action_scale", "action_clip", "policy_dt", "physics_dt"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: must be greater than 0")
+        self._check_joints()
+        for name, (low, high) in self.command_ranges.items():
+            if name not in AXES:
+                raise ValueError(f"command_ranges.{name}: unknown axis; those of a command are {', '.join(AXES)}")
+            if low > high:
+                raise ValueError(f"command_ranges.{name}: the lowest, {low:g}, is above the highest, {high:g}")
+
+    def _check_joints(self) -> None:
+        """Raise ValueError with the key of a joint's value that no drive can have."""
+        if twice := {name for name in self.joints if self.joints.count(name) > 1}:
+            raise ValueError(f"joints: {', '.join(sorted(twice))} stands there twice")
+        for name in ("kp", "kd"):
+            for k, value in enumerate(getattr(self, name) or ()):
+                if value < 0:
+                    raise ValueError(f"{name}.{k} = {value:g}: must be at least 0, as the gain of {self.joints[k]}")
+        for name in ("torque_limit", "velocity_limit"):
+            for k, value in enumerate(getattr(self, name)):
+                if value <= 0:
+                    raise ValueError(
+                        f"{name}.{k} = {value:g}: must be greater than 0, as the limit of {self.joints[k]}"
+                    )
+        for k, (low, high) in enumerate(self.joint_limits):
+            if low >= high:
+                raise ValueError(
+                    f"joint_limits.{k}: the lower stop of {self.joints[k]}, {low:g}, is not below {high:g}"
+                )
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
