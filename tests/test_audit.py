@@ -482,6 +482,15 @@ def test_joints_beyond_their_stops_and_torques_beyond_their_limits_are_found() -
     assert ("limits", "tau_est_FL_hip", "bad") in flaws(report)
 
 
+def test_a_clock_that_is_too_fast_is_bad_and_asks_for_its_unit() -> None:
+    for factor, question in ((1e-3, "1000 times too small, by a wrong unit?"), (1e-6, "1000000 times too small")):
+        report = stretched(factor, "qd_")
+        assert report.verdict == "bad"
+        (line,) = [f.message for f in report.by_check("rate")]
+        assert "(median); a log of joints must step by at least 5e-05 s. Are its times" in line
+        assert question in line
+
+
 # ---------------------------------------------------------------------- sign and order
 
 
@@ -491,6 +500,22 @@ def test_a_joint_of_wrong_sign_is_named() -> None:
         report = audit(with_(sound, q_FL_hip=-sound.channels["q_FL_hip"], qd_FL_hip=-sound.channels["qd_FL_hip"]))
         assert ("sign", "q_FL_hip", "bad") in flaws(report)
         assert {f.channel for f in report.flaws} <= {"q_FL_hip", "qd_FL_hip", "tau_est_FL_hip"}
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("q", 1.0), ("q", 180 / np.pi), ("q", np.pi / 180), ("q_target", np.pi / 180)]
+)
+def test_an_angle_in_another_unit_than_its_target_is_named(name: str, factor: float) -> None:
+    sound = made("multisine")
+    size = 0.1 if factor > 1.0 else 1.0  # so that no angle is too large for radians
+    arm = replace(META, robot="arm", kp=None, kd=None, tau_limit=None)
+    small = {k: v - v[0] for k, v in sound.channels.items() if k.startswith(("q_FL_hip", "q_target_FL_hip"))}
+    channels = {"t": sound.t, "q_hip": size * small["q_FL_hip"], "q_target_hip": size * small["q_target_FL_hip"]}
+    channels[f"{name}_hip"] = factor * channels[f"{name}_hip"]
+    arm = replace(arm, joints=("hip",), base="fixed", base_quat=(1.0, 0.0, 0.0, 0.0))
+    lines = [(f.channel, f.verdict) for f in audit(Recording(arm, channels)).by_check("units")]
+    far = factor > 1 if name == "q" else factor < 1
+    assert lines == ([] if factor == 1.0 else [("q_hip", "bad" if far else "suspect")])
 
 
 @pytest.mark.parametrize("name", ["qd_RR_calf", "imu_gyro_x", "tau_est_FL_thigh"])

@@ -23,7 +23,7 @@ LONGEST_TRAIL = 0.3
 
 
 def order_and_sign(log: Log) -> Iterator[Finding]:
-    """Check that each joint follows its own target better than that of another joint, and with the right sign."""
+    """Check that each joint follows its own target better than that of another, with the right sign and unit."""
     if not (log.recording.has("q_target") and log.recording.has("q")) or not _enough(log):
         return
     target, q = _matches_inputs(log)
@@ -40,6 +40,21 @@ def order_and_sign(log: Log) -> Iterator[Finding]:
         elif match[j, j] < -limits.CLEARLY:
             message = f"goes against q_target_{joint} (correlation {match[j, j]:.2f}): a sign is flipped"
             yield finding("sign", joint_channel("q", joint), "bad", match[j, j], "", message)
+        elif match[j, j] > limits.CLEARLY:
+            yield from _other_unit(joint, float(np.std(q[:, j]) / np.std(target[:, j])))
+
+
+def _other_unit(joint: str, times: float) -> Iterator[Finding]:
+    """Report an angle that moves ``times`` as far as its target, if that looks like degrees in one of the two.
+
+    Nothing moves so much farther than its target. So much less far moves a joint that is blocked, too.
+    """
+    degrees = 180.0 / np.pi
+    for factor, verdict, which in ((times, "bad", "q"), (1.0 / times, "suspect", "q_target")):
+        if degrees / limits.FARTHER < factor < degrees * limits.FARTHER:
+            message = f"moves {times:.3g} times as far as q_target_{joint}: {which}_{joint} looks like degrees"
+            message += "" if which == "q" else f", or q_{joint} was taken for degrees"
+            yield finding("units", joint_channel("q", joint), verdict, times, "", message)  # type: ignore[arg-type]
 
 
 def _enough(log: Log) -> bool:

@@ -22,6 +22,8 @@ GAPS = (0.0, 0.02)
 """Share of missing samples: any is reported; with 2 %, every tenth of a second has a derivative that is wrong."""
 LONGEST_GAP = 0.1
 """s; longer ones are bad: half a stride is missing."""
+LEAST_STEP = 5e-5
+"""s; no joint is logged in shorter steps (20 kHz; chosen: drives that log each turn of their control loop reach 10)."""
 
 # ---------------------------------------------------------------------- single channels
 
@@ -85,6 +87,9 @@ TORQUE_SCALE = (0.15, 0.50)
 """As ``SCALE``, for the reported torque against the PD law; strength and gains of real motors are off by 5 to 15 %."""
 TORQUE_LAG = 0.04
 """s: largest lag of a torque behind the control law; commands to a Go1 arrive up to 40 ms late."""
+FARTHER = 2.0
+"""Factor on 180 / pi within which an angle that moves so many times as far as its target has another unit: the answer
+of a drive is between a half and twice its target."""
 UNIT_SCALES = {"degrees instead of radians": 180 / math.pi, "milliseconds instead of seconds": 1e-3}
 """Scales that have a name, recognised within a tenth."""
 RELATED = 0.5

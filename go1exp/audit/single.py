@@ -19,12 +19,16 @@ SHORTEST_STEP = 2e-4
 """s; no joint log steps by less (5 kHz)."""
 
 
-def long_steps(log: Log) -> str | None:
-    """Return what is wrong with a clock whose steps are too long for a joint's motion; None if they are short enough.
+def wrong_steps(log: Log) -> str | None:
+    """Return what is wrong with a clock whose steps are too long or too short for the log of a joint; None if nothing.
 
     Where speeds are recorded, their integral over the clock tells the unit of the clock: it must be the change of the
     angles.
     """
+    if log.dt < limits.LEAST_STEP:
+        message = f"steps by {log.dt:g} s (median); a log of joints must step by at least {limits.LEAST_STEP:g} s"
+        fits = [f for f, _ in SMALLER if SHORTEST_STEP <= log.dt * f <= limits.LONGEST_GAP]
+        return message + (f". Are its times {fits[0]:.0f} times too small, by a wrong unit?" if fits else "")
     if log.dt <= limits.LONGEST_GAP:
         return None
     ratio = _integral_of_speed(log)
@@ -57,7 +61,7 @@ def clock(log: Log) -> Iterator[Finding]:
         if 0.9 < log.dt / (factor * nominal) < 1.1:
             yield finding("rate", "t", "bad", log.dt, "s", f"steps by {log.dt:g}: it is in {unit}, not in seconds")
             return
-    if message := long_steps(log):
+    if message := wrong_steps(log):
         # The rate of the metadata does not help: an import takes it from the same clock.
         yield finding("rate", "t", "bad", log.dt, "s", message)
         return

@@ -37,7 +37,7 @@ def _task(container: dict[str, Any]) -> None:
         recording.write(file, r)
     total = sum(float(r.t[-1] - r.t[0]) for r in recordings)
     print(f"{counted(len(recordings), 'recording')}, {total:.0f} s, in {out}")
-    for note in [*_long_steps(recordings), *dict.fromkeys(r.meta.notes for r in recordings if r.meta.notes)]:
+    for note in [*_wrong_steps(recordings), *dict.fromkeys(r.meta.notes for r in recordings if r.meta.notes)]:
         print(f"note: {note}")
 
 
@@ -53,17 +53,21 @@ def _refuse_one_name(path: str, names: Sequence[str]) -> None:
         )
 
 
-def _long_steps(recordings: Sequence[Recording]) -> list[str]:
-    """Return what is wrong with clocks that step too slowly for a joint, one line for all of one kind."""
+def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
+    """Return what is wrong with clocks whose steps are too long or too short, one line for all of one kind."""
+    import numpy as np
+
+    from go1exp.audit.limits import LEAST_STEP
     from go1exp.audit.log import Log
-    from go1exp.audit.single import long_steps
+    from go1exp.audit.single import wrong_steps
 
     flaws: dict[str, list[str]] = {}
     for r in recordings:
-        if len(r.t) > 1 and (message := long_steps(Log(r))):
-            flaws.setdefault(message, []).append(r.meta.episode)
-    remedy = "with source=csv, columns gives the unit: t: {column: NAME, unit: ms}"
-    return [f"{_listed(episodes)}: t {message}; {remedy}" for message, episodes in flaws.items()]
+        if len(r.t) > 1 and (message := wrong_steps(Log(r))):
+            unit = "ms" if float(np.median(np.diff(r.t))) > LEAST_STEP else "s"
+            remedy = f"with source=csv, columns gives the unit: t: {{column: NAME, unit: {unit}}}"
+            flaws.setdefault(f"t {message}; {remedy}", []).append(r.meta.episode)
+    return [f"{_listed(episodes)}: {message}" for message, episodes in flaws.items()]
 
 
 def _listed(names: Sequence[str]) -> str:
