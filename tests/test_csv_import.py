@@ -374,6 +374,34 @@ def test_what_an_import_replaces_is_told_and_two_files_of_one_name_are_refused(t
     assert not (tmp_path / "both").exists()
 
 
+def test_an_import_asks_for_the_unit_of_short_steps(tmp_path: Path) -> None:
+    (tmp_path / "lä").mkdir()
+    (tmp_path / "one").mkdir()
+    (tmp_path / "lä" / "arm.yaml").write_text("robot: arm\ncolumns: {t: {column: stamp, unit: ms}, q_knee: q}\n")
+    clocked(tmp_path / "one" / "a.csv", 0.004 * K)
+    done = run(tmp_path, *ARM, "out=o")
+    assert "note: a: t steps by 4e-06 s (median); a log of joints must step by at least 5e-05 s" in done.stdout
+    assert "unit: s}" in done.stdout
+
+
+def test_a_folder_gives_its_files_whatever_the_case_of_their_ending(tmp_path: Path) -> None:
+    for name in ("a.csv", "B.CSV", "c.Csv"):
+        clocked(tmp_path / name, 0.004 * K)
+    (tmp_path / "d.csv").mkdir()
+    (tmp_path / "e.txt").touch()
+    columns = {"t": "stamp", "q_knee": "q", "qd_knee": {"column": "q"}}
+    read = import_recordings("csv", tmp_path, {"robot": "arm", "columns": columns})
+    assert [r.meta.episode for r in read] == ["B", "a", "c"]
+    assert all("Column 'q' of the source is q_knee, qd_knee." in r.meta.notes for r in read)
+
+
+@pytest.mark.parametrize("second", ["0.0", "0.5"])
+def test_a_file_without_names_of_columns_is_asked_about(tmp_path: Path, second: str) -> None:
+    (tmp_path / "a.csv").write_text(f"0.0,{second}\n0.1,0.2\n")
+    with pytest.raises(RecordingError, match=r"first line numbers, not names\? Then give header: false"):
+        import_recordings("csv", tmp_path, {"robot": "arm", "columns": {"t": "stamp", "q_knee": "q"}})
+
+
 @pytest.mark.parametrize(("factor", "noted"), [(1000.0, True), (1.0, False)])
 def test_an_import_asks_for_the_unit_of_long_steps(tmp_path: Path, factor: float, noted: bool) -> None:
     (tmp_path / "lä").mkdir()

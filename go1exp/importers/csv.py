@@ -182,7 +182,9 @@ def _one(
         channels = {"t": np.arange(rows) / rate_hz} | channels
         remarks.append(f"No clock in the source: t = row / {rate_hz:g} Hz.")
     if unused:
-        remarks.append(f"Columns of the source that are left out: {', '.join(unused)}.")
+        named = ", ".join(name or "one without a name" for name in unused)
+        remarks.append(f"Columns of the source that are left out: {named}.")
+    remarks += [f"Column {column!r} of the source is {names}." for column, names in wanted.items() if ", " in names]
     hz = rate_hz or rate(path, channels["t"])
     return recording(path, "csv", channels, rate_hz=hz, episode=path.stem, notes=" ".join(remarks), **about)
 

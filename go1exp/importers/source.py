@@ -6,6 +6,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ def counted(number: int, noun: str) -> str:
 def files(path: Path, pattern: str) -> list[Path]:
     """Return ``path`` itself, or the files below the folder ``path`` that match ``pattern``, by name.
 
+    The ending may be in capitals: ``*.csv`` matches ``RUN.CSV``, too.
+
     Raises:
         RecordingError: if there is none.
     """
@@ -39,7 +42,7 @@ def files(path: Path, pattern: str) -> list[Path]:
         return [path]
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
-    matches = sorted(path.rglob(pattern))
+    matches = sorted(file for file in path.rglob("*") if fnmatch(file.name.lower(), pattern) and file.is_file())
     if not matches:
         raise RecordingError(f"{path}: no {pattern} in this folder")
     return matches

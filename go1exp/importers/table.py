@@ -84,8 +84,8 @@ def read(path: Path, wanted: Mapping[str, str], layout: Layout) -> tuple[dict[st
     table = _table(path, layout)
     present = table.column_names
     lacking = [name for name in wanted if name not in present]
-    hint = _question(present[0], layout) if len(present) == 1 else ""
-    # Where the delimiter is another one, no name is right, and one complaint will do.
+    hint = _question(present[0], layout) if len(present) == 1 else _no_names(present, layout)
+    # Where the delimiter is another one, or names are missing, no name is right, and one complaint will do.
     wrong = [_missing(path, name, wanted[name], present) + hint for name in (lacking[:1] if hint else lacking)]
     values: dict[str, np.ndarray] = {}
     other_sign: list[tuple[str, _NoNumber]] = []
@@ -161,7 +161,8 @@ def _table(path: Path, layout: Layout) -> Any:
     stripped = [name.strip() for name in given]
     twice = sorted({name for name in stripped if stripped.count(name) > 1})
     if twice:
-        raise RecordingError(f"{path}: two columns are called {', '.join(map(repr, twice))}; names must differ")
+        called = ", ".join(map(repr, twice))
+        raise RecordingError(f"{path}: two columns are called {called}; names must differ{_no_names(stripped, layout)}")
     if table.num_rows == 0:
         raise RecordingError(f"{path}: has no rows of numbers")
     return table.rename_columns(stripped)
@@ -197,6 +198,15 @@ def _missing(path: Path, name: str, what: str, present: Iterable[str]) -> str:
     close = [lower[n] for n in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.5)]
     hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
     return f"{path}: no column {name!r} (for {what}); {hint}it has {', '.join(present)}"
+
+
+def _no_names(names: Iterable[str], layout: Layout) -> str:
+    """Ask whether the file has names of columns at all, if the first line is nothing but numbers; else empty."""
+    try:
+        _ = [float(name.replace(layout.decimal, ".")) for name in names]
+    except ValueError:
+        return ""
+    return "; is the first line numbers, not names? Then give header: false" if layout.header else ""
 
 
 def _other_delimiter(text: str, layout: Layout) -> str | None:
