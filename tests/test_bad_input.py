@@ -78,6 +78,11 @@ def test_an_effect_file_that_is_none_is_refused_by_name_and_line(
     assert [p.name for p in tmp_path.iterdir()] == ["e.yaml"]
 
 
+def test_an_empty_model_is_not_told_to_be_none(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "arm.yaml").touch()
+    assert run("gap", "model=arm.yaml") == (2, "go1exp gap: model=arm.yaml: is empty; it must describe one\n")
+
+
 def test_every_wrong_file_is_named_at_once(run: Run) -> None:
     status, text = run("train", "effect=[a.yaml,payload]", "reward=b.yaml")
     assert (status, text.splitlines()[1:]) == (2, ["  effect=a.yaml: no such file", "  reward=b.yaml: no such file"])

@@ -168,7 +168,10 @@ def test_the_arm_is_held_up_by_its_servos() -> None:
         ({"tolerances": {"colomb": {"bound": 1.0}}}, "model.tolerances.colomb: unknown effect 'colomb'; did you mean"),
         ({"tolerances": {"coulomb": {"bond": 1.0}}}, "model.tolerances.coulomb.bond: unknown parameter 'bond'"),
         ({"tolerances": {"stribeck": {"speed": 1.0}}}, "model.tolerances.stribeck.speed: is a shape"),
-        ({"firmware": {"note": "gain", "kp": 1.0}, "drive": "position"}, "must have one group, the number"),
+        (
+            {"firmware": {"note": "P gain", "kp": 1.0}, "drive": "position"},
+            "note = 'P gain': must have one group, the number",
+        ),
     ],
 )
 def test_a_wrong_description_is_told_by_its_key(changes: Mapping[str, Any], said: str) -> None:
@@ -475,3 +478,9 @@ def test_the_go2s_rows_are_closer_than_its_file_says() -> None:
     assert len(found) / (found[-1] - found[0]) == pytest.approx(226.0, abs=4.0)
     calves = noise_in_time([Recording(log.meta, {**log.channels, "t": found})])[~tell]
     assert np.all(calves < 0.85 * noise_in_time([log])[~tell])
+
+
+def test_a_model_that_is_no_xml_is_told_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text("<mujoco>\n<worldbody>\n<body>\n</worldbody>\n</mujoco>\n")
+    with pytest.raises(ConfigError, match=r"arm\.xml': not a MuJoCo model \(XML parse error .* Line number=3"):
+        machine("ak80_double_pendulum_a", mjcf=str(tmp_path / "arm.xml"))

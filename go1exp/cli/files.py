@@ -66,7 +66,13 @@ def _unquoted(item: str) -> str:
 def _choice(group: str, file: str) -> str:
     """Make a file a choice of ``group`` and return its name there."""
     path, key = Path(file).expanduser(), f"{group}={file}"
-    content = _mapping(path, key, f"without any, use {group}=none", f"as the files of conf/{group} are")
+    none = "none" in choice_files(group, [config_folder()])
+    content = _mapping(
+        path,
+        key,
+        f"without any, use {group}=none" if none else "it must describe one",
+        f"as the files of conf/{group} are",
+    )
     named = content.get(PATHS.get(group, ""))
     if isinstance(named, str):
         content[PATHS[group]] = str((path.parent / named).resolve())

@@ -57,7 +57,7 @@ def build_fixed_base(
     try:
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
-        raise FixedBaseError(f"mjcf = {str(file)!r}: not a MuJoCo model ({str(error).splitlines()[0]})") from None
+        raise FixedBaseError(f"mjcf = {str(file)!r}: not a MuJoCo model ({_in_a_line(error)})") from None
     _checked(spec, file, base, joints)
     for joint in list(spec.joints):
         if joint.name not in joints:
@@ -84,11 +84,16 @@ def build_fixed_base(
     try:
         model = spec.compile()
     except ValueError as error:
-        raise FixedBaseError(f"mjcf = {str(file)!r}: does not compile ({str(error).splitlines()[0]})") from None
+        raise FixedBaseError(f"mjcf = {str(file)!r}: does not compile ({_in_a_line(error)})") from None
     order = [model.joint(k).name for k in range(len(MOUNT) if mounted else 0, model.njnt)]
     if order != list(joints):
         raise FixedBaseError(f"joints: must be in the order of {str(file)!r}: {', '.join(order)}")
     return model
+
+
+def _in_a_line(error: ValueError) -> str:
+    """Return MuJoCo's complaint in one line; its later lines say where in the file."""
+    return " ".join(str(error).split())
 
 
 def _checked(spec: mujoco.MjSpec, file: Path, base: str, joints: Sequence[str]) -> None:

@@ -100,7 +100,9 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
         elif e["type"] in ("missing", "missing_argument"):
             lines.append(f"{key}: required, but not given")
         else:
-            value, what = f"{key} = {e['input']!r}: ", e["msg"].removeprefix("Value error, ").lower()
+            message = e["msg"].removeprefix("Value error, ")
+            # A value that is quoted in it stays as it was written.
+            value, what = f"{key} = {e['input']!r}: ", message[:1].lower() + message[1:]
             if len(keys) < len(places) and lines and lines[-1].startswith(value):  # the next type that it may be of
                 lines[-1] += f" or {what.removeprefix('input should be ')}"
             else:
