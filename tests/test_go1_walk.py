@@ -526,6 +526,10 @@ def test_the_ticks_unit_is_measured() -> None:
 
 def test_a_calibration_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "feet.json"
+    for content in ("[]", '{"zero": [1, 2, 3, 4]}'):
+        path.write_text(content)
+        with pytest.raises(CalibrationError, match="must be a mapping with the keys zero and scale"):
+            FootCalibration.read(path)
     for content in ("{", "{}", '{"zero": [1, 2, 3], "scale": null}', '{"zero": [1,2,3,4], "scale": [1,1,1,0]}'):
         path.write_text(content)
         with pytest.raises(CalibrationError, match=r"feet\.json: is no calibration"):

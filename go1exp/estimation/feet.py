@@ -61,6 +61,8 @@ class FootCalibration:
         """
         try:
             content = json.loads(Path(path).read_text())
+            if not isinstance(content, dict) or not {"zero", "scale"} <= set(content):
+                raise ValueError("must be a mapping with the keys zero and scale; check=true makes one")
             zero, scale = content["zero"], content["scale"]
             numbers = [*zero, *(scale or [1.0] * LEGS)]
             if len(zero) != LEGS or len(numbers) != 2 * LEGS or not np.isfinite(numbers).all():
