@@ -457,7 +457,7 @@ def test_a_recording_is_made_imported_audited_and_refused(tmp_path: Path) -> Non
     done = cli(tmp_path, "record", *quick)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    assert done.stdout.startswith("1 recordings, 1 s, in logs\n")
+    assert done.stdout.startswith("1 recording, 1 s, in logs\n")
     (file,) = (tmp_path / "logs").iterdir()
     done = cli(tmp_path, "record", "audit", f"logs/{file.name}", "out=audit/found.json")
     (name,) = found = json.loads((tmp_path / "audit/found.json").read_text())

@@ -32,7 +32,8 @@ COMMANDS = "gentle"
 def _motions(given: Any) -> list[Term]:
     """Resolve the excitations; raise ConfigError with every problem of them."""
     if not given or not isinstance(given, list):
-        raise ConfigError([f"excitation = {given!r}: must be a list, such as [steps,{{chirp: {{band: [0.2, 5.0]}}}}]"])
+        what = "at least one is needed" if given == [] else "must be a list"
+        raise ConfigError([f"excitation = {given!r}: {what}, such as [steps,{{chirp: {{band: [0.2, 5.0]}}}}]"])
     return bind_list("excitation", given, "excitation")
 
 
@@ -73,6 +74,7 @@ def _task(container: dict[str, Any]) -> None:
     walk = trained(settings.run, settings.policy, "", "")[0] if settings.run or settings.policy else None
 
     from go1exp.cli.logs import writable
+    from go1exp.importers.source import counted
     from go1exp.record import plan
     from go1exp.record.simulate import Rig
 
@@ -81,7 +83,8 @@ def _task(container: dict[str, Any]) -> None:
     episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
     out = writable(settings.out)
     if present := sorted(p.name for p in out.glob("*.parquet")):
-        print(f"note: {out} holds {len(present)} recordings already; they stay, those of the same name are replaced")
+        held = counted(len(present), "recording")
+        print(f"note: {out} holds {held} already; they stay, those of the same name are replaced")
     recordings = _record_motions(rig, episodes, settings)
     if walk and POLICY in names:
         recordings += _record_policy(rig, walk, settings)
@@ -145,11 +148,12 @@ def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> 
 def _write(out: Path, recordings: list[Recording]) -> None:
     """Write the recordings and print what to do with them."""
     from go1exp import recording
+    from go1exp.importers.source import counted
 
     for r in recordings:
         recording.write(out / f"{r.meta.episode}.parquet", r)
     total = sum(float(r.t[-1] - r.t[0]) for r in recordings)
-    print(f"{len(recordings)} recordings, {total:.0f} s, in {out}")
+    print(f"{counted(len(recordings), 'recording')}, {total:.0f} s, in {out}")
     print(f"now: {command('record', 'audit', str(out))}")
 
 
