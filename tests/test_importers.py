@@ -383,8 +383,8 @@ def xl330(**changes: Any) -> str:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", "invalid json"),
-        (xl330()[:-30], "invalid json"),
+        ("", "invalid JSON"),
+        (xl330()[:-30], "invalid JSON"),
         ("{}", "mass: required, but not given"),
         (xl330(speed=None), r"entries.0.speed: required, but not given\n(.*\n)+.*and 2 more"),
         (xl330(torque_enable=1), "entries.0.torque_enable = 1"),

@@ -263,9 +263,9 @@ def about(**changes: Any) -> bytes:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        (b"", "metadata = .*invalid json"),
-        (b"{'robot': 'arm'}", "metadata = .*invalid json"),
-        (b"\xff\xfe", "metadata = .*invalid json"),
+        (b"", "metadata = .*invalid JSON"),
+        (b"{'robot': 'arm'}", "metadata = .*invalid JSON"),
+        (b"\xff\xfe", "metadata = .*invalid JSON"),
         (b"[]", "metadata = .*object"),
         (b"{}", "metadata.robot: required, but not given"),
         (about(rate_hz="100"), "metadata.rate_hz = '100': input should be a valid number"),
