@@ -31,10 +31,11 @@ def replacing(path: str | Path, keep_suffix: bool = False) -> Iterator[Path]:
     Raises:
         OSError: if it cannot be written; the message names ``path``.
     """
-    final = Path(path).resolve()
-    if final.exists() and not final.is_file() and not final.is_dir():
-        yield final
+    given = Path(path)
+    if given.exists() and not given.is_file() and not given.is_dir():  # a pipe's link leads to no name: not resolved
+        yield given
         return
+    final = given.resolve()
     partial = _beside(final, keep_suffix)
     try:
         yield partial

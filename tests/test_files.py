@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,14 @@ def test_a_link_is_followed_and_a_device_is_written_not_replaced(tmp_path: Path)
     assert (tmp_path / "target").read_text() == "text"
     files.write_text("/dev/null", "text")
     assert Path("/dev/null").is_char_device()
+
+
+def test_the_link_to_a_pipe_is_written_although_it_leads_to_no_name() -> None:
+    end, start = os.pipe()
+    files.write_text(f"/proc/self/fd/{start}", "text")
+    os.close(start)
+    with os.fdopen(end) as read:
+        assert read.read() == "text"
 
 
 def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:
