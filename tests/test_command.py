@@ -6,11 +6,13 @@ import json
 import re
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from go1exp import __version__
 from tests.command import LIGHT, WARM, WITH_MODULES, run, run_alone
 from tests.test_cli import HEAVY
 
@@ -49,6 +51,12 @@ def test_the_real_command_refuses_at_once_and_loads_nothing_heavy(words: str, tm
     assert "Traceback" not in done.stderr
     assert not HEAVY & set(json.loads(modules.read_text()))
     assert list(here.rglob("config.yaml")) == []
+
+
+@pytest.mark.parametrize("module", ["go1exp", "go1exp.cli"])
+def test_the_command_line_is_a_module_too(module: str) -> None:
+    done = subprocess.run([sys.executable, "-m", module, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"go1exp {__version__}\n"
 
 
 @pytest.mark.parametrize("preload", [LIGHT, WARM], ids=["light", "warm"])

@@ -97,6 +97,14 @@ def test_help_shows_what_was_chosen_and_stands_wrong_choices() -> None:
     assert "episodes=16" in helped("eval", "episode=3", "--help")
 
 
+def test_help_before_the_verb_is_the_help_of_the_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    for word in ("--help", "help"):
+        assert helped(word, "gap", "next") == helped("gap", "next", "--help")
+    with mock.patch.object(sys, "argv", ["go1exp", "--help", "trian"]):
+        assert main() == 2
+    assert "unknown verb 'trian'; did you mean 'train'?" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

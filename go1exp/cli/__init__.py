@@ -32,6 +32,8 @@ HELP = """usage: go1exp VERB [key=value ...]
   eval "$(go1exp -sc install=bash)"      tab completion
 """
 
+HELP_WORDS = ("-h", "--help", "help")
+"""Ask for help; a verb may come after."""
 
 READER_LEFT = 141
 """Exit status of a closed pipe, 128 + 13 as shells count."""
@@ -74,7 +76,9 @@ def _run(arguments: list[str]) -> int:
         from go1exp.cli import completion
 
         return completion.serve(arguments[1])
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
+    if len(arguments) > 1 and arguments[0] in HELP_WORDS:
+        arguments = [*arguments[1:], "--help"]
+    if not arguments or arguments[0] in HELP_WORDS:
         print(HELP.format(verbs="\n".join(f"  {verb:12} {text}" for verb, text in VERBS.items())), end="")
         return 0
     if arguments[0] in ("-V", "--version"):
