@@ -90,7 +90,8 @@ def read(path: Path) -> dict[str, Any]:
     """Read one checkpoint.
 
     Raises:
-        DamagedCheckpoint: if it is not whole, no checkpoint, or one of a version that is not known here.
+        DamagedCheckpoint: if it is not whole, no checkpoint, one of a version that is not known here, or one whose
+            policy has a weight that is not finite.
         OSError: if the file cannot be opened.
     """
     data = io.BytesIO(path.read_bytes())  # first: torch's reader has an OSError for a file that is cut off, too
@@ -101,6 +102,9 @@ def read(path: Path) -> dict[str, Any]:
     known = state.get("format") if isinstance(state, dict) else None
     if known != FORMAT:
         raise DamagedCheckpoint(f"{path}: checkpoint format {known!r}, this version reads {FORMAT}")
+    wrong = [name for name, weight in state["policy"].items() if not weight.isfinite().all()]
+    if wrong:
+        raise DamagedCheckpoint(f"{path}: damaged checkpoint (weights of the policy are not finite: {wrong[0]})")
     return state
 
 
