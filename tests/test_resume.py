@@ -342,6 +342,37 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_warning(damage: str, flat: P
         assert_the_same_run(killed_copy, flat)
 
 
+def test_a_checkpoint_whose_weights_are_not_finite_is_passed_over(killed_copy: Path) -> None:
+    newest = killed_copy / "checkpoints/000004.pt"
+    state = checkpoint.read(newest)
+    state["policy"]["log_std"][0] = torch.nan
+    torch.save(state, newest)
+    with pytest.warns(UserWarning, match=r"000004\.pt: .*not finite: log_std\); skipped"):
+        assert checkpoint.load_latest(killed_copy)[1].name == "000002.pt"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("reward: [", "no YAML (line 1"),
+        ("", "is not the configuration of a run"),
+        ("- 1", "is not the configuration of a run"),
+        ("seed: 1\n", "sim: required"),
+    ],
+)
+def test_a_run_with_a_damaged_configuration_is_refused_with_the_name_of_the_file(
+    text: str, said: str, killed_copy: Path, tmp_path: Path
+) -> None:
+    (killed_copy / "config.yaml").write_text(text)
+    before = contents(killed_copy)
+    for words in (("train", f"resume={killed_copy}"), ("eval", f"run={killed_copy}")):
+        done = cli(tmp_path, *words)
+        assert done.returncode == 2, done.stderr
+        assert "Traceback" not in done.stderr
+        assert f"{killed_copy}/config.yaml: {said}" in done.stderr
+    assert contents(killed_copy) == before
+
+
 def test_a_half_written_checkpoint_is_never_taken_for_one(killed_copy: Path) -> None:
     newest = killed_copy / "checkpoints/000004.pt"
     newest.rename(newest.with_name(f"{newest.name}.1a2b3c4d.partial"))

@@ -62,10 +62,9 @@ def place(run: str | None, policy: str | None, file: str, out: str | None) -> Pa
 
 def task_of(run: Path) -> TaskConfig:
     """Return the task of a run folder."""
-    from go1exp.config import parse_train
     from go1exp.train import run_folder
 
-    return parse_train(run_folder.read_config(run)).task
+    return run_folder.read_parsed(run).task
 
 
 def maker(settings: MpcSettings, task: TaskConfig) -> Callable[[], Controller]:

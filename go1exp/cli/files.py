@@ -9,10 +9,10 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
-from yaml import MarkedYAMLError, YAMLError
 
 from go1exp.choices import choice_files, config_folder, groups_in, groups_of
 from go1exp.schema.registry import ConfigError
+from go1exp.schema.yaml_file import UNREADABLE, why_unreadable
 
 PATHS = {"model": "mjcf"}
 """Group -> key of its files that names another file, from where the file itself lies."""
@@ -103,15 +103,8 @@ def _mapping(path: Path, key: str, when_empty: str, like: str) -> DictConfig:
     try:
         content = OmegaConf.load(path)
         lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise ConfigError([f"{key}: not UTF-8 (byte {error.start})"]) from None
-    except MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line = f"line {mark.line + 1}: " if mark else ""
-        raise ConfigError([f"{key}: no YAML ({line}{error.problem})"]) from None
-    except (YAMLError, OSError) as error:
-        why = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
-        raise ConfigError([f"{key}: cannot be read ({why})"]) from None
+    except UNREADABLE as error:
+        raise ConfigError([f"{key}: {why_unreadable(error)}"]) from None
     if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
         raise ConfigError([f"{key}: is empty; {when_empty}"])
     if not isinstance(content, DictConfig):

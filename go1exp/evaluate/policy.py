@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.config import PPOConfig, TrainConfig, parse_train
+from go1exp.config import PPOConfig, TrainConfig
 from go1exp.train import checkpoint, run_folder, start
 from go1exp.train.ppo import GaussianPolicy, policy_settings
 
@@ -27,7 +27,7 @@ def load_run(run: Path, which: Path | None = None) -> tuple[TrainConfig, Policy,
         FileNotFoundError: if ``run`` is not a run folder or has no checkpoint.
         go1exp.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
-    config = parse_train(run_folder.read_config(run))
+    config = run_folder.read_parsed(run)
     policy, about = load_policy(run, config.ppo, which)
     return config, policy, about
 

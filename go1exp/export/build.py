@@ -16,7 +16,7 @@ from torch import Tensor
 
 from go1exp import __version__, robot
 from go1exp.actuator.net import find
-from go1exp.config import TaskConfig, parse_train
+from go1exp.config import TaskConfig
 from go1exp.deploy import bundle
 from go1exp.deploy.metadata import Metadata, Trained
 from go1exp.effects.rules import drives
@@ -72,7 +72,7 @@ def build(
         FileNotFoundError: if ``run`` is not a run folder or has no checkpoint.
         go1exp.schema.registry.ConfigError: if its configuration is not one that this version knows.
     """
-    config = parse_train(run_folder.read_config(run))
+    config = run_folder.read_parsed(run)
     network, about = load_network(run, config.ppo, checkpoint)
     module = DeployedPolicy(network, config.task.observation, config.task.action)
     with one_thread():

@@ -21,7 +21,10 @@ from omegaconf import OmegaConf
 
 from go1exp import __version__, data_root
 from go1exp.actuator.net import find
+from go1exp.config import TrainConfig, parse_train
 from go1exp.files import write_bytes, write_json, write_text
+from go1exp.schema.registry import ConfigError
+from go1exp.schema.yaml_file import UNREADABLE, why_unreadable
 from go1exp.train import kept_plugins
 
 NET = "actuator.npz"
@@ -77,17 +80,36 @@ def read_config(run: Path) -> dict[str, Any]:
     return container
 
 
+def read_parsed(run: Path) -> TrainConfig:
+    """Return what ``read_config`` reads, checked.
+
+    Raises:
+        FileNotFoundError: if ``run`` is not a run folder.
+        go1exp.schema.registry.ConfigError: if its configuration is not one that this version knows; names the file.
+    """
+    container = read_config(run)
+    try:
+        return parse_train(container)
+    except ConfigError as error:
+        raise ConfigError([f"{run / 'config.yaml'}: {problem}" for problem in error.problems]) from None
+
+
 def read_as_written(run: Path) -> dict[str, Any]:
     """Return the configuration that the run was started with.
 
     Raises:
         FileNotFoundError: if ``run`` is not a run folder.
+        go1exp.schema.registry.ConfigError: if its config.yaml is damaged.
     """
     path = run / "config.yaml"
     if not path.is_file():
         raise FileNotFoundError(f"{run}: not a run folder (it has no config.yaml)")
-    container = OmegaConf.to_container(OmegaConf.load(path))
-    assert isinstance(container, dict)
+    try:
+        container = OmegaConf.to_container(OmegaConf.load(path))
+    except UNREADABLE as error:
+        raise ConfigError([f"{path}: {why_unreadable(error)}"]) from None
+    if not isinstance(container, dict) or not container:
+        raise ConfigError([f"{path}: is not the configuration of a run"])
     return {str(k): v for k, v in container.items()}
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from go1exp.config import TrainConfig, parse_train
+from go1exp.config import TrainConfig
 from go1exp.files import write_json
 from go1exp.schema import plugins
 from go1exp.schema.history import frame_width, frames_of
@@ -41,7 +41,7 @@ def read(config: TrainConfig, source: Path) -> Weights:
         FileNotFoundError: if ``source`` holds no checkpoint.
     """
     with plugins.restored():
-        theirs = parse_train(run_folder.read_config(source))
+        theirs = run_folder.read_parsed(source)
     differ = [
         f"{name} is {new} here and {old} there"
         for name, new, old in (
