@@ -129,7 +129,8 @@ def test_time_on_the_ground_counts_as_the_whole_command() -> None:
 
 
 def test_a_training_ends_when_a_figure_is_good_enough_and_is_complete(tmp_path: Path) -> None:
-    ppo = train(tmp_path, "ppo.iterations=6", "stop.figure=steps_total", "stop.at=1.0")
+    with pytest.warns(UserWarning, match="stop.figure: unknown metric 'steps_total'"):
+        ppo = train(tmp_path, "ppo.iterations=6", "stop.figure=steps_total", "stop.at=1.0")
     assert ppo.iteration == 6  # no such metric: no rule
     rule = ("ppo.iterations=6", "stop.figure=train/learning_rate", "stop.better=lower", "stop.at=1.0")
     ppo = train(tmp_path / "early", *rule)
@@ -159,6 +160,19 @@ def test_a_rule_needs_a_figure_and_a_limit() -> None:
         parse_train(compose("train", ["stop.at=1.0"]))
     with pytest.raises(ConfigError, match="needs at or patience"):
         parse_train(compose("train", ["stop.figure=rollout/return"]))
+    by_score = ["stop.figure=eval/score", "stop.at=0.1"]
+    with pytest.raises(ConfigError, match=r"stop.figure = 'eval/score'.*set eval.every"):
+        parse_train(compose("train", by_score))
+    assert parse_train(compose("train", [*by_score, "eval.every=5"])).stop.figure == "eval/score"
+
+
+def test_a_rule_on_a_metric_that_there_is_not_is_said_once(tmp_path: Path) -> None:
+    stop = EarlyStop(StopRule(figure="rollout/retrun", at=1.0), tmp_path, 0)
+    with pytest.warns(UserWarning, match="stop.figure: unknown metric 'rollout/retrun'; did you mean 'rollout/return'"):
+        assert stop.reason(1, {"rollout/return": 2.0}) == ""
+    assert stop.reason(2, {"rollout/return": 2.0}) == ""  # every warning is an error
+    later = EarlyStop(StopRule(figure="eval/score", at=1.0), tmp_path, 0)
+    assert later.reason(1, {"rollout/return": 2.0}) == ""
 
 
 def test_runs_of_older_versions_have_none_of_it_and_may_get_it(tmp_path: Path) -> None:

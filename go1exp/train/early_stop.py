@@ -6,12 +6,14 @@ import csv
 import dataclasses
 import json
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from go1exp.files import write_json
 from go1exp.schema.beside import StopRule
+from go1exp.schema.registry import unknown_name
 
 FILE = "stopped_early.json"
 """In the run folder: the rule that ended it, at which iteration and why."""
@@ -23,6 +25,7 @@ class EarlyStop:
     def __init__(self, rule: StopRule, run: Path, iteration: int) -> None:
         self._rule, self._run = rule, run
         self._best, self._since = -math.inf, 0
+        self._warned = False
         (run / FILE).unlink(missing_ok=True)
         for k, value in _logged(run / "metrics.csv", rule.figure or ""):
             if k <= iteration:
@@ -31,7 +34,10 @@ class EarlyStop:
     def reason(self, iteration: int, metrics: Mapping[str, Any]) -> str:
         """Return why training shall end after ``iteration`` with these metrics; empty if it shall go on."""
         rule = self._rule
-        if rule.figure is None or rule.figure not in metrics:
+        if rule.figure is None:
+            return ""
+        if rule.figure not in metrics:
+            self._warn_once(rule.figure, metrics)
             return ""
         value = float(metrics[rule.figure])
         self._take(iteration, value)
@@ -42,6 +48,12 @@ class EarlyStop:
         if rule.patience is not None and self._since and waited >= rule.patience:
             return f"{rule.figure} is no better than {abs(self._best):.4g} since iteration {self._since}"
         return ""
+
+    def _warn_once(self, figure: str, metrics: Mapping[str, Any]) -> None:
+        """Say that the rule waits for a metric that there is not; those of an evaluation come later than others."""
+        if not self._warned and not figure.startswith("eval/"):
+            self._warned = True
+            warnings.warn(unknown_name("stop.figure", figure, metrics, "metric"), stacklevel=2)
 
     def note(self, iteration: int, reason: str) -> None:
         """Leave in the run folder that the run is complete, and by which rule."""
