@@ -184,7 +184,8 @@ def baseline(made: Sequence[Group], wanted: str | None) -> Group:
     meant = exact or [g for g in made if wanted in g.name or _has(g, wanted)]
     if len(meant) != 1:
         those = "no group" if not meant else f"{len(meant)} groups"
-        raise ConfigError([f"baseline = {wanted!r}: {those} of these:", *(repr(g.name) for g in meant or made)])
+        listed = ", ".join(repr(g.name) for g in meant or made)
+        raise ConfigError([f"baseline = {wanted!r}: {those} of these: {listed}"])
     return meant[0]
 
 
