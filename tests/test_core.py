@@ -372,6 +372,9 @@ def test_actions_are_cut_and_scaled_to_joint_targets_about_the_nominal_stance(ma
     target = robot.NOMINAL_STANCE + np.array([0.25, -0.25, 0.5, -0.5] + [0.0] * 8)
     np.testing.assert_allclose(core.snapshot().joint_target[0], target, atol=1e-6)
     assert result.observation[0, 36:40].tolist() == [1.0, -1.0, 2.0, -2.0]
+    for wrong in (torch.zeros(12), torch.zeros(2, 12), torch.zeros(1, 1)):
+        with pytest.raises(ValueError, match=r"action has shape .*; needed is \(1, 12\)"):
+            core.step(wrong)
     core.step(torch.zeros(1, 12))
     s = core.snapshot()
     assert s.previous_action[0, :4].tolist() == [1.0, -1.0, 2.0, -2.0]

@@ -25,7 +25,7 @@ from go1exp.env.plant import Plant, drive_setup
 from go1exp.env.restarts import Restarts
 from go1exp.env.task_log import TaskLog
 from go1exp.env.terms import StepTerms
-from go1exp.mdp.actions import clipped, joint_target
+from go1exp.mdp.actions import clipped, joint_target, of_shape
 from go1exp.mdp.clearance import lift
 from go1exp.mdp.commands import UniformVelocity
 from go1exp.mdp.feet import Feet
@@ -252,7 +252,7 @@ class Go1Core:
     def _advance_physics(self, action: Tensor) -> None:
         """Run the substeps of one policy step."""
         self.previous_action.copy_(self.action)
-        self.action.copy_(clipped(action, self.task.action.clip))
+        self.action.copy_(clipped(of_shape(action, self.action.shape), self.task.action.clip))
         self._last_action.copy_(self.action)
         self.target.copy_(joint_target(self.action, self._nominal, self.task.action.scale))
         target = self.target.to(self.backend.qpos.dtype)

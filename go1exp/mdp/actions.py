@@ -13,6 +13,13 @@ def clipped(action: Tensor, clip: float) -> Tensor:
     return action.clamp(-clip, clip)
 
 
+def of_shape(action: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return ``action``; raise ValueError where it has not one row for each robot: torch would spread it out."""
+    if tuple(action.shape) != tuple(shape):
+        raise ValueError(f"action has shape {tuple(action.shape)}; needed is {tuple(shape)}, one row for each robot")
+    return action
+
+
 def joint_target(action: Tensor, nominal: Tensor, scale: float) -> Tensor:
     """Return position targets (N, 12), rad: nominal stance (12,) + ``scale`` (rad) x clipped action (N, 12)."""
     return nominal + scale * action
