@@ -20,7 +20,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -165,9 +165,14 @@ def composition_problem(
         ours = next((group for group in FOLDERS if "/" in group and missing.startswith(f"{group}/")), "")
         group, _, choice = (ours, "", missing.removeprefix(f"{ours}/")) if ours else missing.partition("/")
         known = choice_files(group, [config_folder(), *folders])
-        if choice and known:
+        if known and not choice:
+            return f"{group}=: a group takes the name of one of its files: {', '.join(sorted(known))}"
+        if known:
             return unknown_name(f"{group}={choice}", choice, known, f"choice of {group}")
         return str(error).split("\n")[0]
+    if isinstance(error, OverrideParseException):
+        about = "a value with =, brackets or quotes takes quotes"
+        return f"""{error.override}: cannot be read as key=value; {about}, as in 'key="a=(b)"'"""
     if isinstance(error, HydraException | OmegaConfBaseException):
         return _refused_override(error, name, overrides, folders)
     if isinstance(error, ValueError) and "override must be a string" in str(error):
@@ -189,6 +194,8 @@ def _refused_override(error: Exception, name: str, overrides: Sequence[str], fol
     if "Could not append to config" in str(error):
         plain = given.lstrip("+")
         return f"{given}: {key!r} exists already; leave out the plus: {plain!r}"
+    if named := next((group for group, folder in FOLDERS.items() if folder == key), None):
+        return f"{given}: no such key {key!r}; did you mean {given.replace(key, named, 1)!r}?"
     groups = [o for o in overrides if re.match(r"[a-z_]+=[a-z]", o) and o != given]
     try:
         known = [k for k in flat_keys(name, groups, folders) if k != key]

@@ -32,6 +32,7 @@ from go1exp.schema.learner import WandbConfig as WandbConfig
 from go1exp.schema.registry import (
     STRICT,
     ConfigError,
+    FolderName,
     NonNegative,
     Positive,
     Term,
@@ -133,10 +134,10 @@ class ProcessConfig:
 
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
-    torch_threads: CountOrZero
-    resume: str | None
-    start_from: str | None = None  # runs of older versions have none of these keys
-    sweep: str | None = None
+    torch_threads: Annotated[int, Field(ge=0, le=1024)]
+    resume: FolderName | None
+    start_from: FolderName | None = None  # runs of older versions have none of these keys
+    sweep: FolderName | None = None
     plugins: str | tuple[str, ...] = ()
     devices: Annotated[int, Field(ge=1, le=64)] = 1
 
@@ -386,6 +387,9 @@ def parse_train(container: Mapping[str, Any]) -> TrainConfig:
     parts, of_parts = parse_parts(container, (*task_names, *others))
     process, of_process = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
     problems += of_parts + of_process + _cross_rules(parts)
+    stop, during = parts.get("stop"), parts.get("eval")
+    if stop and during and (stop.figure or "").startswith("eval/") and not during.every:
+        problems.append(f"stop.figure = {stop.figure!r}: is of the evaluations beside a training; set eval.every")
     if problems:
         raise ConfigError(problems)
     task = TaskConfig(**{name: parts[name] for name in task_names})

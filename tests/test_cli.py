@@ -93,6 +93,17 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("play log=x.parquet viewer=clip", ("viewer = 'clip'", "viewer=web alone")),
         ("play policy=paper terrain=rough train_ground=true", ("train_ground = True and terrain",)),
         ("gap view host=", ("host = ''", "127.0.0.1")),
+        # a folder that a variable of the shell was to name
+        ("train resume=", ("resume = ''",)),
+        ("train sweep=", ("sweep = ''",)),
+        ("train start_from=", ("start_from = ''",)),
+        # a group by its folder's name, a choice left out, what Hydra cannot read
+        ("train randomization=table1", ("no such key 'randomization'; did you mean 'rand=table1'?",)),
+        ("train launcher=joblib", ("did you mean 'hydra/launcher=joblib'?",)),
+        ("train rand=", ("rand=: a group takes the name of one of its files: none, table1, text",)),
+        ("train logger.wandb.notes=a(b", ("logger.wandb.notes=a(b: cannot be read as key=value",)),
+        # a launcher without a sweep
+        ("train hydra/launcher=joblib", ("needs -m: go1exp train -m hydra/launcher=joblib",)),
         # a misspelt term
         ("train +reward.foot_slp={weight:1}", ("reward.foot_slp: unknown reward term", "did you mean 'foot_slip'")),
         ("train actuator.term=dp", ("actuator", "unknown actuator term 'dp'", "did you mean 'pd'")),
@@ -103,6 +114,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("eval run=x grid.x=3", ("grid.x = 3", "array")),
         # out of range
         ("train ppo.gamma=1.5", ("ppo.gamma = 1.5", "less than or equal to 1")),
+        ("train torch_threads=100000", ("torch_threads = 100000", "less than or equal to 1024")),
         ("train event.push.interval=[3,1]", ("event.push.interval = [3, 1]", "low must not exceed high")),
         ("eval run=x measures=[stride_rat]", ("measures.stride_rat", "did you mean 'stride_rate'")),
         ("eval run=x measures=all", ("measures = 'all'", "[stride_rate]")),
@@ -264,6 +276,15 @@ def test_a_traceback_is_there_for_who_asks_for_it(tmp_path: Path) -> None:
     assert done.returncode not in (0, 2)
     assert "Traceback" in done.stderr
     assert "ConfigError" in done.stderr
+
+
+def test_a_wrong_item_of_a_list_is_one_problem() -> None:
+    """Pydantic counts the items that are left, and would call the list too short as well."""
+    with pytest.raises(registry.ConfigError) as refused:
+        parse_train(compose("train", ["ppo.hidden=[0]"]))
+    assert refused.value.problems == ["ppo.hidden.0 = 0: input should be greater than or equal to 1"]
+    with pytest.raises(registry.ConfigError, match=r"ppo.hidden = \[\]: .* at least 1 item"):
+        parse_train(compose("train", ["ppo.hidden=[]"]))
 
 
 # ---------------------------------------------------------------------- help

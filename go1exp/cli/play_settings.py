@@ -6,10 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from go1exp.schema.registry import Positive
+from go1exp.schema.registry import FolderName, Positive
 from go1exp.schema.settings import settings
-
-RunFolder = Annotated[str, Field(min_length=1)]
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 
@@ -42,7 +40,7 @@ class PlaySettings:
     """
 
     controller: Any = None
-    run: RunFolder | None
+    run: FolderName | None
     policy: str | None
     bundle: str | None
     log: str | None

@@ -11,14 +11,13 @@ from go1exp.cli.gap_settings import GapLoopSettings as GapLoopSettings
 from go1exp.cli.gap_settings import GapNextSettings as GapNextSettings
 from go1exp.cli.gap_settings import GapVerb as GapVerb
 from go1exp.cli.play_settings import PlaySettings as PlaySettings
-from go1exp.cli.play_settings import RunFolder
 from go1exp.deploy.controller import Stages
 from go1exp.fit.settings import FitSettings
 from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
 from go1exp.report.settings import ReportSettings
 from go1exp.schema import settings as schema
-from go1exp.schema.registry import NonNegative, Positive
+from go1exp.schema.registry import FolderName, NonNegative, Positive
 from go1exp.schema.settings import settings
 from go1exp.sim_robot.settings import SimConfig, SimSettings
 from go1exp.sweep.settings import TuneSettings
@@ -76,7 +75,7 @@ class EvalSettings:
     """
 
     controller: Any = None
-    run: RunFolder | None
+    run: FolderName | None
     policy: str | None
     bundle: str | None
     checkpoint: str | None
@@ -182,7 +181,7 @@ class ExportSettings:
         out: file; null writes bundle.zip in the run folder (of a shipped policy paper_bundle.zip here).
     """
 
-    run: RunFolder | None
+    run: FolderName | None
     policy: str | None
     checkpoint: str | None
     seconds: Annotated[float, Field(gt=0, le=600)]

@@ -127,7 +127,7 @@ def _task(container: dict[str, Any]) -> int | None:
     try:
         if container.get("sweep"):
             sweep.leave_to_go_on(container, overrides)
-        _refuse_one_of_a_study()
+        _refuse_one_of_a_sweep()
         job = resolved(container, overrides, folder)
         check(job)
     except BaseException:
@@ -138,14 +138,22 @@ def _task(container: dict[str, Any]) -> int | None:
     return _run(job)
 
 
-def _refuse_one_of_a_study() -> None:
-    """Raise ConfigError where a study was chosen without ``-m``: Hydra composes one run, of none of its values."""
+def _refuse_one_of_a_sweep() -> None:
+    """Raise ConfigError where a study or a launcher was chosen without ``-m``.
+
+    Hydra composes one run, of none of the study's values, and would train it here, whatever the launcher.
+    """
     about = HydraConfig.get()
-    study = about.runtime.choices.get("study")
-    if study is None or about.mode == RunMode.MULTIRUN or not about.sweeper.params:
+    if about.mode == RunMode.MULTIRUN:
         return
+    study = about.runtime.choices.get("study")
     given = [o for o in (*about.overrides.task, *about.overrides.hydra) if not o.startswith("hydra.mode=")]
-    raise ConfigError([f"study={study}: is a sweep and needs -m: {command('train', '-m', *given)}"])
+    again = command("train", "-m", *given)
+    if study is not None and about.sweeper.params:
+        raise ConfigError([f"study={study}: is a sweep and needs -m: {again}"])
+    for launcher in given:
+        if launcher.startswith("hydra/launcher=") and launcher != "hydra/launcher=basic":
+            raise ConfigError([f"{launcher}: starts the jobs of a sweep and needs -m: {again}"])
 
 
 def _go_on(run: Path, overrides: list[str]) -> int | None:
@@ -162,10 +170,15 @@ def _planned(run: Path, overrides: list[str]) -> TrainJob:
         ConfigError: if they change what they may not.
     """
     from go1exp.config import parse_train
-    from go1exp.train import kept_plugins
+    from go1exp.train import kept_plugins, run_folder
 
     container = _resumed(run, overrides)
-    return TrainJob(run, parse_train(kept_plugins.with_copies(run, container)), container, resumed=True)
+    try:
+        config = parse_train(kept_plugins.with_copies(run, container))
+    except ConfigError:
+        run_folder.read_parsed(run)  # where the run itself is not one that this version knows, that names its file
+        raise
+    return TrainJob(run, config, container, resumed=True)
 
 
 def plan(job: TrainJob) -> None:

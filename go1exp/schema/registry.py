@@ -60,6 +60,10 @@ class DuplicateError(ValueError):
     """A name that a group has already; the message names both places."""
 
 
+FolderName = Annotated[str, Field(min_length=1)]
+"""The name of a folder: an empty one, as an unset variable of the shell leaves it, is a mistake."""
+
+
 def nearest(name: str, known: Iterable[str], most: int = 3) -> list[str]:
     """Return up to ``most`` names of ``known`` that look like ``name``, best first."""
     return difflib.get_close_matches(name, list(known), n=most, cutoff=0.5)
@@ -86,6 +90,8 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
     """Translate a pydantic error into lines ``key.path = value: what is wrong``."""
     lines: list[str] = []
     for e in error.errors():
+        if e["type"] == "too_short" and len(e["input"]) >= e["ctx"]["min_length"]:
+            continue  # long enough as it was given: its items are wrong, and each is an error of its own
         places = [str(place) for place in e["loc"]]
         unknown = e["type"] in ("extra_forbidden", "unexpected_keyword_argument")
         last = len(places) - 1
