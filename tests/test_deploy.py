@@ -1111,11 +1111,11 @@ def children(pid: int) -> list[int]:
 
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="children are found in Linux's /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("way", ["go1exp.deploy", "go1exp.cli"])
+@pytest.mark.parametrize("way", ["go1exp.deploy", "go1exp"])
 def test_a_signal_while_the_robot_starts_ends_both_at_once(
     file: str, tmp_path: Path, way: str, number: signal.Signals
 ) -> None:
-    arguments = ["deploy", file, "out=logs"] if way == "go1exp.cli" else [file, "--out", "logs"]
+    arguments = ["deploy", file, "out=logs"] if way == "go1exp" else [file, "--out", "logs"]
     process, pipe = begun(tmp_path, "-m", way, *arguments)
     lines = [next(pipe)]
     while "starting the simulated robot" not in lines[-1]:
