@@ -23,6 +23,13 @@ KEY_WIDTH = 34
 NO_SUCH_WORD = 2
 """Exit status, that of a refused configuration."""
 
+WITHOUT = {
+    "experiment": "",
+    "study": "",
+    "terrain": "; without it flat, or that of training with train_ground=true",
+}
+"""Group without a choice of its own -> what its line says of that; all others then keep the choice of training."""
+
 
 def show(verb: str, title: str, arguments: Sequence[str]) -> None:
     """Print the help of a verb, or of the group that is named among the arguments.
@@ -180,7 +187,7 @@ def _choices(group: str, default: str | None) -> str:
         n if "/" not in n else f"{n.split('/')[0]}/..." for n in choice_files(group, [config_folder()])
     )
     listed = ", ".join(name + ("*" if name == default else "") for name in names)
-    return listed if default or group == "experiment" else f"{listed}; without it that of training"
+    return listed if default else listed + WITHOUT.get(group, "; without it that of training")
 
 
 def _flat(container: Mapping[str, Any], path: str = "") -> dict[str, Any]:
