@@ -1,7 +1,7 @@
 """What a policy remembers, at another rate than that of training.
 
-A policy has learnt the effect of an action over one training period. An earlier shipped policy, trained at 50 Hz, run at
-400 Hz and commanded 1.0 m/s sideways, walked at 0.33 m/s with its action of 2.5 ms ago, and at 1.01 m/s with that of
+A policy has learnt the effect of an action over one training period. An earlier shipped policy, trained at 50 Hz, run
+at 400 Hz and commanded 1.0 m/s sideways, walked at 0.33 m/s with its action of 2.5 ms ago, and at 1.01 m/s with that of
 20 ms ago. The same holds for earlier frames of what it observes.
 """
 
