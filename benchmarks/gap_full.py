@@ -1,10 +1,10 @@
 """The whole sealed benchmark: ``python -m benchmarks.gap_full out=DIR seed=INT [jobs=2] [scale=1.0] [kinds=null]``.
 
 Draws and seals the cases of every kind, solves them without their answers (``gap_solve``), scores all together, prints
-the table and writes ``OUT/gap.json`` (``docs/results/gap.json`` is made of several). What is done already is not done again, so an
-interrupted run goes on. ``scale`` makes all numbers of cases smaller or larger (of single effects, half has them at
-the smaller size alone). ``kinds`` leaves out all others: a kind has the same cases whichever others are drawn with it,
-and what earlier calls have drawn into ``OUT`` is scored with it.
+the table and writes ``OUT/gap.json`` (``docs/results/gap.json`` is made of several). What is done already is not done
+again, so an interrupted run goes on. ``scale`` makes all numbers of cases smaller or larger (of single effects, half
+has them at the smaller size alone). ``kinds`` leaves out all others: a kind has the same cases whichever others are
+drawn with it, and what earlier calls have drawn into ``OUT`` is scored with it.
 """
 
 from __future__ import annotations
