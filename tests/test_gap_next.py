@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
+from go1exp import recording
 from go1exp.cli import main
 from go1exp.cli.gap_next import text
 from go1exp.env.plant import Plant
 from go1exp.excitations import ExcitationError
+from go1exp.gap import files as gap_files
 from go1exp.gap.comparison import Comparison, compare
 from go1exp.gap.design.choice import ENOUGH, choose
 from go1exp.gap.design.limits import DesignError, Limits, limits_of
@@ -33,6 +36,7 @@ from go1exp.gap.robots.hung import hung
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
 from go1exp.gap.stages import next as stage_next
+from go1exp.gap.stages.next import NextResult
 from go1exp.record.playback import playback
 from go1exp.record.simulate import held_quat
 from go1exp.recording import Meta, Recording, joint_channels
@@ -368,6 +372,25 @@ def test_the_verb_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monke
         monkeypatch.setattr("sys.argv", ["go1exp", "gap", "next", *words])
         assert main() != 0
         assert complaint in capsys.readouterr().err
+
+
+def test_logs_that_the_search_left_out_are_left_out_here_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (told,) = told_go1()
+    short = replace(told, channels={name: values[:5] for name, values in told.channels.items()})
+    for name, each in (("walk", told), ("short", short)):
+        recording.write(tmp_path / f"{name}.parquet", replace(each, meta=replace(each.meta, episode=name)))
+    searched = replace(SETTINGS, window_s=0.1, burn_s=0.02)
+    gap_files.save(answer(provenance={"settings": asdict(searched)}), tmp_path / "gap")
+    given: list[str] = []
+
+    def design(result: GapResult, recordings: Sequence[Recording], *rest: Any) -> NextResult:
+        given.extend(r.meta.episode for r in recordings)
+        return NextResult("nothing left", (), (), None, 500.0, JOINTS)
+
+    monkeypatch.setattr(stage_next, "design", design)
+    monkeypatch.setattr("sys.argv", ["go1exp", "gap", "next", f"logs={tmp_path}", f"out={tmp_path / 'gap'}"])
+    assert main() == 0
+    assert given == ["walk"]
 
 
 # ---------------------------------------------------------------------- the file

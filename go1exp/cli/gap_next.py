@@ -21,7 +21,7 @@ TARGETS, ANSWER = "next.csv", "next.json"
 
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.gap import _progress
-    from go1exp.cli.logs import read_all
+    from go1exp.cli.logs import long_enough, read_all
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.settings import GapNextSettings
     from go1exp.gap import files
@@ -31,11 +31,16 @@ def _task(container: dict[str, Any]) -> int:
     out = Path(settings.out)
     answer = files.load(out)
 
+    from go1exp.gap.design.limits import DesignError
     from go1exp.gap.robots.choice import robot_of
     from go1exp.gap.stages.next import design
 
     robot = robot_of(parts["model"], parts["robot"])
-    result = design(answer, read_all(settings.logs), robot, files.search_of(answer), settings.design, _progress())
+    search = files.search_of(answer)
+    recordings = long_enough(read_all(settings.logs), search.window_s + search.burn_s)  # as the search left them out
+    if not recordings:
+        raise DesignError("logs: none of these recordings can be compared")
+    result = design(answer, recordings, robot, search, settings.design, _progress())
     save(result, out)
     print("\n" + text(result, out / TARGETS))
     print(f"\nwritten to {', '.join(str(out / name) for name in written(result))}")
