@@ -82,6 +82,10 @@ def test_what_differs_between_strata_makes_nothing_uncertain() -> None:
     means = [*values[:4].mean(axis=1), values[4, :2].mean()]
     assert (fewer.n, fewer.estimate) == (34, pytest.approx(np.mean(means)))
     assert math.isnan(stratified_mean_interval([1.0, 2.0], [0, 1]).low)
+    # The mean of three times 0.1 is not 0.1 in floating point.
+    same = stratified_mean_interval([0.1, 0.1, 0.1, 0.2, 0.2, 0.2], [0, 0, 0, 1, 1, 1])
+    assert same.estimate == pytest.approx(0.15)
+    assert math.isnan(same.low)
 
 
 def test_intervals_within_strata_hold_the_truth_in_nineteen_of_twenty_studies() -> None:

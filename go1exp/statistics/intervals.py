@@ -203,7 +203,7 @@ def stratified_mean_interval(values: ArrayLike, strata: ArrayLike, level: float 
     means = np.bincount(stratum, each) / sizes
     estimate, free = float(means.mean()), len(each) - len(labels)
     within = float(((each - means[stratum]) ** 2).sum())
-    if not (free and within > 0.0):
+    if not free or np.sqrt(within / free) <= ROUNDING * np.abs(each).max():
         return Interval(estimate, np.nan, np.nan, len(each))
     error = np.sqrt(within / free * (1.0 / sizes).sum()) / len(labels)
     half = float(stats.t.ppf(0.5 + 0.5 * level, free) * error)
