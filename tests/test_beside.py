@@ -17,7 +17,7 @@ from go1exp.cli.train import _refuse_other
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.evaluate.beside import answered, score
-from go1exp.schema.beside import StopRule
+from go1exp.schema.beside import ROWS, StopRule
 from go1exp.schema.registry import ConfigError
 from go1exp.train import checkpoint, early_stop, run_folder, trainer
 from go1exp.train.beside import Beside
@@ -153,6 +153,13 @@ def test_patience_counts_from_the_best_and_goes_on_after_a_pause(tmp_path: Path)
     (tmp_path / "metrics.csv").write_text(table)
     resumed = EarlyStop(rule, tmp_path, 4)
     assert resumed.reason(5, {"r": 2.2}) == reasons[4]
+
+
+def test_a_rule_on_an_evaluation_goes_on_from_the_rows_of_evals(tmp_path: Path) -> None:
+    (tmp_path / ROWS).write_text("iteration,steps,score\n2,20,0.5\n4,40,0.9\n6,60,0.1\n")
+    rule = StopRule(figure="eval/score", better="lower", patience=3)
+    resumed = EarlyStop(rule, tmp_path, 4)
+    assert resumed.reason(5, {"eval/score": 0.6}) == "eval/score is no better than 0.5 since iteration 2"
 
 
 def test_a_rule_needs_a_figure_and_a_limit() -> None:

@@ -12,22 +12,25 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.files import write_json
-from go1exp.schema.beside import StopRule
+from go1exp.schema.beside import ROWS, StopRule
 from go1exp.schema.registry import unknown_name
 
 FILE = "stopped_early.json"
 """In the run folder: the rule that ended it, at which iteration and why."""
 
+EVALUATED = "eval/"
+"""Begin of metrics that are columns of ``evals.csv``."""
+
 
 class EarlyStop:
-    """Watches a metric; a run that goes on from a checkpoint looks at the rows of ``metrics.csv`` up to there again."""
+    """Watches a metric; a run that goes on from a checkpoint looks at the logged rows up to there again."""
 
     def __init__(self, rule: StopRule, run: Path, iteration: int) -> None:
         self._rule, self._run = rule, run
         self._best, self._since = -math.inf, 0
         self._warned = False
         (run / FILE).unlink(missing_ok=True)
-        for k, value in _logged(run / "metrics.csv", rule.figure or ""):
+        for k, value in _logged(run, rule.figure or ""):
             if k <= iteration:
                 self._take(k, value)
 
@@ -51,7 +54,7 @@ class EarlyStop:
 
     def _warn_once(self, figure: str, metrics: Mapping[str, Any]) -> None:
         """Say that the rule waits for a metric that there is not; those of an evaluation come later than others."""
-        if not self._warned and not figure.startswith("eval/"):
+        if not self._warned and not figure.startswith(EVALUATED):
             self._warned = True
             warnings.warn(unknown_name("stop.figure", figure, metrics, "metric"), stacklevel=2)
 
@@ -65,8 +68,10 @@ class EarlyStop:
             self._best, self._since = good, iteration
 
 
-def _logged(file: Path, figure: str) -> list[tuple[int, float]]:
-    """Return iteration and value of each row that has one."""
+def _logged(run: Path, figure: str) -> list[tuple[int, float]]:
+    """Return iteration and value of each row that has one; those of evaluations have a file of their own."""
+    evaluated = figure.startswith(EVALUATED)
+    file, figure = run / (ROWS if evaluated else "metrics.csv"), figure.removeprefix(EVALUATED)
     if not figure or not file.is_file():
         return []
     with file.open(newline="") as opened:
