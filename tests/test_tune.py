@@ -18,8 +18,10 @@ import pytest
 import yaml
 
 from go1exp import data_root
+from go1exp.cli.tune import _ranges
 from go1exp.compose import compose
 from go1exp.config import parse_train
+from go1exp.schema.registry import ConfigError
 from go1exp.sweep import trials
 from go1exp.sweep.command import Ended
 from go1exp.sweep.settings import TuneSettings
@@ -256,3 +258,10 @@ def test_a_metric_of_evaluations_needs_evaluations(tmp_path: Path) -> None:
     done = cli(tmp_path, "tune", SPACE, words(), "metric=eval/score", "direction=minimize")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "metric = 'eval/score': needs evaluations; add eval.every=50 to overrides" in done.stderr
+
+
+@pytest.mark.parametrize("drawn", ["range(5,5)", "interval(1,0.1)", "tag(log,interval(0,1))"])
+def test_a_range_that_holds_nothing_is_refused_before_the_first_trial(drawn: str) -> None:
+    with pytest.raises(ConfigError, match="is none of key=interval"):
+        _ranges([f"ppo.gamma={drawn}"])
+    assert _ranges(["ppo.epochs=range(5,6)"])["ppo.epochs"].high == 5

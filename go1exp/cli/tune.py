@@ -43,6 +43,14 @@ def _ranges(space: Sequence[str]) -> dict[str, Range]:
 
 def _range(override: Override) -> Range:
     """Return the range that an override in Hydra's grammar for sweeps stands for; ValueError if it is none."""
+    drawn = _drawn(override)
+    if not drawn.choices and (drawn.low > drawn.high or (drawn.log and drawn.low <= 0)):
+        raise ValueError(override.input_line)  # Optuna would refuse it at the first trial
+    return drawn
+
+
+def _drawn(override: Override) -> Range:
+    """Return the range as it was typed; ValueError if it is none."""
     from go1exp.sweep.tune import Range
 
     value = override.value()
