@@ -255,7 +255,8 @@ def test_another_encoding_is_told_and_can_be_given(tmp_path: Path, encoding: str
     np.testing.assert_allclose(r.joint("q")[:, 0], TABLE["angle [deg]"])
     path.write_text(path.read_text(encoding=encoding) + "1200,hot,0,0,12\n", encoding=encoding)
     assert "line 42 has 'hot'" in refusal(path, columns=columns, encoding=encoding)
-    assert "importer.csv.encoding = 'utf-99': unknown encoding; utf-8" in refusal(path, encoding="utf-99")
+    for name in ("utf-99", "idna"):
+        assert f"importer.csv.encoding = {name!r}: unknown encoding; utf-8" in refusal(path, encoding=name)
 
 
 def clocked(path: Path, stamps: np.ndarray) -> Path:

@@ -267,7 +267,7 @@ def _per_joint(given: Mapping[str, Any], joints: tuple[str, ...]) -> tuple[dict[
 def _is_encoding(name: str) -> bool:
     try:
         b"abc".decode(name, "replace")  # of no bytes, Python does not look at the name
-    except LookupError:
+    except (LookupError, UnicodeError):  # idna takes no replacement
         return False
     return True
 
