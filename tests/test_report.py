@@ -399,6 +399,10 @@ def test_damaged_rows_are_named_and_the_others_stay(tmp_path: Path) -> None:
     got = made(tmp_path)
     assert any("a1/eval.json: cannot be read" in n for n in got.study.notes)
     assert list(got.outcomes[0].judged.runs) == [(tmp_path / "a0").resolve()]
+    (tmp_path / "a1/eval.parquet").write_bytes((tmp_path / "a0/eval.parquet").read_bytes())
+    (tmp_path / "a1/eval.json").write_text("[]")  # JSON, but no report
+    got = made(tmp_path)
+    assert any("a1/eval.json: cannot be read (TypeError" in n for n in got.study.notes)
 
 
 def test_two_sweeps_of_one_name_keep_their_runs_apart_and_count_each_seed_once(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def _judged(name: str, study: Study) -> Judged:
         try:
             abouts[run.folder] = about = json.loads(file.read_text())
             entries[run.folder] = Evaluated(_table(rows_file(file)), _settings(name, about))
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             study.notes.append(f"{file}: cannot be read ({type(error).__name__}: {' '.join(str(error).split())[:100]})")
     if not entries:
         return Judged(name, (), (), ())
