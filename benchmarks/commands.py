@@ -17,7 +17,7 @@ def run(*words: str, allowed: Sequence[int] = (0,)) -> int:
         SystemExit: if that is not one of ``allowed``.
     """
     print("$ go1exp", *words, flush=True)
-    status = subprocess.run([sys.executable, "-m", "go1exp.cli", *words]).returncode
+    status = subprocess.run([sys.executable, "-m", "go1exp", *words]).returncode
     if status not in allowed:
         raise SystemExit(f"go1exp {' '.join(words)}: exit status {status}")
     return status

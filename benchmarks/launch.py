@@ -34,7 +34,7 @@ TASK = ("experiment=five_minutes", "ppo.iterations=6", "logger.tensorboard=false
 
 
 def train(*arguments: str) -> None:
-    subprocess.run([sys.executable, "-m", "go1exp.cli", "train", *arguments], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([sys.executable, "-m", "go1exp", "train", *arguments], check=True, stdout=subprocess.DEVNULL)
 
 
 def plain(folder: Path) -> float:

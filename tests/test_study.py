@@ -43,7 +43,7 @@ def killed_half_way(line: list[str], place: Path, variables: dict[str, str]) -> 
     """Start a sweep and kill its launcher when the first job has a checkpoint and none is done."""
     with (place / "output.txt").open("w") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "go1exp.cli", *line],
+            [sys.executable, "-m", "go1exp", *line],
             cwd=place,
             env=environment(**variables),
             stdout=output,
