@@ -1,11 +1,12 @@
-"""Names from walks by legs in swing: ``python -m benchmarks.gap_walks out=FILE seed=INT [scale=1] [policy=trot]``.
+"""Names from walks: ``python -m benchmarks.gap_walks out=FILE seed=INT [scale=1] [policy=trot]``.
 
-``[episodes=4] [seconds=6] [phase=swing] [kinds=hidden,null]``: walks of a case and their length; what of them is
-compared; what is drawn.
+``[episodes=4] [seconds=6] [phase=swing] [kinds=hidden,null] [effects=coulomb,strength] [size=5]``: walks of a case and
+their length; what of them is compared; what is drawn; which effects are hidden, and how large, in tolerances.
 
-A shipped policy walks under the random commands of its training, on a robot in which one effect of the joints is
-hidden, at five tolerances, at all joints or at those of one kind; or nothing that a leg in the air feels (nulls: no
-effect, a payload, slippery feet). Each is one case for each unit of ``scale``. The logger has the noise of
+A shipped policy walks under the random commands of its training, on a robot in which one effect is hidden, at all
+joints or at those of one kind, or on its trunk; or nothing that a leg in the air feels (nulls: no
+effect, a payload, slippery feet). With ``phase=auto`` or ``whole`` the trunk and the ground are compared as well, so a
+null is a robot with no effect. Each is one case for each unit of ``scale``. The logger has the noise of
 ``conf/record.yaml``; the robot's step is 0.5 ms, the search's 1 ms. Counted: hidden effects that are the first name,
 or do as well as it and are named with it; cases of all in which anything else is named; and, of those named right, at
 exactly the joints where they are. Adds the figures to FILE, with Wilson's 95 % intervals,
@@ -28,11 +29,8 @@ from benchmarks.results import write_results
 
 USAGE = (
     "usage: python -m benchmarks.gap_walks out=FILE seed=INT [scale=1] [policy=trot] [episodes=4] [seconds=6] "
-    "[phase=swing] [kinds=hidden,null]"
+    "[phase=swing] [kinds=hidden,null] [effects=coulomb,strength] [size=5]"
 )
-
-SIZE = 5.0
-"""Size of a hidden effect in tolerances."""
 
 HIDDEN: dict[str, tuple[str, float]] = {
     "coulomb": ("bound", 1.0),
@@ -41,8 +39,13 @@ HIDDEN: dict[str, tuple[str, float]] = {
     "torque_delay": ("delay", 1.0),
     "command_delay": ("delay", 1.0),
     "strength": ("scale", -1.0),
+    "encoder_offset": ("offset", 1.0),
+    "payload": ("mass", 1.0),
 }
-"""Effect of the joints -> its parameter, and in which direction it leaves its null value."""
+"""Effect -> its parameter, and in which direction it leaves its null value."""
+
+USUAL = "coulomb,viscous,armature,torque_delay,command_delay,strength"
+"""Effects that are hidden unless told otherwise: those that a leg in the air feels."""
 
 NULLS: tuple[Mapping[str, Mapping[str, float]], ...] = (
     {},
@@ -76,20 +79,24 @@ class Case:
     seed: int
 
 
-def cases(seed: int, scale: int, kinds: Sequence[str]) -> list[Case]:
-    """Draw the cases."""
+def cases(seed: int, scale: int, kinds: Sequence[str], effects: Sequence[str], size: float, phase: str) -> list[Case]:
+    """Draw the cases; ``size`` in tolerances."""
     from go1exp import robot
     from go1exp.effects.tolerances import declared
 
     rng, drawn = np.random.default_rng(seed), []
     for turn in range(scale):
-        for effect, (parameter, sign) in HIDDEN.items():
+        for effect in effects:
+            parameter, sign = HIDDEN[effect]
             kind, p = KINDS[int(rng.integers(len(KINDS)))], declared((effect, parameter))
-            value = p.null + sign * SIZE * p.tolerance
+            value = p.null + sign * size * p.tolerance
+            if p.per != "joint":
+                drawn.append(Case(f"{effect}_{turn}", {effect: {parameter: value}}, effect, (), 0))
+                continue
             joints = tuple(j for j in robot.JOINTS if kind in ("all", j.split("_")[1]))
             values = dict.fromkeys(robot.JOINTS, p.null) | dict.fromkeys(joints, value)
             drawn.append(Case(f"{effect}_{kind}_{turn}", {effect: {parameter: values}}, effect, joints, 0))
-        for null in NULLS:
+        for null in NULLS if phase == "swing" else NULLS[:1]:
             drawn.append(Case(f"null_{'_'.join(null) or 'plain'}_{turn}", null, "", (), 0))
     seeded = [Case(c.name, c.effect, c.hidden, c.joints, int(rng.integers(2**31))) for c in drawn]
     return [c for c in seeded if ("hidden" if c.hidden else "null") in kinds]
@@ -143,19 +150,24 @@ def main(arguments: Sequence[str]) -> None:
     """Walk, search, count."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
     usual = {"scale": "1", "policy": "trot", "episodes": "4", "seconds": "6", "phase": "swing", "kinds": "hidden,null"}
+    usual |= {"effects": USUAL, "size": "5"}
     if not {"out", "seed"} <= set(given) <= {"out", "seed", *usual} or len(given) != len(arguments):
         raise SystemExit(USAGE)
     usual |= given
     try:
         seed, scale, episodes, seconds = (int(usual[k]) for k in ("seed", "scale", "episodes", "seconds"))
+        size = float(usual["size"])
     except ValueError as error:
         raise SystemExit(f"{USAGE}\n{error}") from error
+    effects, phase = usual["effects"].split(","), usual["phase"]
+    if unknown := sorted({*effects} - {*HIDDEN}):
+        raise SystemExit(f"effects={unknown[0]}: there are {', '.join(HIDDEN)}")
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    todo, begun = cases(seed, scale, usual["kinds"].split(",")), time.monotonic()
+    todo, begun = cases(seed, scale, usual["kinds"].split(","), effects, size, phase), time.monotonic()
     counts: dict[str, list[bool]] = {"walks_named": [], "walks_certified": [], "walks_joints_right": [], WRONG: []}
     command = " ".join(f"{k}={v}" for k, v in usual.items() if k != "out")
     for done, case in enumerate(todo, start=1):
-        result = solved(case, usual["policy"], episodes, float(seconds), usual["phase"])
+        result = solved(case, usual["policy"], episodes, float(seconds), phase)
         first = result.named[0] if result.named else None
         right = first is not None and case.hidden in first.alias_set
         counts[WRONG].append(any(case.hidden not in n.alias_set for n in result.named))

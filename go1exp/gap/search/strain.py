@@ -51,10 +51,10 @@ def price(matrix: np.ndarray, right: np.ndarray, limits: tolerances.Bounds) -> f
 
 
 def relief(scorer: Scorer, linear: Table, may: tolerances.Freedom) -> dict[str, float]:
-    """Return by how much chi2 and priors would fall if an effect of ``own`` might leave its tolerance."""
+    """Return by how much chi2 and priors would fall if an effect might leave its tolerance."""
     effects = dict.fromkeys(p.key[0] for p in linear.probes)
-    price = cost(scorer, linear)
-    return {effect: price(may) - price(may.also(effect)) for effect in effects}
+    smallest = cost(scorer, linear)
+    return {effect: smallest(may) - smallest(may.also(effect)) for effect in effects}
 
 
 def straining(relieved: Mapping[str, float], count: float, but: Collection[str]) -> list[str]:
