@@ -23,7 +23,7 @@ from go1exp.mdp import mirror
 from go1exp.robot import RobotConfig
 from go1exp.schema import plugins
 from go1exp.schema.backends import BACKENDS, BackendConfig, CpuBackend
-from go1exp.schema.beside import BESIDE, EvalDuring, StopRule, VideoDuring
+from go1exp.schema.beside import BESIDE, EVALUATED, EvalDuring, StopRule, VideoDuring
 from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.schema.learner import CheckpointConfig as CheckpointConfig
 from go1exp.schema.learner import LoggerConfig as LoggerConfig
@@ -388,7 +388,7 @@ def parse_train(container: Mapping[str, Any]) -> TrainConfig:
     process, of_process = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
     problems += of_parts + of_process + _cross_rules(parts)
     stop, during = parts.get("stop"), parts.get("eval")
-    if stop and during and (stop.figure or "").startswith("eval/") and not during.every:
+    if stop and during and (stop.figure or "").startswith(EVALUATED) and not during.every:
         problems.append(f"stop.figure = {stop.figure!r}: is of the evaluations beside a training; set eval.every")
     if problems:
         raise ConfigError(problems)

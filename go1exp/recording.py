@@ -36,6 +36,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from go1exp.files import opened
 from go1exp.robot import JOINTS, LEGS
 from go1exp.schema.registry import STRICT, Expected, NonNegative, Positive, explain, nearest
+from go1exp.wording import counted
 
 if TYPE_CHECKING:
     import pyarrow.parquet as pq
@@ -261,7 +262,7 @@ def _clock_problems(t: np.ndarray, rate: float) -> list[str]:
     back = np.flatnonzero(steps <= 0)
     if back.size:
         row = int(back[0]) + 1
-        rows = "1 such row" if back.size == 1 else f"{back.size} such rows"
+        rows = counted(back.size, "such row")
         return [f"t: must increase strictly, but row {row} has {t[row]} s after {t[row - 1]} s ({rows})"]
     if steps.size and not 1 / RATE_FACTOR <= np.median(steps) * rate <= RATE_FACTOR:
         return [f"t: steps by {np.median(steps):.6g} s (median), but rate_hz = {rate:g} says {1 / rate:.6g} s"]

@@ -502,6 +502,15 @@ def test_a_joint_of_wrong_sign_is_named() -> None:
         assert {f.channel for f in report.flaws} <= {"q_FL_hip", "qd_FL_hip", "tau_est_FL_hip"}
 
 
+def test_rows_that_arrive_in_bursts_are_bad_and_no_delay_is_told_from_them() -> None:
+    """The grid of delays is as fine as half a step: microseconds of a whole log would fill the memory."""
+    sound = made("multisine")
+    burst, place = np.divmod(np.arange(len(sound.t)), 3)
+    report = audit(replace(sound, channels=sound.channels | {"t": sound.t[3 * burst] + 1e-9 * place}))
+    assert [f.verdict for f in report.by_check("rate")] == ["bad"]
+    assert report.by_check("delay") == []
+
+
 @pytest.mark.parametrize(
     ("name", "factor"), [("q", 1.0), ("q", 180 / np.pi), ("q", np.pi / 180), ("q_target", np.pi / 180)]
 )

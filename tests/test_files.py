@@ -78,7 +78,7 @@ def test_a_link_is_followed_and_a_device_is_written_not_replaced(tmp_path: Path)
 
 def test_the_link_to_a_pipe_is_written_although_it_leads_to_no_name() -> None:
     end, start = os.pipe()
-    files.write_text(f"/proc/self/fd/{start}", "text")
+    files.write_text(f"/dev/fd/{start}", "text")
     os.close(start)
     with os.fdopen(end) as read:
         assert read.read() == "text"

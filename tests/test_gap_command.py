@@ -76,10 +76,8 @@ def test_logs_that_are_all_too_short_are_bad_logs(tmp_path: Path, capsys: pytest
 def test_what_an_earlier_answer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
     for name in ("effect.yaml", "applied.json", "report.html", "mine.txt", "next.csv"):
         (tmp_path / name).write_text("{}")
-    assert files.remove_older(tmp_path) == []  # without a result these are the user's
-    (tmp_path / files.RESULT).write_text("{}")
     assert files.remove_older(tmp_path) == ["effect.yaml", "applied.json", "report.html"]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.txt", "next.csv", "verdict.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.txt", "next.csv"]
 
 
 def test_a_bad_log_takes_the_effect_of_an_earlier_answer_away(
@@ -88,7 +86,6 @@ def test_a_bad_log_takes_the_effect_of_an_earlier_answer_away(
     out = tmp_path / "gap"
     out.mkdir()
     (out / "effect.yaml").write_text("coulomb: {bound: 0.2}\n")
-    (out / files.RESULT).write_text("{}")
     (recording,) = read_all(str(DEMO[0]))
     still = {k: np.full_like(v, v[0]) if k.startswith("q_") and "target" not in k else v for k, v in
              recording.channels.items()}  # fmt: skip

@@ -53,6 +53,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "__main__.py": (*FOREIGN, "torch", "numpy", "pydantic", *up("cli")),
     "errors.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "files.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
+    "wording.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "signals.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "schema/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),

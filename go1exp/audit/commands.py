@@ -11,7 +11,7 @@ import go1exp.audit.limits as limits
 import go1exp.audit.signals as signals
 from go1exp.audit.delay import Delay, delays
 from go1exp.audit.log import Log, finding
-from go1exp.audit.report import Finding
+from go1exp.audit.report import Finding, Verdict
 from go1exp.recording import joint_channel
 
 SMOOTH = 0.2
@@ -50,11 +50,12 @@ def _other_unit(joint: str, times: float) -> Iterator[Finding]:
     Nothing moves so much farther than its target. So much less far moves a joint that is blocked, too.
     """
     degrees = 180.0 / np.pi
-    for factor, verdict, which in ((times, "bad", "q"), (1.0 / times, "suspect", "q_target")):
+    cases: tuple[tuple[float, Verdict, str], ...] = ((times, "bad", "q"), (1.0 / times, "suspect", "q_target"))
+    for factor, verdict, which in cases:
         if degrees / limits.FARTHER < factor < degrees * limits.FARTHER:
             message = f"moves {times:.3g} times as far as q_target_{joint}: {which}_{joint} looks like degrees"
             message += "" if which == "q" else f", or q_{joint} was taken for degrees"
-            yield finding("units", joint_channel("q", joint), verdict, times, "", message)  # type: ignore[arg-type]
+            yield finding("units", joint_channel("q", joint), verdict, times, "", message)
 
 
 def _enough(log: Log) -> bool:

@@ -12,6 +12,7 @@ from go1exp.audit.log import Log, finding, graded
 from go1exp.audit.report import Finding
 from go1exp.recording import joint_channel
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
+from go1exp.wording import counted
 
 SMALLER = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
 """How many of them make a second, and their name."""
@@ -90,9 +91,9 @@ def clock(log: Log) -> Iterator[Finding]:
         share = missing / (len(log.t) + missing)
         verdict = "bad" if longest > limits.LONGEST_GAP else graded(share, limits.GAPS)
         at = float(log.t[int(np.argmax(steps))])
-        samples = "1 sample is missing" if missing == 1 else f"{missing} samples are missing"
+        samples = f"{counted(missing, 'sample')} {'is' if missing == 1 else 'are'} missing"
         count = int(long.sum())
-        gaps = f"1 gap of {longest * 1e3:.4g} ms" if count == 1 else f"{count} gaps, the longest {longest * 1e3:.4g} ms"
+        gaps = f"{counted(count, 'gap')}{' of' if count == 1 else ', the longest'} {longest * 1e3:.4g} ms"
         yield finding("gaps", "t", verdict, missing, "samples", f"{samples} ({share:.2%}) in {gaps} at {at:.3f} s")
 
 

@@ -99,8 +99,6 @@ def writable_file(out: Path) -> None:
     """
     from go1exp.cli.logs import writable
 
-    if out.is_dir():
-        raise ConfigError([f"out = {str(out)!r}: is a folder; the results need the name of a file"])
     if out.exists() and not out.is_file():
         return
     try:

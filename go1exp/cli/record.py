@@ -74,9 +74,9 @@ def _task(container: dict[str, Any]) -> None:
     walk = trained(settings.run, settings.policy, "", "")[0] if settings.run or settings.policy else None
 
     from go1exp.cli.logs import writable
-    from go1exp.importers.source import counted
     from go1exp.record import plan
     from go1exp.record.simulate import Rig
+    from go1exp.wording import counted
 
     rig = Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
     driven = [m for m in motions if m.entry.name not in (POLICY, MPC)]
@@ -148,7 +148,7 @@ def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> 
 def _write(out: Path, recordings: list[Recording]) -> None:
     """Write the recordings and print what to do with them."""
     from go1exp import recording
-    from go1exp.importers.source import counted
+    from go1exp.wording import counted
 
     for r in recordings:
         recording.write(out / f"{r.meta.episode}.parquet", r)

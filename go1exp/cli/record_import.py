@@ -21,7 +21,7 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.files import mapping_of
     from go1exp.cli.settings import ImportSettings, parse
     from go1exp.importers import import_recordings
-    from go1exp.importers.source import counted
+    from go1exp.wording import counted
 
     settings = parse(ImportSettings, container)
     options = mapping_of(settings.options, "options")
@@ -55,16 +55,15 @@ def _refuse_one_name(path: str, names: Sequence[str]) -> None:
 
 def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
     """Return what is wrong with clocks whose steps are too long or too short, one line for all of one kind."""
-    import numpy as np
-
     from go1exp.audit.limits import LEAST_STEP
     from go1exp.audit.log import Log
     from go1exp.audit.single import wrong_steps
 
     flaws: dict[str, list[str]] = {}
     for r in recordings:
-        if len(r.t) > 1 and (message := wrong_steps(Log(r))):
-            unit = "ms" if float(np.median(np.diff(r.t))) > LEAST_STEP else "s"
+        log = Log(r)
+        if len(r.t) > 1 and (message := wrong_steps(log)):
+            unit = "ms" if log.dt > LEAST_STEP else "s"
             remedy = f"with source=csv, columns gives the unit: t: {{column: NAME, unit: {unit}}}"
             flaws.setdefault(f"t {message}; {remedy}", []).append(r.meta.episode)
     return [f"{_listed(episodes)}: {message}" for message, episodes in flaws.items()]

@@ -54,12 +54,7 @@ def save(result: GapResult, folder: Path) -> Path:
 
 
 def remove_older(folder: Path) -> list[str]:
-    """Remove what was made of an earlier result in a folder, and return the names: a new result has others or none.
-
-    Without a result there nothing was made of one, and a file of that name is the user's.
-    """
-    if not (folder / RESULT).is_file():
-        return []
+    """Remove what was made of an earlier result in a folder, and return the names: a new result has others or none."""
     older = [name for name in MADE_OF_IT if (folder / name).is_file()]
     for name in older:
         (folder / name).unlink()

@@ -11,11 +11,12 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from go1exp.importers.source import LEVEL, counted, files, rate, recording
+from go1exp.importers.source import LEVEL, files, rate, recording
 from go1exp.importers.table import UTF8, Layout, line_of, names, read
 from go1exp.recording import FLAG, FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Quaternion, Recording, RecordingError
 from go1exp.schema.joint_values import JointValues, each_within, spread
 from go1exp.schema.registry import STRICT, ConfigError, Positive, as_json, explain, importer, nearest
+from go1exp.wording import counted
 
 PATH = "importer.csv"
 """Where a complaint about an option begins."""

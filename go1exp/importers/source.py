@@ -17,17 +17,13 @@ from go1exp import __version__
 from go1exp.deploy.go1_fields import TORQUE_NOTE, in_torque_steps
 from go1exp.recording import Meta, Recording, RecordingError, joint_channels, problems
 from go1exp.schema.registry import explain
+from go1exp.wording import counted
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 """Attitude of an upright base, w-x-y-z."""
 
 RATE_DIGITS = 6
 """Significant digits of a rate taken from time stamps."""
-
-
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: ``1 row``, ``2 rows``."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def files(path: Path, pattern: str) -> list[Path]:
@@ -42,7 +38,7 @@ def files(path: Path, pattern: str) -> list[Path]:
         return [path]
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
-    matches = sorted(file for file in path.rglob("*") if fnmatch(file.name.lower(), pattern) and file.is_file())
+    matches = sorted(file for file in path.rglob("*") if fnmatch(file.name.lower(), pattern.lower()) and file.is_file())
     if not matches:
         raise RecordingError(f"{path}: no {pattern} in this folder")
     return matches

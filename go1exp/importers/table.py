@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.importers.source import counted
 from go1exp.recording import RecordingError
+from go1exp.wording import counted
 
 UTF8 = "utf-8"
 

@@ -15,6 +15,9 @@ Count = Annotated[int, Field(ge=1)]
 ROWS = "evals.csv"
 """File of a run folder: a row for each evaluation."""
 
+EVALUATED = "eval/"
+"""Begin of metrics that are columns of ``ROWS``, as trainings log them."""
+
 
 @dataclass(frozen=True)
 class EvalDuring:

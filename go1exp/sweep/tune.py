@@ -20,15 +20,12 @@ from typing import Any
 
 from go1exp.errors import Expected
 from go1exp.files import write_json
-from go1exp.schema.beside import ROWS
+from go1exp.schema.beside import EVALUATED, ROWS
 from go1exp.sweep import index, trials
 from go1exp.sweep.command import CORES, PARENT, Command, Ended, Running
 from go1exp.sweep.local import shares
 from go1exp.sweep.settings import TuneSettings
 from go1exp.sweep.trials import FOLDER, LOOK_S
-
-EVALUATED = "eval/"
-"""Begin of metrics that are columns of ``evals.csv``, as trainings log them."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ import torch
 
 from go1exp.config import TrainConfig
 from go1exp.files import opened, write_bytes, write_json, write_text
-from go1exp.schema.beside import ROWS
+from go1exp.schema.beside import EVALUATED, ROWS
 from go1exp.train.checkpoint import FORMAT, SUFFIX
 from go1exp.train.ppo import AdaptivePPO
 
@@ -167,7 +167,7 @@ class Beside:
         if better:
             write_bytes(self._run / BEST, file.read_bytes())
             write_json(self._run / "best.json", row)
-        return {f"eval/{key}": float(value) for key, value in row.items() if key != "steps"}
+        return {f"{EVALUATED}{key}": float(value) for key, value in row.items() if key != "steps"}
 
     def _write_rows(self) -> None:
         text = io.StringIO(newline="")

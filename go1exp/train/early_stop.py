@@ -12,14 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.files import write_json
-from go1exp.schema.beside import ROWS, StopRule
+from go1exp.schema.beside import EVALUATED, ROWS, StopRule
 from go1exp.schema.registry import unknown_name
 
 FILE = "stopped_early.json"
 """In the run folder: the rule that ended it, at which iteration and why."""
-
-EVALUATED = "eval/"
-"""Begin of metrics that are columns of ``evals.csv``."""
 
 
 class EarlyStop:

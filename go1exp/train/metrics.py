@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import HParam, KVWriter, Logger, TensorBoar
 
 from go1exp.config import LoggerConfig
 from go1exp.files import write_text
+from go1exp.schema.beside import EVALUATED
 from go1exp.train.wandb_writer import WandbWriter
 from go1exp.train.wandb_writer import check_account as check_account
 from go1exp.train.wandb_writer import log_tables as log_tables
@@ -104,7 +105,9 @@ def _hparams(settings: dict[str, Any]) -> HParam:
             flat[path] = str(value)
 
     take(settings, "")
-    return HParam(flat, dict.fromkeys(("rollout/return", "rollout/length", "task/fall_share", "eval/score"), 0.0))
+    return HParam(
+        flat, dict.fromkeys(("rollout/return", "rollout/length", "task/fall_share", f"{EVALUATED}score"), 0.0)
+    )
 
 
 def log_film(logger: Logger, steps: int, file: Path) -> None:
