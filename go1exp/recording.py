@@ -35,6 +35,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from go1exp.files import opened
 from go1exp.robot import JOINTS, LEGS
+from go1exp.schema.contact import ContactConfig
 from go1exp.schema.registry import STRICT, Expected, NonNegative, Positive, explain, nearest
 from go1exp.wording import counted
 
@@ -104,6 +105,8 @@ class Meta:
         versions: package -> version, of the tool and of the packages it used.
         notes: known flaws and anything else that a reader must know.
         format: version of the format.
+        contact: of the feet in the robot's model of training (time constant in s), or None where unknown. It says
+            nothing of the floor that the robot was on. Files leave it out where it is None.
     """
 
     robot: Annotated[str, Field(min_length=1)]
@@ -122,6 +125,7 @@ class Meta:
     versions: dict[str, str]
     notes: str
     format: Literal[1] = 1
+    contact: ContactConfig | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Meta:
@@ -143,6 +147,11 @@ class Meta:
 
 
 _META = TypeAdapter(Meta)
+
+
+def as_json(meta: Meta) -> bytes:
+    """Return metadata as JSON. That without a contact is to the byte what it was before there was such a field."""
+    return _META.dump_json(meta, exclude={"contact"} if meta.contact is None else None)
 
 
 def _joint_columns(joints: Iterable[str]) -> list[str]:
@@ -342,7 +351,7 @@ def write(path: Path, recording: Recording) -> None:
     path = Path(path)
     _stop(path, problems(recording))
     table = pa.table({name: pa.array(values) for name, values in recording.channels.items()})
-    table = table.replace_schema_metadata({KEY: _META.dump_json(recording.meta)})
+    table = table.replace_schema_metadata({KEY: as_json(recording.meta)})
     path.parent.mkdir(parents=True, exist_ok=True)
     with opened(path) as file:
         pq.write_table(table, file, compression="zstd", use_dictionary=False, write_page_checksum=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.cli.record import RIG
+from go1exp.cli.record import rig_groups
 from go1exp.cli.settings import RecordSettings, parse
 from go1exp.compose import compose
 from go1exp.config import parse_parts
@@ -22,10 +22,11 @@ def recorded(
     container = compose("record", ["backend.threads=1", *overrides])
     if effect is not None:
         container["effect"] = effect
-    parts, problems = parse_parts(container, RIG)
+    groups = rig_groups(container)
+    parts, problems = parse_parts(container, groups)
     assert problems == []
     terms = [bind("excitation", name, {}, name)[0] for name in container["excitation"]]
-    settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*RIG, "excitation")})
+    settings = parse(RecordSettings, {k: v for k, v in container.items() if k not in (*groups, "excitation")})
     rig = simulate.Rig(**parts, physics_dt=settings.physics_dt)
     episodes = plan.episodes([t for t in terms if t], settings)
     return rig, tuple(simulate.play(rig, episodes, settings.sensors, settings.seed, lambda done, total: None))

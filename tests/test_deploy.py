@@ -59,6 +59,7 @@ from go1exp.gap.robots.hung import hung
 from go1exp.record.plan import make_motion
 from go1exp.record.played import played
 from go1exp.recording import VECTORS
+from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.sim_robot.__main__ import bundle_task, sim_config
 from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
@@ -440,6 +441,7 @@ def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> N
         *("policy", "floating"),
     )
     assert r.meta.kp == (35.0,) * 12
+    assert r.meta.contact == bundle_task(file, {}).contact == MUJOCO_CONTACT
     assert r.meta.rate_hz == pytest.approx(500.0)
     assert len(r.t) == 600
     np.testing.assert_allclose(np.diff(r.t), TICK, atol=1e-9)
@@ -922,6 +924,29 @@ def test_a_robot_that_does_not_tell_what_it_obeys_is_taken_to_obey_the_newest(fi
     assert not any(name.startswith("foot_force") for name in result.channels)  # in no unit that anybody knows
     assert result.meta.source == "measured"
     assert "does not tell what it obeys" in result.meta.notes
+    assert result.meta.contact is None
+
+
+@pytest.mark.parametrize(
+    ("config", "contact"),
+    [
+        ({"contact": {"time_constant": 0.005, "cone": "elliptic", "impratio": 10}}, (0.005, "elliptic", 10.0)),
+        ({"robot": {}}, (0.02, "pyramidal", 1.0)),  # of a version that knew MuJoCo's own alone
+        ({"contact": {"time_constant": "soft"}}, None),
+        ({}, None),
+    ],
+)
+def test_a_log_names_the_contact_that_its_policy_was_trained_with(
+    file: str, config: dict[str, Any], contact: tuple[Any, ...] | None
+) -> None:
+    log = Log(100.0, 1.0)
+    for t, phase in ((0.0, "walking"), (0.01, "walking"), (0.02, "damping")):
+        log.note(cycle(t, phase, [make_state(t - k, clock=math.nan, in_force=-1) for k in (0.006, 0.002)]))
+    twelve = np.full(12, 20.0)
+    about = About(load(file).metadata, twelve, twelve, simulated=False, newton=False, episode="e", trained=config)
+    recording = log.recording(about)
+    assert recording is not None
+    assert recording.meta.contact == (None if contact is None else ContactConfig(*contact))
 
 
 def test_a_long_walk_keeps_its_newest_seconds(file: str, tmp_path: Path) -> None:

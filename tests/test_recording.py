@@ -22,6 +22,7 @@ from pydantic import ValidationError
 from go1exp import recording as rec
 from go1exp.recording import Meta, Recording, RecordingError
 from go1exp.robot import JOINTS, LEGS
+from go1exp.schema.contact import ContactConfig
 
 META = Meta(
     robot="arm",
@@ -140,7 +141,20 @@ def test_metadata_is_one_json_object_that_any_reader_finds(path: Path) -> None:
     assert result["joints"] == ["shoulder", "elbow"]
     assert result["format"] == 1
     assert result["tau_limit"] is None
-    assert set(result) == set(Meta.__dataclass_fields__)
+    assert set(result) == set(Meta.__dataclass_fields__) - {"contact"}  # which is left out where it is unknown
+
+
+def test_the_contact_of_the_model_comes_back_and_files_without_one_have_none(path: Path) -> None:
+    rec.write(path, arm())
+    assert rec.read(path).meta.contact is None  # as of files that older versions wrote
+    contact = ContactConfig(time_constant=0.005, cone="elliptic", impratio=10.0)
+    written = Recording(replace(META, contact=contact), arm().channels)
+    rec.write(path, written)
+    assert same(rec.read(path), written)
+    text = json.loads(pq.read_schema(path).metadata[rec.KEY])
+    assert text["contact"] == {"time_constant": 0.005, "cone": "elliptic", "impratio": 10.0}
+    plant(path, columns(written), {rec.KEY: json.dumps({**text, "contact": {"time_constant": 0.005}}).encode()})
+    refused(path, r"metadata\.contact\.cone")
 
 
 def test_a_joint_quantity_is_returned_in_the_order_of_the_metadata(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,11 +23,19 @@ if TYPE_CHECKING:
 RIG = ("robot", "actuator", "effect", "terrain", "backend")
 """Groups of the configuration that describe the robot to be recorded."""
 
+CONTACT = "contact"
+"""Group that may be left open: then a policy has the contact of its training, and motions have MuJoCo's own."""
+
 POLICY, MPC = "policy", "mpc"
 """The excitations that are a trained policy, and a model predictive controller, walking."""
 
 COMMANDS = "gentle"
 """Random commands (``conf/command``) that a model predictive controller walks under."""
+
+
+def rig_groups(container: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the groups of a configuration that describe the robot to be recorded, the contact if there is a choice."""
+    return (*RIG, CONTACT) if container.get(CONTACT) is not None else RIG
 
 
 def _motions(given: Any) -> list[Term]:
@@ -57,7 +66,8 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.effects.rules import drive_problems, has_gains
 
     readers = {"excitation": _motions, "controller": parse_controller}
-    settings, parts = parse_with_groups(RecordSettings, container, RIG, **readers)
+    groups = rig_groups(container)
+    settings, parts = parse_with_groups(RecordSettings, container, groups, **readers)
     motions = parts["excitation"]
     problems = drive_problems(parts["actuator"], parts["effect"], robot.JOINTS)
     names = {m.entry.name for m in motions}
@@ -78,7 +88,7 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.record.simulate import Rig
     from go1exp.wording import counted
 
-    rig = Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
+    rig = Rig(**{name: parts[name] for name in groups}, physics_dt=settings.physics_dt)
     driven = [m for m in motions if m.entry.name not in (POLICY, MPC)]
     episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
     out = writable(settings.out)

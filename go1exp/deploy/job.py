@@ -314,6 +314,7 @@ def _about(job: Job, bundle: Bundle, simulated: bool) -> About:
         notes="ends where the drives begin to brake"
         + (ON_WIRE if job.on_wire else "")
         + (OTHER_MOVER if job.mover and job.motion is None else ""),
+        trained=bundle.config,
     )
 
 

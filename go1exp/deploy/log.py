@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from go1exp.files import opened
 
 if TYPE_CHECKING:
     from go1exp.recording import Meta, Recording
+    from go1exp.schema.contact import ContactConfig
 
 STATES_PER_S = 500.0
 """States that a Go1 sends in a second."""
@@ -87,6 +88,7 @@ class About:
         excitation: what moved the robot.
         hung: whether its trunk was held in the air; the mean of what the IMU says is its attitude then.
         notes: anything else that a reader must know.
+        trained: the configuration of the policy's run, which says the contact of its feet.
     """
 
     metadata: Metadata
@@ -98,6 +100,7 @@ class About:
     excitation: str = "policy"
     hung: bool = False
     notes: str = ""
+    trained: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Log:
@@ -257,7 +260,17 @@ def _meta(about: About, channels: Mapping[str, np.ndarray], notes: str) -> Meta:
         tool="go1exp deploy",
         versions={"go1exp": __version__, "onnxruntime": metadata.version("onnxruntime")},
         notes=notes,
+        contact=_contact(about.trained),
     )
+
+
+def _contact(trained: Mapping[str, Any]) -> ContactConfig | None:
+    """Return the contact of a run, None if it cannot be read; one of an older version had MuJoCo's own."""
+    from go1exp.schema.contact import MUJOCO_CONTACT, read_contact
+
+    if not trained:
+        return None
+    return read_contact(trained["contact"]) if "contact" in trained else MUJOCO_CONTACT
 
 
 def _attitude(quat: np.ndarray) -> tuple[float, float, float, float]:

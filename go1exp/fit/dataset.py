@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from go1exp.fit.net import InputName, Target
 from go1exp.fit.settings import FitError
 from go1exp.fit.smoothing import smooth_motion
-from go1exp.recording import Meta, Recording
+from go1exp.recording import Recording, as_json
 from go1exp.schema.registry import unknown_name
 
 JointTorque = Callable[[Recording], np.ndarray]
@@ -270,7 +269,7 @@ def _clusters(recordings: Sequence[Recording]) -> list[set[str]]:
 def fingerprint(recording: Recording) -> str:
     """Return the SHA-256 of a recording: its metadata as JSON, then its columns by name, as float64 bytes."""
     # Sorted by name and always float64, so that neither column order nor file format changes the hash.
-    digest = hashlib.sha256(TypeAdapter(Meta).dump_json(Meta(**asdict(recording.meta))))
+    digest = hashlib.sha256(as_json(recording.meta))
     for name in sorted(recording.channels):
         digest.update(name.encode() + b"\0")
         digest.update(np.ascontiguousarray(recording.channels[name], dtype=np.float64).tobytes())

@@ -28,6 +28,7 @@ from go1exp.record.tape import Tape
 from go1exp.recording import Meta, Recording
 from go1exp.robot import RobotConfig
 from go1exp.schema.backends import BackendConfig
+from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import ConfigError, Term
 from go1exp.tensors.randomness import EnvRandom
@@ -41,7 +42,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Rig:
-    """The robots of a recording: model, drives, effects, ground, engine, and the physics step, s."""
+    """The robots of a recording: model, drives, effects, ground, engine, and the physics step, s.
+
+    ``contact`` is that of the feet. None is MuJoCo's own for motions, and for a policy the one that it was trained on.
+    """
 
     robot: RobotConfig
     actuator: Term
@@ -49,6 +53,7 @@ class Rig:
     terrain: TerrainConfig
     backend: BackendConfig
     physics_dt: float
+    contact: ContactConfig | None = None
 
 
 def held_quat(hang: tuple[float, float]) -> tuple[float, float, float, float]:
@@ -96,6 +101,7 @@ def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
         rig.robot,
         build_terrain(rig.terrain),
         rig.physics_dt,
+        contact=rig.contact or MUJOCO_CONTACT,
         imu=True,
         held=None if hang is None else held_quat(hang),
         mounted=on_mount(rig.effect),
@@ -163,6 +169,7 @@ def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[
         meta(
             rig.robot,
             sensors,
+            contact=rig.contact or MUJOCO_CONTACT,
             base="floating" if episode.hang is None else "fixed",
             base_quat=None if episode.hang is None else held_quat(episode.hang),
             kp=(episode.kp,) * robot.NUM_JOINTS,
@@ -198,6 +205,7 @@ def policy_task(rig: Rig, trained: TaskConfig, seconds: float) -> TaskConfig:
     if problems := time_rules(sim):
         raise ConfigError(problems)
     parts = {f.name: getattr(rig, f.name) for f in dataclasses.fields(rig) if f.name != "physics_dt"}
+    parts["contact"] = rig.contact or trained.contact
     return dataclasses.replace(trained, sim=sim, rand=(), event=(), curriculum=(), **parts)
 
 
@@ -259,6 +267,7 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
         about = meta(
             rig.robot,
             sensors,
+            contact=core.task.contact,
             base="floating" if held is None else "fixed",
             base_quat=held,
             kp=configured(rig.actuator, "kp"),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from go1exp.schema.registry import STRICT
+from go1exp.schema.registry import STRICT, as_json
 
 
 @dataclass(frozen=True)
@@ -29,3 +29,16 @@ class ContactConfig:
 
 MUJOCO_CONTACT = ContactConfig(time_constant=0.02, cone="pyramidal", impratio=1.0)
 """MuJoCo's own: a mattress. Runs of go1exp 0.1 were trained on it."""
+
+
+def read_contact(given: Any) -> ContactConfig | None:
+    """Return a contact from plain data; None if that is none."""
+    try:
+        return TypeAdapter(ContactConfig).validate_json(as_json(given))
+    except ValidationError:
+        return None
+
+
+def contact_text(contact: ContactConfig) -> str:
+    """Return a contact in words: ``5 ms, pyramidal, impratio 1``."""
+    return f"{1e3 * contact.time_constant:g} ms, {contact.cone}, impratio {contact.impratio:g}"
