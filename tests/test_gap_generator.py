@@ -56,6 +56,8 @@ def test_the_tolerances_are_those_of_the_library() -> None:
     import math
 
     import go1exp.config  # noqa: F401  (registers every effect)
+    from go1exp.effects.tolerances import Tolerances
+    from go1exp.schema.contact import MUJOCO_CONTACT
     from go1exp.schema.registry import members
 
     library: dict[str, dict[str, float]] = {}
@@ -63,7 +65,8 @@ def test_the_tolerances_are_those_of_the_library() -> None:
     for name, entry in members("effect").items():
         params: Any = entry.target.params  # type: ignore[attr-defined]
         library[name] = {p.name: p.tolerance for p in params if p.tolerance != math.inf}
-        nulls |= {(name, p.name): p.null for p in params if p.tolerance != math.inf}
+        keys = [(name, p.name) for p in params if p.tolerance != math.inf]
+        nulls |= {key: Tolerances(contact=MUJOCO_CONTACT).param(key).null for key in keys}
     assert library == known.TOLERANCES
     assert nulls == {(e, p): known.null(e, p) for e, ps in known.TOLERANCES.items() for p in ps}
 

@@ -18,6 +18,7 @@ from go1exp.config import parse_parts
 from go1exp.errors import Expected
 from go1exp.gap.result import GapResult, Overlay
 from go1exp.recording import Meta, Recording, RecordingError, joint_channels
+from go1exp.schema.contact import MUJOCO_CONTACT
 from go1exp.schema.registry import ConfigError
 from go1exp.viewer import requests as wish
 from go1exp.viewer.conditions import Setup
@@ -108,12 +109,12 @@ def test_an_effect_acts_by_its_size_and_goes(session: Session) -> None:
 
 def test_sizes_are_multiples_of_the_distance_from_null(robots: Robots) -> None:
     strength = robots.effects["strength"]
-    half = resized(strength, 0.5)
+    half = resized(strength, 0.5, MUJOCO_CONTACT)
     scale = strength.parameters["scale"]
     given = scale if isinstance(scale, float) else scale[0]
     shrunk = half.parameters["scale"] if isinstance(scale, float) else half.parameters["scale"][0]
     assert shrunk == pytest.approx(1.0 + 0.5 * (given - 1.0))
-    assert resized(robots.effects["coulomb"], 0.0).parameters["bound"] == (0.0, 0.0, 0.0)
+    assert resized(robots.effects["coulomb"], 0.0, MUJOCO_CONTACT).parameters["bound"] == (0.0, 0.0, 0.0)
     assert half.slots == {"spread": {}}
 
 

@@ -7,13 +7,15 @@ the robot moves as without it, bit for bit.
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from go1exp.drive import DriveSetup, ModelFields
 from go1exp.effects.identification import Identification
+from go1exp.schema.contact import ContactConfig
 from go1exp.schema.joint_values import JointValues, each_within
 from go1exp.tensors.memory import Memory
 
@@ -36,6 +38,8 @@ class Param:
             Infinite for a shape parameter.
         per: ``joint`` or ``robot``.
         doc: what it is, in a few words.
+        least: smallest value but ``null``, where that one is a word for what the model has anyway and no value by
+            itself (``Effect.nominal``); ``low`` if None.
     """
 
     name: str
@@ -46,13 +50,27 @@ class Param:
     tolerance: float
     per: Literal["joint", "robot"]
     doc: str
+    least: float | None = None
+
+    @property
+    def smallest(self) -> float:
+        """Smallest value at which the effect is there."""
+        return self.low if self.least is None else self.least
 
     @property
     def annotation(self) -> Any:
         """Type of the YAML value."""
+        if self.least is not None:
+            return Annotated[float, Field(ge=self.low, le=self.high), AfterValidator(self._apart)]
         if self.per == "joint":
             return Annotated[JointValues, each_within(self.low, self.high)]
         return Annotated[float, Field(ge=self.low, le=self.high)]
+
+    def _apart(self, value: float) -> float:
+        """Return a value that is null or large enough."""
+        if value != self.null and value < self.smallest:
+            raise ValueError(f"must be at least {self.smallest:g}, or {self.null:g} for that of the model")
+        return value
 
 
 @dataclass
@@ -136,6 +154,11 @@ class Effect(Memory):
             given = values.get(p.name, p.null)
             full = setup.rows(given) if p.per == "joint" else setup.zeros()[:, :1] + float(given)  # type: ignore[arg-type]
             setattr(self, p.name, full.nan_to_num(nan=p.null))
+
+    @classmethod
+    def nominal(cls, contact: ContactConfig) -> Mapping[str, float]:
+        """Return, by parameter, what a robot with this contact has where the null value leaves that of the model."""
+        return {}
 
     def prepare(self) -> None:
         """Work out what follows from the values; called when they have changed (``Plant.refresh``)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,6 +11,7 @@ from go1exp import robot
 from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Param
 from go1exp.effects.identification import Identification
+from go1exp.schema.contact import ContactConfig
 from go1exp.schema.registry import effect
 
 if TYPE_CHECKING:
@@ -17,8 +19,11 @@ if TYPE_CHECKING:
 
 FEET = tuple(f"{leg}_foot" for leg in robot.LEGS)
 
-NULL = 0.02
-"""MuJoCo's own time constant of a contact, s."""
+NULL = 0.0
+"""Leaves the time constant of the model, that of ``contact``."""
+
+LEAST = 0.004
+"""Smallest time constant that a step of 2 ms carries, s."""
 
 
 @effect("ground_compliance")
@@ -27,11 +32,14 @@ class GroundCompliance(Effect):
 
     Stiffness is 1 / (time_constant damping_ratio)^2 per effective mass (MuJoCo, "solver parameters"); the damping ratio
     stays, so a randomisation of ``foot_restitution``, which sets that one, acts as well. Below twice the physics step
-    MuJoCo raises it to that. It shows at touch-down and in the height of the stance, like a foot of another radius.
+    MuJoCo raises it to that. 0 leaves that of ``contact``. It shows at touch-down and in the height of the stance, like
+    a foot of another radius.
     """
 
     title = "compliance of the ground"
-    params = (Param("time_constant", "s", 0.004, 0.1, NULL, 0.003, "robot", "of the contact's spring-damper"),)
+    params = (
+        Param("time_constant", "s", NULL, 0.1, NULL, 0.003, "robot", "of the contact's spring-damper", least=LEAST),
+    )
     identification = Identification(
         nominal=True,
         rank=23,
@@ -41,6 +49,11 @@ class GroundCompliance(Effect):
     )
     fields = ("geom_solref",)
     time_constant: Tensor
+
+    @classmethod
+    def nominal(cls, contact: ContactConfig) -> Mapping[str, float]:
+        """Return the contact's own time constant."""
+        return {"time_constant": contact.time_constant}
 
     def edit_model(self, model: ModelFields) -> None:
         """Set the feet's, which have priority in a contact."""

@@ -56,6 +56,12 @@ def _values_problems(term: Term, path: str, joints: Sequence[str]) -> list[str]:
     return problems
 
 
+def _leaves_the_model(term: Term, name: str) -> bool:
+    """Return whether a parameter is null, and that is a word for what the model has and no value by itself."""
+    params = {p.name: p for p in getattr(term.entry.target, "params", ())}
+    return name in params and params[name].least is not None and term.parameters[name] == params[name].null
+
+
 def drive_problems(actuator: Term, effects: Iterable[Term], joints: Sequence[str]) -> list[str]:
     """Return what is wrong with actuator and effects together, one line each with its key path."""
     problems = [problem for term, path in drives(actuator) for problem in _values_problems(term, path, joints)]
@@ -65,6 +71,8 @@ def drive_problems(actuator: Term, effects: Iterable[Term], joints: Sequence[str
         for name in term.slots.get("spread", ()):
             if name not in term.parameters:
                 problems.append(unknown_name(f"{path}.spread.{name}", name, term.parameters, "parameter"))
+            elif _leaves_the_model(term, name):
+                problems.append(f"{path}.spread.{name}: needs {path}.{name}, the value that robots differ from")
         if term.entry.traits.get("gains") and not has_gains(actuator):
             problems.append(f"{path}: changes kp or kd, and actuator {actuator.entry.name!r} has neither")
     return problems

@@ -80,7 +80,7 @@ class EffectStack:
                 else:
                     centre += float(given) - p.null
                 unit = self._setup.random.stream(f"effect.{key}.{p.name}").uniform(live.shape[1], low=-1.0)
-                drawn = (centre + widths[p.name] * unit.to(live.dtype)).clamp(p.low, p.high)
+                drawn = (centre + widths[p.name] * unit.to(live.dtype)).clamp(p.smallest, p.high)
                 live.copy_(torch.where(named, drawn, centre))
 
     def model_values(self, compiled: Callable[[str], Tensor], ids: Callable[..., Tensor]) -> dict[str, Tensor]:

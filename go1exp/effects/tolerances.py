@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from go1exp.effects.base import Effect, Param
+from go1exp.schema.contact import ContactConfig
 from go1exp.schema.registry import members, unknown_name
 
 Key = tuple[str, str]
@@ -35,26 +36,37 @@ def sizes(effect: str) -> tuple[Key, ...]:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Tolerances of all parameters of all effects.
+    """All parameters of all effects as one robot has them: about which value, and how far that may be off.
 
     Attributes:
         replaced: (effect, parameter) -> tolerance in the place of the declared one, in the parameter's unit.
+        contact: of the robot's feet, whose values are the null ones of what acts on it; None of a robot in the air.
     """
 
     replaced: Mapping[Key, float] = field(default_factory=dict, hash=False)
+    contact: ContactConfig | None = None
 
     @staticmethod
-    def from_effects(by_effect: Mapping[str, Mapping[str, float]]) -> Tolerances:
+    def from_effects(by_effect: Mapping[str, Mapping[str, float]], contact: ContactConfig | None = None) -> Tolerances:
         """Return those of a configuration or a file: effect -> parameter -> tolerance."""
         return Tolerances(
-            {(effect, name): value for effect, params in by_effect.items() for name, value in params.items()}
+            {(effect, name): value for effect, params in by_effect.items() for name, value in params.items()}, contact
         )
 
+    def on(self, contact: ContactConfig) -> Tolerances:
+        """Return those of the same robot on its feet, which have this contact."""
+        return dataclasses.replace(self, contact=contact)
+
     def param(self, key: Key) -> Param:
-        """Return the declaration of a parameter with the tolerance that counts."""
+        """Return the declaration of a parameter with the null value and the tolerance that count."""
         param = declared(key)
         tolerance = self.replaced.get(key, param.tolerance)
-        return param if tolerance == param.tolerance else dataclasses.replace(param, tolerance=tolerance)
+        if tolerance != param.tolerance:
+            param = dataclasses.replace(param, tolerance=tolerance)
+        value = effect_class(key[0]).nominal(self.contact).get(key[1]) if self.contact else None
+        if value is not None:
+            param = dataclasses.replace(param, null=value, low=min(param.smallest, value), least=None)
+        return param
 
     def by_effect(self) -> dict[str, dict[str, float]]:
         """Return every finite tolerance that counts, the declared ones too: effect -> parameter -> tolerance."""

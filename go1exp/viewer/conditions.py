@@ -140,6 +140,6 @@ def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effe
         physics_dt=period / math.ceil(period / step - 1e-6),
         engine=setup.engine,
     )
-    ground, effect = known[setup.ground].built(setup.level), acting(setup.sizes, effects, task.actuator)
+    ground, effect = known[setup.ground].built(setup.level), acting(setup.sizes, effects, task.actuator, task.contact)
     made = dataclasses.replace(evaluation_task(task, config), terrain=ground, effect=effect)
     return delayed(made, setup.delay + delay_of_effects(made)) if setup.delay > 0.0 else made

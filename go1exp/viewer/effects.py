@@ -11,6 +11,8 @@ from go1exp.choices import choice_files, config_folder, load
 from go1exp.config import parse_parts
 from go1exp.effects.base import Param
 from go1exp.effects.rules import drive_problems
+from go1exp.effects.tolerances import Tolerances
+from go1exp.schema.contact import ContactConfig
 from go1exp.schema.joint_values import JointValues, numbers
 from go1exp.schema.registry import ConfigError, Term
 
@@ -46,13 +48,16 @@ def _acts(term: Term) -> bool:
     return any(v != nulls[name] for name, value in term.parameters.items() for v in numbers(value))
 
 
-def acting(sizes: Mapping[str, float], effects: Mapping[str, Term], actuator: Term) -> tuple[Term, ...]:
+def acting(
+    sizes: Mapping[str, float], effects: Mapping[str, Term], actuator: Term, contact: ContactConfig
+) -> tuple[Term, ...]:
     """Return the effects of a size above 0, at that size.
 
     Args:
         sizes: by name.
         effects: by name, at size 1.
         actuator: the drives.
+        contact: of the feet.
 
     Raises:
         ConfigError: if a name is not known, or effects and drives do not go together.
@@ -60,21 +65,25 @@ def acting(sizes: Mapping[str, float], effects: Mapping[str, Term], actuator: Te
     if strange := [name for name in sizes if name not in effects]:
         raise ConfigError([f"effect {strange[0]!r}: known are {', '.join(effects)}"])
     chosen = {name: size for name, size in sizes.items() if size > 0.0}
-    terms = tuple(effects[name] if size == 1.0 else resized(effects[name], size) for name, size in chosen.items())
+    terms = tuple(
+        effects[name] if size == 1.0 else resized(effects[name], size, contact) for name, size in chosen.items()
+    )
     if problems := drive_problems(actuator, terms, robot.JOINTS):
         raise ConfigError(problems)
     return terms
 
 
-def resized(term: Term, size: float) -> Term:
+def resized(term: Term, size: float, contact: ContactConfig) -> Term:
     """Return an effect whose parameters are ``size`` times as far from null, within their limits, alike in all robots.
 
-    A parameter per joint keeps its joints; one of which every value is null, a shape, stays.
+    A parameter per joint keeps its joints; one of which every value is null, a shape, stays. Null is what a robot has
+    whose feet have this contact.
     """
-    parameters = dict(term.parameters)
+    parameters, known = dict(term.parameters), Tolerances(contact=contact)
     for p in params_of(term):
-        if p.name in parameters:
-            parameters[p.name] = _scaled(parameters[p.name], p, size)
+        left_alone = p.least is not None and parameters.get(p.name) == p.null  # what the model has stays
+        if p.name in parameters and not left_alone:
+            parameters[p.name] = _scaled(parameters[p.name], known.param((term.entry.name, p.name)), size)
     return dataclasses.replace(term, parameters=parameters, slots={**term.slots, "spread": {}})
 
 

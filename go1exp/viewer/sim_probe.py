@@ -183,7 +183,7 @@ class Probe:
     def _begin_exchange(self, sizes: dict[str, float]) -> None:
         """Build a robot with other effects beside the one that walks; it takes over when it is ready."""
         try:
-            effect = acting(sizes, self._effects, self._body.actuator)
+            effect = acting(sizes, self._effects, self._body.actuator, self._body.contact)
         except ConfigError as error:
             self._message = " ".join(str(error).split())
             return
