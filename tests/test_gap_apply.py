@@ -29,6 +29,7 @@ from go1exp.gap.stages.explain import explain
 from go1exp.record import simulate
 from go1exp.recording import Recording
 from go1exp.robot import JOINTS
+from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
 from tests.laboratory import recorded
 
 NAN = math.nan
@@ -44,6 +45,7 @@ def named(effect: str, status: Status = "certified", half: float = 0.1, **params
 
 
 FRICTION = named("coulomb", bound={j: 0.2 + 0.01 * k for k, j in enumerate(CALVES)})
+STIFF = ContactConfig(time_constant=0.005, cone="pyramidal", impratio=1.0)
 TILT = replace(named("base_tilt", half=0.004, roll={"robot": 0.0210049}, pitch={"robot": -0.01}), joints=())
 GAIN = replace(named("kd_scale", scale={"FR_hip": 1.4}), alias_set=("kd_scale", "viscous"))
 
@@ -73,6 +75,7 @@ def whole() -> GapResult:
         advice=("Record steps.",),
         bootstrap_share={"coulomb": 0.9, "base_tilt": NAN},
         waterfall=(("model as it is", 56.3), ("within tolerances", NAN)),
+        contact=STIFF,
         overlays=(Overlay("chirp_0", np.array([0.0, 0.002, 0.004]), curves, curves, curves, {"q_a": NAN}),),
         box={"viscous": {"damping": {"FR_hip": 0.01, "FL_hip": NAN}}},
         provenance={"seed": 7, "physics_dt": 0.001, "logs": {"chirp_0": "ab" * 32}, "versions": {"numpy": "2"}},
@@ -171,6 +174,16 @@ def test_training_is_offered_only_where_there_is_something_to_train_with(capsys:
     assert "nothing is certified" in empty
     _print_next({"coulomb": {"bound": 0.2}}, robot, Path("gap/effect.yaml"))
     assert capsys.readouterr().out == "now: go1exp train effect=gap/effect.yaml\n"
+    for contact, choice in (
+        (MUJOCO_CONTACT, ""),
+        (STIFF, " contact=stiff"),
+        (
+            replace(STIFF, time_constant=0.008),
+            " contact.time_constant=0.008 contact.cone=pyramidal contact.impratio=1.0",
+        ),
+    ):
+        _print_next({"coulomb": {"bound": 0.2}}, robot, Path("effect.yaml"), contact)
+        assert capsys.readouterr().out == f"now: go1exp train effect=effect.yaml{choice}\n"
 
 
 # ---------------------------------------------------------------------- what training reads

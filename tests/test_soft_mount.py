@@ -22,6 +22,7 @@ from go1exp.compose import compose
 from go1exp.config import TaskConfig, parse_task
 from go1exp.effects.rules import on_mount
 from go1exp.effects.soft_mount import SoftMount
+from go1exp.effects.tolerances import DECLARED
 from go1exp.env.plant import Plant, drive_setup
 from go1exp.gap.comparison import LEVEL
 from go1exp.gap.data.prepare import Ready
@@ -285,7 +286,7 @@ def replayed(theta: Theta, more: Theta | None = None) -> list[np.ndarray]:
     """Replay four windows with ``theta``, and then also with ``more`` beside it in one call."""
     four, machine = np.arange(4), replayer().machine
     rows = [variants(machine, values, four, []) for values in (theta, *([] if more is None else [more]))]
-    return list(replayer().run(stacked(rows), 0.001).reshape(len(rows), 4, *replayer().windows.y.shape[1:]))
+    return list(replayer().run(stacked(rows, DECLARED), 0.001).reshape(len(rows), 4, *replayer().windows.y.shape[1:]))
 
 
 def test_null_values_change_no_bit_of_a_replay_whatever_is_replayed_beside_them() -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from go1exp.gap.result import GapResult
     from go1exp.gap.robots.protocol import Robot
     from go1exp.recording import Recording
+    from go1exp.schema.contact import ContactConfig
 
 DOES_NOT_HOLD = 15
 """Exit status if what was found is not as good at the step of training."""
@@ -50,7 +51,8 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.settings import GapVerb
     from go1exp.gap.robots.description import parse_model
 
-    settings, parts = parse_with_groups(GapVerb, with_logs(container), ("robot",), model=parse_model)
+    groups = ("robot",) if container.get("contact") is None else ("robot", "contact")
+    settings, parts = parse_with_groups(GapVerb, with_logs(container), groups, model=parse_model)
     if settings.accept:
         settings = replace(settings, search=replace(settings.search, accept=settings.accept))
     out, where = Path(settings.out), address(settings.host, settings.port)
@@ -72,7 +74,7 @@ def _task(container: dict[str, Any]) -> int:
 
     from go1exp.gap.robots.choice import robot_of
 
-    robot = robot_of(parts["model"], parts["robot"])
+    robot = robot_of(parts["model"], parts["robot"], contact=parts.get("contact"))
     if settings.stage == "check":
         return _check(recordings, robot, settings)
     if settings.stage == "localise":
@@ -187,7 +189,7 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
         least = proof.reported if proof.after <= proof.before else proof.before
         print(f"NOT applied: the error is {1 + proof.after:.3g} with the files at this step; {better} {1 + least:.3g}")
         return
-    _print_next(contents[apply.EFFECT], robot, out / apply.EFFECT)  # type: ignore[arg-type]
+    _print_next(contents[apply.EFFECT], robot, out / apply.EFFECT, result.contact)  # type: ignore[arg-type]
 
 
 def _status(result: GapResult, out: Path) -> int:
@@ -200,14 +202,30 @@ def _status(result: GapResult, out: Path) -> int:
     return DOES_NOT_HOLD if certified and not proof["holds"] else result.exit_code
 
 
-def _print_next(lacking: dict[str, Any], robot: Robot, file: Path) -> None:
-    """Say how to train with the effects in ``file``, if there are any, and a robot that is trained."""
+def _print_next(lacking: dict[str, Any], robot: Robot, file: Path, contact: ContactConfig | None = None) -> None:
+    """Say how to train with the effects in ``file``, if there are any, and a robot that is trained.
+
+    Training has MuJoCo's own contact by default; with another one, it is told.
+    """
     from go1exp.robot import JOINTS
 
     if not lacking:
         print(f"nothing is certified: {file} is empty, and training with it would change nothing")
     elif robot.joints == JOINTS:
-        print(f"now: {command('train', settings={'effect': file})}")
+        print(f"now: {command('train', settings={'effect': file, **_contact_choice(contact)})}")
+
+
+def _contact_choice(contact: ContactConfig | None) -> dict[str, str]:
+    """Return the choice of ``contact`` that training needs; nothing if it is the default or not known."""
+    from go1exp.choices import choice_files, config_folder, load
+    from go1exp.schema.contact import MUJOCO_CONTACT, read_contact
+
+    if contact is None or contact == MUJOCO_CONTACT:
+        return {}
+    names = [n for n, file in choice_files("contact", [config_folder()]).items() if read_contact(load(file)) == contact]
+    if names:
+        return {"contact": names[0]}
+    return {f"contact.{name}": str(value) for name, value in asdict(contact).items()}
 
 
 def _report(result: GapResult, out: Path) -> int:

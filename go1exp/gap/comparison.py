@@ -11,6 +11,7 @@ import numpy as np
 from go1exp.audit import audit, clock_flaws
 from go1exp.errors import Expected
 from go1exp.gap.data.clocks import rows_of, same_rows
+from go1exp.gap.data.contact import too_coarse
 from go1exp.gap.data.cutting import Place
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.splits import Splits, splits, stretches
@@ -158,6 +159,7 @@ def compare(
 
     Raises:
         NotComparable: if the recordings do not suit the robot, or are too short.
+        ConfigError: if recordings on the ground name different contacts, and none was chosen.
     """
     robot, clock = clock_taken(recordings, robot, settings, on_progress)
     on_progress("auditing the logs", 0.0)
@@ -174,6 +176,8 @@ def compare(
         raise NotComparable(sentence, [f"{short}; {fewest} are needed"], [sentence])
     on_progress("measuring the floors", 0.02)
     dt, scorer, numerical = _scored(robot, ready, windows, settings, physics_dt)
+    if physics_dt is None:
+        ready = replace(ready, warnings=(*ready.warnings, *too_coarse(robot.tolerances.contact, dt)))
     return Comparison(robot, ready, windows, dt, scorer, numerical, clock)
 
 

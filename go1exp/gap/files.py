@@ -26,6 +26,7 @@ from go1exp.gap.result import (
     NamedEffect,
     Overlay,
 )
+from go1exp.schema.contact import ContactConfig, read_contact
 from go1exp.schema.registry import Expected
 
 RESULT = "verdict.json"
@@ -94,6 +95,7 @@ def from_dict(plain: Mapping[str, Any]) -> GapResult:
     # Results of older versions call it bags.
     values["bootstrap_share"] = _numbers(plain["bags"] if "bags" in plain else plain["bootstrap_share"])
     values["tolerances"] = _numbers(plain.get("tolerances", {}))  # of an older version: the declared ones
+    values["contact"] = _contact(plain.get("contact"))
     values["clock"] = _clock(plain.get("clock"))  # older results have none
     for name in ("closed", "seconds"):
         values[name] = _number(plain[name])
@@ -134,6 +136,14 @@ def _errors(item: Mapping[str, Any] | None) -> AngleErrors | None:
     numbers = {name: _number(item[name]) for name in ("removed", "worse")}
     within = _pair(item["within"]) if item.get("within") else None  # older results have none
     return AngleErrors(**{**item, **numbers, **pairs, "median": _pair(item["median"]), "within": within})
+
+
+def _contact(item: Mapping[str, Any] | None) -> ContactConfig | None:
+    """Return the contact of a result; older ones have none."""
+    contact = None if item is None else read_contact(item)
+    if item is not None and contact is None:
+        raise ValueError(f"contact {item!r}")
+    return contact
 
 
 def _clock(item: Mapping[str, Any] | None) -> ClockChoice | None:

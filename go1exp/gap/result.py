@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
+from go1exp.schema.contact import ContactConfig
 from go1exp.schema.registry import STRICT, Fraction, NonNegative, Positive
 
 Verdict = Literal["no gap", "explained", "partly explained", "unexplained", "not excited", "bad log"]
@@ -332,6 +333,7 @@ class GapResult:
         overlays: windows to look at.
         box: parameters within their tolerances: effect -> parameter -> joint or ``robot`` -> value.
         tolerances: that counted: effect -> parameter -> tolerance; where there is none, the effect's declared one.
+        contact: of the feet in the model; None of a robot that is not on its feet, and in older results.
         clock: which of two clocks was taken; None if the model did not ask for a comparison.
         provenance: hashes, versions, seeds, steps.
         warnings: what a reader must know, a sentence each.
@@ -355,6 +357,7 @@ class GapResult:
     overlays: tuple[Overlay, ...] = ()
     box: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
     tolerances: dict[str, dict[str, float]] = field(default_factory=dict)
+    contact: ContactConfig | None = None
     clock: ClockChoice | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()

@@ -119,11 +119,13 @@ def _lacking(effect: NamedEffect, everyone: Sequence[str], known: Tolerances) ->
     texts = []
     for name in [*telling, *(shape for _, shape in free_shapes(effect.effect) if effect.params.get(shape))]:
         values = np.array(list(effect.params[name].values()))
-        p = declared((effect.effect, name))
+        p = known.param((effect.effect, name))
         half = np.mean([0.5 * (b - a) for a, b in effect.interval[name].values()])
         spread = f", {values.min():.3g} to {values.max():.3g}" if len(values) > 1 else ""
         unit = "" if p.unit == "-" else f" {p.unit}"
-        texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}")
+        # A null that is the model's own is none that a reader could know.
+        instead = f" (the model has {p.null:g}{unit})" if declared((effect.effect, name)).least is not None else ""
+        texts.append(f"{p.name} {values.mean():.3g} ± {half:.2g}{unit}{spread}{instead}")
     held = dict.fromkeys(name for law in effect_class(effect.effect).identification.laws for name in law)
     laws = {name: effect.params[name].values() for name in held if effect.params.get(name)}
     texts += [f"{name} {np.mean(list(values)):.3g}" for name, values in laws.items()]

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 import go1exp.effects  # noqa: F401  (registers every effect)
-from go1exp.effects.tolerances import declared, effect_class, sizes
+from go1exp.effects.tolerances import Tolerances, declared, effect_class, sizes
 from go1exp.gap.replay.machine import Machine
 from go1exp.robot import MOUNT_HINGES, MOUNT_SLIDES
-from go1exp.schema.registry import members
 
 MOUNT_LOAD = 2 * (*(10.0 for _ in MOUNT_SLIDES), *(2.0 for _ in MOUNT_HINGES))
 """Standard deviation of ``Rows.mount``, N and N m (chosen: a leg of 2 kg that swings at 5 m/s2)."""
@@ -64,9 +63,10 @@ def bolted(rows: Rows) -> Rows:
     return replace(rows, values={key: v for key, v in rows.values.items() if not effect_class(key[0]).mounts})
 
 
-def null(effect: str) -> Theta:
-    """Return the null values of an effect as arrays (1,)."""
-    return {(effect, p.name): np.array([p.null]) for p in members("effect")[effect].target.params}  # type: ignore[attr-defined]
+def null(effect: str, tolerances: Tolerances) -> Theta:
+    """Return the null values of an effect as a robot with these tolerances has them, as arrays (1,)."""
+    keys = [(effect, p.name) for p in effect_class(effect).params]
+    return {key: np.array([tolerances.param(key).null]) for key in keys}
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,8 @@ def variants(
     full: dict[Key, np.ndarray] = {}
     keys = {*theta, *(p.key for p in probes if isinstance(p.key, tuple)), *(k for p in probes for k in p.also), *known}
     for effect in dict.fromkeys(sorted(name for name, _ in keys)):
-        for key, value in null(effect).items():
-            per = {p.name: p.per for p in members("effect")[effect].target.params}[key[1]]  # type: ignore[attr-defined]
-            wide = joints if per == "joint" else 1
+        for key, value in null(effect, machine.tolerances).items():
+            wide = joints if declared(key).per == "joint" else 1
             full[key] = np.tile(np.broadcast_to(theta.get(key, value), (wide,)), (count, 1))
     q, qd, base = np.zeros((count, joints)), np.zeros((count, joints)), np.zeros((count, len(machine.base_probe)))
     mount = np.zeros((count, len(MOUNT_LOAD)))

@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 import go1exp.gap.report.words as words
 from go1exp.effects.tolerances import Tolerances
+from go1exp.gap.data.contact import tolerances_of
 from go1exp.gap.result import GapResult, NamedEffect, Overlay
 from go1exp.svg import PAGE_INCHES, draw
 
@@ -212,7 +213,7 @@ def box(result: GapResult) -> Markup:
     rows = []
     for effect, by_name in result.box.items():
         for name, values in by_name.items():
-            declared = words.param(effect, name, words.tolerances(result))
+            declared = words.param(effect, name, tolerances_of(result))
             if declared and math.isfinite(declared.tolerance):
                 unit = words.unit(effect, name)
                 label = f"{effect} {name} (± {words.number(declared.tolerance)}{' ' if unit else ''}{unit})"

@@ -12,6 +12,7 @@ import go1exp.gap.report.figures as figures
 import go1exp.gap.report.tables as tables
 import go1exp.gap.report.words as words
 from go1exp.files import write_text
+from go1exp.gap.data.contact import tolerances_of
 from go1exp.gap.result import GapResult
 from go1exp.gap.search import clocks
 
@@ -82,7 +83,7 @@ def _context(result: GapResult) -> dict[str, Any]:
         ],
         "waterfall": figures.waterfall(result) if any(v == v for _, v in result.waterfall) else None,
         "forests": [
-            figures.forest(n, name, k, words.tolerances(result)) for k, (n, name) in enumerate(forests[:MOST_FORESTS])
+            figures.forest(n, name, k, tolerances_of(result)) for k, (n, name) in enumerate(forests[:MOST_FORESTS])
         ],
         "box": figures.box(result),
         "bootstraps": figures.bootstraps(result),

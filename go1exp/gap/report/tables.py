@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 import go1exp.gap.report.words as words
+from go1exp.gap.data.contact import tolerances_of
 from go1exp.gap.result import Candidate, GapResult, Localisation
+from go1exp.schema.contact import contact_text
 
 SMALLEST = 0.1
 """Excess below which the heat map's colour is that of none."""
@@ -217,7 +219,7 @@ def values(result: GapResult) -> list[Value]:
     rows = []
     for named in result.named:
         for name, by_joint in named.params.items():
-            p = words.param(named.effect, name, words.tolerances(result))
+            p = words.param(named.effect, name, tolerances_of(result))
             for joint, value in by_joint.items():
                 pair = named.interval.get(name, {}).get(joint)
                 interval = f"{words.number(pair[0])} to {words.number(pair[1])}" if pair else words.NOTHING
@@ -246,6 +248,8 @@ def provenance(result: GapResult) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return where the result is from: (what, entries), what is not a mapping of names under ``Run``."""
     plain = result.as_dict()["provenance"]
     single = [(name, _value_text(value)) for name, value in plain.items() if not isinstance(value, dict)]
+    if result.contact:
+        single.append(("contact of the feet", contact_text(result.contact)))
     if math.isfinite(result.seconds):
         single.append(("seconds", f"{words.number(result.seconds)} s"))
     tables = [

@@ -113,11 +113,6 @@ def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | 
     return tolerances.param((effect, name)) if any(p.name == name for p in known) else None
 
 
-def tolerances(result: GapResult) -> Tolerances:
-    """Return the tolerances that counted."""
-    return Tolerances.from_effects(result.tolerances)
-
-
 def unit(effect: str, name: str) -> str:
     """Return the unit of a parameter, empty for none."""
     declared = param(effect, name)

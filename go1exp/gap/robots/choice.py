@@ -8,14 +8,28 @@ from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.robots.protocol import Robot
 from go1exp.robot import RobotConfig
+from go1exp.schema.contact import ContactConfig
+from go1exp.schema.registry import ConfigError
 
 
-def robot_of(model: ModelConfig | Go1Model, config: RobotConfig, path: str = "model") -> Robot:
+def robot_of(
+    model: ModelConfig | Go1Model, config: RobotConfig, path: str = "model", contact: ContactConfig | None = None
+) -> Robot:
     """Return the robot of a description; the Go1 is ``config``, hung.
 
+    Args:
+        model: the description.
+        config: of the Go1.
+        path: key of the description, for messages.
+        contact: of a Go1's feet, if one was chosen.
+
     Raises:
-        ConfigError: with what its MuJoCo file lacks, naming the key.
+        ConfigError: with what its MuJoCo file lacks, naming the key; or if a contact was chosen for a fixed base.
     """
     if isinstance(model, Go1Model):
-        return hung(config, Tolerances.from_effects(model.tolerances))
+        return hung(config, Tolerances.from_effects(model.tolerances), contact)
+    if contact is not None:
+        raise ConfigError(
+            [f"contact: is of the feet of a Go1; {path} is a robot on a fixed base, and it would do nothing"]
+        )
     return FixedBase.from_config(model, path)

@@ -13,6 +13,7 @@ from go1exp.audit import AuditReport
 from go1exp.drive import DriveSetup
 from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.env.plant import drive_setup
+from go1exp.gap.data.contact import contact_of
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.windows import Windows
@@ -28,6 +29,7 @@ from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
+from go1exp.schema.contact import ContactConfig
 from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import TerrainConfig, build_terrain
 
@@ -45,6 +47,7 @@ class HungGo1(Go1):
         base_probe: none, as the trunk is held.
         on_ground: no.
         tolerances: of nominal parameters.
+        contact: of its feet where a recording shows it on them; None takes the one that recordings name.
         free_trunk: no.
     """
 
@@ -54,6 +57,7 @@ class HungGo1(Go1):
     base_probe: tuple[float, ...] = ()
     on_ground: bool = False
     tolerances: Tolerances = DECLARED
+    contact: ContactConfig | None = None
     free_trunk: ClassVar[bool] = False
 
     @property
@@ -78,12 +82,18 @@ class HungGo1(Go1):
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
-        """Return the Go1 on its feet, or its legs in the air, if its trunk is free in a recording, else this one."""
+        """Return the Go1 on its feet, or its legs in the air, if its trunk is free in a recording, else this one.
+
+        Raises:
+            ConfigError: for one on its feet, if recordings name different contacts and none was chosen.
+        """
         if not any(r.meta.base == "floating" for r in recordings):
             return self
         if phase == "swing":
             return SwingingGo1(self.config, tolerances=self.tolerances)
-        return StandingGo1(self.config, replace(self, groups=ONE_GROUP), tolerances=self.tolerances)
+        contact = contact_of(recordings, self.contact)
+        held, known = replace(self, groups=ONE_GROUP), self.tolerances.on(contact)
+        return StandingGo1(self.config, held, tolerances=known, contact=contact)
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are."""
@@ -98,6 +108,6 @@ class HungGo1(Go1):
         return Replayer(self, windows, quats, max_rows, threads)
 
 
-def hung(config: RobotConfig, tolerances: Tolerances = DECLARED) -> Robot:
-    """Return a Go1 whose trunk is held."""
-    return HungGo1(config, tolerances=tolerances)
+def hung(config: RobotConfig, tolerances: Tolerances = DECLARED, contact: ContactConfig | None = None) -> Robot:
+    """Return a Go1 whose trunk is held; on its feet it has ``contact``, or the one that recordings name."""
+    return HungGo1(config, tolerances=tolerances, contact=contact)

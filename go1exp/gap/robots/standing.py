@@ -13,6 +13,7 @@ from go1exp.audit import AuditReport
 from go1exp.drive import DriveSetup
 from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.env.plant import drive_setup
+from go1exp.gap.data.contact import contact_warnings
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet
 from go1exp.gap.data.windows import Windows
@@ -26,6 +27,7 @@ from go1exp.physics.mujoco_cpu import MujocoCpu
 from go1exp.physics.scene import build_model
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
+from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.tensors.randomness import EnvRandom
 from go1exp.terrain import TerrainConfig, build_terrain
 
@@ -34,6 +36,9 @@ NO_SENSORS = 1 << 13
 
 BASE_PROBE = (5.0e-4, 1.0e-3, 1.0e-3, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
 """Changes of a base's initial height, roll, pitch, velocity and rate by which their influence is measured."""
+
+
+ON_MUJOCO = DECLARED.on(MUJOCO_CONTACT)
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,8 @@ class StandingGo1(Go1):
         groups: all joints in one.
         base_probe: as for :class:`~go1exp.gap.replay.machine.Machine`.
         on_ground: yes.
-        tolerances: of nominal parameters.
+        tolerances: of nominal parameters, about the values of this contact.
+        contact: of the feet.
         free_trunk: yes.
     """
 
@@ -57,14 +63,16 @@ class StandingGo1(Go1):
     groups: tuple[tuple[int, ...], ...] = ONE_GROUP
     base_probe: tuple[float, ...] = BASE_PROBE
     on_ground: bool = True
-    tolerances: Tolerances = DECLARED
+    tolerances: Tolerances = ON_MUJOCO
+    contact: ContactConfig = MUJOCO_CONTACT
     free_trunk: ClassVar[bool] = True
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
     ) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
-        model, blocks = build_model(self.config, build_terrain(TerrainConfig(kind="flat")), physics_dt)
+        ground = build_terrain(TerrainConfig(kind="flat"))
+        model, blocks = build_model(self.config, ground, physics_dt, contact=self.contact)
         model.opt.disableflags |= NO_SENSORS
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
@@ -75,7 +83,8 @@ class StandingGo1(Go1):
 
     def prepared(self, recordings: Sequence[Recording], reports: Sequence[AuditReport], settings: GapSettings) -> Ready:
         """Return the recordings as they are, with windows that suit contact."""
-        return Ready(tuple(recordings), for_feet(settings, recordings))
+        warnings = tuple(contact_warnings(recordings, self.contact))
+        return Ready(tuple(recordings), for_feet(settings, recordings), warnings=warnings)
 
     def windows(self, ready: Ready) -> StandingWindows:
         """Cut recordings into windows that begin where at least two feet carry weight."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from go1exp.effects.tolerances import Tolerances
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Rows, Theta, null, variants
 from go1exp.gap.score.likelihood import Scorer
@@ -42,10 +43,10 @@ class Model:
     residual: np.ndarray | None = None
 
 
-def stacked(parts: Sequence[Rows]) -> Rows:
-    """Put rows one below the other; effects that one has not are null there."""
+def stacked(parts: Sequence[Rows], known: Tolerances) -> Rows:
+    """Put rows of a robot with these tolerances one below the other; effects that one has not are null there."""
     effects = dict.fromkeys(effect for rows in parts for effect, _ in rows.values)
-    keys = {key: value for effect in effects for key, value in null(effect).items()}
+    keys = {key: value for effect in effects for key, value in null(effect, known).items()}
     values = {}
     for key, value in keys.items():
         wide = max(rows.values[key].shape[1] for rows in parts if key in rows.values)
@@ -58,7 +59,7 @@ def stacked(parts: Sequence[Rows]) -> Rows:
 def residuals(scorer: Scorer, thetas: Sequence[Theta], windows: np.ndarray, dt: float) -> np.ndarray:
     """Return the residuals (M, V, G, m) of several models."""
     machine = scorer.replayer.machine
-    rows = stacked([variants(machine, theta, windows, []) for theta in thetas])
+    rows = stacked([variants(machine, theta, windows, []) for theta in thetas], machine.tolerances)
     flat = scorer.residual(rows, dt)
     return flat.reshape(len(thetas), len(windows), *flat.shape[1:])
 
@@ -182,7 +183,7 @@ def _refreshed(
     if not any(lots):
         return [([], np.empty(0)) for _ in models]
     parts = [variants(machine, m.theta, windows, probes) for m, probes in zip(models, lots, strict=True)]
-    y = replayer.run(stacked(parts), 2.0 * dt)
+    y = replayer.run(stacked(parts, machine.tolerances), 2.0 * dt)
     refreshed, at = [], 0
     for probes, rows in zip(lots, parts, strict=True):
         replayed = y[at : at + len(rows.window)].reshape(len(windows), 1 + len(probes), *y.shape[1:])

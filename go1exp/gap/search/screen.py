@@ -160,10 +160,27 @@ def _levels(machine: Machine, effect: str, how: Identification, moved: Motion) -
             keys = [key for key in sizes(effect) if not level or key[1] in level]
             probes = []
             for p in tolerances.probes(machine, keys, {}, PROBE):
-                delta = np.broadcast_to(level[p.key[1]], p.delta.shape).copy() if level else p.delta
+                key = (effect, p.key[1])
+                delta = _within(machine, key, level[key[1]], p.delta) if level else p.delta
                 probes.append(Probe(p.key, p.place, delta, shapes))
+            if any(not probe.delta.any() for probe in probes):
+                continue  # no room for this level: a robot on hard ground has hardly any harder one
             exact = bool(how.limits_torque) and isinstance(level.get(how.limits_torque), np.ndarray)
             yield Variant(effect, tuple(probes), shapes, exact)
+
+
+def _within(machine: Machine, key: Key, change: float | np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Return a change from null in the shape of ``like``, a number within the parameter's bounds.
+
+    All 0 if next to nothing is left of it.
+    """
+    delta, p = np.broadcast_to(change, like.shape).copy(), machine.tolerances.param(key)
+    if isinstance(change, np.ndarray):
+        return delta
+    beyond = (p.null + delta < p.low) | (p.null + delta > p.high)
+    delta[beyond] = (p.null + delta[beyond]).clip(p.low, p.high) - p.null
+    delta[beyond & (np.abs(delta) < tolerances.SMALL * p.tolerance)] = 0.0
+    return delta
 
 
 @dataclass(frozen=True)

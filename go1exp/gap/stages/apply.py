@@ -16,16 +16,19 @@ from go1exp.effects.base import Effect, Param
 from go1exp.effects.tolerances import Tolerances
 from go1exp.files import write_text
 from go1exp.gap.comparison import Comparison, compare, robot_from
+from go1exp.gap.data.contact import tolerances_of
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.files import CALIBRATION, COMPENSATING, EFFECT, GapFileError
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.robots.fixed_base import FixedBase
+from go1exp.gap.robots.hung import HungGo1
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search.fit import scores
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
+from go1exp.schema.contact import contact_text
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term, members
 from go1exp.tensors.threads import one_thread
@@ -78,7 +81,7 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
         (
             CALIBRATION,
             "The model's own parameters, within their tolerances.",
-            _box_lines(result.box, Tolerances.from_effects(result.tolerances)),
+            _box_lines(result.box, tolerances_of(result)),
         ),
         (COMPENSATING, "Makes up for something that no effect describes. Not for training.", _named_lines(rest)),
     ):
@@ -155,6 +158,8 @@ def _provenance(result: GapResult) -> list[str]:
     lines = [f"# Found by go1exp gap, {date.today().isoformat()}: {result.verdict}.", f"# {result.sentence}"]
     lines.append(f"# versions {json.dumps(about.get('versions', {}))}")
     lines.append(f"# seed {about.get('seed')}, step {about.get('physics_dt')} s")
+    if result.contact:
+        lines.append(f"# contact of the feet: {contact_text(result.contact)}; train with the same `contact`")
     return lines + [f"# log {name}: sha256 {digest}" for name, digest in about.get("logs", {}).items()]
 
 
@@ -218,7 +223,7 @@ def _same_search(
     changed = [f"search.{k}" for k in SPLITTING if k in before and before[k] != now[k]]
     if changed:
         raise GapFileError(f"{', '.join(changed)}: not as in the search that found this; run go1exp gap explain again")
-    searched = Tolerances.from_effects(result.tolerances)
+    searched = tolerances_of(result)
     for key, value in tolerances.replaced.items():
         if value != searched.param(key).tolerance:
             raise GapFileError(
@@ -262,6 +267,8 @@ def prove(
     _same_search(recordings, settings, result, robot.tolerances)
     with one_thread():
         comparison = compare(recordings, robot, settings, physics_dt=physics_dt, fewest=1)
+        if comparison.robot.on_ground:
+            _same_contact(comparison.robot.tolerances, tolerances_of(result))
         windows = _judged(comparison, result)
         values = _proposals(contents, robot)
         plain, effect_only, both = (excess(_held_out(comparison, theta, windows)) for theta in values)
@@ -272,6 +279,28 @@ def prove(
 
 
 def read_as(robot: Robot, result: GapResult) -> Robot:
+    """Return the robot with the contact, and read by the clock, that a result was found by.
+
+    Raises:
+        GapFileError: if another contact is chosen now, or the model says now what the search was to compare.
+    """
+    if isinstance(robot, HungGo1) and result.contact is not None:
+        if robot.contact is not None:
+            _same_contact(Tolerances(contact=robot.contact), tolerances_of(result))
+        return replace(robot, contact=result.contact)
+    return _by_clock(robot, result)
+
+
+def _same_contact(now: Tolerances, searched: Tolerances) -> None:
+    """Raise a ``GapFileError`` unless the feet have the contact that they had in a search."""
+    if now.contact != searched.contact and now.contact and searched.contact:
+        texts = contact_text(now.contact), contact_text(searched.contact)
+        raise GapFileError(
+            f"contact: {texts[0]}; {texts[1]} in the search that found this; run go1exp gap explain again"
+        )
+
+
+def _by_clock(robot: Robot, result: GapResult) -> Robot:
     """Return the robot whose recordings are read by the clock that a result was found by.
 
     Raises:

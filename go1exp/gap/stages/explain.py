@@ -54,11 +54,15 @@ def explain(
         robot: the nominal Go1, or another :class:`~go1exp.gap.robots.protocol.Robot`.
         settings: how; the defaults if None.
         on_progress: called with what is being done, and which share of the work is finished.
+
+    Raises:
+        ConfigError: if the whole robot is compared, and recordings on the ground name different contacts.
     """
     settings, robot = settings or GapSettings(), robot_from(robot)
     if settings.phase != "auto":
         return _explained(recordings, robot, settings, on_progress)
     whole, notes, seconds = replace(settings, phase="whole"), tuple[str, ...](), 0.0
+    robot.suited(recordings)  # refuses recordings of different contacts before the legs take their minutes
     if all(r.meta.base == "floating" for r in recordings):
         swing = replace(settings, phase="swing")
         legs = _explained(recordings, robot, swing, lambda what, share: on_progress(what, 0.5 * share))
@@ -167,6 +171,7 @@ def written(
         waterfall=(("model as it is", answer.excess["null"]), *search.steps),
         overlays=overlays(score, comparison.recordings, search.state.theta, parts.select, settings.overlays, dt),
         tolerances=comparison.robot.tolerances.by_effect(),
+        contact=comparison.robot.tolerances.contact,
         clock=comparison.clock,
         box=_nested(answer.theta, score.windows.joints, named),
         provenance={**about, "simulation_steps": score.replayer.made},
