@@ -30,6 +30,12 @@ WITHOUT = {
 }
 """Group without a choice of its own -> what its line says of that; all others then keep the choice of training."""
 
+WITHOUT_IN = {
+    ("gap", "contact"): "; without it that which the recordings name, or soft",
+    ("record", "contact"): "; without it soft, and of a policy that of training",
+}
+"""The same for a group of one verb."""
+
 
 def show(verb: str, title: str, arguments: Sequence[str]) -> None:
     """Print the help of a verb, or of the group that is named among the arguments.
@@ -98,7 +104,7 @@ def _page(verb: str, title: str, container: Mapping[str, Any]) -> list[str]:
     if groups:
         lines.append("Groups (group=choice, or group=FILE.yaml; * is what is chosen otherwise):")
         for group, default in groups.items():
-            lines += _beside(group, _choices(group, default), 14)
+            lines += _beside(group, _choices(verb, group, default), 14)
         lines += ["", f"  {title} --help {next(iter(groups))}      choices and keys of one group", ""]
     texts = texts_of(verb)
     lines.append("Settings (key=value; these are the values without it):")
@@ -181,13 +187,15 @@ def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
     return {f"{group}.{key}": terms[name].doc for key, name in names.items() if name in terms}
 
 
-def _choices(group: str, default: str | None) -> str:
+def _choices(verb: str, group: str, default: str | None) -> str:
     """Return the names of a group's choices in a line; those in folders as ``ablation/...``."""
     names = dict.fromkeys(
         n if "/" not in n else f"{n.split('/')[0]}/..." for n in choice_files(group, [config_folder()])
     )
     listed = ", ".join(name + ("*" if name == default else "") for name in names)
-    return listed if default else listed + WITHOUT.get(group, "; without it that of training")
+    if default:
+        return listed
+    return listed + WITHOUT_IN.get((verb, group), WITHOUT.get(group, "; without it that of training"))
 
 
 def _flat(container: Mapping[str, Any], path: str = "") -> dict[str, Any]:
