@@ -13,8 +13,9 @@ import pytest
 
 import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp import robot
+from go1exp.cli.gap import APP
 from go1exp.compose import compose
-from go1exp.config import parse_parts
+from go1exp.config import parse_parts, parse_task
 from go1exp.effects.rules import drive_problems
 from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.gap import files
@@ -35,7 +36,8 @@ from go1exp.gap.search.screen import Motion, library
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.stages import apply
 from go1exp.gap.stages.explain import explain
-from go1exp.recording import Recording
+from go1exp.record.simulate import policy_task
+from go1exp.recording import Recording, write
 from go1exp.robot import RobotConfig
 from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig, contact_text
 from go1exp.schema.registry import ConfigError, bind
@@ -80,6 +82,14 @@ def test_record_names_its_contact_and_one_that_is_not_chosen_is_mujocos_own() ->
         assert np.abs(a.joint("q") - c.joint("q")).max() > 1e-3
 
 
+def test_a_policy_is_recorded_on_the_contact_of_its_training_unless_another_is_chosen() -> None:
+    rig, _ = laboratory.recorded(["excitation=[chirp]", "seconds=0.5"])
+    trained = parse_task(compose("train", ["contact=stiff"]))
+    assert rig.contact is None
+    assert policy_task(rig, trained, 1.0).contact == STIFF
+    assert policy_task(replace(rig, contact=ELLIPTIC), trained, 1.0).contact == ELLIPTIC
+
+
 def test_the_model_has_the_contact_that_recordings_name_or_that_is_chosen() -> None:
     config, soft = recorded("excitation=[squat,drop]")
     _, hard = recorded("excitation=[squat,drop]", "contact=stiff")
@@ -107,6 +117,18 @@ def test_recordings_that_name_different_contacts_are_refused_by_their_names() ->
     assert "walk_a, walk_b: 5 ms, pyramidal, impratio 1; squat_0: 20 ms, pyramidal, impratio 1" in text
     assert "contact=stiff" in text
     assert contact_of(mixed, ELLIPTIC) == ELLIPTIC
+
+
+def test_the_command_refuses_them_and_takes_a_choice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, soft = recorded("excitation=[squat,drop]")
+    _, hard = recorded("excitation=[squat,drop]", "contact=stiff")
+    for k, recording in enumerate((*soft, *hard)):
+        write(tmp_path / f"{k}.parquet", replace(recording, meta=replace(recording.meta, episode=f"e{k}")))
+    words = ["stage=localise", f"logs={tmp_path}", f"out={tmp_path / 'gap'}", "search.window_s=0.1", "search.threads=1"]
+    assert APP.run(words) == 2
+    assert "(e0, e1: 20 ms, pyramidal, impratio 1; e2, e3: 5 ms" in capsys.readouterr().err
+    assert not (tmp_path / "gap").exists()
+    assert APP.run([*words, "contact=stiff"]) == 0
 
 
 def test_a_robot_that_hangs_feels_no_contact_whatever_its_recordings_name() -> None:
@@ -224,6 +246,18 @@ def test_a_hard_floor_is_the_models_own_where_recordings_name_it_and_else_off() 
     right, wrong = (np.log(s.state.held_out({})).mean() for s in (own, other))
     assert right < 0.3
     assert wrong > right + 1.0
+    assert own.single_cause() is None
+    assert own.candidates == []
+
+
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+def test_a_payload_on_a_hard_floor_is_named_by_the_models_own_contact_alone() -> None:
+    config, recordings = recorded("excitation=[squat,drop]", "contact=stiff", "seeds=[0,1]", "+effect.payload.mass=1.0")
+    cause = search_in(recordings, config, None).single_cause()
+    assert cause is not None
+    assert cause.name == "payload"
+    assert cause.theta["payload", "mass"].item() == pytest.approx(1.0, abs=0.1)
+    assert search_in(recordings, config, MUJOCO_CONTACT).single_cause() is None
 
 
 # ---------------------------------------------------------------------- answers
