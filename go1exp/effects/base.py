@@ -39,7 +39,7 @@ class Param:
         per: ``joint`` or ``robot``.
         doc: what it is, in a few words.
         least: smallest value but ``null``, where that one is a word for what the model has anyway and no value by
-            itself (``Effect.nominal``); ``low`` if None.
+            itself (``Effect.nominal``), of a parameter of the robot; ``low`` if None.
     """
 
     name: str

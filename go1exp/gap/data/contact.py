@@ -74,7 +74,7 @@ def contact_warnings(recordings: Sequence[Recording], contact: ContactConfig) ->
 
 def too_coarse(contact: ContactConfig | None, dt: float) -> list[str]:
     """Return what is wrong with a physics step, s, whose double is that of derivatives; nothing without a contact."""
-    if contact is None or 4.0 * dt <= contact.time_constant * (1.0 + 1e-6):
+    if contact is None or 4.0 * dt <= contact.time_constant * (1.0 + 1e-3):
         return []
     return [
         f"search.physics_dt = {dt:g} s is coarse for a contact of {1e3 * contact.time_constant:g} ms: derivatives are "
