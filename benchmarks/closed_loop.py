@@ -95,7 +95,7 @@ SIZES = {
         ground=Ground(time_constant=0.005),
         recordings=8,
         seconds=5.0,
-        search=(),
+        search=("contact=stiff",),  # that of experiment=trot, with 5 ms
         for_net=(20, 5.0),
         net=(*NET, "epochs=60"),
         commands=(*SLOW, *FAST),
