@@ -19,10 +19,13 @@ from omegaconf import OmegaConf
 from go1exp import data_root
 from go1exp.cli import ONE_BLAS_THREAD, SUBVERBS, VERBS, _by_name, main
 from go1exp.cli.files import choices_from_files
+from go1exp.cli.other_robot import CHOICES
+from go1exp.cli.settings import DeploySettings, parse
 from go1exp.compose import compose
 from go1exp.config import parse_train
 from go1exp.evaluate.camera import RenderingUnavailable, choose_gl
 from go1exp.schema import registry
+from go1exp.schema.registry import ConfigError
 from go1exp.train import run_folder, trainer
 from tests.command import LIGHT, WITH_MODULES, run_alone
 from tests.command import run as cli
@@ -177,6 +180,23 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_a_wrong_setting_is_refused_at_once_in_words(arguments: str, said: tuple[str, ...], tmp_path: Path) -> None:
     assert_refused(tmp_path, arguments.split(), *said)
+
+
+@pytest.mark.parametrize(
+    ("command", "problems"),
+    [
+        ([], [f"command.{k}: required, but not given" for k in range(3)]),
+        ([1.0, "b", 0.0], ["command.1 = 'b': input should be a valid number"]),
+        ([0.0] * 4, ["command = [0.0, 0.0, 0.0, 0.0]: tuple should have at most 3 items after validation, not 4"]),
+        (3, ["command = 3: input should be a valid array or a valid string"]),
+    ],
+)
+def test_a_list_with_wrong_items_is_not_told_to_be_a_word(command: Any, problems: list[str]) -> None:
+    """A command may be a word, too; of what is a list, only its items are spoken of."""
+    given = {k: v for k, v in compose("deploy", ["bundle=a.zip"]).items() if k not in CHOICES}
+    with pytest.raises(ConfigError) as refused:
+        parse(DeploySettings, {**given, "command": command})
+    assert refused.value.problems == problems
 
 
 def test_a_key_that_the_chosen_group_does_not_have_is_not_proposed_for_itself(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -86,16 +86,24 @@ _UNION_MEMBER = re.compile(r"(str|int|float|bool|none)$|.+\[.+\]$")
 """What pydantic puts between the keys where a value may be of several types: the type that it tried."""
 
 
+Place = tuple[int | str, ...]
+"""Where pydantic found an error: keys, numbers of items, and types that it tried."""
+
+
 def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str]:
     """Translate a pydantic error into lines ``key.path = value: what is wrong``."""
     lines: list[str] = []
-    for e in error.errors():
+    errors = error.errors()
+    foreign = _foreign([e["loc"] for e in errors], [e["type"] for e in errors])
+    for e in errors:
+        if e["loc"] in foreign:
+            continue
         if e["type"] == "too_short" and len(e["input"]) >= e["ctx"]["min_length"]:
             continue  # long enough as it was given: its items are wrong, and each is an error of its own
         places = [str(place) for place in e["loc"]]
         unknown = e["type"] in ("extra_forbidden", "unexpected_keyword_argument")
         last = len(places) - 1
-        keys = [p for i, p in enumerate(places) if (unknown and i == last) or not _UNION_MEMBER.match(p)]
+        keys = [p for i, p in enumerate(places) if (unknown and i == last) or not _is_member(p)]
         key = ".".join([path, *keys]).strip(".")
         if unknown:
             lines.append(unknown_name(key, str(e["loc"][-1]), known, "key") + f" (given: {e['input']!r})")
@@ -114,6 +122,17 @@ def explain(error: ValidationError, path: str, known: Iterable[str]) -> list[str
             else:
                 lines.append(value + what)
     return lines
+
+
+def _foreign(places: Sequence[Place], kinds: Sequence[str]) -> set[Place]:
+    """Return where a value is only of another type, and one more of its possible types says what is wrong inside it."""
+    other = {p for p, kind in zip(places, kinds, strict=True) if p and kind.endswith("_type") and _is_member(p[-1])}
+    inside = {p[:k] for p in places if p not in other for k in range(len(p)) if _is_member(p[k])}
+    return {p for p in other if p[:-1] in inside}
+
+
+def _is_member(place: int | str) -> bool:
+    return _UNION_MEMBER.match(str(place)) is not None
 
 
 @dataclass(frozen=True)
