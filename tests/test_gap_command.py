@@ -57,13 +57,33 @@ def slower(recording: Recording, factor: float) -> Recording:
     return replace(recording, channels={**recording.channels, "t": factor * recording.t})
 
 
-def test_times_in_milliseconds_and_short_logs_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+def test_times_in_other_units_and_short_logs_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    """The unit is the audit's to tell: here by the speeds, without them by the length of the steps."""
     (recording,) = read_all(str(DEMO[0]))
     short = replace(recording, channels={name: v[:5] for name, v in recording.channels.items()})
-    assert long_enough([recording, slower(recording, 1000.0), short], 0.37) == [recording]
-    told = capsys.readouterr().out
-    assert "Is it in milliseconds?" in told
-    assert "5 rows" in told
+    bare = replace(recording, channels={k: v for k, v in recording.channels.items() if not k.startswith("qd_")})
+    odd = [slower(r, factor) for factor in (1e3, 1e6) for r in (recording, bare)]
+    assert long_enough([recording, *odd, slower(bare, 1e-3), short], 0.37) == [recording]
+    milli, asked, micro, asked_micro, small, few = capsys.readouterr().out.splitlines()
+    assert "it is in milliseconds, not in seconds" in milli
+    assert asked.endswith("Is it in milliseconds?")
+    assert "it is in microseconds, not in seconds" in micro
+    assert asked_micro.endswith("Is it in microseconds?")
+    assert small.endswith("Are its times 1000 times too small, by a wrong unit?")
+    assert "5 rows, " in few
+    assert few.endswith(" s: too short; windows take 0.37 s")
+
+
+def test_a_slow_log_whose_speeds_fit_is_left_out_and_not_taken_for_milliseconds(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (recording,) = read_all(str(DEMO[0]))
+    t = 0.25 * np.arange(400)
+    joints = recording.meta.joints
+    q, qd = np.sin(0.5 * t), 0.5 * np.cos(0.5 * t)
+    channels = {"t": t, **{f"q_{j}": q for j in joints}, **{f"qd_{j}": qd for j in joints}}
+    assert long_enough([replace(recording, channels=channels)], 0.37) == []
+    assert capsys.readouterr().out.endswith("a log of joints must step by at most 0.1 s\n")
 
 
 def test_logs_that_are_all_too_short_are_bad_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -63,18 +63,25 @@ def remove_empty(folder: Path) -> None:
 
 
 def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
-    """Return the recordings that windows of ``least`` s can be cut from, and say which are left out and why."""
+    """Return the recordings that windows of ``least`` s can be cut from, and say which are left out and why.
+
+    Whether the unit of the times is wrong, the audit's law says (``wrong_steps``).
+    """
+    from go1exp.audit.log import Log
+    from go1exp.audit.single import wrong_steps
+
     fit = []
     for recording in recordings:
         t, name = recording.t, recording.meta.episode
         length, step = float(t[-1] - t[0]), float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-        if length < least:
-            print(f"left out: {name}: {len(t)} rows, {length:g} s: too short; windows take {least:g} s")
-        elif step > least / FEWEST_ROWS:
-            why = f"t steps by {step:g} s; windows take {least:g} s. Is it in milliseconds?"
-            print(f"left out: {name}: {why}")
-        else:
+        short = length < least
+        if not short and step <= least / FEWEST_ROWS:
             fit.append(recording)
+            continue
+        wrong = wrong_steps(Log(recording)) if len(t) > 1 else None
+        window = f"windows take {least:g} s"
+        why = f"{len(t)} rows, {length:g} s: too short; {window}" if short else f"t steps by {step:g} s; {window}"
+        print(f"left out: {name}: " + (f"{len(t)} rows, {length:g} s; t {wrong}" if wrong else why))
     return fit
 
 
