@@ -184,6 +184,23 @@ def test_effect_sizes_are_those_of_their_formulas() -> None:
     assert math.isnan(compare.hedges(np.ones(3), np.ones(3)))
 
 
+@pytest.mark.parametrize("paired", [False, True])
+def test_runs_that_are_all_alike_say_nothing_of_how_sure_a_difference_is(paired: bool) -> None:
+    """Three times 0.1 has another mean than 0.1 in floating point; a warning of SciPy would fail this test."""
+    tenths, rounded = np.full(3, 0.1), np.array([0.1 + 0.2, 0.3, 0.3])
+    for a, b in ((tenths, np.full(3, 0.3)), (rounded, np.full(3, 0.5)), (np.append(np.zeros(7), 1.0), np.ones(8))):
+        got = compare.difference(a, b, paired)
+        assert got.estimate.estimate < -0.1
+        assert math.isnan(got.estimate.low)
+        assert math.isnan(got.estimate.high)
+        assert math.isnan(got.effect) == (len(a) == 3)
+    same = compare.difference(tenths, tenths, paired)
+    assert (same.estimate, same.p) == (Interval(0.0, 0.0, 0.0, 3), 1.0)
+    assert math.isnan(same.effect)
+    assert compare.permutation_p(rounded, np.full(3, 0.3)) == 1.0
+    assert not math.isnan(compare.yuen(tenths, np.array([0.3, 0.3, 0.4]), paired).low)
+
+
 def test_the_runs_needed_are_those_of_the_normal_approximation() -> None:
     a, b = np.array([0.0, 2.0, 4.0]), np.array([1.0, 3.0, 5.0])  # 4 + 4 of variance, 1 apart
     assert compare.runs_needed(a, b) == math.ceil(7.8489 * 8 + 0.25 * 3.8415)

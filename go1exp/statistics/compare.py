@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from go1exp.statistics.intervals import LEVEL, Interval
+from go1exp.statistics.intervals import LEVEL, Interval, alike
 from go1exp.statistics.runs import TRIM, WINSORISED_FROM, iqm, iqm_interval
 
 Word = Literal["better", "worse", "not told apart"]
@@ -85,7 +85,7 @@ def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool =
         signed = stats.rankdata(np.abs(gain)) * np.sign(gain)
         return _p_of_ranks((tuple(np.sort(signed).tolist()),), seed) if gain.any() else 1.0
     together = stats.rankdata(np.concatenate([a, b]))
-    if np.ptp(together) == 0.0:
+    if alike(np.concatenate([a, b])):
         return 1.0
     return _p_of_ranks(tuple(tuple(np.sort(each).tolist()) for each in np.split(together, [len(a)])), seed)
 
@@ -151,22 +151,28 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, level: float = LEVEL) -> Interval:
-    """Return the difference of interquartile means with Yuen's interval (1974); of pairs, that of their differences."""
+    """Return the difference of interquartile means with Yuen's interval (1974); of pairs, that of their differences.
+
+    Where runs are all alike within both groups, or all pairs differ alike, nothing says how sure a difference is: the
+    interval is NaN, unless there is no difference.
+    """
     from scipy import stats
 
-    if paired:
-        return iqm_interval(a - b, level)
-    n = min(len(a), len(b))
+    parts = [a - b] if paired else [a, b]
+    n = min(len(part) for part in parts)
     if not n:
         return Interval(math.nan, math.nan, math.nan, 0)
-    estimate = float(iqm(a) - iqm(b))
+    estimate = float(iqm(parts[0]) - (0.0 if paired else iqm(b)))
     if n < 2:
         return Interval(estimate, math.nan, math.nan, n)
-    if np.ptp(a) == 0.0 and np.ptp(b) == 0.0:  # no spread that an interval could be made of
-        return Interval(estimate, estimate, estimate, n)
-    bounds = stats.ttest_ind(a, b, equal_var=False, trim=TRIM if n >= WINSORISED_FROM else 0.0).confidence_interval(
-        level
-    )
+    trim = TRIM if n >= WINSORISED_FROM else 0.0
+    if all(alike(part, trim) for part in parts):
+        bound = 0.0 if estimate == 0.0 else math.nan
+        return Interval(estimate, bound, bound, n)
+    if paired:
+        return iqm_interval(parts[0], level)
+    centred = (part - np.median(part) for part in parts)  # exact where one group is alike; only the width counts
+    bounds = stats.ttest_ind(*centred, equal_var=False, trim=trim).confidence_interval(level)
     shift = estimate - 0.5 * (bounds.low + bounds.high)
     return Interval(estimate, float(bounds.low + shift), float(bounds.high + shift), n)
 
@@ -174,11 +180,9 @@ def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, l
 def hedges(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """Return Hedges' g: the difference of means in pooled standard deviations, corrected for few runs; or NaN."""
     n, m = len(a), len(b)
-    if min(n, m) < 2:
+    if min(n, m) < 2 or (alike(a) and alike(b)):
         return math.nan
     pooled = math.sqrt(((n - 1) * a.var(ddof=1) + (m - 1) * b.var(ddof=1)) / (n + m - 2))
-    if pooled == 0.0:
-        return math.nan
     return float((a.mean() - b.mean()) / pooled * (1.0 - 3.0 / (4.0 * (n + m) - 9.0)))
 
 

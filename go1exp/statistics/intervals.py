@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 LEVEL = 0.95
 
 ROUNDING = 1e-9
-"""Differences that vary by less than this share of their mean are the same."""
+"""Values that vary by less than this share of their largest are the same."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,18 @@ class Interval:
     low: float
     high: float
     n: int
+
+
+def alike(values: ArrayLike, trim: float = 0.0) -> bool:
+    """Return whether values are the same but for rounding; NaNs, and a share ``trim`` at each end, are left out.
+
+    Of such values nothing says how sure they are: no interval and no effect size can be made of them.
+    """
+    each = np.asarray(values, dtype=np.float64).ravel()
+    each = np.sort(each[np.isfinite(each)])
+    cut = int(trim * len(each))
+    middle = each[cut : len(each) - cut]
+    return not len(middle) or bool(np.ptp(middle) <= ROUNDING * np.abs(each).max())
 
 
 def mean_interval(values: ArrayLike, level: float = LEVEL) -> Interval:
@@ -157,7 +169,7 @@ def paired_mean_interval(difference: ArrayLike, level: float = LEVEL) -> Interva
     nothing says how sure that is: the interval is NaN.
     """
     around = mean_interval(difference, level)
-    if around.n > 1 and around.high - around.low < ROUNDING * abs(around.estimate):
+    if around.n > 1 and around.estimate != 0.0 and alike(difference):
         return Interval(around.estimate, np.nan, np.nan, around.n)
     return around
 
@@ -219,7 +231,7 @@ def pairs_needed(difference: ArrayLike, power: float = 0.8, level: float = LEVEL
 
     each = np.asarray(difference, dtype=np.float64).ravel()
     each = each[np.isfinite(each)]
-    if len(each) < 2 or each.mean() == 0.0 or np.ptp(each) < ROUNDING * abs(each.mean()):
+    if len(each) < 2 or each.mean() == 0.0 or alike(each):
         return None
     z = float(stats.norm.ppf(0.5 + 0.5 * level) + stats.norm.ppf(power))
     return max(2, int(np.ceil((z * each.std(ddof=1) / each.mean()) ** 2)))
