@@ -100,6 +100,10 @@ def test_the_loop_ends_for_a_reason(
         assert "gait, kp 20, kd 1, roll 0, pitch 0.26" in stage_loop.table(rows)
     if ended == "one name is left":
         assert (rows[-1].names, rows[-1].power) == ((("viscous",),), 1.0)
+    if isinstance(verdicts[0], DesignError):  # nobody knows the chance; the search's equals are left
+        assert (rows[0].names, rows[0].power) == ((("viscous", "kd_scale"),), None)
+        assert json.loads(json.dumps(rows[0].as_dict()))["power"] is None
+        assert stage_loop.table(rows).splitlines()[1].split()[:3] == ["0", f"{rows[0].robot_seconds:.1f}", "–"]
 
 
 def test_nothing_named_ends_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +112,7 @@ def test_nothing_named_ends_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     anything: Any = None
     (row,) = stage_loop.loop(anything, [], anything, anything, GapSettings(), DesignSettings(), 2, lambda turn: None)
     assert row.ended == "nothing is named: no gap"
-    assert row.power == 0.0
+    assert row.power is None
 
 
 @pytest.mark.parametrize(

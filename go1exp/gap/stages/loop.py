@@ -28,8 +28,10 @@ class Round:
         recordings: how many there are.
         robot_seconds: of all recordings so far.
         verdict: of the search.
-        names: effects that are named, each with the rivals that are not settled behind it.
-        power: least chance to tell a name from a rival, by the recordings so far; 1 if no rival is left.
+        names: effects that are named, each with the rivals that are not settled behind it; without a design, with
+            those that the search took for its equals.
+        power: least chance to tell a name from a rival, by the recordings so far; 1 if no rival is left. None if that
+            is not known: nothing is named, or no design could be made.
         next: what was designed, in words; empty if the loop ends here.
         ended: why it ends here; empty if it goes on.
     """
@@ -39,7 +41,7 @@ class Round:
     robot_seconds: float
     verdict: str
     names: tuple[tuple[str, ...], ...]
-    power: float
+    power: float | None
     next: str
     ended: str
 
@@ -59,9 +61,10 @@ class Turn:
 
 
 def names_left(result: GapResult, planned: NextResult | None) -> tuple[tuple[str, ...], ...]:
-    """Return each named effect, and behind it the rivals that are not settled."""
-    pairs = planned.pairs if planned else ()
-    return tuple((n.effect, *(p.rival for p in pairs if p.truth == n.effect and p.rival)) for n in result.named)
+    """Return each named effect, and behind it the rivals that are not settled, or its equals where none was judged."""
+    if planned is None:
+        return tuple((n.effect, *(a for a in n.alias_set if a != n.effect)) for n in result.named)
+    return tuple((n.effect, *(p.rival for p in planned.pairs if p.truth == n.effect and p.rival)) for n in result.named)
 
 
 def as_episode(planned: NextResult, number: int, seed: int) -> Episode:
@@ -143,8 +146,7 @@ def _row(
     number: int, recordings: Sequence[Recording], result: GapResult, planned: NextResult | None, ended: str
 ) -> Round:
     seconds = round(sum(float(r.t[-1] - r.t[0]) for r in recordings), 3)
-    pairs = planned.pairs if planned else ()
-    power = min((p.before.power for p in pairs), default=1.0 if result.named else 0.0)
+    power = min((p.before.power for p in planned.pairs), default=1.0) if planned else None
     best = planned.best if planned else None
     words = ""
     if best and not ended:
@@ -159,6 +161,7 @@ def table(rows: Sequence[Round]) -> str:
     lines = [f"{'round':>5} {'robot s':>8} {'power':>6}  names left"]
     for row in rows:
         names = "; ".join(" or ".join(each) for each in row.names) or "none"
-        lines.append(f"{row.number:5d} {row.robot_seconds:8.1f} {row.power:6.0%}  {names} ({row.verdict})")
+        power = "–" if row.power is None else f"{row.power:.0%}"
+        lines.append(f"{row.number:5d} {row.robot_seconds:8.1f} {power:>6}  {names} ({row.verdict})")
         lines.append(" " * 23 + (f"ended: {row.ended}" if row.ended else f"next: {row.next}"))
     return "\n".join(lines)
