@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import json
 import math
 from pathlib import Path
@@ -88,6 +89,84 @@ def test_a_run_that_goes_on_drops_evaluations_of_later_iterations(tmp_path: Path
     (tmp_path / "evals.csv").write_text(f"{head}1,16,0.5,0.5,0.5,0.0\n2,32,0.4,0.4,0.5,0.0\n3,48,0.3")
     Beside(config, tmp_path, 1)
     assert [r["iteration"] for r in rows(tmp_path / "evals.csv")] == [1]
+
+
+def evaluated_run(run: Path, scores: dict[int, float]) -> Beside:
+    """A run in which policies had these scores by iteration; a policy is a byte with its iteration."""
+    beside = Beside(parse_train(compose("train", [*SMALL, "eval.every=1"])), run, 0)
+    (run / "evals").mkdir()
+    for iteration, value in scores.items():
+        file = run / f"evals/{iteration:06d}.pt"
+        file.write_bytes(bytes([iteration]))
+        result = {"kind": "evaluate", "iteration": iteration, "steps": 16 * iteration, "policy": str(file)}
+        beside._take({**result, "figures": {"score": value, "fall_share": 0.0}})
+    return beside
+
+
+def best_of(run: Path) -> tuple[int, int, float]:
+    """What is in best.pt, and the iteration and score that best.json says."""
+    row = json.loads((run / "best.json").read_text())
+    return (run / "best.pt").read_bytes()[0], row["iteration"], row["score"]
+
+
+@pytest.mark.parametrize("policies", [True, False])
+def test_a_best_policy_of_later_iterations_gives_way_when_a_run_goes_on_before_it(
+    tmp_path: Path, policies: bool
+) -> None:
+    """It was kept, and a worse one of the new rows then took its place, as these knew nothing of it."""
+    config = parse_train(compose("train", [*SMALL, "eval.every=1"]))
+    evaluated_run(tmp_path, {1: 0.5, 2: 0.4, 3: 0.2})
+    if not policies:  # somebody made room
+        for file in (tmp_path / "evals").glob("*.pt"):
+            file.unlink()
+    again = Beside(config, tmp_path, 2)
+    assert [r["iteration"] for r in rows(tmp_path / "evals.csv")] == [1, 2]
+    assert (tmp_path / "evals/000003.pt").read_bytes() == bytes([3])  # nothing is lost
+    if policies:
+        assert best_of(tmp_path) == (2, 2, 0.4)
+    else:
+        assert not (tmp_path / "best.pt").exists()
+        assert not (tmp_path / "best.json").exists()
+    (tmp_path / "new.pt").write_bytes(bytes([33]))
+    result = {"kind": "evaluate", "iteration": 3, "steps": 48, "policy": str(tmp_path / "new.pt")}
+    again._take({**result, "figures": {"score": 0.45, "fall_share": 0.0}})
+    assert best_of(tmp_path) == ((2, 2, 0.4) if policies else (33, 3, 0.45))
+
+
+def test_a_crash_between_row_and_best_policy_is_made_good(tmp_path: Path) -> None:
+    config = parse_train(compose("train", [*SMALL, "eval.every=1"]))
+    evaluated_run(tmp_path, {1: 0.5, 2: 0.2, 3: 0.4})
+    table = (tmp_path / "evals.csv").read_text()
+    head, first, second, third = table.splitlines(keepends=True)
+    (tmp_path / "evals.csv").write_text(head + first + third)  # the row of the best is lost
+    Beside(config, tmp_path, 3)
+    assert (tmp_path / "evals.csv").read_text() == table
+    (tmp_path / "evals.csv").unlink()
+    Beside(config, tmp_path, 3)
+    assert (tmp_path / "evals.csv").read_text() == head + second
+    assert best_of(tmp_path) == (2, 2, 0.2)
+    (tmp_path / "evals.csv").write_text(table)
+    (tmp_path / "best.pt").write_bytes(bytes([1]))
+    (tmp_path / "best.json").write_text(json.dumps({"iteration": 1, "steps": 16, "score": 0.5, "fall_share": 0.0}))
+    Beside(config, tmp_path, 3)  # killed after the row of the second was written
+    assert best_of(tmp_path) == (2, 2, 0.2)
+    (tmp_path / "best.json").write_text('{"iteration": 2, "st')
+    Beside(config, tmp_path, 3)
+    assert best_of(tmp_path) == (2, 2, 0.2)
+
+
+def test_a_policy_that_waited_before_a_crash_is_not_evaluated_for_the_one_of_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "evals").mkdir()
+    (tmp_path / "evals/000002.pt").write_bytes(b"of a training that went on otherwise")
+    beside = Beside(parse_train(compose("train", [*SMALL, "eval.every=1", "video.every=1"])), tmp_path, 1)
+    sent = io.StringIO()
+    monkeypatch.setattr(beside, "_begin", lambda: SimpleNamespace(stdin=sent))
+    policy = SimpleNamespace(state_dict=dict)
+    beside.offer(SimpleNamespace(iteration=2, num_timesteps=32, policy=policy), last=False)  # type: ignore[arg-type]
+    assert len(sent.getvalue().splitlines()) == 2
+    assert torch.load(tmp_path / "evals/000002.pt")["num_timesteps"] == 32
 
 
 @pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")

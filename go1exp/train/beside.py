@@ -1,7 +1,8 @@
 """Evaluates and films policies while training goes on: another process, on the CPU engine, of the lowest priority.
 
 The process is ``python -m go1exp.evaluate.beside RUN``; jobs and results are lines of JSON. Training never waits for
-it but at its end. What it finds goes to ``evals.csv``, to the loggers, and the best policy to ``best.pt``.
+it but at its end. What it finds goes to ``evals.csv``, to the loggers, and the best policy to ``best.pt``, whose row
+is ``best.json``: always one of ``evals.csv``.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from go1exp.schema.beside import EVALUATED, ROWS
 from go1exp.train.checkpoint import FORMAT, SUFFIX
 from go1exp.train.ppo import AdaptivePPO
 
-FOLDER, BEST, FILMS = "evals", "best.pt", "videos"
-"""In the run folder: policies that wait to be evaluated, what came of them, the best one, films."""
+FOLDER, BEST, BEST_ROW, FILMS = "evals", "best.pt", "best.json", "videos"
+"""In the run folder: policies that are evaluated, the best one, its row, films."""
 
 WAITING = 3
 """Jobs that may wait; a policy that would be the next one is not evaluated."""
@@ -57,9 +58,48 @@ class Beside:
         self._process: subprocess.Popen[str] | None = None
         self._results: queue.Queue[dict[str, Any] | None] = queue.Queue()
         self._waiting, self.skipped, self.problems = 0, 0, list[str]()
+        self._written, self._best = set[Path](), math.inf
         self._rows = [row for row in _rows(run / ROWS) if row["iteration"] <= iteration]
-        if self._rows or (run / ROWS).is_file():
+        if self._rows or any((run / name).is_file() for name in (ROWS, BEST_ROW)):
+            self._settle_best(iteration)
             self._write_rows()
+
+    def _settle_best(self, iteration: int) -> None:
+        """Make the best policy that of a row again, after a crash or a return to an older checkpoint.
+
+        A row that was lost comes back from its copy. A best policy of an iteration that is still to come gives way to
+        the best of the rows, and stays among those that were evaluated.
+        """
+        best, file, kept = _row_of_best(self._run), self._run / BEST, None
+        if best and file.is_file():
+            fits = best["iteration"] <= iteration and all(row.keys() == best.keys() for row in self._rows)
+            if fits and best["iteration"] not in [row["iteration"] for row in self._rows]:
+                self._rows = sorted([*self._rows, best], key=lambda row: row["iteration"])
+            policy = self._policy(best["iteration"])
+            if fits:
+                kept = best["iteration"]
+            elif not policy.is_file():
+                policy.parent.mkdir(exist_ok=True)
+                write_bytes(policy, file.read_bytes())
+        known = [r for r in self._rows if r["iteration"] == kept or self._policy(r["iteration"]).is_file()]
+        wanted = min((r for r in known if math.isfinite(r["score"])), key=lambda row: row["score"], default=None)
+        if wanted is None and best:
+            file.unlink(missing_ok=True)
+            (self._run / BEST_ROW).unlink()
+        elif wanted and wanted["iteration"] != kept:
+            self._keep(wanted, self._policy(wanted["iteration"]))
+        elif wanted:
+            self._best = wanted["score"]
+
+    def _policy(self, iteration: float) -> Path:
+        """Return the file of the policy that is evaluated after an iteration."""
+        return self._run / FOLDER / f"{int(iteration):06d}{SUFFIX}"
+
+    def _keep(self, row: dict[str, float], policy: Path) -> None:
+        """Make a policy the best one; ``row`` is what its evaluation came to."""
+        write_bytes(self._run / BEST, policy.read_bytes())
+        write_json(self._run / BEST_ROW, row)
+        self._best = row["score"]
 
     def offer(self, ppo: AdaptivePPO, last: bool) -> None:
         """Have the policy evaluated and filmed if it is its turn, or the ``last``; returns at once."""
@@ -72,8 +112,9 @@ class Beside:
                 self._send(kind, ppo)
 
     def _send(self, kind: str, ppo: AdaptivePPO) -> None:
-        file = self._run / FOLDER / f"{ppo.iteration:06d}{SUFFIX}"
-        if not file.is_file():
+        file = self._policy(ppo.iteration)
+        if file not in self._written:  # one that is there is of a training that went on from here otherwise
+            self._written.add(file)
             file.parent.mkdir(exist_ok=True)
             state = {"format": FORMAT, "iteration": ppo.iteration, "num_timesteps": ppo.num_timesteps}
             with opened(file) as written:
@@ -160,13 +201,11 @@ class Beside:
                 self._on_film(result["steps"], Path(result["out"]))
             return {}
         row = {"iteration": result["iteration"], "steps": result["steps"], **result["figures"]}
-        better = all(not row["score"] >= old["score"] for old in self._rows) and math.isfinite(row["score"])
+        better = row["score"] < self._best
         self._rows.append(row)
         self._write_rows()
-        file = Path(result["policy"])
         if better:
-            write_bytes(self._run / BEST, file.read_bytes())
-            write_json(self._run / "best.json", row)
+            self._keep(row, Path(result["policy"]))
         return {f"{EVALUATED}{key}": float(value) for key, value in row.items() if key != "steps"}
 
     def _write_rows(self) -> None:
@@ -176,6 +215,15 @@ class Beside:
             writer.writeheader()
             writer.writerows(self._rows)
         write_text(self._run / ROWS, text.getvalue())
+
+
+def _row_of_best(run: Path) -> dict[str, float] | None:
+    """Return the row of the best policy; None if there is none, or a crash left half of it."""
+    try:
+        row = json.loads((run / BEST_ROW).read_text())
+        return {**row, "iteration": int(row["iteration"]), "score": float(row["score"])}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _rows(file: Path) -> list[dict[str, float]]:
