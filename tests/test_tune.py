@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from go1exp import data_root
 from go1exp.cli.tune import _ranges
 from go1exp.compose import compose
 from go1exp.config import parse_train
+from go1exp.errors import Expected
 from go1exp.schema.registry import ConfigError
 from go1exp.sweep import trials
 from go1exp.sweep.command import Ended
@@ -130,7 +132,9 @@ def test_the_same_search_from_nothing_draws_the_same_and_one_that_goes_on_draws_
 
 
 @NEEDS_OPTUNA
-def test_a_trial_whose_search_was_killed_goes_on_and_one_whose_search_lives_is_left_alone(tmp_path: Path) -> None:
+def test_a_trial_whose_search_was_killed_goes_on_and_one_whose_search_lives_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from optuna.trial import TrialState
 
     study = searched(tmp_path, trials=1)._study()
@@ -149,7 +153,41 @@ def test_a_trial_whose_search_was_killed_goes_on_and_one_whose_search_lives_is_l
     _, lost, *_, again = study.get_trials()
     assert again.user_attrs[trials.FOLDER] == lost.user_attrs[trials.FOLDER] == "trial-0001"
     assert again.system_attrs["fixed_params"] == lost.params
+    monkeypatch.setattr(trials, "NAMELESS", timedelta(0))  # a minute later
     assert searched(tmp_path, trials=5)._study().get_trials()[5].params == lost.params
+
+
+@NEEDS_OPTUNA
+def test_a_trial_that_was_killed_before_it_had_a_name_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whose it is shows only after a while; the search that goes on at once had one trial less than asked for."""
+    from optuna.trial import TrialState
+
+    monkeypatch.setattr(trials, "NAMELESS", timedelta(seconds=1.5))
+    monkeypatch.setattr(trials, "LOOK_S", 0.1)
+    study = searched(tmp_path, trials=1)._study()
+    study.ask()  # killed here
+    states = [trial.state for trial in searched(tmp_path, trials=3)._study().get_trials()]
+    assert states == [TrialState.COMPLETE, TrialState.FAIL, TrialState.COMPLETE, TrialState.COMPLETE]
+    named = study.ask()
+    named.set_user_attr(trials.SEARCH, "killed")  # killed here, before it drew and had a folder
+    (tmp_path / trials.SEARCHES / "killed").mkdir()
+    states = [trial.state for trial in searched(tmp_path, trials=4)._study().get_trials()]
+    assert states[4:] == [TrialState.FAIL, TrialState.COMPLETE]
+
+
+@NEEDS_OPTUNA
+def test_a_search_that_was_killed_while_it_said_what_it_is_of_goes_on(tmp_path: Path) -> None:
+    import optuna
+
+    optuna.create_study(study_name=tmp_path.name, storage=f"sqlite:///{tmp_path / 'optuna.db'}").set_user_attr(
+        "metric", parsed_defaults()["metric"]
+    )
+    study = searched(tmp_path, trials=1, direction="minimize")._study()
+    assert study.user_attrs == {"metric": parsed_defaults()["metric"], "space": ["ppo.gamma"]}
+    with pytest.raises(Expected, match="holds a search for"):
+        searched(tmp_path, trials=1, direction="minimize", metric="train/kl")
 
 
 @NEEDS_OPTUNA

@@ -67,7 +67,8 @@ PATIENCE_S = 60.0
 def put_back(study: Any, folder: Path, patience: float = PATIENCE_S) -> bool:
     """Put the trials of searches that were killed in front, so that they go on in their run folders.
 
-    Returns whether the trainings of some still ran after ``patience``: those trials stay as they are.
+    Returns whether some stay as they are: their trainings still ran after ``patience``, or nobody knows yet whose they
+    are.
 
     Args:
         study: Optuna's.
@@ -79,6 +80,7 @@ def put_back(study: Any, folder: Path, patience: float = PATIENCE_S) -> bool:
     until, some_left = time.monotonic() + patience, False
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         if _is_run(trial, folder):
+            some_left = some_left or is_nameless(trial)
             continue
         run = trial.user_attrs.get(FOLDER)
         if run and not _ended(folder / run, until):
@@ -107,6 +109,11 @@ def _is_run(trial: Any, folder: Path) -> bool:
     if run:  # of a version that named no search
         return not (folder / run).is_dir() or run_lock.in_use(folder / run)
     return bool(datetime.now() - trial.datetime_start < NAMELESS)
+
+
+def is_nameless(trial: Any) -> bool:
+    """Whether a running trial names neither search nor folder: it has just begun, or its search was killed then."""
+    return trial.state.name == "RUNNING" and not {SEARCH, FOLDER} & {*trial.user_attrs}
 
 
 def _ended(run: Path, until: float) -> bool:

@@ -12,6 +12,7 @@ import math
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -124,7 +125,7 @@ class Search:
             result = (str(error).strip().splitlines() or [type(error).__name__])[0]
             raise Expected(f"storage = {storage!r}: cannot be used ({result})") from None
         about = {"metric": settings.metric, "space": sorted(self.ranges)}
-        if study.user_attrs and study.user_attrs != about:
+        if any(study.user_attrs.get(key, value) != value for key, value in about.items()):  # killed, it may have one
             raise Expected(f"{self.folder}: holds a search for {study.user_attrs}; use another out")
         for key, value in about.items():
             study.set_user_attr(key, value)
@@ -137,12 +138,17 @@ class Search:
                 if self._some_left:
                     self._some_left = trials.put_back(study, self.folder, patience=0.0)
                 counted = [t for t in study.get_trials(deepcopy=False) if t.state.name not in ("FAIL", "WAITING")]
-                if len(counted) >= self.settings.trials:
+                full = len(counted) >= self.settings.trials
+                if full and not any(trials.is_nameless(t) for t in counted):
                     return
-                trial = study.ask()
-                trial.set_user_attr(trials.SEARCH, search)
-                study.sampler = trials.sampler(self.settings.seed, trial.number, self.settings.workers > 1)
-                drawn = {key: drawn_from.draw(trial, key) for key, drawn_from in self.ranges.items()}
+                if not full:
+                    trial = study.ask()
+                    trial.set_user_attr(trials.SEARCH, search)
+                    study.sampler = trials.sampler(self.settings.seed, trial.number, self.settings.workers > 1)
+                    drawn = {key: drawn_from.draw(trial, key) for key, drawn_from in self.ranges.items()}
+            if full:  # whether the nameless one counts is known in a minute
+                time.sleep(trials.LOOK_S)
+                continue
             self._try(study, trial, drawn, share)
 
     def _try(self, study: Any, trial: Any, drawn: dict[str, Any], share: tuple[int, ...]) -> None:
