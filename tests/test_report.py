@@ -321,14 +321,15 @@ def test_without_anything_random_there_are_no_robots_to_pair(tmp_path: Path) -> 
     assert all(v.robots is not None and math.isnan(v.robots.low) for v in outcome.verdicts)
 
 
-def test_a_protocols_rows_are_compared_by_its_claims(tmp_path: Path) -> None:
+def kicked(folder: Path, evaluated: bool = False) -> None:
+    """Write two groups of six runs that were kicked; with a larger weight they recover sooner."""
     from go1exp.protocol.result import write_rows
 
     protocol = compose("eval", ["protocol=kicks"])["protocol"]["kicks"]
     for seed in range(6):
         for group, level in ((10.0, 1.0), (0.0, 2.0)):
-            folder = run(tmp_path / f"g{group:.0f}s{seed}", seed, group, evaluated=False) / "protocols"
-            folder.mkdir()
+            place = run(folder / f"g{group:.0f}s{seed}", seed, group, evaluated=evaluated) / "protocols"
+            place.mkdir()
             rng = np.random.default_rng([seed, int(group)])
             rows = [
                 {"impulse": impulse, "robot": n, "fell": False, "left_map": False, "moving_s": 4.0, "fingerprint": n}
@@ -336,9 +337,13 @@ def test_a_protocols_rows_are_compared_by_its_claims(tmp_path: Path) -> None:
                 for impulse in protocol["impulses"]
                 for n in range(4)
             ]
-            write_rows(folder / "kicks.parquet", rows, {})
+            write_rows(place / "kicks.parquet", rows, {})
             about = {"kind": "kicks", "settings": protocol, "rates": {"seed": 1}, "robot": {}}
-            (folder / "kicks.json").write_text(json.dumps(about))
+            (place / "kicks.json").write_text(json.dumps(about))
+
+
+def test_a_protocols_rows_are_compared_by_its_claims(tmp_path: Path) -> None:
+    kicked(tmp_path)
     (outcome,) = made(tmp_path, figures=("recovery_s",), baseline="weight=0.0").outcomes
     assert outcome.judged.name == "kicks"
     assert [(v.column.name, v.word) for v in outcome.verdicts] == [("recovery_s", "better")]
@@ -421,6 +426,33 @@ def test_two_sweeps_of_one_name_keep_their_runs_apart_and_count_each_seed_once(t
 def test_a_figure_that_is_not_there_is_refused_with_the_nearest(two_groups: Path) -> None:
     with pytest.raises(ConfigError, match=r"figures.*error_yow.*did you mean 'error_yaw'"):
         made(two_groups, figures=("error_yow",))
+
+
+def test_figures_are_refused_before_anything_is_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(tmp_path / "a", 0, evaluated=False)
+    (tmp_path / "a/checkpoints").mkdir()
+    (tmp_path / "a/checkpoints/000001.pt").write_bytes(b"")
+    made_of: list[Any] = []
+    monkeypatch.setattr("go1exp.report.evaluating.evaluate_missing", lambda wanted, *rest: made_of.append(wanted) or [])
+    line = [f"folders=[{tmp_path}]", f"folder={tmp_path}/out", "eval=true", "protocol=[grid,kicks]"]
+    with pytest.raises(ConfigError, match=r"figures: unknown figure 'nosuch'; known: .*error_xy.*recovery_s"):
+        _task(compose("report", [*line, "figures=[nosuch,error_xy]"]))
+    assert made_of == []
+    _task(compose("report", [*line, "figures=[recovery_s,error_xy]"]))
+    assert len(made_of) == 1
+
+
+def test_of_one_group_a_figure_that_is_not_there_is_refused_too(tmp_path: Path) -> None:
+    run(tmp_path / "a", 0)
+    with pytest.raises(ConfigError, match="unknown figure 'nosuch'"):
+        made(tmp_path, figures=("nosuch",))
+
+
+def test_a_figure_of_one_evaluation_may_be_asked_for_where_there_is_another(tmp_path: Path) -> None:
+    kicked(tmp_path, evaluated=True)
+    outcomes = {o.judged.name: o for o in made(tmp_path, figures=("recovery_s",), baseline="weight=0.0").outcomes}
+    assert [v.column.name for v in outcomes["kicks"].verdicts] == ["recovery_s"]
+    assert outcomes["grid"].verdicts == []
 
 
 def test_runs_of_other_tasks_are_said(tmp_path: Path) -> None:

@@ -63,6 +63,10 @@ def _evaluate(runs: Study, settings: ReportSettings, protocols: Sequence[Chosen 
     """Evaluate what is missing, and say what is being done."""
     import go1exp.measures  # noqa: F401  (registers them)
     from go1exp.report.evaluating import evaluate_missing, missing
+    from go1exp.report.evaluations import check_figures, evaluations
+
+    if settings.figures:  # before hours of evaluations
+        check_figures(settings.figures, evaluations(dataclasses.replace(runs, notes=[])), protocols)
 
     def on_run(number: int, count: int, label: str) -> Callable[[int, int], None]:
         print(f"evaluating {number}/{count}: {label}", file=sys.stderr, flush=True)

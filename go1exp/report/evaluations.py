@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,10 @@ from go1exp.evaluate.rows import COLUMNS, KEYS
 from go1exp.measures import every_measure
 from go1exp.protocol.quantities import FELL, MOVING, ROBOT, Column, columns_of
 from go1exp.report.runs import Run, Study
+from go1exp.schema.registry import ConfigError, unknown_name
+
+if TYPE_CHECKING:
+    from go1exp.protocol.base import Chosen
 
 GRID = "grid"
 PROTOCOLS = "protocols"
@@ -86,6 +90,31 @@ def evaluations(study: Study) -> list[Judged]:
     if not made:
         study.notes.append(f"no run has an evaluation; eval=true makes them ({len(study.runs)} runs)")
     return [judged for judged in made if judged.runs]
+
+
+def check_figures(wanted: Sequence[str], judged: Sequence[Judged], to_come: Sequence[Chosen | None] = ()) -> None:
+    """Refuse figures that no evaluation has, and those without a better direction.
+
+    Args:
+        wanted: names.
+        judged: evaluations that runs have.
+        to_come: protocols that will be played, None for the grid.
+
+    Raises:
+        ConfigError: with each of them, and the nearest or all that there are.
+    """
+    columns = [c for each in judged for c in each.columns]
+    columns += [c for each in to_come for c in (each.protocol.columns() if each else _grid_columns())]
+    if not columns:  # nothing is compared, and a note says so
+        return
+    known = {c.name for c in columns if c.better}
+    problems = [unknown_name("figures", name, known, "figure") for name in wanted if name not in known]
+    if problems:
+        raise ConfigError(problems)
+
+
+def _grid_columns() -> tuple[Column, ...]:
+    return (*COLUMNS, *columns_of(every_measure(), robot.LEGS))
 
 
 def _advice(name: str) -> str:
@@ -162,9 +191,8 @@ def _described(name: str, about: Mapping[str, Any], runs: dict[Path, Evaluated],
     """Return an evaluation with its columns, and its rows without repeats."""
     if name == GRID:
         random = any(settings.get(key) for key in ("noise", "randomize", "push", "train_ground"))
-        columns = (*COLUMNS, *columns_of(every_measure(), robot.LEGS))
         distinct = {f: e if random else _first_robots(e) for f, e in runs.items()}
-        return Judged(name, KEYS, _present(columns, runs), MAIN, distinct, settings)
+        return Judged(name, KEYS, _present(_grid_columns(), runs), MAIN, distinct, settings)
     from go1exp.protocol.base import chosen
 
     given = {"term": about["kind"], **about["settings"]}

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from go1exp.protocol.quantities import ROBOT, Column
 from go1exp.report.evaluations import Judged
 from go1exp.report.groups import Group
-from go1exp.schema.registry import ConfigError, unknown_name
 from go1exp.statistics import compare
 from go1exp.statistics.compare import Word
 from go1exp.statistics.intervals import Interval, stratified_mean_interval
@@ -147,17 +146,11 @@ def compared(
         judged: an evaluation.
         made: all groups.
         baseline: one of them.
-        wanted: names of figures; None takes the evaluation's main ones.
+        wanted: names of figures, of which those count that the evaluation has; None takes its main ones.
         correction: over all figures of all groups here, or none.
         paired: pair runs by their seed.
-
-    Raises:
-        ConfigError: if a figure is asked for that rows do not have, or that has no better direction.
     """
     known = {c.name: c for c in judged.columns if c.better}
-    problems = [unknown_name("figures", name, known, "figure") for name in wanted or () if name not in known]
-    if problems:
-        raise ConfigError(problems)
     columns = [known[name] for name in (wanted or judged.main) if name in known]
     evaluated = [g for g in made if any(run.folder in judged.runs for run in g.runs)]
     if baseline not in evaluated:

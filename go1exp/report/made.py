@@ -8,7 +8,7 @@ from typing import Any
 
 from go1exp.report import curves as learning
 from go1exp.report.curves import Curve
-from go1exp.report.evaluations import Judged, evaluations
+from go1exp.report.evaluations import Judged, check_figures, evaluations
 from go1exp.report.figures import Figure, Verdict, by_condition, compared, table
 from go1exp.report.groups import Group, baseline, groups
 from go1exp.report.runs import Study
@@ -74,7 +74,9 @@ def report(study: Study, settings: ReportSettings, plain: dict[str, Any]) -> Rep
     drawn, notes = learning.curves(made, metrics, settings.curves, settings.points)
     study.notes += notes
     outcomes = []
-    for judged in evaluations(study):
+    evaluated = evaluations(study)
+    check_figures(settings.figures or (), evaluated)
+    for judged in evaluated:
         given = (settings.figures, settings.correction, settings.paired)
         verdicts = compared(judged, made, first, *given) if len(made) > 1 else []
         if not any(run.folder in judged.runs for run in first.runs):
