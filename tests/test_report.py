@@ -410,6 +410,50 @@ def test_damaged_rows_are_named_and_the_others_stay(tmp_path: Path) -> None:
     assert any("a1/eval.json: cannot be read (TypeError" in n for n in got.study.notes)
 
 
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"kind": "kickz"}, "unknown protocol 'kickz'; did you mean 'kicks'?"),
+        ({"settings": {"old": 1}}, "protocol.kicks.old: unknown key 'old'"),
+        ({"settings": {"measures": ["lost"]}}, "protocol.kicks.measures.lost: unknown measure term 'lost'"),
+        ({"kind": None}, "it has no kind, or no settings, of a protocol"),
+    ],
+    ids=["kind", "key", "measure", "none"],
+)
+@pytest.mark.parametrize("old", [1, 12])
+def test_protocols_of_another_version_are_named_and_the_others_stay(
+    change: dict[str, Any], why: str, old: int, tmp_path: Path
+) -> None:
+    """One line for each file, also where all are old; it was a refusal of the whole report, or a traceback."""
+    kicked(tmp_path)
+    files = sorted(tmp_path.glob("*/protocols/kicks.json"))[:old]
+    for file in files:
+        about = json.loads(file.read_text())
+        parts = {k: {**about[k], **v} if isinstance(v, dict) else v for k, v in change.items()}
+        file.write_text(json.dumps({**about, **parts}))
+    got = made(tmp_path)
+    lines = [n for n in got.study.notes if "its settings are not of this version" in n]
+    assert len(lines) == old
+    assert all(any(line.startswith(str(file)) for line in lines) for file in files)
+    assert all(why in line for line in lines)
+    assert [len(o.judged.runs) for o in got.outcomes] == ([11] if old == 1 else [])
+
+
+def test_rows_without_a_column_that_others_have_are_left_out(tmp_path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    kicked(tmp_path, evaluated=True)
+    for name, lost in (("protocols/kicks.parquet", "impulse"), ("eval.parquet", "robot")):
+        file = tmp_path / "g0s0" / name
+        pq.write_table(pq.read_table(file).drop_columns([lost]), file)
+    got = made(tmp_path)
+    assert "kicks: g0s0 left out, evaluated with other settings (columns of the rows) than most" in got.study.notes
+    assert any(
+        "g0s0/eval.json: cannot be read (ValueError: its rows have no column 'robot')" in n for n in got.study.notes
+    )
+    assert [len(o.judged.runs) for o in got.outcomes] == [11, 11]
+
+
 def test_two_sweeps_of_one_name_keep_their_runs_apart_and_count_each_seed_once(tmp_path: Path) -> None:
     for place in ("monday", "tuesday"):
         for seed in range(2):

@@ -21,7 +21,7 @@ from go1exp.report.runs import Run, Study
 from go1exp.schema.registry import ConfigError, unknown_name
 
 if TYPE_CHECKING:
-    from go1exp.protocol.base import Chosen
+    from go1exp.protocol.base import Chosen, Protocol
 
 GRID = "grid"
 PROTOCOLS = "protocols"
@@ -127,30 +127,69 @@ def _listed(labels: Sequence[str]) -> str:
     )
 
 
+@dataclass(frozen=True)
+class _File:
+    """One file of an evaluation: its rows, the protocol that was played (None: the grid), the key columns it has."""
+
+    evaluated: Evaluated
+    protocol: Protocol | None
+    keys: tuple[str, ...]
+
+    @property
+    def sign(self) -> str:
+        """What is the same in files that may be compared."""
+        return json.dumps([self.evaluated.settings, self.keys], sort_keys=True)
+
+
 def _judged(name: str, study: Study) -> Judged:
     """Read one evaluation of all runs and keep those with the settings that most have."""
-    entries: dict[Path, Evaluated] = {}
-    abouts: dict[Path, dict[str, Any]] = {}
+    entries: dict[Path, _File] = {}
     for run in study.runs:
         if name not in names(run):
             continue
         file = run.folder / FILE if name == GRID else run.folder / PROTOCOLS / f"{name}.json"
         try:
-            abouts[run.folder] = about = json.loads(file.read_text())
-            entries[run.folder] = Evaluated(_table(rows_file(file)), _settings(name, about))
+            entries[run.folder] = _read(name, file)
+        except ConfigError as error:
+            why = error.problems[0] + (f" and {len(error.problems) - 1} more" if len(error.problems) > 1 else "")
+            advice = f"go1exp eval protocol={name} makes it again"
+            study.notes.append(f"{file}: left out, its settings are not of this version ({why}); {advice}")
         except (OSError, ValueError, KeyError, TypeError) as error:
             study.notes.append(f"{file}: cannot be read ({type(error).__name__}: {' '.join(str(error).split())[:100]})")
     if not entries:
         return Judged(name, (), (), ())
-    signs = {folder: json.dumps(e.settings, sort_keys=True) for folder, e in entries.items()}
-    usual = Counter(signs.values()).most_common(1)[0][0]
-    others = [run.label for run in study.runs if run.folder in signs and signs[run.folder] != usual]
+    usual = Counter(e.sign for e in entries.values()).most_common(1)[0][0]
+    kept = {folder: e for folder, e in entries.items() if e.sign == usual}
+    first = next(iter(kept.values()))
+    others = [run.label for run in study.runs if run.folder in entries and run.folder not in kept]
     if others:
-        differ = _differing(json.loads(usual), next(entries[f].settings for f, sign in signs.items() if sign != usual))
+        other = next(e for e in entries.values() if e.sign != usual)
+        differ = _differing(first.evaluated.settings, other.evaluated.settings) or "columns of the rows"
         study.notes.append(f"{name}: {_listed(others)} left out, evaluated with other settings ({differ}) than most")
-    kept = {folder: e for folder, e in entries.items() if signs[folder] == usual}
-    first = next(iter(kept))
-    return _described(name, abouts[first], kept, kept[first].settings)
+    return _described(name, first, {folder: e.evaluated for folder, e in kept.items()})
+
+
+def _read(name: str, file: Path) -> _File:
+    """Read a file of an evaluation, and its rows beside it.
+
+    Raises:
+        ConfigError: if its protocol is none of this version.
+        OSError, ValueError, KeyError, TypeError: if it is damaged.
+    """
+    about = json.loads(file.read_text())
+    if not isinstance(about, dict):
+        raise TypeError("holds no evaluation")
+    evaluated = Evaluated(_table(rows_file(file)), _settings(name, about))
+    if name == GRID:
+        if ROBOT not in evaluated.table:
+            raise ValueError(f"its rows have no column {ROBOT!r}")
+        return _File(evaluated, None, tuple(key for key in KEYS if key in evaluated.table))
+    from go1exp.protocol.base import chosen
+
+    if not isinstance(about.get("kind"), str) or not isinstance(about.get("settings"), dict):
+        raise ConfigError(["it has no kind, or no settings, of a protocol"])
+    protocol = chosen({name: {**about["settings"], "term": about["kind"]}})[0][0].protocol
+    return _File(evaluated, protocol, tuple(key for key in (*protocol.keys, ROBOT) if key in evaluated.table))
 
 
 def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
@@ -187,16 +226,13 @@ def _table(file: Path) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def _described(name: str, about: Mapping[str, Any], runs: dict[Path, Evaluated], settings: dict[str, Any]) -> Judged:
-    """Return an evaluation with its columns, and its rows without repeats."""
-    if name == GRID:
+def _described(name: str, first: _File, runs: dict[Path, Evaluated]) -> Judged:
+    """Return an evaluation with its columns, and its rows without repeats; ``first`` is one of its files."""
+    settings, protocol = first.evaluated.settings, first.protocol
+    if protocol is None:
         random = any(settings.get(key) for key in ("noise", "randomize", "push", "train_ground"))
         distinct = {f: e if random else _first_robots(e) for f, e in runs.items()}
         return Judged(name, KEYS, _present(_grid_columns(), runs), MAIN, distinct, settings)
-    from go1exp.protocol.base import chosen
-
-    given = {"term": about["kind"], **about["settings"]}
-    protocol = chosen({name: given})[0][0].protocol
     columns = _present(protocol.columns(), runs)
     known = {c.name for c in columns if c.better}
     main = [c.quantity for c in protocol.claims.values() if c.quantity in known]
