@@ -21,6 +21,7 @@ from go1exp.evaluate import table
 from go1exp.evaluate.observed import columns
 from go1exp.evaluate.policy import Policy, load_policy
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
+from go1exp.measures import every_measure
 from go1exp.schema.registry import ConfigError
 from go1exp.train import checkpoint, run_folder, trainer
 
@@ -269,6 +270,19 @@ def test_no_time_limit_falls_into_the_evaluation(make_task: MakeTask) -> None:
     task = make_task("backend.threads=1", "sim.episode_s=0.2")
     report = evaluate(task, stand, settings(duration_s=0.6))
     assert report["commands"][0]["mean_time_s"] == pytest.approx(0.6, abs=1e-4)
+
+
+def test_an_episode_that_does_not_fit_into_memory_is_refused_by_its_key(task: TaskConfig) -> None:
+    """Without measures nothing is kept, and the first step is made."""
+    long = settings(duration_s=1e9)
+    with pytest.raises(ConfigError, match=r"duration_s = 1e\+09: .* at least .* GB are free .* s at most would fit"):
+        evaluate(task, stand, long, measures=every_measure())
+
+    def interrupted(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(task, stand, long, interrupted)
 
 
 def test_the_report_says_under_what_it_was_made(task: TaskConfig) -> None:

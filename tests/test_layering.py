@@ -54,6 +54,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "errors.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "files.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "wording.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
+    "memory.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "signals.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
     "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
     "schema/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),

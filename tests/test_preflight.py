@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from go1exp import memory
 from go1exp.compose import compose
 from go1exp.config import LoggerConfig, TrainConfig, WandbConfig, parse_train
 from go1exp.schema.registry import ConfigError
@@ -98,10 +99,20 @@ def test_the_limit_of_a_container_or_of_a_job_counts(
     (tmp_path / "cgroup").write_text(f"7:pids:/elsewhere\n{line}\n")
     group(tmp_path / place / "job", limit_file, "50000", used)
     group(tmp_path / place / "job/step", limit_file, "max", used)
-    assert memory_need._of_group(tmp_path / "cgroup", tmp_path) == 49000
+    assert memory._of_group(tmp_path / "cgroup", tmp_path) == 49000
     group(tmp_path / place / "job/step", limit_file, "20000", used)
-    assert memory_need._of_group(tmp_path / "cgroup", tmp_path) == 19000
-    assert memory_need._of_group(tmp_path / "nothing", tmp_path) is None
+    assert memory._of_group(tmp_path / "cgroup", tmp_path) == 19000
+    assert memory._of_group(tmp_path / "nothing", tmp_path) is None
+
+
+def test_a_length_that_does_not_fit_is_told_with_what_it_takes_and_what_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "free", lambda: 8_000_000_000)
+    assert memory.too_long(8000.0, 1e6) is None
+    words = "takes at least 1000.0 GB, and 8.0 GB are free in memory; 8000 s at most would fit"
+    assert memory.too_long(1e6, 1e6) == words
+    assert "takes at least inf GB" in str(memory.too_long(1e308, 1e6))
+    monkeypatch.setattr(memory, "free", lambda: None)
+    assert memory.too_long(1e9, 1e6) is None
 
 
 # ---------------------------------------------------------------------- accounts

@@ -477,7 +477,12 @@ def test_figures_are_refused_before_anything_is_evaluated(tmp_path: Path, monkey
     (tmp_path / "a/checkpoints").mkdir()
     (tmp_path / "a/checkpoints/000001.pt").write_bytes(b"")
     made_of: list[Any] = []
-    monkeypatch.setattr("go1exp.report.evaluating.evaluate_missing", lambda wanted, *rest: made_of.append(wanted) or [])
+
+    def noted(wanted: Any, *rest: Any) -> list[str]:
+        made_of.append(wanted)
+        return []
+
+    monkeypatch.setattr("go1exp.report.evaluating.evaluate_missing", noted)
     line = [f"folders=[{tmp_path}]", f"folder={tmp_path}/out", "eval=true", "protocol=[grid,kicks]"]
     with pytest.raises(ConfigError, match=r"figures: unknown figure 'nosuch'; known: .*error_xy.*recovery_s"):
         _task(compose("report", [*line, "figures=[nosuch,error_xy]"]))

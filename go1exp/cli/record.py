@@ -85,12 +85,15 @@ def _task(container: dict[str, Any]) -> None:
 
     from go1exp.cli.logs import writable
     from go1exp.record import plan
-    from go1exp.record.simulate import Rig
     from go1exp.wording import counted
 
-    rig = Rig(**{name: parts[name] for name in groups}, physics_dt=settings.physics_dt)
     driven = [m for m in motions if m.entry.name not in (POLICY, MPC)]
     episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
+    if names & {POLICY, MPC}:
+        plan.refuse_too_long(settings, settings.episodes)
+    from go1exp.record.simulate import Rig
+
+    rig = Rig(**{name: parts[name] for name in groups}, physics_dt=settings.physics_dt)
     out = writable(settings.out)
     if present := sorted(p.name for p in out.glob("*.parquet")):
         held = counted(len(present), "recording")

@@ -9,14 +9,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from go1exp import robot
+from go1exp import memory, robot
+from go1exp.config import TaskConfig
 from go1exp.env.core import Go1Core
+from go1exp.errors import Expected
 from go1exp.mdp.derived import slip_speed
 from go1exp.mdp.types import Snapshot
 from go1exp.measures.trace import Trace
+from go1exp.wording import counted
 
 SNAPSHOT_COLUMNS = ("command", "base_lin_vel_b", "projected_gravity_b", "joint_vel", "joint_torque", "joint_target")
 """Columns of a trace that are a Snapshot's fields of the same name."""
+
+
+STEP_BYTES = 4 * (3 * robot.NUM_JOINTS + 3 * 3 + 6 * robot.NUM_LEGS + 2) + 1
+"""What a robot's policy step takes beside contact."""
+
+
+def bytes_per_second(task: TaskConfig, robots: int) -> float:
+    """Return what a ``Recorder`` takes, B/s."""
+    return robots * (STEP_BYTES + robot.NUM_LEGS * task.sim.decimation) / task.sim.policy_dt
 
 
 class Recorder:
@@ -27,7 +39,14 @@ class Recorder:
     """
 
     def __init__(self, core: Go1Core, steps: int) -> None:
-        """Make room for ``steps`` policy steps; whoever observed the plant before goes on to do so."""
+        """Make room for ``steps`` policy steps; whoever observed the plant before goes on to do so.
+
+        Raises:
+            Expected: if so many do not fit into memory.
+        """
+        seconds = steps * core.task.sim.policy_dt
+        if wrong := memory.too_long(seconds, bytes_per_second(core.task, core.num_envs)):
+            raise Expected(f"{seconds:g} s of {counted(core.num_envs, 'robot')}: what measures need of them {wrong}")
         n, self._samples = core.num_envs, core.task.sim.decimation
         self._core, self._plant, self._row, self._sample = core, core.plant, 0, 0
         self._before_us, self._listening = core.plant.observer, False

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from go1exp import memory
 from go1exp.config import TaskConfig, time_rules
 from go1exp.controller.types import Controller
 from go1exp.env.core import Go1Core
@@ -18,13 +19,14 @@ from go1exp.evaluate.engine import require_agreement
 from go1exp.evaluate.measured import described, interval
 from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.evaluate.policy import Policy
-from go1exp.evaluate.recorder import Recorder
+from go1exp.evaluate.recorder import Recorder, bytes_per_second
 from go1exp.evaluate.rows import drawn, rows_of
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.measures import measured
 from go1exp.schema.backends import BackendConfig
 from go1exp.schema.registry import ConfigError, Term, members
 from go1exp.terrain import TerrainConfig
+from go1exp.wording import counted
 
 Command = tuple[float, float, float]
 """Commanded velocity: x, y in m/s, yaw rate in rad/s, body frame."""
@@ -122,11 +124,13 @@ def evaluate(
 
     Raises:
         Expected: if that is not near enough.
+        ConfigError: if what measures need does not fit into memory.
     """
     count = len(config.commands) * config.episodes
     driver = _driver(task, policy, controller)
     imu = config.trunk_velocity == "estimated" or driver.senses
     judged = evaluation_task(task, config)
+    _refuse_too_long(config, bytes_per_second(judged, count) if measures else 0.0, count)
     checks = require_agreement(judged)
     core = Go1Core(judged, count, config.seed, noise=config.noise, imu=imu)
     act = driver.begin(core, config.trunk_velocity, config.seed)
@@ -164,6 +168,13 @@ def evaluate(
         commands=core.command.value.double().numpy(), draws=draws, measures=of_robots, **tally.each(config)
     )
     return report
+
+
+def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:
+    """Raise ConfigError if ``rate`` B/s of what measures need of ``count`` robots do not fit into memory."""
+    if wrong := memory.too_long(config.duration_s - config.settle_s, rate):
+        what = f"what measures need of {counted(count, 'robot')}"
+        raise ConfigError([f"duration_s = {config.duration_s:g}: {what} {wrong}; measures=[] needs none of it"])
 
 
 def _driver(task: TaskConfig, policy: Policy | None, controller: Callable[[], Controller] | None) -> Driver:

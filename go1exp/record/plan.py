@@ -9,13 +9,21 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from go1exp import robot
+from go1exp import memory, robot
 from go1exp.excitations import Motion
 from go1exp.record.sensors import SensorConfig
 from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, Term
+from go1exp.wording import counted
 
 SOFT_LIMIT = 0.95
 """Share of the joint ranges that motions may use."""
+
+
+MOTION_BYTES = 8 * (1 + robot.NUM_JOINTS)
+"""A row of a motion: its time, and the targets of all joints."""
+
+ROW_BYTES = MOTION_BYTES + (4 + 8) * (4 * robot.NUM_JOINTS + 14)
+"""Lower bound of a row of a recording: motion, what is true, what the logger writes (measured: 1400 B)."""
 
 
 @dataclass(frozen=True)
@@ -77,14 +85,23 @@ def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion
     return motion
 
 
+def refuse_too_long(wishes: Wishes, recordings: int) -> None:
+    """Raise ConfigError if so many recordings do not fit into memory."""
+    if wrong := memory.too_long(wishes.seconds, recordings * wishes.sensors.rate_hz * ROW_BYTES):
+        raise ConfigError([f"seconds = {wishes.seconds:g}: with {counted(recordings, 'recording')} it {wrong}"])
+
+
 def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
     """Return an episode for each combination of motion, seed, base and gain set, and then the repetitions.
 
     The first episode of each gain set is repeated.
 
     Raises:
-        ConfigError: if a motion cannot be made on the wanted base, or two episodes would have one name.
+        ConfigError: if a motion cannot be made on the wanted base, two episodes would have one name, or so many do not
+            fit into memory.
     """
+    if terms:  # as many as there are at least: where a motion is hung is not known yet
+        refuse_too_long(wishes, len(wishes.gains) * (len(terms) * len(wishes.seeds) + wishes.repeats))
     planned: list[Episode] = []
     for term in terms:
         for seed in wishes.seeds:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from go1exp import robot
+from go1exp import memory, robot
 from go1exp.config import MANY_TERMS
 from go1exp.deploy.messages import LowCmd, LowState
 from go1exp.excitations import Motion
-from go1exp.record.plan import make_motion
+from go1exp.record.plan import MOTION_BYTES, make_motion
 from go1exp.record.playback import written
 from go1exp.recording import joint_channels
 from go1exp.schema.registry import ConfigError, bind
@@ -79,7 +79,7 @@ def played(
         seed: of an excitation's random numbers.
 
     Raises:
-        ConfigError: if there is no such motion, or it is not for a hung robot.
+        ConfigError: if there is no such motion, it is not for a hung robot, or it does not fit into memory.
         go1exp.excitations.ExcitationError: if the file is no table of targets, or leaves the joints' range.
     """
     table = written(Path(wish)) if wish.endswith(".csv") else None
@@ -98,6 +98,8 @@ def played(
     term, problems = bind("excitation", name, given, "motion", MANY_TERMS.get("excitation"))
     if term is None:
         raise ConfigError([f"motion = {wish!r}: {problem}" for problem in problems])
+    if wrong := memory.too_long(seconds, rate * MOTION_BYTES):
+        raise ConfigError([f"seconds = {seconds:g}: the motion {wrong}"])
     return PlayedMotion(name, make_motion(term, seconds, rate, seed), rate, chosen)
 
 

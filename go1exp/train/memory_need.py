@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import torch
 
-from go1exp import robot
+from go1exp import memory, robot
 from go1exp.config import TrainConfig
 from go1exp.schema.backends import WarpBackend
 from go1exp.schema.registry import ConfigError
@@ -65,49 +62,4 @@ def _available(device: torch.device) -> int | None:
     """Return the free memory of a device, B; None where the system does not tell."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    amounts = [amount for amount in (_of_machine(), _of_group(Path("/proc/self/cgroup"))) if amount is not None]
-    return min(amounts, default=None)
-
-
-def _of_machine() -> int | None:
-    """Return the machine's memory that can be had without swapping, B."""
-    try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (OSError, ValueError):
-        return None
-
-
-def _of_group(membership: Path, root: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Return what the limits of this process's control groups (containers, Slurm jobs) leave, B; None without one."""
-    try:
-        lines = membership.read_text().splitlines()
-    except OSError:
-        return None
-    left: list[int] = []
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        if controllers == "":
-            names, base = ("memory.max", "memory.stat", "anon"), root
-        elif "memory" in controllers.split(","):
-            names, base = ("memory.limit_in_bytes", "memory.stat", "rss"), root / "memory"
-        else:
-            continue
-        group = base / path.strip("/")
-        for folder in (group, *group.parents):  # a limit of any of them holds
-            left += _left_in(folder, *names)
-            if folder == base:
-                break
-    return min(left, default=None)
-
-
-def _left_in(folder: Path, limit: str, statistics: str, used: str) -> list[int]:
-    """Return a group's limit less what its processes use (the disk's cache gives way); empty if unlimited."""
-    try:
-        most = int((folder / limit).read_text())
-        figures = dict(line.split() for line in (folder / statistics).read_text().splitlines())
-    except (OSError, ValueError):
-        return []
-    return [most - int(figures.get(used, 0))]
+    return memory.free()
