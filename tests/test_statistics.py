@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from go1exp import data_root
 from go1exp.statistics import association, compare
-from go1exp.statistics.intervals import Interval, mean_interval, share_interval, stratified_mean_interval
+from go1exp.statistics.intervals import (
+    Interval,
+    bootstrap_interval,
+    mean_interval,
+    share_interval,
+    stratified_mean_interval,
+)
 from go1exp.statistics.runs import (
     clustered_share,
     iqm,
@@ -63,6 +69,21 @@ def test_intervals_move_and_stretch_with_the_values() -> None:
     values = np.random.default_rng(1).normal(size=8)
     one, other = iqm_interval(values), iqm_interval(10.0 * values - 3.0)
     assert (other.low, other.high) == pytest.approx((10.0 * one.low - 3.0, 10.0 * one.high - 3.0))
+
+
+@pytest.mark.parametrize("n", [4, 6, 10])
+def test_the_mean_of_few_robots_has_students_interval_and_the_bootstraps_would_be_too_narrow(n: int) -> None:
+    """The figures of docs/experiments.md: 95 % at any n, and 79, 86 and 90 %."""
+    rng = np.random.default_rng(n)
+    studies = rng.normal(size=(2000, n))
+    held = [i.low <= 0.0 <= i.high for i in map(mean_interval, studies)]
+    assert 0.93 <= np.mean(held) <= 0.97
+
+    def resampled(values: Floats) -> Interval:
+        return bootstrap_interval(lambda robots: float(values[robots].mean()), n, draws=200)
+
+    held = [i.low <= 0.0 <= i.high for i in map(resampled, studies[:400])]
+    assert abs(np.mean(held) - {4: 0.79, 6: 0.86, 10: 0.90}[n]) < 0.06
 
 
 # ---------------------------------------------------------------------- rliable's examples
