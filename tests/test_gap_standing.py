@@ -242,5 +242,18 @@ def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
-def test_drives_that_are_all_a_little_weak_are_no_payload() -> None:
-    assert search_in("+effect.strength.scale=0.93").single_cause() is None
+@pytest.mark.parametrize(
+    "hidden",
+    [("+effect.strength.scale=0.93",), ("+effect.strength.scale=0.96", "+effect.kp_scale.scale=0.92")],
+    ids=["strength", "strength and gain"],
+)
+def test_drives_that_are_all_a_little_weak_are_no_payload_and_within_tolerances(hidden: tuple[str, ...]) -> None:
+    assert search_in(*hidden).single_cause() is None
+
+
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+def test_drives_that_are_all_weaker_than_tolerances_allow_are_one_cause() -> None:
+    cause = search_in("+effect.strength.scale=0.8").single_cause()
+    assert cause is not None
+    assert cause.name == "strength"
+    assert cause.theta["strength", "scale"] == pytest.approx(np.full(12, 0.8), abs=0.02)

@@ -123,6 +123,35 @@ def fitted(
     return theta, least
 
 
+def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows: np.ndarray, dt: float) -> Theta:
+    """Return the values within their tolerances that fit best, alike at all joints, one parameter after the other.
+
+    Args:
+        score: what :func:`begun` returns.
+        begin: values to begin at, as far as tolerances let them.
+        keys: the parameters.
+        windows: (V,) to fit.
+        dt: physics step, s.
+    """
+    machine = score.replayer.machine
+    limits = {}
+    for key in keys:
+        p = machine.tolerances.param(key)
+        limits[key] = max(p.low, p.null - p.tolerance), min(p.high, p.null + p.tolerance)
+    theta = {key: value.clip(*limits[key]) for key, value in begin.items() if key in limits}
+    least = cost(score, theta, windows, dt)
+    for key in [*(k for k in keys if k not in theta), *theta]:
+        wide = len(machine.joints) if machine.tolerances.param(key).per == "joint" else 1
+
+        def at(value: float, key: Key = key, wide: int = wide, others: Theta = theta) -> float:
+            return cost(score, {**others, key: np.full(wide, value)}, windows, dt)
+
+        nearest = minimize_scalar(at, bounds=limits[key], options={"maxiter": CLOSER})
+        if nearest.fun < least:
+            theta, least = {**theta, key: np.full(wide, nearest.x)}, float(nearest.fun)
+    return theta
+
+
 def ladder(p: Param) -> list[float]:
     """Return the values of a parameter that are tried first, in order, the null value among them."""
     rungs, far = {p.null}, FIRST * p.tolerance

@@ -2,9 +2,10 @@
 
 A payload makes every leg bear more; so does every drive that is a little weak, each within its tolerance. On the ground
 the tolerances of twelve joints together imitate any effect on the trunk up to several times its own tolerance, so a
-search that lets them move first finds no gap. An effect of the whole robot has a few numbers. If one of them alone, all
-else at its nominal value, removes nearly all of the error, and no common weakness of the drives does as well, then it
-is the explanation, not a hundred numbers that happen to agree.
+search that lets them move first finds no gap. An effect of the whole robot has a few numbers, and so has one that is
+alike at all joints, such as drives on a low battery. If one of them alone, all else at its nominal value, removes
+nearly all of the error, and no other does as well, then it is the explanation, not a hundred numbers that happen to
+agree. One of the joints must also do better than all that drives and legs may be off alike within their tolerances.
 """
 
 from __future__ import annotations
@@ -65,26 +66,24 @@ def refitted(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Mo
 
 
 def clearest(begun: Scorer, state: State) -> Model | None:
-    """Return the effect of the whole robot that does best, every model by initial states of its own.
+    """Return the effect of the whole robot, or alike at all joints, that does best by initial states of its own.
 
     Args:
         begun: scores from the initial states that sensors tell (``profile_likelihood.py``).
         state: of the search, whose windows count.
 
     Returns:
-        None unless, on windows that no fit has seen, it does clearly better than all others, joints that are all off
-        alike, and nothing at all.
+        None unless, on windows that no fit has seen, it does clearly better than all others and nothing at all; one of
+        the joints also better than joints that are all off alike within their tolerances.
     """
     train, select, dt = state.splits.train, state.splits.select, state.dt
-    fitted = profile_likelihood.fitted
     none = profile_likelihood.cost(begun, {}, train, dt)
-    machine = begun.replayer.machine
+    of_trunk = [n for n in tolerances.nominal(begun.replayer.machine) if tolerances.identification(n).needs_ground]
+    of_joints = [effect for effect in members("effect") if tolerances.identification(effect).weighs_on_legs]
     fits = {
-        name: fitted(begun, sizes(name), train, dt, none)
-        for name in tolerances.nominal(machine)
-        if tolerances.identification(name).needs_ground
+        effect: profile_likelihood.fitted(begun, sizes(effect), train, dt, none) for effect in (*of_trunk, *of_joints)
     }
-    name = min(fits, key=lambda n: fits[n][1])
+    name = min(fits, key=lambda effect: fits[effect][1])
     best = fits.pop(name)[0]
     if not best:
         return None
@@ -94,12 +93,23 @@ def clearest(begun: Scorer, state: State) -> Model | None:
         other = profile_likelihood.chi2(begun, rival, select, dt)
         return bool(significance.gains(chi2, other[None]).mean() < -significance.SAME)
 
-    # In the order of what they cost: the first that does as well ends it.
     if not loses({}) or not all(loses(rival) for rival, _ in fits.values() if rival):
         return None
-    weights = [effect for effect in members("effect") if tolerances.identification(effect).weighs_on_legs]
-    clear = all(loses(fitted(begun, sizes(effect), train, dt, none)[0]) for effect in weights)
-    return Model(name, best, state.may.also(name), sizes(name)) if clear else None
+    if name in of_joints and not loses(_off_alike(begun, best, train, dt)):
+        return None
+    return Model(name, best, state.may.also(name), sizes(name))
+
+
+def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Theta:
+    """Return what does most of what ``best`` does within tolerances: drives and legs that are all off alike."""
+    known = members("effect")
+    effects = [
+        name
+        for name in tolerances.nominal(begun.replayer.machine)
+        if tolerances.identification(name).weighs_on_legs or known[name].traits.get("gains")
+    ]
+    keys = [key for name in effects for key in sizes(name)]
+    return profile_likelihood.within_tolerances(begun, best, keys, windows, dt)
 
 
 Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model | None, Model | None]]
@@ -107,7 +117,7 @@ Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model |
 
 
 def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -> Model | None:
-    """Return the effect of the whole robot that explains nearly everything by itself, if there is one.
+    """Return the effect of the whole robot, or alike at all joints, that explains nearly everything by itself, if any.
 
     Initial states that suit the nominal model hide a part of what is missing. So effects are compared by initial states
     of their own, and the best is fitted again at states that suit it.
