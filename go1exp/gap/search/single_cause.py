@@ -5,7 +5,8 @@ the tolerances of twelve joints together imitate any effect on the trunk up to s
 search that lets them move first finds no gap. An effect of the whole robot has a few numbers, and so has one that is
 alike at all joints, such as drives on a low battery. If one of them alone, all else at its nominal value, removes
 nearly all of the error, and no other does as well, then it is the explanation, not a hundred numbers that happen to
-agree. One of the joints must also do better than all that drives and legs may be off alike within their tolerances.
+agree. One of the joints must also do better than all that drives and legs may be off alike within their tolerances,
+and stay alike where each joint is fitted by itself: what is wrong in two ways takes other values at each.
 """
 
 from __future__ import annotations
@@ -112,6 +113,12 @@ def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Th
     return profile_likelihood.within_tolerances(begun, best, keys, windows, dt)
 
 
+def _alike(model: Model) -> bool:
+    """Return whether each parameter of a cause is the same at all joints, to one tolerance."""
+    known = model.may.tolerances
+    return all(np.ptp(model.theta[key]) <= known.param(key).tolerance for key in model.keys if key in model.theta)
+
+
 Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model | None, Model | None]]
 """Tests fitted candidates on held-out windows and notes the evidence (``Search._judged``)."""
 
@@ -138,6 +145,8 @@ def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -
     for _ in range(TURNS):
         state = replace(state, theta=best.theta).renewed()
         best = refitted(state.scorer, best, train, dt)
+    if not _alike(best):
+        return None
     share = removed(excess(now), excess(state.held_out(best.theta)))
     accepted, _ = judged([best], state, plain, now)
     return best if accepted is not None and share >= NEARLY_ALL else None
