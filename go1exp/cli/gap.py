@@ -181,7 +181,7 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
     write_json(out / APPLIED, about)
     print(f"\nwritten to {', '.join(str(path) for path in written)}")
     print(
-        f"at training's step of {1e3 * proof.physics_dt:g} ms the held-out error is {1 + proof.after:.3g} times the "
+        f"at training's step of {1e3 * proof.physics_dt:.4g} ms the held-out error is {1 + proof.after:.3g} times the "
         f"floor ({1 + proof.before:.3g} without; {1 + proof.effect_only:.3g} with {apply.EFFECT} alone)"
     )
     if not proof.holds:
