@@ -32,13 +32,16 @@ def too_long(seconds: float, rate: float) -> str | None:
 
 
 def _of_machine() -> int | None:
-    """Return the machine's memory that can be had without swapping, B."""
+    """Return the machine's memory that can be had without swapping, B; all that it has where only that is told."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (OSError, ValueError):
+        pass  # no Linux
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
         return None
 
 

@@ -9,12 +9,13 @@ Where feet stick, derivatives say little. So values on a ladder are tried, and t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from go1exp.effects.base import Param
+from go1exp.effects.tolerances import declared
 from go1exp.gap.replay.rows import Key, Theta, variants
 from go1exp.gap.score.initial_state import FARTHEST, solved
 from go1exp.gap.score.likelihood import Scorer, gram, scorer
@@ -106,12 +107,7 @@ def fitted(
     least = cost(score, {}, windows, dt) if nominal is None else nominal
     for key in keys:
         p = score.replayer.machine.tolerances.param(key)
-        wide = len(score.windows.joints) if p.per == "joint" else 1
-
-        def at(value: float, key: Key = key, wide: int = wide, others: Theta = theta) -> float:
-            return cost(score, {**others, key: np.full(wide, value)}, windows, dt)
-
-        rungs = ladder(p)
+        at, rungs = _along(score, key, theta, windows, dt), ladder(p)
         costs = [least if value == p.null else at(value) for value in rungs]
         k = int(np.argmin(costs))
         if rungs[k] == p.null:
@@ -119,8 +115,19 @@ def fitted(
         between = rungs[max(k - 1, 0)], rungs[min(k + 1, len(rungs) - 1)]
         nearest = minimize_scalar(at, bounds=between, options={"maxiter": CLOSER})
         value, least = (nearest.x, float(nearest.fun)) if nearest.fun < costs[k] else (rungs[k], costs[k])
-        theta = {**theta, key: np.full(wide, value)}
+        theta = {**theta, key: _everywhere(score, key, value)}
     return theta, least
+
+
+def _everywhere(score: Scorer, key: Key, value: float) -> np.ndarray:
+    """Return one value of a parameter for all joints (J,), or for the robot (1,)."""
+    wide = len(score.windows.joints) if declared(key).per == "joint" else 1
+    return np.full(wide, value)
+
+
+def _along(score: Scorer, key: Key, others: Theta, windows: np.ndarray, dt: float) -> Callable[[float], float]:
+    """Return the cost as a function of one parameter, the others held."""
+    return lambda value: cost(score, {**others, key: _everywhere(score, key, value)}, windows, dt)
 
 
 def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows: np.ndarray, dt: float) -> Theta:
@@ -133,22 +140,18 @@ def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows:
         windows: (V,) to fit.
         dt: physics step, s.
     """
-    machine = score.replayer.machine
     limits = {}
     for key in keys:
-        p = machine.tolerances.param(key)
+        p = score.replayer.machine.tolerances.param(key)
         limits[key] = max(p.low, p.null - p.tolerance), min(p.high, p.null + p.tolerance)
     theta = {key: value.clip(*limits[key]) for key, value in begin.items() if key in limits}
     least = cost(score, theta, windows, dt)
     for key in [*(k for k in keys if k not in theta), *theta]:
-        wide = len(machine.joints) if machine.tolerances.param(key).per == "joint" else 1
-
-        def at(value: float, key: Key = key, wide: int = wide, others: Theta = theta) -> float:
-            return cost(score, {**others, key: np.full(wide, value)}, windows, dt)
-
-        nearest = minimize_scalar(at, bounds=limits[key], options={"maxiter": CLOSER})
+        nearest = minimize_scalar(
+            _along(score, key, theta, windows, dt), bounds=limits[key], options={"maxiter": CLOSER}
+        )
         if nearest.fun < least:
-            theta, least = {**theta, key: np.full(wide, nearest.x)}, float(nearest.fun)
+            theta, least = {**theta, key: _everywhere(score, key, nearest.x)}, float(nearest.fun)
     return theta
 
 
