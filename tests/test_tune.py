@@ -157,6 +157,82 @@ def test_a_trial_whose_search_was_killed_goes_on_and_one_whose_search_lives_is_l
     assert searched(tmp_path, trials=5)._study().get_trials()[5].params == lost.params
 
 
+class Killed(BaseException):
+    """What a kill leaves behind: nothing of the search is done any more."""
+
+
+class Stopping(Drawing):
+    """A search that is stopped in its first training."""
+
+    def _train(self, trial: Any, run: Path, share: tuple[int, ...]) -> tuple[Ended, list[tuple[int, float]], bool]:
+        self._stopping = True
+        return Ended(1, ""), [], False
+
+
+def die_at_the_second_call(patch: pytest.MonkeyPatch) -> None:
+    """Have a search die between telling a trial as failed and putting the one that goes on with it in front."""
+    from optuna.study import Study
+
+    calls: list[str] = []
+
+    def dying(name: str) -> Any:
+        real = getattr(Study, name)
+
+        def call(*arguments: Any, **keys: Any) -> Any:
+            calls.append(name)
+            if len(calls) > 1:
+                raise Killed
+            return real(*arguments, **keys)
+
+        return call
+
+    for name in ("tell", "enqueue_trial"):
+        patch.setattr(Study, name, dying(name))
+
+
+@NEEDS_OPTUNA
+@pytest.mark.parametrize("again", [False, True], ids=["as it stops", "as it starts, too"])
+def test_a_search_that_is_killed_while_it_hands_on_a_trial_does_not_lose_it(
+    again: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = TuneSettings(**parsed_defaults() | {"trials": 1, "out": str(tmp_path)})
+    search = Stopping(settings, {"ppo.gamma": Range(low=0.9, high=0.999)}, lambda overrides, run: None)
+    with monkeypatch.context() as patch:
+        die_at_the_second_call(patch)
+        with pytest.raises(Killed):
+            search.run()
+    if again:
+        study = search._study()
+        trials.put_back(study, tmp_path)
+        assert study.ask().user_attrs[trials.FOLDER] == "trial-0000"  # goes on; killed before it draws
+        (tmp_path / "trial-0000").mkdir()
+        with monkeypatch.context() as patch:
+            die_at_the_second_call(patch)
+            with pytest.raises(Killed):
+                trials.put_back(study, tmp_path)
+    first, *_, newest = searched(tmp_path, trials=1)._study().get_trials()
+    assert [first.state.name, newest.state.name, newest.number] == ["FAIL", "COMPLETE", 1 + again]
+    assert newest.user_attrs[trials.FOLDER] == "trial-0000"
+    assert newest.params == first.params
+
+
+@NEEDS_OPTUNA
+def test_of_two_trials_that_go_on_with_the_same_one_only_the_older_runs(tmp_path: Path) -> None:
+    """Two searches that start at once may both put it in front."""
+    study = searched(tmp_path, trials=1)._study()
+    lost = study.ask()
+    lost.suggest_float("ppo.gamma", 0.9, 0.999)
+    lost.set_user_attr(trials.SEARCH, "killed")
+    lost.set_user_attr(trials.FOLDER, "trial-0001")
+    (tmp_path / trials.SEARCHES / "killed").mkdir()
+    for _ in range(2):
+        study.enqueue_trial(lost.params, user_attrs={trials.FOLDER: "trial-0001", trials.CONTINUES: lost.number})
+    found = searched(tmp_path, trials=3)._study().get_trials()
+    assert [trial.state.name for trial in found] == ["COMPLETE", "FAIL", "COMPLETE", "FAIL", "COMPLETE"]
+    assert found[2].params == lost.params
+    assert found[4].params != lost.params
+
+
 @NEEDS_OPTUNA
 def test_a_trial_that_was_killed_before_it_had_a_name_does_not_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

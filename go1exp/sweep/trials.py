@@ -20,6 +20,9 @@ from go1exp.train import run_lock
 FOLDER = "folder"
 """Attribute of a trial that was stopped, and of the one that goes on with it: its run folder."""
 
+CONTINUES = "continues"
+"""Attribute of a trial that goes on with another one: the number of that."""
+
 SEARCH = "search"
 """Attribute of a trial: the name of the search that runs it."""
 
@@ -83,21 +86,58 @@ def put_back(study: Any, folder: Path, patience: float = PATIENCE_S) -> bool:
             some_left = some_left or is_nameless(trial)
             continue
         run = trial.user_attrs.get(FOLDER)
-        if run and not _ended(folder / run, until):
+        goes_on = run and not is_superfluous(study, trial)
+        if goes_on and not _continuations(study, trial.number) and not _ended(folder / run, until):
             some_left = True
             if patience:
                 print(f"trial {trial.number}: its training still runs, so others go first", flush=True)
             continue
+        if goes_on:
+            go_on(study, trial, run)
         try:
             study.tell(trial.number, state=TrialState.FAIL)
         except (ValueError, RuntimeError):  # another search was quicker
             continue
-        if run:
-            study.enqueue_trial(trial.params, user_attrs={FOLDER: run})
-        print(
-            f"trial {trial.number}: its search was killed; {'goes on now' if run else 'counts as failed'}", flush=True
-        )
+        result = "goes on now" if goes_on else "counts as failed"
+        print(f"trial {trial.number}: its search was killed; {result}", flush=True)
     return some_left
+
+
+def go_on(study: Any, trial: Any, run: str) -> None:
+    """Put in front the trial that goes on with a stopped one, unless that is done already.
+
+    To be called before the stopped one is told as failed: a search that is killed between the two has its trial still
+    running, and ``put_back`` finds it. Two searches may do so at once; see ``is_superfluous``.
+
+    Args:
+        study: Optuna's.
+        trial: the stopped one.
+        run: name of its run folder.
+    """
+    if not _continuations(study, trial.number):
+        stored = study.get_trials(deepcopy=False)[trial.number]
+        params = {**stored.system_attrs.get("fixed_params", {}), **stored.params}  # one killed early has drawn none
+        study.enqueue_trial(params, user_attrs={FOLDER: run, CONTINUES: trial.number})
+
+
+def is_superfluous(study: Any, trial: Any) -> bool:
+    """Whether an older trial goes on with the same one as this does: two searches may have put it in front at once."""
+    continued = trial.user_attrs.get(CONTINUES)
+    return continued is not None and min(_continuations(study, continued)) < trial.number
+
+
+def ask(study: Any) -> Any:
+    """Return Optuna's next trial that is not superfluous; those that are have failed."""
+    from optuna.trial import TrialState
+
+    while is_superfluous(study, trial := study.ask()):
+        study.tell(trial, state=TrialState.FAIL)
+    return trial
+
+
+def _continuations(study: Any, number: int) -> list[int]:
+    """Return the numbers of the trials that go on with trial ``number``."""
+    return [t.number for t in study.get_trials(deepcopy=False) if t.user_attrs.get(CONTINUES) == number]
 
 
 def _is_run(trial: Any, folder: Path) -> bool:

@@ -142,7 +142,7 @@ class Search:
                 if full and not any(trials.is_nameless(t) for t in counted):
                     return
                 if not full:
-                    trial = study.ask()
+                    trial = trials.ask(study)
                     trial.set_user_attr(trials.SEARCH, search)
                     study.sampler = trials.sampler(self.settings.seed, trial.number, self.settings.workers > 1)
                     drawn = {key: drawn_from.draw(trial, key) for key, drawn_from in self.ranges.items()}
@@ -165,8 +165,8 @@ class Search:
             raise
         how, values, hopeless = self._train(trial, run, share)
         if self._stopping:
+            trials.go_on(study, trial, run.name)
             study.tell(trial, state=optuna.trial.TrialState.FAIL)
-            study.enqueue_trial(trial.params, user_attrs={FOLDER: run.name})
             result = "stopped; goes on next time"
         elif hopeless:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
