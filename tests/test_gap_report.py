@@ -24,7 +24,7 @@ from go1exp import robot
 from go1exp.cli.settings import RecordSettings, parse
 from go1exp.compose import compose
 from go1exp.gap.report import localisation_text, text, words, write_report
-from go1exp.gap.report.figures import shown_joints, split_channel
+from go1exp.gap.report.figures import rows_of, shown_joints, split_channel
 from go1exp.gap.report.html import page
 from go1exp.gap.report.tables import Cell, heat_maps, short
 from go1exp.gap.result import Candidate, ClockChoice, Floors, GapResult, Localisation, NamedEffect, Overlay, Verdict
@@ -451,6 +451,62 @@ def test_windows_show_the_worst_joints() -> None:
         ("tau_est", "b_c"),
         ("", "odd"),
     ]
+
+
+def on_its_feet() -> Overlay:
+    """A window of a walk: no torques, and the trunk's IMU, which is further off than any joint."""
+    window = without(answer("explained").overlays[0], "tau_est")
+    curves = {f"imu_{sensor}_{axis}": np.sin(9.0 * window.t) for sensor in ("gyro", "acc") for axis in "xyz"}
+    far = {name: values + 100.0 for name, values in curves.items()}
+    noise = {**window.noise, **dict.fromkeys(curves, 0.01)}
+    changes = {name: getattr(window, name) | those for name, those in (("measured", curves), ("before", far))}
+    return replace(window, **changes, after=window.after | curves, noise=noise)
+
+
+def without(window: Overlay, quantity: str) -> Overlay:
+    """Return the window as if nothing had measured this quantity."""
+    names = ("measured", "before", "after", "noise")
+    kept: dict[str, Any] = {
+        n: {c: v for c, v in getattr(window, n).items() if split_channel(c)[0] != quantity} for n in names
+    }
+    return replace(window, **kept)
+
+
+def test_a_window_of_a_walk_shows_the_trunk_and_no_empty_panel() -> None:
+    window = on_its_feet()
+    joints = shown_joints(window)
+    assert set(joints) < set(CALVES)
+    assert rows_of(window) == {
+        **{quantity: [f"{quantity}_{joint}" for joint in joints] for quantity in ("q", "qd")},
+        **{quantity: [f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("imu_gyro", "imu_acc")},
+    }
+    floors = Floors({"imu_acc": 0.2}, {}, None)
+    shown = Reader(page(answer("explained", overlays=(window,), floors=floors))).text
+    assert "not recorded" not in shown
+    assert ", ?" not in shown
+    assert "with the largest error before, and what the trunk's IMU measured." in shown
+    assert [shown.count(f"{q}, {u}") for q, u in (("imu_gyro", "rad/s"), ("imu_acc", "m/s²"), ("tau_est", "N m"))] == [
+        1,
+        1,
+        0,
+    ]
+    assert "imu_acc m/s² 0.2" in shown
+
+
+def test_windows_with_and_without_torques_have_the_rows_that_they_have() -> None:
+    """Also where only one of the shown joints has a sensor, or the channels are there and hold nothing."""
+    full = answer("explained").overlays[0]
+    worst, *_ = shown_joints(full)
+    nothing = {c: np.full_like(v, math.nan) for c, v in full.measured.items() if c.startswith("tau_est")}
+    empty = replace(full, measured=full.measured | nothing)
+    one = replace(full, measured=without(full, "tau_est").measured | {f"tau_est_{worst}": np.sin(full.t)})
+    assert [[*rows_of(w)] for w in (full, empty, one)] == [["q", "qd", "tau_est"], ["q", "qd"], ["q", "qd", "tau_est"]]
+    shown = Reader(page(answer("explained", overlays=(full, empty, one)))).text
+    assert shown.count("tau_est, N m") == 2
+    assert shown.count("not recorded") == len(shown_joints(one)) - 1
+    assert "trunk's IMU" not in shown
+    nobody = replace(full, measured={}, before={}, after={})
+    assert "No curves were kept." in Reader(page(answer("explained", overlays=(nobody,)))).text
 
 
 def test_every_command_is_one_that_record_takes() -> None:

@@ -36,8 +36,8 @@ LEAST = 1e-2
 
 
 def split_channel(channel: str) -> tuple[str, str]:
-    """Return quantity and joint of a channel such as ``q_FR_calf``."""
-    for quantity in sorted(words.UNITS, key=len, reverse=True):
+    """Return quantity and joint of a channel such as ``q_FR_calf``, or quantity and axis of ``imu_acc_x``."""
+    for quantity in sorted(words.ALL_UNITS, key=len, reverse=True):
         if channel.startswith(f"{quantity}_"):
             return quantity, channel[len(quantity) + 1 :]
     return "", channel
@@ -47,11 +47,31 @@ def shown_joints(overlay: Overlay) -> list[str]:
     """Return the joints with the largest error before, in units of noise, worst first."""
     off: dict[str, float] = {}
     for channel, measured in overlay.measured.items():
+        quantity, joint = split_channel(channel)
+        if quantity in words.TRUNK_UNITS:
+            continue
         scaled = _scaled(overlay, channel, overlay.before.get(channel, measured))
         square = float(np.mean(scaled[np.isfinite(scaled)] ** 2)) if np.isfinite(scaled).any() else 0.0
-        joint = split_channel(channel)[1]
         off[joint] = off.get(joint, 0.0) + square
     return sorted(off, key=lambda joint: -off[joint])[:SHOWN_JOINTS]
+
+
+def rows_of(overlay: Overlay) -> dict[str, list[str]]:
+    """Return the channels to draw by quantity: those of the shown joints, or of the trunk's axes, one a column.
+
+    A quantity that no sensor gave, or of the trunk that no model predicts, has no row.
+    """
+    given = {c for c, values in overlay.measured.items() if np.isfinite(values).any()}
+    rows: dict[str, list[str]] = {}
+    for quantity in dict.fromkeys(split_channel(c)[0] for c in overlay.measured):
+        if quantity in words.TRUNK_UNITS:
+            channels, known = [f"{quantity}_{axis}" for axis in "xyz"], given & {*overlay.before}
+        else:
+            channels = [f"{quantity}_{joint}" if quantity else joint for joint in shown_joints(overlay)]
+            known = given
+        if known.intersection(channels):
+            rows[quantity] = channels
+    return rows
 
 
 def _scaled(overlay: Overlay, channel: str, model: np.ndarray) -> np.ndarray:
@@ -62,40 +82,50 @@ def _scaled(overlay: Overlay, channel: str, model: np.ndarray) -> np.ndarray:
 
 def overlay(window: Overlay, name: str) -> Markup:
     """Draw one window: each quantity with the models' curves, and below it their errors in units of noise."""
-    joints = shown_joints(window)
-    quantities = list(dict.fromkeys(split_channel(c)[0] for c in window.measured))
+    rows, joints = rows_of(window), shown_joints(window)
     every = slice(None, None, max(1, math.ceil(len(window.t) / POINTS)))
 
     def paint() -> Figure:
         from matplotlib.figure import Figure
 
-        ratios = [2.0, 1.2] * len(quantities)
-        height = 0.85 + 2.2 * len(quantities)
+        ratios = [2.0, 1.2] * len(rows)
+        columns = max(map(len, rows.values()))
+        height = 0.85 + 2.2 * len(rows)
         figure = Figure(figsize=(PAGE_INCHES, height))  # constrained layout would take most of the time
         edges = {"left": 0.058, "right": 0.998, "bottom": 0.45 / height, "top": 1 - 0.4 / height}
         figure.subplots_adjust(**edges, wspace=0.17, hspace=0.16)
-        axes = figure.subplots(len(ratios), len(joints), sharex=True, sharey=False, squeeze=False, height_ratios=ratios)
-        for column, joint in enumerate(joints):
-            axes[0, column].set_title(joint, loc="left", fontweight="bold")
-            for row, quantity in enumerate(quantities):
-                channel = f"{quantity}_{joint}" if quantity else joint
-                _window((axes[2 * row, column], axes[2 * row + 1, column]), window, channel, every)
-            axes[-1, column].set_xlabel("time in the episode, s")
-        for row, quantity in enumerate(quantities):
-            axes[2 * row, 0].set_ylabel(f"{quantity}, {words.UNITS.get(quantity, '?')}")
-            axes[2 * row + 1, 0].set_ylabel("error, sd")
-            _same_errors(axes[2 * row + 1])
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="upper right", ncols=4, frameon=False, borderaxespad=0.1)
+        axes = figure.subplots(len(ratios), columns, sharex=True, sharey=False, squeeze=False, height_ratios=ratios)
+        for row, (quantity, channels) in enumerate(rows.items()):
+            above, below = axes[2 * row], axes[2 * row + 1]
+            for column, channel in enumerate(channels):
+                _window((above[column], below[column]), window, channel, every)
+            _titles(above, quantity, channels, first=row == 0)
+            above[0].set_ylabel(f"{quantity}, {words.ALL_UNITS[quantity]}" if quantity else "")
+            below[0].set_ylabel("error, sd")
+            _same_errors(below)
+            for unused in (*above[len(channels) :], *below[len(channels) :]):
+                unused.set_axis_off()
+        for axis in axes[-1]:
+            axis.set_xlabel("time in the episode, s")
+        handles = {label: h for a in axes[0] for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
+        figure.legend([*handles.values()], [*handles], loc="upper right", ncols=4, frameon=False, borderaxespad=0.1)
         figure.align_ylabels(axes[:, 0])
         return figure
 
-    return draw(name, f"Measured and predicted curves of {', '.join(joints)} in {window.episode}", paint)
+    trunk = ["the trunk"] if words.TRUNK_UNITS.keys() & rows else []
+    return draw(name, f"Measured and predicted curves of {', '.join(joints + trunk)} in {window.episode}", paint)
+
+
+def _titles(row: Sequence[Axes], quantity: str, channels: Sequence[str], first: bool) -> None:
+    """Write what the columns are: joints above the ``first`` row, axes above those of the trunk."""
+    if first or quantity in words.TRUNK_UNITS:
+        for axes, channel in zip(row, channels, strict=False):
+            axes.set_title(split_channel(channel)[1], loc="left", fontweight="bold", pad=None if first else 2.0)
 
 
 def _window(pair: tuple[Axes, Axes], window: Overlay, channel: str, every: slice) -> None:
     above, below = pair
-    if channel not in window.measured:
+    if not np.isfinite(window.measured.get(channel, math.nan)).any():
         above.text(0.5, 0.5, "not recorded", ha="center", va="center", transform=above.transAxes, color=GREY)
         return
     t, y, noise = window.t[every], window.measured[channel], window.noise.get(channel, math.nan)

@@ -50,6 +50,7 @@ def page(result: GapResult) -> str:
 
 
 def _context(result: GapResult) -> dict[str, Any]:
+    drawn = [w for w in result.overlays[:MOST_WINDOWS] if len(w.t) and figures.rows_of(w)]
     forests = [(n, name) for n in result.named for name, values in n.params.items() if values]
     return {
         "result": result,
@@ -76,11 +77,8 @@ def _context(result: GapResult) -> dict[str, Any]:
         "values": tables.values(result),
         "floors": tables.floors(result),
         "provenance": tables.provenance(result),
-        "windows": [
-            (window, figures.overlay(window, f"window{k}"))
-            for k, window in enumerate(result.overlays[:MOST_WINDOWS])
-            if len(window.t) and window.measured
-        ],
+        "windows": [(window, figures.overlay(window, f"window{k}")) for k, window in enumerate(drawn)],
+        "trunk": any(words.TRUNK_UNITS.keys() & figures.rows_of(window) for window in drawn),
         "waterfall": figures.waterfall(result) if any(v == v for _, v in result.waterfall) else None,
         "forests": [
             figures.forest(n, name, k, tolerances_of(result)) for k, (n, name) in enumerate(forests[:MOST_FORESTS])

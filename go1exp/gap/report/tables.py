@@ -240,7 +240,7 @@ def floors(result: GapResult) -> list[tuple[str, str, str, str, str]]:
     rows = []
     for name in names:
         noise, numerical, repeated = (words.number(table.get(name)) for table in tables)
-        rows.append((name, words.UNITS.get(name, ""), noise, numerical, repeated))
+        rows.append((name, words.ALL_UNITS.get(name, ""), noise, numerical, repeated))
     return rows
 
 

@@ -24,7 +24,13 @@ NOTHING = "–"
 """Stands for a number that there is not."""
 
 UNITS: dict[str, str] = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
-"""Logged quantity -> unit."""
+"""Logged quantity of a joint -> unit."""
+
+TRUNK_UNITS: dict[str, str] = {"imu_gyro": "rad/s", "imu_acc": "m/s²"}
+"""The same of the trunk, along x, y and z."""
+
+ALL_UNITS: dict[str, str] = UNITS | TRUNK_UNITS
+"""The same of both."""
 
 ERRORS: dict[str, str] = {
     "null": "model as it is",
