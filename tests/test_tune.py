@@ -157,6 +157,16 @@ def test_a_trial_whose_search_was_killed_goes_on_and_one_whose_search_lives_is_l
     assert searched(tmp_path, trials=5)._study().get_trials()[5].params == lost.params
 
 
+def with_a_killed_search(study: Any, folder: Path) -> Any:
+    """Return a trial, running, whose search is gone; its training had a folder."""
+    trial = study.ask()
+    trial.suggest_float("ppo.gamma", 0.9, 0.999)
+    trial.set_user_attr(trials.SEARCH, "killed")
+    trial.set_user_attr(trials.FOLDER, f"trial-{trial.number:04}")
+    (folder / trials.SEARCHES / "killed").mkdir()
+    return trial
+
+
 class Killed(BaseException):
     """What a kill leaves behind: nothing of the search is done any more."""
 
@@ -220,11 +230,7 @@ def test_a_search_that_is_killed_while_it_hands_on_a_trial_does_not_lose_it(
 def test_of_two_trials_that_go_on_with_the_same_one_only_the_older_runs(tmp_path: Path) -> None:
     """Two searches that start at once may both put it in front."""
     study = searched(tmp_path, trials=1)._study()
-    lost = study.ask()
-    lost.suggest_float("ppo.gamma", 0.9, 0.999)
-    lost.set_user_attr(trials.SEARCH, "killed")
-    lost.set_user_attr(trials.FOLDER, "trial-0001")
-    (tmp_path / trials.SEARCHES / "killed").mkdir()
+    lost = with_a_killed_search(study, tmp_path)
     for _ in range(2):
         study.enqueue_trial(lost.params, user_attrs={trials.FOLDER: "trial-0001", trials.CONTINUES: lost.number})
     found = searched(tmp_path, trials=3)._study().get_trials()
@@ -271,11 +277,7 @@ def test_a_training_that_does_not_end_holds_nobody_up_and_its_trial_goes_on_when
     from optuna.trial import TrialState
 
     study = searched(tmp_path, trials=1)._study()
-    trial = study.ask()
-    trial.suggest_float("ppo.gamma", 0.9, 0.999)
-    trial.set_user_attr(trials.SEARCH, "killed")
-    trial.set_user_attr(trials.FOLDER, "trial-0001")
-    (tmp_path / trials.SEARCHES / "killed").mkdir()
+    with_a_killed_search(study, tmp_path)
     (tmp_path / "trial-0001").mkdir()
     with run_lock.locked(tmp_path / "trial-0001"):
         begin = time.monotonic()

@@ -62,12 +62,13 @@ def rows_of(overlay: Overlay) -> dict[str, list[str]]:
     A quantity that no sensor gave, or of the trunk that no model predicts, has no row.
     """
     given = {c for c, values in overlay.measured.items() if np.isfinite(values).any()}
+    joints = shown_joints(overlay)
     rows: dict[str, list[str]] = {}
     for quantity in dict.fromkeys(split_channel(c)[0] for c in overlay.measured):
         if quantity in words.TRUNK_UNITS:
             channels, known = [f"{quantity}_{axis}" for axis in "xyz"], given & {*overlay.before}
         else:
-            channels = [f"{quantity}_{joint}" if quantity else joint for joint in shown_joints(overlay)]
+            channels = [f"{quantity}_{joint}" if quantity else joint for joint in joints]
             known = given
         if known.intersection(channels):
             rows[quantity] = channels
