@@ -1,18 +1,19 @@
 """The loop closed on a policy: hidden robots are recorded, the gap is named, the policy is fine-tuned and walks again.
 
-    python -m benchmarks.closed_loop out=DIR [size=full|small|tiny] [robots=friction,late] [seed=0] [jobs=1] [threads=2]
+    python -m benchmarks.closed_loop out=DIR [size=full|small|tiny] [robots=friction,late] [trainings=1] [seed=0]
+        [jobs=1] [threads=2]
 
 For each hidden robot (``benchmarks/gap/hidden.py``, physics that is not the library's) ``go1exp gap`` writes an
 ``effect.yaml`` from its recordings, hung, or on its feet where those give no effect. Then the policy is fine-tuned
 with it, and with equally many steps on the plain model and with an actuator net fitted to hung recordings.
-All four policies walk on the hidden robot with the same seeds. Writes ``robots.json``, ``robots.csv`` and
+All four policies walk on the hidden robot with the same seeds. Each of the three is trained ``trainings`` times, with
+seeds of their own: a training alone says little. Writes ``robots.json``, ``robots.csv`` and
 ``closed_loop.json``. What is done already is not done again, so an interrupted run goes on. ``jobs`` robots are worked
 on at a time: the searches want processor cores, the trainings share the GPU.
 """
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import sys
@@ -28,13 +29,13 @@ import numpy as np
 import torch
 
 from benchmarks import commands
+from benchmarks.closed_loop_figures import Walks, figures_of, row_of, table, write_table
 from benchmarks.gap import hidden, logger
 from benchmarks.gap.walking import Ground, Policy
 from benchmarks.results import write_results
 from go1exp.config import parse_train
 from go1exp.evaluate.policy import load_network
 from go1exp.export.graph import DeployedPolicy
-from go1exp.statistics.intervals import Interval, bootstrap_interval, mean_interval, share_interval
 from go1exp.train import run_folder
 
 Command = tuple[float, float, float]
@@ -90,7 +91,7 @@ SIZES = {
         task=("experiment=trot", "actuator=pd", "~actuator.command", "effect=none", "rand=none"),
         first=(),
         walker=("ppo.iterations=50",),
-        tuned=("ppo.iterations=100",),
+        tuned=("ppo.iterations=100", "ppo.max_kl=0.05"),  # without a limit one of 21 threw its policy away
         physics_dt=0.002,
         ground=Ground(time_constant=0.005),
         recordings=8,
@@ -138,9 +139,6 @@ SIZES = {
     ),
 }
 
-POLICIES = ("before", "plain", "net", "effects")
-"""As trained; fine-tuned on the plain model, with the actuator net, and with the named effects."""
-
 DONE = "done.json"
 """In the folder of a step that is finished."""
 
@@ -155,6 +153,7 @@ class Place:
         seed: of robots, trainings and walks.
         jobs: robots at a time.
         threads: of each search.
+        trainings: of each fine-tuned policy.
     """
 
     out: Path
@@ -162,6 +161,7 @@ class Place:
     seed: int
     jobs: int
     threads: int
+    trainings: int = 1
 
     def named(self, *parts: str) -> Path:
         """Return a folder of it."""
@@ -184,26 +184,30 @@ def finish(folder: Path, **content: Any) -> None:
 # ---------------------------------------------------------------------- what the user of the robot does
 
 
-def trained(place: Place, run: Path, *words: str) -> Path:
+def trained(place: Place, run: Path, *words: str, seed: int) -> Path:
     """Train into a run folder, or go on with what is there; return it."""
     if not finished(run):
         if list((run / "checkpoints").glob("*.pt")):
             commands.run("train", f"resume={run}")
         else:
-            commands.run("train", *place.size.task, *words, f"seed={place.seed}", f"hydra.run.dir={run}")
+            commands.run("train", *place.size.task, *words, f"seed={seed}", f"hydra.run.dir={run}")
         finish(run)
     return run
 
 
 def walker(place: Place) -> Path:
     """Return the run of the policy that all others start from: trained on the nominal robot."""
-    first = trained(place, place.named("first"), *place.size.first)
-    return trained(place, place.named("walker"), f"start_from={first}", *place.size.walker)
+    first = trained(place, place.named("first"), *place.size.first, seed=place.seed)
+    return trained(place, place.named("walker"), f"start_from={first}", *place.size.walker, seed=place.seed)
 
 
-def tuned(place: Place, run: Path, *words: str) -> Path:
-    """Return the run of a fine-tuned policy."""
-    return trained(place, run, f"start_from={place.named('walker')}", *place.size.tuned, *words)
+def tuned(place: Place, run: Path, *words: str) -> list[Path]:
+    """Return the runs of a fine-tuned policy, one of each training: ``run``, ``run_1`` and so on."""
+    runs = [run.with_name(f"{run.name}_{k}" if k else run.name) for k in range(place.trainings)]
+    start = f"start_from={place.named('walker')}"
+    for k, each in enumerate(runs):
+        trained(place, each, start, *place.size.tuned, *words, seed=place.seed + k)
+    return runs
 
 
 def searched(place: Place, name: str, support: str) -> dict[str, Any]:
@@ -284,113 +288,6 @@ def judge(place: Place, robot: hidden.Hidden, run: Path, file: Path) -> None:
         file.write_text(json.dumps({"errors": errors.round(6).tolist(), "fell": fell.tolist()}) + "\n")
 
 
-# ---------------------------------------------------------------------- figures
-
-
-@dataclass(frozen=True)
-class Walks:
-    """Walks of one policy on one robot: errors (n,) m/s, and falls (n,) bool; the k-th has the k-th seed."""
-
-    errors: np.ndarray
-    fell: np.ndarray
-
-    @classmethod
-    def read(cls, file: Path) -> Walks:
-        """Read what ``judge`` wrote."""
-        plain = json.loads(file.read_text())
-        return cls(np.array(plain["errors"]), np.array(plain["fell"], dtype=bool))
-
-
-def won_back(nominal: np.ndarray, before: np.ndarray, after: np.ndarray) -> Interval:
-    """Return the share of what a robot adds to the mean (over the nominal one) that fine-tuning takes away again.
-
-    (before - after) / (before - nominal) of the means, with the bootstrap over walks (n,), which belong together by
-    their seeds. NaN where the robot adds nothing: where the interval of what it adds holds zero.
-    """
-
-    def added(walks: np.ndarray) -> float:
-        return float(before[walks].mean() - nominal[walks].mean())
-
-    if not bootstrap_interval(added, len(before)).low > 0:
-        return Interval(float("nan"), float("nan"), float("nan"), len(before))
-    return bootstrap_interval(lambda k: float(before[k].mean() - after[k].mean()) / added(k), len(before))
-
-
-def median_over(robots: Sequence[float]) -> Interval:
-    """Return the median over robots, NaNs left out, with the bootstrap over robots."""
-    each = np.array([value for value in robots if np.isfinite(value)])
-    return bootstrap_interval(lambda k: float(np.median(each[k])), len(each), draws=4000)
-
-
-def falls_won_back(nominal: Walks, robots: Sequence[Mapping[str, Walks]], policy: str) -> Interval:
-    """Return the share of the falls added by all robots that fine-tuning takes away, with the bootstrap over robots."""
-
-    def share(k: np.ndarray) -> float:
-        before, after = (sum(robots[i][which].fell.mean() for i in k) for which in ("before", policy))
-        added = before - len(k) * nominal.fell.mean()
-        return float((before - after) / added) if added > 0 else float("nan")
-
-    return bootstrap_interval(share, len(robots), draws=4000)
-
-
-def row_of(name: str, verdict: Mapping[str, Any], nominal: Walks, walks: Mapping[str, Walks]) -> dict[str, Any]:
-    """Return a robot's row of the table: errors with 95 % intervals, falls, shares won back."""
-    row: dict[str, Any] = {"robot": name, "hides": hidden.SECRETS[name].about, "walks": len(nominal.errors)}
-    row |= {"logs": verdict["logs"], "verdict": verdict["verdict"], "named": ", ".join(verdict["named"])}
-    for policy, each in {"nominal": nominal, **walks}.items():
-        error = mean_interval(each.errors)
-        falls = share_interval(int(each.fell.sum()), len(each.fell))
-        row |= {f"{policy}_error": error.estimate, f"{policy}_error_low": error.low, f"{policy}_error_high": error.high}
-        row |= {f"{policy}_falls": int(each.fell.sum()), f"{policy}_falls_low": falls.low}
-        row |= {f"{policy}_falls_high": falls.high}
-    for policy in POLICIES[1:]:
-        share = won_back(nominal.errors, walks["before"].errors, walks[policy].errors)
-        row |= {f"won_back_{policy}": share.estimate, f"won_back_{policy}_low": share.low}
-        row |= {f"won_back_{policy}_high": share.high}
-    return {key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()}
-
-
-def figures_of(
-    rows: Sequence[Mapping[str, Any]], nominal: Walks, walks: Sequence[Mapping[str, Walks]]
-) -> dict[str, float | int | str | None]:
-    """Return the figures of all robots: the median share of the error won back, and the share of the falls."""
-    figures: dict[str, float | int | str | None] = {"closed_loop_robots": len(rows)}
-    figures["closed_loop_walks"] = len(nominal.errors)
-    for policy, end in (("effects", ""), ("plain", "_plain"), ("net", "_net")):
-        shares = median_over([row[f"won_back_{policy}"] for row in rows])
-        falls = falls_won_back(nominal, walks, policy)
-        figures["closed_loop_robots_hurt"] = shares.n
-        for key, figure in ((f"won_back{end}", shares), (f"falls_won_back{end}", falls)):
-            parts = {"": figure.estimate, "_low": figure.low, "_high": figure.high}
-            figures |= {f"closed_loop_{key}{k}": round(v, 4) if np.isfinite(v) else None for k, v in parts.items()}
-    return figures
-
-
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the rows as lines for people."""
-    lines = [f"{'robot':14} {'nominal':>8}" + "".join(f"{p:>16}" for p in POLICIES) + "  won back (95 %), named"]
-    for row in rows:
-        cells = "".join(f"{row[f'{p}_error']:8.3f} ({row[f'{p}_falls']:2d} fell)" for p in POLICIES)
-        shares = "; ".join(
-            f"{p} {row[f'won_back_{p}']:.0%} ({row[f'won_back_{p}_low']:.0%} to {row[f'won_back_{p}_high']:.0%})"
-            for p in POLICIES[1:]
-        )
-        lines.append(
-            f"{row['robot']:14} {row['nominal_error']:8.3f}{cells}  {shares}; {row['named'] or 'nothing named'}"
-        )
-    return "\n".join(lines)
-
-
-def write_table(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write the rows as ``robots.json`` and ``robots.csv``; what is not defined is null, or empty."""
-    plain = [{k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()} for row in rows]
-    (out / "robots.json").write_text(json.dumps(plain, indent=1) + "\n")
-    with open(out / "robots.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(plain[0]))
-        writer.writeheader()
-        writer.writerows(plain)
-
-
 # ---------------------------------------------------------------------- the whole
 
 
@@ -411,16 +308,21 @@ def robot_of(place: Place, name: str) -> tuple[dict[str, Any], dict[str, Walks]]
     net = place.named(name, "net_fit", "net.npz")
     through_net = ("actuator=net", f"actuator.file={net}", "actuator.period=resample")
     runs = {
-        "before": place.named("walker"),
-        "plain": place.named("plain"),
+        "before": [place.named("walker")],
+        "plain": tuned(place, place.named("plain")),
         "net": tuned(place, place.named(name, "net"), *through_net),
     }
     verdict = named_effects(place, name)
     runs["effects"] = tuned(place, place.named(name, "effects"), f"effect={verdict['file']}")
     robot = hidden.make(name, place.seed, place.size.ground)
-    for policy, run in runs.items():
-        judge(place, robot, run, place.named(name, f"walks_{policy}.json"))
-    return verdict, {policy: Walks.read(place.named(name, f"walks_{policy}.json")) for policy in runs}
+    walks = {}
+    for policy, of_policy in runs.items():
+        endings = [run.name.removeprefix(of_policy[0].name) for run in of_policy]
+        files = [place.named(name, f"walks_{policy}{ending}.json") for ending in endings]
+        for run, file in zip(of_policy, files, strict=True):
+            judge(place, robot, run, file)
+        walks[policy] = Walks.read(*files)
+    return verdict, walks
 
 
 def in_turn(place: Place, names: Sequence[str]) -> Iterator[tuple[dict[str, Any], dict[str, Walks]]]:
@@ -454,26 +356,26 @@ def settled(given: Mapping[str, str]) -> tuple[Place, tuple[str, ...]]:
         SystemExit: if one is wrong, or the folder holds a run of another size or seed.
     """
     usage = (
-        f"usage: python -m benchmarks.closed_loop out=DIR [size={'|'.join(SIZES)}] [robots=NAME,NAME] [seed=0] "
-        f"[jobs=1] [threads=INT]\nrobots: {', '.join(hidden.SECRETS)}"
+        f"usage: python -m benchmarks.closed_loop out=DIR [size={'|'.join(SIZES)}] [robots=NAME,NAME] [trainings=1] "
+        f"[seed=0] [jobs=1] [threads=INT]\nrobots: {', '.join(hidden.SECRETS)}"
     )
-    if not {"out"} <= set(given) <= {"out", "size", "robots", "seed", "jobs", "threads"}:
+    if not {"out"} <= set(given) <= {"out", "size", "robots", "trainings", "seed", "jobs", "threads"}:
         raise SystemExit(usage)
     name = given.get("size", "full")
     if name not in SIZES:
         raise SystemExit(f"size={name}: must be one of {', '.join(SIZES)}\n{usage}")
     try:
-        seed, jobs = int(given.get("seed", 0)), int(given.get("jobs", 1))
+        seed, jobs, trainings = (int(given.get(*pair)) for pair in (("seed", 0), ("jobs", 1), ("trainings", 1)))
         threads = int(given.get("threads", max((os.cpu_count() or 1) // max(jobs, 1), 1)))
     except ValueError as error:
-        raise SystemExit(f"seed, jobs and threads must be whole numbers: {error}\n{usage}") from None
-    if min(jobs, threads) < 1:
-        raise SystemExit(f"jobs={jobs} threads={threads}: each must be at least 1\n{usage}")
+        raise SystemExit(f"seed, jobs, threads and trainings must be whole numbers: {error}\n{usage}") from None
+    if min(jobs, threads, trainings) < 1:
+        raise SystemExit(f"jobs={jobs} threads={threads} trainings={trainings}: each must be at least 1\n{usage}")
     robots = tuple(given["robots"].split(",")) if "robots" in given else SIZES[name].robots
     for robot in robots:
         if robot not in hidden.SECRETS:
             raise SystemExit(f"robots: {robot!r} must be one of {', '.join(hidden.SECRETS)}\n{usage}")
-    place = Place(Path(given["out"]).resolve(), SIZES[name], seed, jobs, threads)
+    place = Place(Path(given["out"]).resolve(), SIZES[name], seed, jobs, threads, trainings)
     settings = json.loads(json.dumps({**asdict(place.size), "seed": seed}))
     del settings["robots"]  # others may be added
     file = place.named("settings.json")
@@ -498,6 +400,7 @@ def main(arguments: Sequence[str]) -> None:
         print(f"robot {count}/{len(robots)}, {(time.monotonic() - begun) / 60:.1f} min\n{table(rows)}\n", flush=True)
     write_table(place.out, rows)
     command = f"python -m benchmarks.closed_loop size={given.get('size', 'full')} seed={place.seed} "
+    command += f"trainings={place.trainings} " if place.trainings > 1 else ""
     write_results(
         place.named("closed_loop.json"), f"{command}robots={','.join(robots)}", figures_of(rows, nominal, walks)
     )

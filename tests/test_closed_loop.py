@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -13,8 +14,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import closed_loop, commands
-from benchmarks.closed_loop import SIZES, Place, Walks
+from benchmarks import closed_loop, closed_loop_figures, commands
+from benchmarks.closed_loop import SIZES, Place
+from benchmarks.closed_loop_figures import Walks
 from benchmarks.gap import hidden
 from benchmarks.gap.motions import RATE
 from benchmarks.gap.truth import Truth
@@ -153,36 +155,38 @@ def test_hung_logs_have_several_gains_and_those_for_a_net_that_of_the_walk() -> 
 def test_the_share_won_back_is_that_of_the_table() -> None:
     """0.10 on the nominal robot, 0.30 before, 0.15 after: 0.15 of 0.20 is won back."""
     wobble = np.array([-0.02, -0.01, 0.01, 0.02])
-    share = closed_loop.won_back(0.10 + wobble, 0.30 + wobble, 0.15 + 2 * wobble)
+    share = closed_loop_figures.won_back(0.10 + wobble, 0.30 + wobble, 0.15 + 2 * wobble)
     assert share.estimate == pytest.approx(0.75)
     assert share.low < 0.75 < share.high
     assert share.n == 4
-    worse = closed_loop.won_back(0.10 + wobble, 0.30 + wobble, 0.40 + wobble)
+    worse = closed_loop_figures.won_back(0.10 + wobble, 0.30 + wobble, 0.40 + wobble)
     assert worse.estimate == pytest.approx(-0.5)
 
 
 def test_a_robot_that_adds_nothing_has_no_share() -> None:
     wobble = np.array([-0.02, -0.01, 0.01, 0.02])
-    assert np.isnan(closed_loop.won_back(0.10 + wobble, 0.10 - wobble, 0.05 + wobble).estimate)
+    assert np.isnan(closed_loop_figures.won_back(0.10 + wobble, 0.10 - wobble, 0.05 + wobble).estimate)
 
 
 def test_the_median_leaves_out_robots_without_a_share() -> None:
-    median = closed_loop.median_over([0.5, float("nan"), 0.9, 0.7])
+    median = closed_loop_figures.median_over([0.5, float("nan"), 0.9, 0.7])
     assert (median.estimate, median.n) == (0.7, 3)
     assert (median.low, median.high) == (0.5, 0.9)
 
 
 def walks(errors: float, falls: int) -> Walks:
-    return Walks(errors + np.linspace(-0.01, 0.01, 10), np.arange(10) < falls)
+    return Walks((errors + np.linspace(-0.01, 0.01, 10))[None], (np.arange(10) < falls)[None])
 
 
 def test_falls_won_back_are_those_of_all_robots() -> None:
     """1 of 10 falls nominally; 6 and 3 before, 2 and 1 after: 6 of the 7 that the robots add are gone."""
     nominal = walks(0.1, 1)
     robots = [{"before": walks(0.3, b), "effects": walks(0.2, a)} for b, a in ((6, 2), (3, 1))]
-    share = closed_loop.falls_won_back(nominal, robots, "effects")
+    share = closed_loop_figures.falls_won_back(nominal, robots, "effects")
     assert share.estimate == pytest.approx(6 / 7)
-    assert np.isnan(closed_loop.falls_won_back(nominal, [{"before": nominal, "effects": nominal}], "effects").estimate)
+    assert np.isnan(
+        closed_loop_figures.falls_won_back(nominal, [{"before": nominal, "effects": nominal}], "effects").estimate
+    )
 
 
 def test_figures_and_tables_hold_what_the_rows_hold(tmp_path: Path) -> None:
@@ -194,19 +198,34 @@ def test_figures_and_tables_hold_what_the_rows_hold(tmp_path: Path) -> None:
         {"before": walks(0.1, 0), "plain": walks(0.1, 0), "net": walks(0.1, 0), "effects": walks(0.09, 0)},
     ]
     names = ("friction", "late", "soft_ground")
-    rows = [closed_loop.row_of(n, verdict, nominal, w) for n, w in zip(names, each, strict=True)]
+    rows = [closed_loop_figures.row_of(n, verdict, nominal, w) for n, w in zip(names, each, strict=True)]
     assert rows[0]["before_falls"] == 2
     assert rows[0]["won_back_effects"] == pytest.approx(0.9)
-    figures = closed_loop.figures_of(rows, nominal, each)
+    figures = closed_loop_figures.figures_of(rows, nominal, each)
     assert figures["closed_loop_won_back"] == pytest.approx(0.9)
     assert figures["closed_loop_won_back_plain"] == pytest.approx(0.125)
     assert figures["closed_loop_won_back_net"] == pytest.approx(0.5)
     assert figures["closed_loop_falls_won_back"] == pytest.approx(0.75)
     assert (figures["closed_loop_robots"], figures["closed_loop_robots_hurt"]) == (3, 2)
-    closed_loop.write_table(tmp_path, rows)
+    closed_loop_figures.write_table(tmp_path, rows)
     assert json.loads((tmp_path / "robots.json").read_text())[2]["won_back_net"] is None
     assert len((tmp_path / "robots.csv").read_text().splitlines()) == 4
-    assert "coulomb (certified)" in closed_loop.table(rows)
+    assert "coulomb (certified)" in closed_loop_figures.table(rows)
+
+
+def test_of_several_trainings_the_mean_counts_and_each_is_shown() -> None:
+    """0.1 nominal, 0.3 before; 0.12 and 0.2 after: 0.9 and 0.5 are won back, 0.7 in the mean."""
+    one, other = walks(0.12, 0), walks(0.2, 4)
+    twice = Walks(np.concatenate((one.errors, other.errors)), np.concatenate((one.fell, other.fell)))
+    each = {"before": walks(0.3, 8), "plain": twice, "net": twice, "effects": twice}
+    row = closed_loop_figures.row_of("late", {"logs": "", "verdict": "", "named": []}, walks(0.1, 0), each)
+    assert row["won_back_effects"] == pytest.approx(0.7)
+    assert row["won_back_effects_each"] == "0.900 0.500"
+    assert row["effects_falls"] == 4
+    assert row["effects_error"] == pytest.approx(0.16)
+    figures = closed_loop_figures.figures_of([row], walks(0.1, 0), [each])
+    assert figures["closed_loop_falls_won_back"] == pytest.approx(0.75)  # 2 of 10 are left of 8 of 10
+    assert figures["closed_loop_trainings"] == 2
 
 
 # ---------------------------------------------------------------------- settings, and going on
@@ -221,6 +240,7 @@ def test_figures_and_tables_hold_what_the_rows_hold(tmp_path: Path) -> None:
         ({"out": "x", "robots": "friction,rust"}, "'rust' must be one of friction"),
         ({"out": "x", "seed": "one"}, "whole numbers"),
         ({"out": "x", "jobs": "0"}, "jobs=0 .* at least 1"),
+        ({"out": "x", "trainings": "0"}, "trainings=0: each must be at least 1"),
     ],
 )
 def test_a_wrong_argument_is_refused(given: dict[str, str], words: str, tmp_path: Path) -> None:
@@ -288,6 +308,10 @@ def test_an_interrupted_training_goes_on_and_a_finished_one_is_left(
     assert first[0] == "train"
     assert {"seed=3", f"start_from={tmp_path / 'walker'}", "sim.physics_dt=0.005"} <= set(first)
     assert second == ("train", f"resume={run}")
+    twice = closed_loop.tuned(dataclasses.replace(place, trainings=2), run)
+    assert [each.name for each in twice] == ["plain", "plain_1"]
+    assert {"seed=4", f"hydra.run.dir={tmp_path / 'plain_1'}"} <= set(asked[2])
+    assert len(asked) == 3
 
 
 def test_the_feet_are_asked_only_where_hung_logs_give_no_effect(

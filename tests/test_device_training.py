@@ -171,6 +171,51 @@ def test_an_update_is_sb3s(ours: type[AdaptivePPO], sb3s: type[AdaptivePPO], ove
         assert len(set(rates)) > 1
 
 
+@pytest.mark.parametrize("kind", [DevicePPO, AdaptivePPO])
+@pytest.mark.parametrize("schedule", ["fixed", "adaptive"])
+def test_an_update_ends_before_the_step_at_which_the_policy_has_diverged_too_far(
+    kind: type[AdaptivePPO], schedule: str
+) -> None:
+    overrides = ("ppo.epochs=5", "ppo.init_std=0.5", f"ppo.schedule={schedule}", "ppo.learning_rate=0.0002")
+
+    def learner(*others: str) -> Any:
+        config = parse_train(compose("train", (*SMALL, *overrides, *others)))
+        core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True)
+        ppo: Any = kind(config.ppo, Go1VecEnv(core), 0, "cpu")
+        ppo.log = []
+        ppo.after_iteration = lambda p: p.log.append(dict(p.logger.name_to_value))
+        torch.manual_seed(1)
+        return ppo
+
+    limited = learner("ppo.max_kl=0.001")
+    limited.learn(48)
+    steps = int(limited.log[0]["train/gradient_steps"])
+    assert 2 <= steps < 5 * 4 - 1  # of five epochs of four minibatches
+    assert limited.log[0]["train/kl"] <= 0.001
+
+    stopped = learner()
+    adam, taken = stopped.policy.optimizer, [0]
+    step = adam.step
+
+    def only_as_many() -> None:
+        taken[0] += 1
+        if taken[0] <= steps:
+            step()
+
+    adam.step = only_as_many
+    stopped.learn(48)
+    assert taken[0] == 20
+    for name, value in stopped.policy.state_dict().items():
+        assert torch.equal(limited.policy.state_dict()[name], value), name
+    for parameter, other in zip(limited.policy.parameters(), stopped.policy.parameters(), strict=True):
+        mine, its = limited.policy.optimizer.state[parameter], adam.state[other]
+        assert all(torch.equal(mine[key], its[key]) for key in ("step", "exp_avg", "exp_avg_sq"))
+
+    limited.learn(48, reset_num_timesteps=False)  # the next one begins anew
+    assert limited.log[1]["train/gradient_steps"] >= 2
+    assert len(set(limited._kl)) > 1
+
+
 def test_training_stopped_and_resumed_is_training_in_one_go(learner: Callable[..., DevicePPO], tmp_path: Path) -> None:
     straight = learner()
     straight.learn(48 * 4)
@@ -228,13 +273,11 @@ def test_a_fault_in_the_environment_is_found_after_the_rollout_with_its_moment(l
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
-@pytest.mark.parametrize("symmetry", ["false", "true"])
-def test_a_recorded_gradient_step_is_the_called_one_and_goes_on_from_a_checkpoint(
-    tmp_path: Path, symmetry: str
-) -> None:
+@pytest.mark.parametrize("option", ["ppo.symmetry=false", "ppo.symmetry=true", "ppo.max_kl=0.001"])
+def test_a_recorded_gradient_step_is_the_called_one_and_goes_on_from_a_checkpoint(tmp_path: Path, option: str) -> None:
     overrides = (
         *SMALL,
-        f"ppo.symmetry={symmetry}",
+        option,
         "backend=warp",
         "ppo.epochs=3",
         "ppo.init_std=0.5",

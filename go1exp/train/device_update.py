@@ -7,7 +7,7 @@ reads six numbers a minibatch back, which costs more than the arithmetic.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -17,8 +17,8 @@ from go1exp.train.device_buffer import DeviceRolloutBuffer
 from go1exp.train.loss import ppo_loss
 from go1exp.train.ppo import LOSS_FIGURES, AdaptivePPO, adapted_rate, gaussian_kl
 
-FIGURES = (*LOSS_FIGURES, "kl", "finite")
-"""What is kept of each gradient step; ``finite`` is 1 if its gradients were."""
+FIGURES = (*LOSS_FIGURES, "kl", "finite", "taken")
+"""What is kept of each gradient step; ``finite`` is 1 if its gradients were, ``taken`` if the update had not ended."""
 
 WARM_UP = 3
 """Steps before one is recorded, as CUDA graphs ask."""
@@ -45,7 +45,8 @@ class DeviceUpdate:
         self._rows = torch.zeros(ppo.batch_size * self._group.size, dtype=torch.int64, device=device)
         self._build_averaged(device)
         self._figures = torch.zeros(c.epochs * c.minibatches, len(FIGURES), device=device)
-        self._taken = torch.zeros(1, dtype=torch.int64, device=device)
+        self._position = torch.zeros(1, dtype=torch.int64, device=device)
+        self._ended = torch.zeros((), dtype=torch.bool, device=device)
         self._on_gpu = device.type == "cuda"
         self._captures = captures and self._on_gpu
         self._step: Callable[[], None] | None = None
@@ -54,8 +55,9 @@ class DeviceUpdate:
         """Make the memory of gradients and figures one piece, which is averaged over the group in one go."""
         parameters = list(self._policy.parameters())
         sizes = [p.numel() for p in parameters]
-        self._averaged = torch.zeros(sum(sizes) + len(FIGURES) - 1, device=device)
-        *gradients, self._step_figures = self._averaged.split([*sizes, len(FIGURES) - 1])
+        measured = len(LOSS_FIGURES) + 1  # and the divergence
+        self._averaged = torch.zeros(sum(sizes) + measured, device=device)
+        *gradients, self._step_figures = self._averaged.split([*sizes, measured])
         self._gradients = [g.view_as(p) for g, p in zip(gradients, parameters, strict=True)]
 
     def __call__(self, scheduled_rate: float) -> dict[str, list[float]]:
@@ -69,12 +71,14 @@ class DeviceUpdate:
         self._old_log_std.copy_(self._policy.log_std.detach())
         if self._step is None:
             self._step = self._captured() if self._captures else self._gradient_step
-        self._taken.zero_()
+        self._position.zero_()
+        self._ended.zero_()
         for _ in range(self._config.epochs):
             for rows in self._buffer.minibatches(len(self._rows)):
                 self._rows.copy_(rows)
                 self._step()
-        return dict(zip(FIGURES, self._figures.T.tolist(), strict=True))
+        *figures, taken = self._figures.T
+        return {name: values[taken > 0.0].tolist() for name, values in zip(FIGURES[:-1], figures, strict=True)}
 
     def _gradient_step(self) -> None:
         """Loss, gradients and rsl_rl's rate for one minibatch; in place, so that it can be replayed."""
@@ -103,13 +107,28 @@ class DeviceUpdate:
         c = self._config
         norm = torch.nn.utils.clip_grad_norm_(self._policy.parameters(), c.max_grad_norm)
         with torch.no_grad():
+            kl = self._step_figures[-1]
+            if c.max_kl is not None:
+                self._ended.logical_or_(kl > c.max_kl)
             if c.schedule == "adaptive":
-                kl = self._step_figures[-1]
-                self._rate.copy_(adapted_rate(self._rate, kl, c.desired_kl, c.learning_rate_range))
-            figures = torch.cat((self._step_figures, torch.isfinite(norm).float().unsqueeze(0)))
-            self._figures.index_copy_(0, self._taken, figures.unsqueeze(0))
-            self._taken.add_(1)
+                rate = adapted_rate(self._rate, kl, c.desired_kl, c.learning_rate_range)
+                self._rate.copy_(torch.where(self._ended, self._rate, rate))
+            figures = torch.cat((self._step_figures, torch.stack((torch.isfinite(norm), ~self._ended)).float()))
+            self._figures.index_copy_(0, self._position, figures.unsqueeze(0))
+            self._position.add_(1)
+        if c.max_kl is None:
+            self._adam.step()
+        else:
+            self._step_unless_ended()
+
+    def _step_unless_ended(self) -> None:
+        """Take Adam's step, and take it back if the update has ended: a graph cannot leave it out."""
+        policy, state = list(self._policy.parameters()), self._adam.state
+        before = [value.clone() for value in (*policy, *_moments(state))] if state else []
         self._adam.step()
+        with torch.no_grad():  # without moments it was the first step of all, before which nothing can end
+            for value, kept in zip((*policy, *_moments(state)), before, strict=bool(before)):
+                value.copy_(torch.where(self._ended, kept, value))
 
     def _take_over_rate(self) -> None:
         """Put the optimiser's rate, and its counts of steps, where a graph can reach them."""
@@ -129,7 +148,7 @@ class DeviceUpdate:
         stream.wait_stream(torch.cuda.current_stream(self._rate.device))
         with torch.cuda.stream(stream):
             for _ in range(WARM_UP):
-                self._taken.zero_()
+                self._position.zero_()
                 self._gradient_step()
         torch.cuda.synchronize(self._rate.device)
         self._rate.copy_(rate)
@@ -157,6 +176,11 @@ class DeviceUpdate:
         with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
             work()
         return graph.replay
+
+
+def _moments(state: Mapping[Tensor, dict[str, Tensor]]) -> list[Tensor]:
+    """Return all tensors of Adam's state: moments and counts of steps."""
+    return [value for of_parameter in state.values() for value in of_parameter.values()]
 
 
 def _clone(state: dict[str, Any] | None) -> dict[str, Tensor]:

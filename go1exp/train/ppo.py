@@ -8,6 +8,7 @@ optimiser).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Generator
 from functools import partial
 from typing import Any
@@ -274,14 +275,19 @@ class AdaptivePPO(PPO):
             self.policy.optimizer.param_groups[0]["lr"] = linear_rate(self.config, self.iteration)
         self.policy.set_training_mode(True)
         batches = (batch for _ in range(self.n_epochs) for batch in self.rollout_buffer.get(self.batch_size))
-        figures = zip(*(self._gradient_step(batch) for batch in batches), strict=True)
+        steps = list(itertools.takewhile(bool, map(self._gradient_step, batches)))
         self._n_updates += self.n_epochs
-        self._report(dict(zip(LOSS_FIGURES, map(list, figures), strict=True)))
+        self._report(dict(zip(LOSS_FIGURES, map(list, zip(*steps, strict=True)), strict=True)))
         self._close_iteration()
 
     def _gradient_step(self, batch: RolloutBufferSamples) -> list[float]:
-        """Follow the loss of a minibatch downhill by one step; return the figures of the loss."""
+        """Follow the loss of a minibatch downhill by one step; return the figures of the loss.
+
+        No figures, and no step, where the policy has diverged by more than ``max_kl``: the update ends.
+        """
         loss = ppo_loss(self.policy, batch, self.config, self.mirror)
+        if self.config.max_kl is not None and self._divergence() > self.config.max_kl:
+            return []
         self.policy.optimizer.zero_grad()
         loss.total.backward()
         nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.max_grad_norm)
@@ -290,7 +296,7 @@ class AdaptivePPO(PPO):
 
     def _report(self, figures: dict[str, list[float]]) -> None:
         """Log an update as SB3 does; ``figures`` of each gradient step, by ``LOSS_FIGURES``."""
-        last_epoch = slice(-self.config.minibatches, None)
+        last_epoch = slice(-self.config.minibatches, None)  # the last steps, where a limit ended the update before
         means = {
             name: float(np.mean(values[last_epoch if name == "approx_kl" else slice(None)]))
             for name, values in figures.items()
@@ -304,6 +310,8 @@ class AdaptivePPO(PPO):
         for name, value in means.items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if self.config.max_kl is not None:
+            self.logger.record("train/gradient_steps", len(figures["loss"]))
 
     def _close_iteration(self) -> None:
         """Count the iteration that is complete, and tell of it."""
