@@ -72,6 +72,7 @@ def test_single_effects() -> None:
     assert value(found, "first_exact") == pytest.approx(2 / 5)
     assert value(found, "in_set") == pytest.approx(2 / 5)
     assert value(found, "set_size") == pytest.approx(5 / 3)
+    assert value(found, "singles_wrong") == pytest.approx(1 / 5)
     assert value(found, "small_not_wrong") == 1.0
     assert value(found, "wrong_explained_library") == pytest.approx(1 / 5)
     assert value(found, "param_error") == pytest.approx(0.1)  # 0.02 / 0.2 and 0.03 / 0.3

@@ -183,6 +183,7 @@ def judge(answers: dict[str, Any], results: dict[str, dict[str, Any]]) -> Score:
     sets = [len({n["effect"], *n.get("alias_set", [])}) for c in singles for n in c.named]
     score.figures["set_size"] = median(sets, np.mean)
     score.rate("joints_exact", ((c, right) for c in singles for right in _right_joints(c)))
+    _misses(score, "singles_wrong", [(c, bool(c.wrong)) for c in singles])
     small = [c for c in of("single") if c.answer["effects"][0]["size"] < LOWEST]
     score.rate("small_not_wrong", ((c, not c.wrong) for c in small))
     for c in singles:
