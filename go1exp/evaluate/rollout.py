@@ -24,7 +24,7 @@ from go1exp.evaluate.rows import drawn, rows_of
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.measures import measured
 from go1exp.schema.backends import BackendConfig
-from go1exp.schema.registry import ConfigError, Term, members
+from go1exp.schema.registry import ConfigError, Term, TooLongError, members
 from go1exp.terrain import TerrainConfig
 from go1exp.wording import counted
 
@@ -124,7 +124,7 @@ def evaluate(
 
     Raises:
         Expected: if that is not near enough.
-        ConfigError: if what measures need does not fit into memory.
+        TooLongError: if what measures need does not fit into memory.
     """
     count = len(config.commands) * config.episodes
     driver = _driver(task, policy, controller)
@@ -171,10 +171,10 @@ def evaluate(
 
 
 def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:
-    """Raise ConfigError if ``rate`` B/s of what measures need of ``count`` robots do not fit into memory."""
+    """Raise TooLongError if ``rate`` B/s of what measures need of ``count`` robots do not fit into memory."""
     if wrong := memory.too_long(config.duration_s - config.settle_s, rate):
         what = f"what measures need of {counted(count, 'robot')}"
-        raise ConfigError([f"duration_s = {config.duration_s:g}: {what} {wrong}; measures=[] needs none of it"])
+        raise TooLongError([f"duration_s = {config.duration_s:g}: {what} {wrong}; measures=[] needs none of it"])
 
 
 def _driver(task: TaskConfig, policy: Policy | None, controller: Callable[[], Controller] | None) -> Driver:

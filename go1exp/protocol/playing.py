@@ -10,7 +10,8 @@ from typing import Any
 
 from go1exp import __version__
 from go1exp.evaluate.drivers import Driver, Progress
-from go1exp.protocol.base import Chosen
+from go1exp.protocol import lengths
+from go1exp.protocol.base import Chosen, Protocol
 from go1exp.protocol.claims import judged
 from go1exp.protocol.quantities import Derived, Row, about, distinct, plain, resampled, summary
 from go1exp.protocol.result import Result
@@ -43,18 +44,14 @@ def play(
     origin: dict[str, Any] | None = None,
     on_step: Progress = lambda done, total: None,
 ) -> Result:
-    """Play a protocol and judge it; ``origin`` is what a report shall say beside that of the driver."""
+    """Play a protocol and judge it; ``origin`` is what a report shall say beside that of the driver.
+
+    Raises:
+        TooLongError: before anything is played, if what its robots do does not fit into memory.
+    """
     began, protocol = time.monotonic(), chosen.protocol
-    setting = Setting(
-        protocol.noise,
-        protocol.randomize,
-        protocol.trunk_velocity,
-        rates.seed,
-        rates.policy_dt,
-        rates.physics_dt,
-        rates.engine,
-    )
-    stage = Stage(driver, setting, on_step)
+    stage = _stage(protocol, driver, rates, on_step)
+    lengths.refuse_too_long(chosen, stage)
     stage.expect(protocol.steps(stage))
     played = protocol.play(stage)
     rows = distinct(played.rows, protocol.keys, protocol.noise or protocol.randomize or not protocol.alike)
@@ -64,6 +61,25 @@ def play(
     about_play = {"driver": driver.about, "rates": dataclasses.asdict(rates), "go1exp": __version__, **(origin or {})}
     verdicts = judged(protocol.claims, figures)
     return Result(chosen, driver.label, about_play, played, repeats, figures, verdicts, time.monotonic() - began)
+
+
+def refuse_too_long(protocols: Sequence[Chosen], driver: Driver, rates: Rates) -> None:
+    """Raise TooLongError if one of several protocols would not be played, before the first one is."""
+    for chosen in protocols:
+        lengths.refuse_too_long(chosen, _stage(chosen.protocol, driver, rates))
+
+
+def _stage(protocol: Protocol, driver: Driver, rates: Rates, on_step: Progress = lambda done, total: None) -> Stage:
+    setting = Setting(
+        protocol.noise,
+        protocol.randomize,
+        protocol.trunk_velocity,
+        rates.seed,
+        rates.policy_dt,
+        rates.physics_dt,
+        rates.engine,
+    )
+    return Stage(driver, setting, on_step)
 
 
 def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[dict[str, Any]]:

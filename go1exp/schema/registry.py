@@ -56,6 +56,10 @@ class ConfigError(ValueError):
         super().__init__("\n".join(self.problems))
 
 
+class TooLongError(ConfigError):
+    """A length of time that does not fit into memory: its setting is at fault, whatever it is asked of."""
+
+
 class DuplicateError(ValueError):
     """A name that a group has already; the message names both places."""
 
