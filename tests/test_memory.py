@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import re
 import types
 from collections.abc import Callable
@@ -21,8 +23,8 @@ from go1exp.config import TaskConfig
 from go1exp.evaluate import video
 from go1exp.evaluate.drivers import PolicyDriver
 from go1exp.protocol.base import Chosen, chosen
-from go1exp.protocol.lengths import refuse_too_long
 from go1exp.protocol.plan import STEP_BYTES, Plan
+from go1exp.protocol.refusing import refuse
 from go1exp.protocol.stage import Setting, Stage
 from go1exp.report import evaluating
 from go1exp.schema.registry import ConfigError, TooLongError, members
@@ -93,7 +95,7 @@ def test_a_protocol_that_does_not_fit_is_refused_by_its_key_with_what_fits(
     whole, falling = key == "robots", key == "speeds"
     wrong = "1000000000" if whole else "1e-9" if falling else "1e9"
     with pytest.raises(TooLongError) as caught:
-        refuse_too_long(one(name, f"{key}={value.format(wrong)}"), stage)
+        refuse(one(name, f"{key}={value.format(wrong)}"), stage)
     (problem,) = caught.value.problems
     offered = re.fullmatch(
         rf"protocol\.{name}\.{key} = \S+: to play \S+ s with \d+ robots takes at least \S+ GB,"
@@ -104,9 +106,9 @@ def test_a_protocol_that_does_not_fit_is_refused_by_its_key_with_what_fits(
     number = float(offered[1])
     beyond = number * (0.95 if falling else 1.05)
     given = (str(round(number)), str(round(beyond) + 1)) if whole else (f"{number!r}", f"{beyond!r}")
-    refuse_too_long(one(name, f"{key}={value.format(given[0])}"), stage)
+    refuse(one(name, f"{key}={value.format(given[0])}"), stage)
     with pytest.raises(TooLongError, match=rf"protocol\.{name}\."):  # by another key where that can mend it as well
-        refuse_too_long(one(name, f"{key}={value.format(given[1])}"), stage)
+        refuse(one(name, f"{key}={value.format(given[1])}"), stage)
 
 
 def test_where_no_setting_alone_can_mend_it_all_are_named(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,9 +117,9 @@ def test_where_no_setting_alone_can_mend_it_all_are_named(stage: Stage, monkeypa
         r"protocol\.kicks: first_s = 1e\+09, every_s = 1e\+09, jitter_s = 0\.4, robots = 200: .* s at most would fit"
     )
     with pytest.raises(TooLongError, match=words):
-        refuse_too_long(one("kicks", "first_s=1e9", "every_s=1e9"), stage)
+        refuse(one("kicks", "first_s=1e9", "every_s=1e9"), stage)
     monkeypatch.setattr(memory, "free", lambda: None)
-    refuse_too_long(one("kicks", "first_s=1e9"), stage)
+    refuse(one("kicks", "first_s=1e9"), stage)
 
 
 @pytest.mark.parametrize("measures", ["[]", "[stride_rate]"])
@@ -145,9 +147,9 @@ def test_a_protocol_plays_the_lengths_that_it_says(
     assert len(plan.command) == stage.steps(length.seconds, length.policy_dt)
     assert plan.policy_dt == length.policy_dt
     if name != "push_map":  # which records none
-        assert (plan.listen_from is None) == (length.listen_from is None)
+        assert (plan.listen_from is not None) == length.recorded
     if plan.listen_from is not None:
-        assert plan.listen_from == stage.steps(length.listen_from or 0.0, length.policy_dt)
+        assert plan.listen_from == stage.steps(length.settle_s, length.policy_dt)
 
 
 def test_a_step_takes_what_a_plan_and_its_motion_are_made_of(stage: Stage) -> None:
@@ -191,3 +193,46 @@ def test_a_report_asks_no_run_for_what_does_not_fit(
         evaluating.evaluate_missing([evaluating.Wanted(run, None)], settings, show)
     with pytest.raises(TooLongError, match=r"^duration_s = "):
         evaluating.evaluate_missing([evaluating.Wanted(run, one("gait"))], settings, show)
+
+
+# ---------------------------------------------------------------------- too short, or without end
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("gait", ("duration_s=0.001", "settle_s=0.0")),
+        ("energy", ("duration_s=0.4", "settle_s=0.399")),
+        ("hardware", ("duration_s=0.4", "settle_s=0.399")),
+        ("rate", ("duration_s=0.02", "settle_s=0.019")),
+    ],
+)
+def test_a_protocol_without_a_step_that_counts_is_refused(name: str, overrides: tuple[str, ...], stage: Stage) -> None:
+    words = rf"^protocol\.{name}\.duration_s = 0\.\d+: of these 0\.\d+ s no step of the policy \(0\.0\d s\) is left"
+    with pytest.raises(ConfigError, match=words):
+        refuse(one(name, *overrides), stage)
+
+
+def test_a_length_beyond_all_numbers_is_refused_too(stage: Stage) -> None:
+    with pytest.raises(TooLongError, match="takes at least inf GB"):
+        refuse(one("kicks", "first_s=1e308", "every_s=1e308"), stage)
+
+
+@pytest.mark.parametrize(
+    ("verb", "overrides", "words"),
+    [
+        ("eval", ("policy=trot", "duration_s=1e308"), "duration_s = 1e+308: input should be less than or equal to"),
+        ("eval", ("policy=trot", "duration_s=0.4", "settle_s=0.399"), "duration_s = 0.4: no step of the policy (0.02"),
+        ("play", ("policy=trot", "viewer=clip", "seconds=1e308"), "seconds = 1e+308: input should be less than or eq"),
+        ("play", ("policy=trot", "viewer=clip", "seconds=0.001"), "seconds = 0.001: shorter than a picture at fps ="),
+        ("record", ("seconds=0.0001",), "seconds = 0.0001: shorter than a sample of the motion at"),
+    ],
+)
+def test_a_time_without_an_end_or_without_a_step_is_refused(
+    verb: str, overrides: tuple[str, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    app = importlib.import_module(f"go1exp.cli.{'evaluate' if verb == 'eval' else verb}").APP
+    with pytest.raises(ConfigError) as caught:
+        app.task(begin(verb, compose(verb, list(overrides))))
+    assert caught.value.problems[0].startswith(words)

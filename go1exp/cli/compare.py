@@ -39,7 +39,7 @@ def _task(container: dict[str, Any]) -> None:
 
     from go1exp.cli.logs import writable
     from go1exp.cli.protocols import note_replaced, refuse
-    from go1exp.protocol.playing import Rates, play, refuse_too_long
+    from go1exp.protocol.playing import Rates, play, refuse_lengths
 
     first = driver(subjects[0][0], other)
     robot_of = first.task if settings.same_robot else None
@@ -48,7 +48,7 @@ def _task(container: dict[str, Any]) -> None:
     rates = [Rates(settings.seed, how.policy_dt, settings.physics_dt, how.engine) for _, how in subjects]
     for theirs, drives, pace in zip(of_each, drivers, rates, strict=True):
         refuse(theirs, drives)
-        refuse_too_long(theirs, drives, pace)
+        refuse_lengths(theirs, drives, pace)
     writable(settings.folder, "folder")
     note_replaced(folder, ["compare.json"])
     plays: dict[str, list[Result]] = {}

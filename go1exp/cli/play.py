@@ -119,6 +119,8 @@ def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path | Non
     if out is None:
         video.live(core, policy)
         return
+    if video.length(settings.seconds, settings.fps) < 1:
+        raise ConfigError([f"seconds = {settings.seconds:g}: shorter than a picture at fps = {settings.fps}"])
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)
     progress = spinner(1, "filming")
     try:

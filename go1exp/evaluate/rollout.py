@@ -125,12 +125,15 @@ def evaluate(
     Raises:
         Expected: if that is not near enough.
         TooLongError: if what measures need does not fit into memory.
+        ConfigError: if no step is left after ``settle_s``.
     """
     count = len(config.commands) * config.episodes
     driver = _driver(task, policy, controller)
     imu = config.trunk_velocity == "estimated" or driver.senses
     judged = evaluation_task(task, config)
     _refuse_too_long(config, bytes_per_second(judged, count) if measures else 0.0, count)
+    dt = judged.sim.policy_dt
+    steps, settle = _steps(config, dt)
     checks = require_agreement(judged)
     core = Go1Core(judged, count, config.seed, noise=config.noise, imu=imu)
     act = driver.begin(core, config.trunk_velocity, config.seed)
@@ -140,8 +143,6 @@ def evaluate(
     core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
     observation = core.reset()
     draws = drawn(core)  # robots that fall are drawn anew
-    dt = core.task.sim.policy_dt
-    steps, settle = round(config.duration_s / dt), round(config.settle_s / dt)
     tally = _Tally(count)
     recorder = Recorder(core, steps - settle) if measures else None
     for step in range(steps):
@@ -168,6 +169,15 @@ def evaluate(
         commands=core.command.value.double().numpy(), draws=draws, measures=of_robots, **tally.each(config)
     )
     return report
+
+
+def _steps(config: EvalConfig, dt: float) -> tuple[int, int]:
+    """Return how many steps are played, and how many of them do not count; raise ConfigError if none does."""
+    steps, settle = round(config.duration_s / dt), round(config.settle_s / dt)
+    if steps <= settle:
+        left = f"no step of the policy ({dt:g} s) is left after settle_s = {config.settle_s:g}"
+        raise ConfigError([f"duration_s = {config.duration_s:g}: {left}"])
+    return steps, settle
 
 
 def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:

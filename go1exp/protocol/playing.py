@@ -10,10 +10,10 @@ from typing import Any
 
 from go1exp import __version__
 from go1exp.evaluate.drivers import Driver, Progress
-from go1exp.protocol import lengths
 from go1exp.protocol.base import Chosen, Protocol
 from go1exp.protocol.claims import judged
 from go1exp.protocol.quantities import Derived, Row, about, distinct, plain, resampled, summary
+from go1exp.protocol.refusing import refuse
 from go1exp.protocol.result import Result
 from go1exp.protocol.stage import Setting, Stage
 from go1exp.schema.backends import BackendConfig
@@ -47,11 +47,11 @@ def play(
     """Play a protocol and judge it; ``origin`` is what a report shall say beside that of the driver.
 
     Raises:
-        TooLongError: before anything is played, if what its robots do does not fit into memory.
+        ConfigError: before anything is played, if it is too long for the memory, or too short.
     """
     began, protocol = time.monotonic(), chosen.protocol
     stage = _stage(protocol, driver, rates, on_step)
-    lengths.refuse_too_long(chosen, stage)
+    refuse(chosen, stage)
     stage.expect(protocol.steps(stage))
     played = protocol.play(stage)
     rows = distinct(played.rows, protocol.keys, protocol.noise or protocol.randomize or not protocol.alike)
@@ -63,10 +63,10 @@ def play(
     return Result(chosen, driver.label, about_play, played, repeats, figures, verdicts, time.monotonic() - began)
 
 
-def refuse_too_long(protocols: Sequence[Chosen], driver: Driver, rates: Rates) -> None:
-    """Raise TooLongError if one of several protocols would not be played, before the first one is."""
+def refuse_lengths(protocols: Sequence[Chosen], driver: Driver, rates: Rates) -> None:
+    """Refuse one of several protocols that is too long or too short, as ``play`` does, before the first is played."""
     for chosen in protocols:
-        lengths.refuse_too_long(chosen, _stage(chosen.protocol, driver, rates))
+        refuse(chosen, _stage(chosen.protocol, driver, rates))
 
 
 def _stage(protocol: Protocol, driver: Driver, rates: Rates, on_step: Progress = lambda done, total: None) -> Stage:

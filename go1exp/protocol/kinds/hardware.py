@@ -59,7 +59,7 @@ class Hardware(Steady):
     def lengths(self) -> list[Length]:
         """Return those of the commands as they are, and of all of them again with late targets."""
         late = self.robots * len(self.commands) * len(self.delays_ms)
-        return [*Steady.lengths(self), Length(self.duration_s, late, self.causes())]
+        return [*Steady.lengths(self), Length(self.duration_s, late, self.causes(), self.settle_s)]
 
     def play(self, stage: Stage) -> Played:
         """Play the commands as they are, and all of them again with late targets, for falls alone."""

@@ -119,7 +119,7 @@ class Kicks(Protocol):
             Cause("every_s", every, LEAST, lambda seconds: (seconds - first - jitter) / count),
             Cause("jitter_s", jitter, 0.0, lambda seconds: seconds - first - count * every),
         ]
-        return [Length(self.duration_s, self.robots, causes, listen_from=0.0 if self.terms() else None)]
+        return [Length(self.duration_s, self.robots, causes, recorded=bool(self.terms()))]
 
     def starts(self) -> NDArray[np.float64]:
         """Return when each robot is kicked (N, P), s."""

@@ -78,7 +78,7 @@ class Rate(Protocol):
         """Return that of each velocity and rate, all delays as one batch."""
         causes, robots = [Cause("duration_s", self.duration_s, least=self.settle_s)], len(self.delays_ms) * self.robots
         return [
-            Length(self.duration_s, robots, causes, 1.0 / rate, self.settle_s)
+            Length(self.duration_s, robots, causes, self.settle_s, True, 1.0 / rate)
             for _ in self.velocities
             for rate in self.rates_hz
         ]

@@ -72,8 +72,7 @@ class Sinusoid(Protocol):
     def lengths(self) -> list[Length]:
         """Return that of all sines as one batch."""
         causes = [Cause("duration_s", self.duration_s, least=2.0 * self.longest)]
-        listen = self.longest if self.terms() else None
-        return [Length(self.duration_s, self.robots * len(self.ladder), causes, listen_from=listen)]
+        return [Length(self.duration_s, self.robots * len(self.ladder), causes, self.longest, bool(self.terms()))]
 
     def play(self, stage: Stage) -> Played:
         """Play all sines as one batch: the robots of one are neighbours."""

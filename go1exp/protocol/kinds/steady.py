@@ -55,8 +55,8 @@ class Steady(Protocol):
 
     def lengths(self) -> list[Length]:
         """Return that of all commands as one batch."""
-        listen = self.settle_s if self.terms() else None
-        return [Length(self.duration_s, self.robots * len(self.commands), self.causes(), listen_from=listen)]
+        robots, recorded = self.robots * len(self.commands), bool(self.terms())
+        return [Length(self.duration_s, robots, self.causes(), self.settle_s, recorded)]
 
     def causes(self) -> list[Cause]:
         """Return what says how long a batch plays."""

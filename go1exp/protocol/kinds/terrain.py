@@ -87,9 +87,9 @@ class OnTerrain(Protocol):
 
     def lengths(self) -> list[Length]:
         """Return that of each ground at each speed, all difficulties as one batch."""
-        listen = 0.0 if self.terms() else None
+        recorded = bool(self.terms())
         return [
-            Length(self.duration(speed), len(levels) * self.robots, self._causes(speed), listen_from=listen)
+            Length(self.duration(speed), len(levels) * self.robots, self._causes(speed), recorded=recorded)
             for levels in self.ladders.values()
             for speed in self.speeds
         ]
