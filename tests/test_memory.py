@@ -213,6 +213,13 @@ def test_a_protocol_without_a_step_that_counts_is_refused(name: str, overrides: 
         refuse(one(name, *overrides), stage)
 
 
+@pytest.mark.parametrize(("name", "rest"), [("kicks", "every_s"), ("push_map", "watch_s")])
+def test_a_push_that_outlasts_its_time_is_refused(name: str, rest: str) -> None:
+    """Its steps would not fit into memory, and the next kick would begin within it."""
+    with pytest.raises(ConfigError, match=rf"^protocol\.{name}\.push_s = 1000000000\.0: must be at most {rest} = "):
+        one(name, "push_s=1e9")
+
+
 def test_a_length_beyond_all_numbers_is_refused_too(stage: Stage) -> None:
     with pytest.raises(TooLongError, match="takes at least inf GB"):
         refuse(one("kicks", "first_s=1e308", "every_s=1e308"), stage)

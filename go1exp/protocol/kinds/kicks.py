@@ -105,6 +105,8 @@ class Kicks(Protocol):
         """Check what concerns two settings."""
         if wrong := repeated("impulses", self.impulses):
             raise ValueError(wrong[0])
+        if self.push_s > self.every_s:
+            raise ValueError(f"push_s = {self.push_s}: must be at most every_s = {self.every_s}")
 
     @property
     def duration_s(self) -> float:

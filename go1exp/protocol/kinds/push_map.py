@@ -72,6 +72,11 @@ class PushMap(Protocol):
         Column("impulse", "N s", "largest impulse that is survived", better="higher"),
     )
 
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.push_s > self.watch_s:
+            raise ValueError(f"push_s = {self.push_s}: must be at most watch_s = {self.watch_s}")
+
     @property
     def count(self) -> int:
         """All robots: ``robots`` in each direction and phase."""
