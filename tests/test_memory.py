@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import re
 import types
@@ -19,7 +18,7 @@ from go1exp import memory
 from go1exp.cli.play import APP as PLAY
 from go1exp.cli.plugins import begin
 from go1exp.compose import compose
-from go1exp.config import TaskConfig
+from go1exp.config import TaskConfig, parse_train
 from go1exp.evaluate import video
 from go1exp.evaluate.drivers import PolicyDriver
 from go1exp.protocol.base import Chosen, chosen
@@ -243,3 +242,8 @@ def test_a_time_without_an_end_or_without_a_step_is_refused(
     with pytest.raises(ConfigError) as caught:
         app.task(begin(verb, compose(verb, list(overrides))))
     assert caught.value.problems[0].startswith(words)
+
+
+def test_an_episode_without_an_end_is_no_multiple_of_a_step() -> None:
+    with pytest.raises(ConfigError, match=r"^sim\.episode_s = 1e\+308: must be a whole multiple of sim\.policy_dt"):
+        parse_train(compose("train", ["sim.episode_s=1e308"]))
