@@ -307,7 +307,7 @@ def time_rules(sim: SimConfig) -> list[str]:
         ("episode_s", sim.episode_s, "policy_dt", sim.policy_dt),
     ):
         ratio = longer / shorter
-        if ratio < 1 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
+        if not math.isfinite(ratio) or ratio < 1 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
             problems.append(f"sim.{name} = {longer}: must be a whole multiple of sim.{unit} = {shorter}")
     return problems
 

@@ -24,11 +24,15 @@ def too_long(seconds: float, rate: float) -> str | None:
         seconds: the length, s.
         rate: lower bound of what a second of it takes, B/s.
     """
-    available, needed = free(), seconds * rate
-    if available is None or needed <= available:
+    available = free()
+    if available is None or seconds * rate <= available:
         return None
-    amounts = f"takes at least {needed / 1e9:.1f} GB, and {available / 1e9:.1f} GB are free in memory"
-    return f"{amounts}; {max(available / rate, 0.0):.0f} s at most would fit"
+    return f"{too_much(seconds * rate, available)}; {max(available / rate, 0.0):.0f} s at most would fit"
+
+
+def too_much(needed: float, available: float) -> str:
+    """Word that so many bytes are needed at least where fewer are free."""
+    return f"takes at least {needed / 1e9:.1f} GB, and {available / 1e9:.1f} GB are free in memory"
 
 
 def _of_machine() -> int | None:

@@ -948,7 +948,7 @@ def play_trace(container: dict[str, Any], walk: Walk) -> Trace:
             pass
 
     def write_mp4(path: Path, frames: Any, fps: float) -> None:
-        path.write_text(f"{len(frames)} frames at {fps}")
+        path.write_text(f"{len(list(frames))} frames at {fps}")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("DISPLAY", raising=False)

@@ -376,8 +376,16 @@ def test_a_metric_of_evaluations_needs_evaluations(tmp_path: Path) -> None:
     assert "metric = 'eval/score': needs evaluations; add eval.every=50 to overrides" in done.stderr
 
 
-@pytest.mark.parametrize("drawn", ["range(5,5)", "interval(1,0.1)", "tag(log,interval(0,1))"])
-def test_a_range_that_holds_nothing_is_refused_before_the_first_trial(drawn: str) -> None:
-    with pytest.raises(ConfigError, match="is none of key=interval"):
+@pytest.mark.parametrize(
+    ("drawn", "reason"),
+    [
+        *((drawn, "is empty; its second number") for drawn in ("range(5,5)", "interval(1,0.1)", "interval(0.1,nan)")),
+        ("interval(0.1,inf)", "is empty; its second number must be the larger one, and both finite"),
+        ("tag(log,interval(0,1))", "a logarithm needs numbers above 0"),
+        ("interval(0.1)", "is none of key=interval"),
+    ],
+)
+def test_a_range_that_holds_nothing_is_refused_before_the_first_trial(drawn: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
         _ranges([f"ppo.gamma={drawn}"])
     assert _ranges(["ppo.epochs=range(5,6)"])["ppo.epochs"].high == 5

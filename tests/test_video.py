@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from go1exp.env.core import Go1Core
 from go1exp.env.gym_env import Go1Env
 from go1exp.evaluate import camera as camera_module
 from go1exp.evaluate.camera import GROUND_RANGE, Camera, Picture, RenderingUnavailable, Stage, choose_gl
-from go1exp.evaluate.video import live, record, steer, write_gif, write_mp4, write_strip
+from go1exp.evaluate.video import keeping, live, record, steer, write_gif, write_mp4, write_strip
 
 PLAIN = ("rand=none", "command=forward")
 MakeCore = Callable[..., Go1Core]
@@ -310,6 +311,34 @@ def test_a_strip_shows_first_to_last(frames: list[Picture], tmp_path: Path) -> N
         middle = strip[40, 81 * panel : 81 * panel + 80, 0]
         expected = np.flatnonzero(frames[index][60, 21:141, 0] == 255).mean() * 80 / 120
         assert np.flatnonzero(middle > 200).mean() == pytest.approx(expected, abs=1)
+
+
+def test_a_film_of_any_length_takes_the_memory_of_a_few_pictures(tmp_path: Path) -> None:
+    drawn: list[weakref.ref[Picture]] = []
+    living: list[int] = []
+
+    def pictures() -> Iterator[Picture]:
+        for _ in range(40):
+            picture = np.zeros((32, 32, 3), np.uint8)
+            drawn.append(weakref.ref(picture))
+            living.append(sum(one() is not None for one in drawn))
+            yield picture
+
+    kept: list[Picture] = []
+    write_mp4(tmp_path / "film.mp4", keeping(pictures(), 40, kept, count=3))
+    assert len(drawn) == 40
+    assert len(kept) == 3
+    assert max(living) <= 3 + 3  # what is kept, the film's first, the one in work and the one before it
+
+
+def test_the_strip_of_a_film_that_is_written_picture_by_picture_is_that_of_all(
+    frames: list[Picture], tmp_path: Path
+) -> None:
+    kept: list[Picture] = []
+    assert list(keeping(iter(frames), len(frames), kept, count=4)) == frames
+    write_strip(tmp_path / "kept.png", kept, count=4, size=40)
+    write_strip(tmp_path / "all.png", frames, count=4, size=40)
+    assert (tmp_path / "kept.png").read_bytes() == (tmp_path / "all.png").read_bytes()
 
 
 def test_a_short_film_makes_a_short_strip(frames: list[Picture], tmp_path: Path) -> None:

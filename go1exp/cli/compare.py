@@ -39,24 +39,25 @@ def _task(container: dict[str, Any]) -> None:
 
     from go1exp.cli.logs import writable
     from go1exp.cli.protocols import note_replaced, refuse
-    from go1exp.protocol.playing import Rates, play
+    from go1exp.protocol.playing import Rates, play, refuse_lengths
 
     first = driver(subjects[0][0], other)
     robot_of = first.task if settings.same_robot else None
     drivers = [first, *(driver(named, other, robot_of) for named, _ in subjects[1:])]
     of_each = [_with(protocols, how.trunk_velocity) for _, how in subjects]
-    for theirs, drives in zip(of_each, drivers, strict=True):
+    rates = [Rates(settings.seed, how.policy_dt, settings.physics_dt, how.engine) for _, how in subjects]
+    for theirs, drives, pace in zip(of_each, drivers, rates, strict=True):
         refuse(theirs, drives)
+        refuse_lengths(theirs, drives, pace)
     writable(settings.folder, "folder")
     note_replaced(folder, ["compare.json"])
     plays: dict[str, list[Result]] = {}
     origin = {"robot": other_robot.described(other), "robot_of": settings.subjects[0] if robot_of else "each its own"}
     for k, protocol in enumerate(protocols):
         results = []
-        for theirs, drives, (_, how) in zip(of_each, drivers, subjects, strict=True):
+        for theirs, drives, pace in zip(of_each, drivers, rates, strict=True):
             show = spinner(1, f"{protocol.key}: {drives.label}")
-            rates = Rates(settings.seed, how.policy_dt, settings.physics_dt, how.engine)
-            results.append(play(theirs[k], drives, rates, origin, show))
+            results.append(play(theirs[k], drives, pace, origin, show))
         plays[protocol.key] = results
     _report(plays, folder, {**dataclasses.asdict(settings), **origin})
 

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from go1exp import memory
 from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.cli.play_web import address
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from go1exp.cli.settings import PlaySettings
     from go1exp.cli.subjects import Named
     from go1exp.env.core import Go1Core
+    from go1exp.evaluate.camera import Picture
     from go1exp.evaluate.policy import Policy
     from go1exp.terrain import TerrainConfig
 
@@ -117,18 +119,30 @@ def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path | Non
     if out is None:
         video.live(core, policy)
         return
+    if video.length(settings.seconds, settings.fps) < 1:
+        raise ConfigError([f"seconds = {settings.seconds:g}: shorter than a picture at fps = {settings.fps}"])
     core.command.value[:] = core.command.value.new_tensor(settings.velocity)
     progress = spinner(1, "filming")
     try:
-        frames = list(video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress, footfalls=True))
+        frames = video.record(core, policy, settings.seconds, fps=settings.fps, on_frame=progress, footfalls=True)
     except RenderingUnavailable as error:
         picture(core, policy, settings.seconds, out.with_suffix(".png"))
         print(f"{error}\nA stick figure instead: {out.with_suffix('.png')}")
         return
-    write = video.write_gif if out.suffix.lower() == ".gif" else video.write_mp4
-    write(out, frames, settings.fps)
-    video.write_strip(out.with_suffix(".png"), frames)
+    gif = out.suffix.lower() == ".gif"
+    if gif:  # an .mp4 is written picture by picture
+        _refuse_too_long(settings, settings.fps * video.GIF_BYTES)
+    panels: list[Picture] = []
+    film = video.keeping(frames, video.length(settings.seconds, settings.fps), panels)
+    (video.write_gif if gif else video.write_mp4)(out, film, settings.fps)
+    video.write_strip(out.with_suffix(".png"), panels)
     print(f"written to {out} and {out.with_suffix('.png')}")
+
+
+def _refuse_too_long(settings: PlaySettings, rate: float) -> None:
+    """Raise ConfigError if a GIF that takes ``rate`` B/s does not fit into memory."""
+    if wrong := memory.too_long(settings.seconds, rate):
+        raise ConfigError([f"seconds = {settings.seconds:g}: a GIF {wrong}; an .mp4 of any length does"])
 
 
 def _has_display() -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from go1exp.schema.registry import FolderName, Positive
+from go1exp.schema.registry import Duration, FolderName
 from go1exp.schema.settings import settings
 
 Port = Annotated[int, Field(ge=0, le=65535)]
@@ -46,7 +46,7 @@ class PlaySettings:
     log: str | None
     checkpoint: str | None
     velocity: tuple[float, float, float]
-    seconds: Positive
+    seconds: Duration
     viewer: Literal["auto", "clip", "live", "web"]
     host: str
     port: Port

@@ -120,11 +120,13 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
     from go1exp.cli.logs import writable
     from go1exp.cli.subjects import driver
     from go1exp.protocol.playing import play as played
+    from go1exp.protocol.playing import refuse_lengths
     from go1exp.protocol.report.writing import write
 
     drives = driver(subject, other)
     refuse(protocols, drives)
     protocols = playable(protocols, drives)
+    refuse_lengths(protocols, drives, rates)
     writable(str(folder), "folder")
     note_replaced(folder, [f"{c.key}.json" for c in protocols])
     for k, c in enumerate(protocols):

@@ -17,7 +17,7 @@ from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
 from go1exp.report.settings import ReportSettings
 from go1exp.schema import settings as schema
-from go1exp.schema.registry import FolderName, NonNegative, Positive
+from go1exp.schema.registry import Duration, FolderName, NonNegative, Positive
 from go1exp.schema.settings import settings
 from go1exp.sim_robot.settings import SimConfig, SimSettings
 from go1exp.sweep.settings import TuneSettings
@@ -81,7 +81,7 @@ class EvalSettings:
     checkpoint: str | None
     grid: Grid
     episodes: Count
-    duration_s: Positive
+    duration_s: Duration
     settle_s: NonNegative
     noise: bool
     randomize: bool

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +34,10 @@ def _ranges(space: Sequence[str]) -> dict[str, Range]:
     for text in space:
         try:
             (override,) = OverridesParser.create().parse_overrides([text])
-            ranges[override.key_or_group] = _range(override)
+            drawn = _drawn(override)
+            if reason := _empty(drawn):
+                problems.append(f"space: {text!r}: {reason}")
+            ranges[override.key_or_group] = drawn
         except (HydraException, ValueError, TypeError):
             problems.append(f"space: {text!r} is none of {FORMS}")
     if problems or not ranges:
@@ -41,16 +45,17 @@ def _ranges(space: Sequence[str]) -> dict[str, Range]:
     return ranges
 
 
-def _range(override: Override) -> Range:
-    """Return the range that an override in Hydra's grammar for sweeps stands for; ValueError if it is none."""
-    drawn = _drawn(override)
-    if not drawn.choices and (drawn.low > drawn.high or (drawn.log and drawn.low <= 0)):
-        raise ValueError(override.input_line)  # Optuna would refuse it at the first trial
-    return drawn
+def _empty(drawn: Range) -> str | None:
+    """Return why nothing can be drawn from a range, which Optuna would refuse at the first trial; None if it can."""
+    if drawn.choices:
+        return None
+    if not -math.inf < drawn.low <= drawn.high < math.inf:
+        return "is empty; its second number must be the larger one, and both finite"
+    return "a logarithm needs numbers above 0" if drawn.log and drawn.low <= 0 else None
 
 
 def _drawn(override: Override) -> Range:
-    """Return the range as it was typed; ValueError if it is none."""
+    """Return the range that an override in Hydra's grammar for sweeps stands for; ValueError if it is none."""
     from go1exp.sweep.tune import Range
 
     value = override.value()

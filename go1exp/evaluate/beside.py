@@ -87,7 +87,7 @@ def film(run: Path, policy_file: Path, settings: dict[str, Any], out: Path) -> N
     core = Go1Core(evaluation_task(config.task, shown), 1, 1, noise=False)
     core.command.value[:] = core.command.value.new_tensor(settings["velocity"])
     out.parent.mkdir(exist_ok=True)
-    video.write_mp4(out, list(video.record(core, policy, settings["seconds"], fps=25)), 25)
+    video.write_mp4(out, video.record(core, policy, settings["seconds"], fps=25), 25)
 
 
 def answered(run: Path, job: dict[str, Any]) -> dict[str, Any]:

@@ -28,7 +28,12 @@ STEP_BYTES = 4 * (3 * robot.NUM_JOINTS + 3 * 3 + 6 * robot.NUM_LEGS + 2) + 1
 
 def bytes_per_second(task: TaskConfig, robots: int) -> float:
     """Return what a ``Recorder`` takes, B/s."""
-    return robots * (STEP_BYTES + robot.NUM_LEGS * task.sim.decimation) / task.sim.policy_dt
+    return robots * bytes_per_step(task.sim.decimation) / task.sim.policy_dt
+
+
+def bytes_per_step(decimation: int) -> int:
+    """Return what a robot's policy step of so many physics steps takes in a ``Recorder``."""
+    return STEP_BYTES + robot.NUM_LEGS * decimation
 
 
 class Recorder:

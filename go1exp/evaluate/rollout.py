@@ -24,7 +24,7 @@ from go1exp.evaluate.rows import drawn, rows_of
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.measures import measured
 from go1exp.schema.backends import BackendConfig
-from go1exp.schema.registry import ConfigError, Term, members
+from go1exp.schema.registry import ConfigError, Term, TooLongError, members
 from go1exp.terrain import TerrainConfig
 from go1exp.wording import counted
 
@@ -124,13 +124,16 @@ def evaluate(
 
     Raises:
         Expected: if that is not near enough.
-        ConfigError: if what measures need does not fit into memory.
+        TooLongError: if what measures need does not fit into memory.
+        ConfigError: if no step is left after ``settle_s``.
     """
     count = len(config.commands) * config.episodes
     driver = _driver(task, policy, controller)
     imu = config.trunk_velocity == "estimated" or driver.senses
     judged = evaluation_task(task, config)
     _refuse_too_long(config, bytes_per_second(judged, count) if measures else 0.0, count)
+    dt = judged.sim.policy_dt
+    steps, settle = _steps(config, dt)
     checks = require_agreement(judged)
     core = Go1Core(judged, count, config.seed, noise=config.noise, imu=imu)
     act = driver.begin(core, config.trunk_velocity, config.seed)
@@ -140,8 +143,6 @@ def evaluate(
     core.command.value.copy_(commands.repeat_interleave(config.episodes, 0))
     observation = core.reset()
     draws = drawn(core)  # robots that fall are drawn anew
-    dt = core.task.sim.policy_dt
-    steps, settle = round(config.duration_s / dt), round(config.settle_s / dt)
     tally = _Tally(count)
     recorder = Recorder(core, steps - settle) if measures else None
     for step in range(steps):
@@ -170,11 +171,20 @@ def evaluate(
     return report
 
 
+def _steps(config: EvalConfig, dt: float) -> tuple[int, int]:
+    """Return how many steps are played, and how many of them do not count; raise ConfigError if none does."""
+    steps, settle = round(config.duration_s / dt), round(config.settle_s / dt)
+    if steps <= settle:
+        left = f"no step of the policy ({dt:g} s) is left after settle_s = {config.settle_s:g}"
+        raise ConfigError([f"duration_s = {config.duration_s:g}: {left}"])
+    return steps, settle
+
+
 def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:
-    """Raise ConfigError if ``rate`` B/s of what measures need of ``count`` robots do not fit into memory."""
+    """Raise TooLongError if ``rate`` B/s of what measures need of ``count`` robots do not fit into memory."""
     if wrong := memory.too_long(config.duration_s - config.settle_s, rate):
         what = f"what measures need of {counted(count, 'robot')}"
-        raise ConfigError([f"duration_s = {config.duration_s:g}: {what} {wrong}; measures=[] needs none of it"])
+        raise TooLongError([f"duration_s = {config.duration_s:g}: {what} {wrong}; measures=[] needs none of it"])
 
 
 def _driver(task: TaskConfig, policy: Policy | None, controller: Callable[[], Controller] | None) -> Driver:

@@ -40,8 +40,20 @@ from go1exp.mdp.commands import FixedVelocity
 AVERAGE_TIME = 0.5
 """Time over which the velocity in the caption is averaged, s: about a gait cycle."""
 
+WIDTH, HEIGHT = 640, 480
+"""Of a picture without a gait diagram, pixels."""
+
+GIF_WIDTH = 320
+"""Of a GIF, pixels."""
+
+GIF_BYTES = 3 * GIF_WIDTH * GIF_WIDTH * HEIGHT // WIDTH
+"""What a picture of a GIF takes in memory, at least: its palette is of all pictures, so all are kept until the end."""
+
 GIF_COLOURS = 128
 """Colours of a GIF, of at most 256; fewer compress better."""
+
+PANELS = 6
+"""Pictures of a strip."""
 
 
 def record(
@@ -54,10 +66,10 @@ def record(
     *,
     caption: bool = True,
     footfalls: bool = False,
-    width: int = 640,
-    height: int = 480,
+    width: int = WIDTH,
+    height: int = HEIGHT,
 ) -> Iterator[Picture]:
-    """Reset the environments, run the policy, and yield ``seconds`` x ``fps`` pictures of one of them.
+    """Reset the environments, run the policy, and yield the pictures (``length``) of one of them, one by one.
 
     Args:
         core: the environments; all of them run.
@@ -92,7 +104,7 @@ def _frames(
 ) -> Iterator[Picture]:
     core = camera.stage.core
     dt = core.task.sim.policy_dt
-    total, step = round(seconds * fps), 0
+    total, step = length(seconds, fps), 0
     try:
         observation = core.reset()
         measured = deque([_velocity(core, env)], maxlen=max(1, round(AVERAGE_TIME / dt)))
@@ -121,6 +133,28 @@ def _frames(
         camera.close()
 
 
+def length(seconds: float, fps: float) -> int:
+    """Return how many pictures a film of ``seconds`` at ``fps`` has."""
+    return round(seconds * fps)
+
+
+def evenly(total: int, count: int) -> list[int]:
+    """Return ``count`` evenly spaced numbers of ``total`` pictures, the first and the last among them; at most all."""
+    return [round(float(k)) for k in np.linspace(0, total - 1, min(count, total))]
+
+
+def keeping(frames: Iterable[Picture], total: int, kept: list[Picture], count: int = PANELS) -> Iterator[Picture]:
+    """Yield ``total`` pictures, and put ``count`` evenly spaced ones of them into ``kept``.
+
+    So a film of any length is written and its strip made from what is kept, without all pictures in memory.
+    """
+    chosen = set(evenly(total, count))
+    for k, picture in enumerate(frames):
+        if k in chosen:
+            kept.append(picture)
+        yield picture
+
+
 def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
     """Write an H.264 film that browsers play; the frames are consumed one by one.
 
@@ -141,7 +175,7 @@ def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
                 film.append_data(picture)
 
 
-def write_strip(path: Path, frames: Sequence[Picture], count: int = 6, size: int = 320) -> None:
+def write_strip(path: Path, frames: Sequence[Picture], count: int = PANELS, size: int = 320) -> None:
     """Write ``count`` evenly spaced frames side by side as one PNG, each cropped to its middle, ``size`` pixels high.
 
     Raises:
@@ -150,7 +184,7 @@ def write_strip(path: Path, frames: Sequence[Picture], count: int = 6, size: int
     """
     if not len(frames):
         raise ValueError(f"{path}: a strip needs at least one frame")
-    chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
+    chosen = evenly(len(frames), count)
     gap = max(1, size // 80)
     strip = Image.new("RGB", (len(chosen) * (size + gap) - gap, size), "white")
     for k, index in enumerate(chosen):
@@ -164,8 +198,10 @@ def write_strip(path: Path, frames: Sequence[Picture], count: int = 6, size: int
         strip.save(partial, optimize=True)
 
 
-def write_gif(path: Path, frames: Iterable[Picture], fps: float = 12, width: int = 320) -> None:
+def write_gif(path: Path, frames: Iterable[Picture], fps: float = 12, width: int = GIF_WIDTH) -> None:
     """Write a small looping GIF of frames that are ``fps`` apart (of a film at 25, every second is about 12).
+
+    Keeps ``GIF_BYTES`` or more of each in memory.
 
     Raises:
         OSError: if it cannot be written.

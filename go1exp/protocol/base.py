@@ -17,6 +17,7 @@ from go1exp.schema.settings import settings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from go1exp.protocol.lengths import Length
     from go1exp.protocol.plan import Motion
     from go1exp.protocol.stage import Stage
 
@@ -114,9 +115,13 @@ class Protocol:
         """Let the robots do it."""
         raise NotImplementedError
 
+    def lengths(self) -> list[Length]:
+        """Return how long its robots play, an entry for each batch; without any the memory is not looked at."""
+        return []
+
     def steps(self, stage: Stage) -> float:
         """Return about how many policy steps, times robots, it takes."""
-        raise NotImplementedError
+        return sum(stage.steps(length.seconds, length.policy_dt) * length.robots for length in self.lengths())
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Return the figures of its report."""

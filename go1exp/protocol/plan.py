@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+STEP_BYTES = 8 * (3 + 3 + 3 + 3) + 1
+"""What a robot's policy step takes in a plan (``command``) and its motion, without a trace."""
+
 
 @dataclass(frozen=True)
 class Plan:

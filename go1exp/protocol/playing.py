@@ -10,9 +10,10 @@ from typing import Any
 
 from go1exp import __version__
 from go1exp.evaluate.drivers import Driver, Progress
-from go1exp.protocol.base import Chosen
+from go1exp.protocol.base import Chosen, Protocol
 from go1exp.protocol.claims import judged
 from go1exp.protocol.quantities import Derived, Row, about, distinct, plain, resampled, summary
+from go1exp.protocol.refusing import refuse
 from go1exp.protocol.result import Result
 from go1exp.protocol.stage import Setting, Stage
 from go1exp.schema.backends import BackendConfig
@@ -43,18 +44,14 @@ def play(
     origin: dict[str, Any] | None = None,
     on_step: Progress = lambda done, total: None,
 ) -> Result:
-    """Play a protocol and judge it; ``origin`` is what a report shall say beside that of the driver."""
+    """Play a protocol and judge it; ``origin`` is what a report shall say beside that of the driver.
+
+    Raises:
+        ConfigError: before anything is played, if it is too long for the memory, or too short.
+    """
     began, protocol = time.monotonic(), chosen.protocol
-    setting = Setting(
-        protocol.noise,
-        protocol.randomize,
-        protocol.trunk_velocity,
-        rates.seed,
-        rates.policy_dt,
-        rates.physics_dt,
-        rates.engine,
-    )
-    stage = Stage(driver, setting, on_step)
+    stage = _stage(protocol, driver, rates, on_step)
+    refuse(chosen, stage)
     stage.expect(protocol.steps(stage))
     played = protocol.play(stage)
     rows = distinct(played.rows, protocol.keys, protocol.noise or protocol.randomize or not protocol.alike)
@@ -64,6 +61,25 @@ def play(
     about_play = {"driver": driver.about, "rates": dataclasses.asdict(rates), "go1exp": __version__, **(origin or {})}
     verdicts = judged(protocol.claims, figures)
     return Result(chosen, driver.label, about_play, played, repeats, figures, verdicts, time.monotonic() - began)
+
+
+def refuse_lengths(protocols: Sequence[Chosen], driver: Driver, rates: Rates) -> None:
+    """Refuse one of several protocols that is too long or too short, as ``play`` does, before the first is played."""
+    for chosen in protocols:
+        refuse(chosen, _stage(chosen.protocol, driver, rates))
+
+
+def _stage(protocol: Protocol, driver: Driver, rates: Rates, on_step: Progress = lambda done, total: None) -> Stage:
+    setting = Setting(
+        protocol.noise,
+        protocol.randomize,
+        protocol.trunk_velocity,
+        rates.seed,
+        rates.policy_dt,
+        rates.physics_dt,
+        rates.engine,
+    )
+    return Stage(driver, setting, on_step)
 
 
 def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[dict[str, Any]]:

@@ -20,11 +20,12 @@ from go1exp.evaluate.delay_margin import delayed
 from go1exp.evaluate.drivers import Driver, Progress
 from go1exp.evaluate.engine import require_agreement
 from go1exp.evaluate.observed import TrunkVelocity
-from go1exp.evaluate.recorder import Recorder
+from go1exp.evaluate.recorder import Recorder, bytes_per_step
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.protocol.disturbances import Impulses, Kicker, heading
-from go1exp.protocol.plan import Array, Motion, Plan
+from go1exp.protocol.lengths import Length
+from go1exp.protocol.plan import STEP_BYTES, Array, Motion, Plan
 from go1exp.schema.backends import BackendConfig
 from go1exp.schema.registry import Entry, Term, members
 
@@ -68,7 +69,21 @@ class Stage:
     def times(self, duration: float, policy_dt: float | None = None) -> Array:
         """Return the instants (T,) at which the policy acts in ``duration`` s."""
         dt = policy_dt or self.policy_dt
-        return np.asarray(np.arange(round(duration / dt)) * dt, dtype=np.float64)
+        return np.asarray(np.arange(self.steps(duration, dt)) * dt, dtype=np.float64)
+
+    def steps(self, duration: float, policy_dt: float | None = None) -> int:
+        """Return how many times the policy acts in ``duration`` s."""
+        return round(duration / (policy_dt or self.policy_dt))
+
+    def physics_dt(self, policy_dt: float) -> float:
+        """Return the physics step with a policy of that period, s."""
+        return self.setting.physics_dt or fitting_step(policy_dt, self.driver.task.sim.physics_dt)
+
+    def bytes_per_second(self, length: Length) -> tuple[float, float]:
+        """Return what robots take, B/s: always, and beside it while what measures need is recorded."""
+        dt = length.policy_dt or self.policy_dt
+        recorded = bytes_per_step(round(dt / self.physics_dt(dt)))
+        return length.robots * STEP_BYTES / dt, length.robots * recorded / dt
 
     def expect(self, steps_of_robots: float) -> None:
         """Say how many policy steps, times their robots, are to come: for the progress alone."""
@@ -95,7 +110,6 @@ class Stage:
         """Return the environment of a plan."""
         setting, of_driver = self.setting, self.driver.task
         policy_dt = plan.policy_dt or self.policy_dt
-        physics_dt = setting.physics_dt or fitting_step(policy_dt, of_driver.sim.physics_dt)
         config = EvalConfig(
             commands=(),
             episodes=plan.robots,
@@ -107,7 +121,7 @@ class Stage:
             train_ground=False,
             policy_dt=policy_dt,
             seed=setting.seed,
-            physics_dt=physics_dt,
+            physics_dt=self.physics_dt(policy_dt),
             engine=setting.engine,
         )
         command = Term("command", Entry("command", "scheduled", _Scheduled), {})

@@ -79,8 +79,14 @@ class Wishes:
 
 
 def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion:
-    """Return the motion of an excitation for the Go1, about its nominal stance."""
+    """Return the motion of an excitation for the Go1, about its nominal stance.
+
+    Raises:
+        ConfigError: if it is shorter than a sample.
+    """
     t = np.arange(round(seconds * rate_hz)) / rate_hz
+    if not len(t):
+        raise ConfigError([f"seconds = {seconds:g}: shorter than a sample of the motion at {rate_hz:g} Hz"])
     motion: Motion = term(t, robot.NOMINAL_STANCE.copy(), robot.soft_limits(SOFT_LIMIT), np.random.default_rng(seed))
     return motion
 

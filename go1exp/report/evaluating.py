@@ -18,7 +18,7 @@ from go1exp.protocol.report.writing import write as write_protocol
 from go1exp.report.evaluations import GRID, PROTOCOLS, names
 from go1exp.report.runs import Run
 from go1exp.report.settings import Evaluation
-from go1exp.schema.registry import bind_list
+from go1exp.schema.registry import TooLongError, bind_list
 
 BEST = "best.pt"
 """The checkpoint that evaluation during training found best, in a run folder."""
@@ -93,6 +93,9 @@ def evaluate_missing(
         settings: how.
         on_run: called with the number of the evaluation, how many there are and its label; returns what shows its
             progress.
+
+    Raises:
+        TooLongError: if what is asked of the runs does not fit into memory.
     """
     notes = []
     for number, each in enumerate(wanted, 1):
@@ -102,6 +105,9 @@ def evaluate_missing(
                 write(evaluate_run(each.run.folder, settings, show), each.run.folder / FILE)
             else:
                 play_protocol(each.run, each.protocol, settings, show)
+        except TooLongError as error:  # asked of every run: none could be evaluated
+            group = "" if each.protocol else "evaluation."
+            raise TooLongError([group + problem for problem in error.problems]) from None
         except (OSError, RuntimeError, ValueError) as error:
             notes.append(f"{each.label}: could not be evaluated ({' '.join(str(error).split())[:160]})")
     return notes

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from go1exp.schema.registry import NonNegative, Positive
+from go1exp.schema.registry import Duration, NonNegative
 from go1exp.schema.settings import settings
 
 Name = Annotated[str, Field(min_length=1)]
@@ -38,7 +38,7 @@ class Evaluation:
     y: tuple[float, ...]
     yaw: tuple[float, ...]
     episodes: Count
-    duration_s: Positive
+    duration_s: Duration
     settle_s: NonNegative
     noise: bool
     randomize: bool

@@ -33,6 +33,8 @@ STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+Duration = Annotated[float, Field(gt=0, le=1e9)]
+"""A length of time of which steps are counted, s; at most 32 years."""
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -54,6 +56,10 @@ class ConfigError(ValueError):
     def __init__(self, problems: Iterable[str]) -> None:
         self.problems = list(problems)
         super().__init__("\n".join(self.problems))
+
+
+class TooLongError(ConfigError):
+    """A length of time that does not fit into memory: its setting is at fault, whatever it is asked of."""
 
 
 class DuplicateError(ValueError):

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from go1exp.schema.registry import STRICT, Fraction, NonNegative, Positive
+from go1exp.schema.registry import STRICT, Duration, Fraction, NonNegative
 from go1exp.schema.settings import settings
 
 
@@ -64,7 +64,7 @@ class SimSettings(SimBasics):
 
     address: str = "127.0.0.1:8007"
     tile: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (0, 0)
-    seconds: Positive | None = None
+    seconds: Duration | None = None
     viewer: Literal["web"] | None = None
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 0

@@ -14,6 +14,7 @@ from go1exp.protocol.claims import judged
 from go1exp.protocol.kinds.energy import effort
 from go1exp.protocol.kinds.rate import LATEST_MS
 from go1exp.protocol.kinds.steady import AXES, ERRORS, Steady
+from go1exp.protocol.lengths import Length
 from go1exp.protocol.quantities import Column, Derived, Row
 from go1exp.protocol.report import paint
 from go1exp.schema.registry import protocol
@@ -55,9 +56,10 @@ class Hardware(Steady):
         if sorted(set(self.delays_ms)) != list(self.delays_ms):
             raise ValueError(f"delays_ms = {list(self.delays_ms)}: must rise")
 
-    def steps(self, stage: Stage) -> float:
-        """Return policy steps times robots."""
-        return Steady.steps(self, stage) * (1 + len(self.delays_ms))
+    def lengths(self) -> list[Length]:
+        """Return those of the commands as they are, and of all of them again with late targets."""
+        late = self.robots * len(self.commands) * len(self.delays_ms)
+        return [*Steady.lengths(self), Length(self.duration_s, late, self.causes(), self.settle_s)]
 
     def play(self, stage: Stage) -> Played:
         """Play the commands as they are, and all of them again with late targets, for falls alone."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
+from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.report import paint
 from go1exp.protocol.signals import Signal
@@ -31,6 +32,10 @@ PEAK_WITHIN = 1.0
 
 BEFORE = 2.0
 """Time before a kick whose mean is the height and velocity to come back to, s."""
+
+
+LEAST = 2.0
+"""Shortest time before a kick, s."""
 
 
 @settings
@@ -72,8 +77,8 @@ class Kicks(Protocol):
     push_s: Positive
     direction_deg: float
     point: tuple[float, float, float]
-    first_s: Annotated[float, Field(ge=2.0)]
-    every_s: Annotated[float, Field(ge=2.0)]
+    first_s: Annotated[float, Field(ge=LEAST)]
+    every_s: Annotated[float, Field(ge=LEAST)]
     jitter_s: NonNegative
     recovery: Recovery
 
@@ -100,15 +105,23 @@ class Kicks(Protocol):
         """Check what concerns two settings."""
         if wrong := repeated("impulses", self.impulses):
             raise ValueError(wrong[0])
+        if self.push_s > self.every_s:
+            raise ValueError(f"push_s = {self.push_s}: must be at most every_s = {self.every_s}")
 
     @property
     def duration_s(self) -> float:
         """Length, s."""
         return self.first_s + len(self.impulses) * self.every_s + self.jitter_s
 
-    def steps(self, stage: Stage) -> float:
-        """Return policy steps times robots."""
-        return len(stage.times(self.duration_s)) * self.robots
+    def lengths(self) -> list[Length]:
+        """Return that of all kicks, one after the other."""
+        count, first, every, jitter = len(self.impulses), self.first_s, self.every_s, self.jitter_s
+        causes = [
+            Cause("first_s", first, LEAST, lambda seconds: seconds - count * every - jitter),
+            Cause("every_s", every, LEAST, lambda seconds: (seconds - first - jitter) / count),
+            Cause("jitter_s", jitter, 0.0, lambda seconds: seconds - first - count * every),
+        ]
+        return [Length(self.duration_s, self.robots, causes, recorded=bool(self.terms()))]
 
     def starts(self) -> NDArray[np.float64]:
         """Return when each robot is kicked (N, P), s."""

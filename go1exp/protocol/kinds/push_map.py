@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from go1exp.protocol.base import Count, Drawing, Played, Protocol, lives
+from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
 from go1exp.protocol.signals import Signal
@@ -34,6 +35,9 @@ LEAST_SWING = 0.05
 GUESS = 0.36
 """Stride of a robot that shows none, s."""
 
+LEAST_SETTLE, LEAST_WATCH = 1.0, 0.5
+"""Shortest times before and after a kick, s."""
+
 
 @protocol("push_map")
 @settings
@@ -55,18 +59,23 @@ class PushMap(Protocol):
     command: Signal
     directions: Annotated[int, Field(ge=3)]
     phases: Count
-    settle_s: Annotated[float, Field(ge=1.0)]
+    settle_s: Annotated[float, Field(ge=LEAST_SETTLE)]
     push_s: Positive
     point: tuple[float, float, float]
     largest: Positive
     halvings: Count
-    watch_s: Annotated[float, Field(ge=0.5)]
+    watch_s: Annotated[float, Field(ge=LEAST_WATCH)]
 
     alike: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("direction_deg",)
     robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("impulse", "N s", "largest impulse that is survived", better="higher"),
     )
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.push_s > self.watch_s:
+            raise ValueError(f"push_s = {self.push_s}: must be at most watch_s = {self.watch_s}")
 
     @property
     def count(self) -> int:
@@ -78,10 +87,19 @@ class PushMap(Protocol):
         """Time after settling in which the latest kick begins, s."""
         return 2 * LONGEST_STRIDE
 
+    def lengths(self) -> list[Length]:
+        """Return that of the walk and one kick: those that follow begin where the first did."""
+        settle, look, watch = self.settle_s, self._look_s, self.watch_s
+        causes = [
+            Cause("settle_s", settle, LEAST_SETTLE, lambda seconds: seconds - look - watch),
+            Cause("watch_s", watch, LEAST_WATCH, lambda seconds: seconds - look - settle),
+        ]
+        return [Length(settle + look + watch, self.count, causes)]
+
     def steps(self, stage: Stage) -> float:
         """Return policy steps times robots."""
-        trial = len(stage.times(self._look_s + self.watch_s))
-        return (len(stage.times(self.settle_s)) + (2 + self.halvings) * trial) * self.count
+        trial = stage.steps(self._look_s + self.watch_s)
+        return (stage.steps(self.settle_s) + (2 + self.halvings) * trial) * self.count
 
     def play(self, stage: Stage) -> Played:
         """Let all walk once; from where they are then, kick them again and again, each in its own phase."""
@@ -92,7 +110,7 @@ class PushMap(Protocol):
         command = np.repeat(self.command.at(t)[:, None], self.count, 1)
         nothing = np.zeros((self.count, 1))
         session = stage.session(Plan(command, impulses=Impulses(nothing, nothing, nothing, self.push_s, self.point)))
-        settle = len(stage.times(self.settle_s))
+        settle = stage.steps(self.settle_s)
         walked = session.run(settle)
         state = session.save()
         unkicked = session.run(len(t) - settle)

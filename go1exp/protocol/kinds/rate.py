@@ -11,6 +11,7 @@ from pydantic import Field
 
 from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
+from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
 from go1exp.protocol.signals import Signal
@@ -73,10 +74,14 @@ class Rate(Protocol):
         """Return what policies see of the velocity."""
         return {"velocities": "estimated" if "estimated" in self.velocities else "exact"}
 
-    def steps(self, stage: Stage) -> float:
-        """Return policy steps times robots."""
-        each = sum(len(stage.times(self.duration_s, 1.0 / rate)) for rate in self.rates_hz)
-        return each * len(self.velocities) * len(self.delays_ms) * self.robots
+    def lengths(self) -> list[Length]:
+        """Return that of each velocity and rate, all delays as one batch."""
+        causes, robots = [Cause("duration_s", self.duration_s, least=self.settle_s)], len(self.delays_ms) * self.robots
+        return [
+            Length(self.duration_s, robots, causes, self.settle_s, True, 1.0 / rate)
+            for _ in self.velocities
+            for rate in self.rates_hz
+        ]
 
     def play(self, stage: Stage) -> Played:
         """Play each rate with each velocity, all delays as one batch."""

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
+from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.report import paint
 from go1exp.protocol.signals import Sine, response
@@ -58,15 +59,20 @@ class Sinusoid(Protocol):
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
-        longest = max(sine.period for sine in self.ladder)
-        if self.duration_s < 2.0 * longest:
-            raise ValueError(f"duration_s = {self.duration_s}: must be at least two periods, {2 * longest:g}")
+        if self.duration_s < 2.0 * self.longest:
+            raise ValueError(f"duration_s = {self.duration_s}: must be at least two periods, {2 * self.longest:g}")
         if wrong := repeated("ladder", [f"{label(sine)} at {sine.period:g} s" for sine in self.ladder]):
             raise ValueError(wrong[0])
 
-    def steps(self, stage: Stage) -> float:
-        """Return policy steps times robots."""
-        return len(stage.times(self.duration_s)) * self.robots * len(self.ladder)
+    @property
+    def longest(self) -> float:
+        """Longest period, s."""
+        return max(sine.period for sine in self.ladder)
+
+    def lengths(self) -> list[Length]:
+        """Return that of all sines as one batch."""
+        causes = [Cause("duration_s", self.duration_s, least=2.0 * self.longest)]
+        return [Length(self.duration_s, self.robots * len(self.ladder), causes, self.longest, bool(self.terms()))]
 
     def play(self, stage: Stage) -> Played:
         """Play all sines as one batch: the robots of one are neighbours."""
@@ -74,7 +80,7 @@ class Sinusoid(Protocol):
 
         t = stage.times(self.duration_s)
         command = np.concatenate([np.repeat(s.at(t)[:, None], self.robots, 1) for s in self.ladder], 1)
-        listen = round(max(s.period for s in self.ladder) / stage.policy_dt) if self.terms() else None
+        listen = round(self.longest / stage.policy_dt) if self.terms() else None
         motion = stage.run(Plan(command, listen_from=listen))
         rows = lives(motion)
         curves: dict[str, Any] = {}

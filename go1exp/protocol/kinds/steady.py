@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from go1exp.protocol.base import Played, Protocol, lives, repeated
+from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.signals import Constant, Velocity
 from go1exp.schema.registry import NonNegative, Positive
@@ -52,9 +53,14 @@ class Steady(Protocol):
         if wrong := repeated("commands", self.commands):
             raise ValueError(wrong[0])
 
-    def steps(self, stage: Stage) -> float:
-        """Return policy steps times robots."""
-        return len(stage.times(self.duration_s)) * self.robots * len(self.commands)
+    def lengths(self) -> list[Length]:
+        """Return that of all commands as one batch."""
+        robots, recorded = self.robots * len(self.commands), bool(self.terms())
+        return [Length(self.duration_s, robots, self.causes(), self.settle_s, recorded)]
+
+    def causes(self) -> list[Cause]:
+        """Return what says how long a batch plays."""
+        return [Cause("duration_s", self.duration_s, least=self.settle_s)]
 
     def play(self, stage: Stage) -> Played:
         """Play all commands as one batch."""

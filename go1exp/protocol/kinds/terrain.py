@@ -11,6 +11,7 @@ from pydantic import Field
 
 from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.protocol.ground import UNITS, GroundName, Lanes, goal
+from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
 from go1exp.schema.registry import NonNegative, Positive, PositiveRange, protocol
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
     from go1exp.protocol.stage import Stage
 
 SHARES = {"at_half": 0.5, "at_95": 0.95}
+
+LEAST_SLACK = 1.0
+"""Of the time at the commanded speed: less is too little for every robot."""
+
+START_S = 1.0
+"""Time that a robot has beside it, to begin, s."""
 
 
 @protocol("terrain")
@@ -42,7 +49,7 @@ class OnTerrain(Protocol):
 
     grounds: dict[GroundName, Annotated[tuple[NonNegative, ...], Field(min_length=2)] | None]
     speeds: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    slack: Annotated[float, Field(ge=1.0)]
+    slack: Annotated[float, Field(ge=LEAST_SLACK)]
     steer: tuple[NonNegative, NonNegative]
     gravel_friction: PositiveRange
     ground_seed: Annotated[int, Field(ge=0)]
@@ -76,12 +83,28 @@ class OnTerrain(Protocol):
 
     def duration(self, speed: float) -> float:
         """Return the time that a robot has, s."""
-        return self.slack * (goal() + 0.5) / speed + 1.0
+        return self.slack * (goal() + 0.5) / speed + START_S
 
-    def steps(self, stage: Stage) -> float:
-        """Return policy steps times robots."""
-        lanes = sum(map(len, self.ladders.values()))
-        return sum(len(stage.times(self.duration(speed))) for speed in self.speeds) * lanes * self.robots
+    def lengths(self) -> list[Length]:
+        """Return that of each ground at each speed, all difficulties as one batch."""
+        recorded = bool(self.terms())
+        return [
+            Length(self.duration(speed), len(levels) * self.robots, self._causes(speed), recorded=recorded)
+            for levels in self.ladders.values()
+            for speed in self.speeds
+        ]
+
+    def _causes(self, speed: float) -> list[Cause]:
+        """Return what says how long robots have at a speed."""
+        way, slack = goal() + 0.5, self.slack
+
+        def pace(seconds: float) -> float:
+            return slack * way / (seconds - START_S) if seconds > START_S else -1.0  # at no speed
+
+        return [
+            Cause("slack", slack, LEAST_SLACK, lambda seconds: (seconds - START_S) * speed / way, unit=""),
+            Cause("speeds", speed, 0.0, pace, " m/s", falling=True),
+        ]
 
     def play(self, stage: Stage) -> Played:
         """Play each ground at each speed, all difficulties as one batch."""

@@ -1,0 +1,249 @@
+"""What does not fit into memory is refused before anything is played, by the key that asks for it."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import go1exp.protocol.kinds  # noqa: F401  (registers them)
+from go1exp import memory
+from go1exp.cli.play import APP as PLAY
+from go1exp.cli.plugins import begin
+from go1exp.compose import compose
+from go1exp.config import TaskConfig, parse_train
+from go1exp.evaluate import video
+from go1exp.evaluate.drivers import PolicyDriver
+from go1exp.protocol.base import Chosen, chosen
+from go1exp.protocol.plan import STEP_BYTES, Plan
+from go1exp.protocol.refusing import refuse
+from go1exp.protocol.stage import Setting, Stage
+from go1exp.report import evaluating
+from go1exp.schema.registry import ConfigError, TooLongError, members
+
+# ---------------------------------------------------------------------- go1exp play
+
+
+def test_a_gif_that_does_not_fit_is_refused_by_its_key_and_a_film_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a GIF every picture is kept until it is written; of a film none is."""
+    monkeypatch.setattr(memory, "free", lambda: 25 * video.GIF_BYTES * 40)
+    monkeypatch.setattr(video, "record", lambda *anything, **options: iter(()))
+    clip = ["policy=trot", "viewer=clip", "seconds=50", "fps=25"]
+    with pytest.raises(ConfigError, match=r"^seconds = 50: a GIF .* 40 s at most would fit; an \.mp4 of any length"):
+        PLAY.task(begin("play", compose("play", [*clip, f"out={tmp_path / 'clip.gif'}"])))
+    with pytest.raises(ValueError, match="at least one frame"):  # none came, and the length was not in the way
+        PLAY.task(begin("play", compose("play", [*clip, f"out={tmp_path / 'clip.mp4'}"])))
+
+
+# ---------------------------------------------------------------------- protocols
+
+FREE = 8_000_000_000
+"""Memory that the tests pretend to have, B."""
+
+
+@pytest.fixture
+def stage(make_task: Callable[..., TaskConfig]) -> Stage:
+    """Robots that stand, at 50 Hz."""
+    task = make_task("backend.threads=1", "sim.physics_dt=0.005", "sim.policy_dt=0.02")
+    driver = PolicyDriver("stand", task, lambda observation: torch.zeros(len(observation), 12))
+    return Stage(driver, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=0))
+
+
+def one(name: str, *overrides: str) -> Chosen:
+    """A protocol of conf/protocol with some settings changed."""
+    changed = [f"++protocol.{name}.{o}" for o in overrides]
+    (selected,), _ = chosen(compose("eval", [f"protocol={name}", *changed])["protocol"])
+    return selected
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value", "unit"),
+    [
+        ("corners", "duration_s", "{}", " s at most"),
+        ("energy", "duration_s", "{}", " s at most"),
+        ("gait", "duration_s", "{}", " s at most"),
+        ("hardware", "duration_s", "{}", " s at most"),
+        ("sinusoid", "duration_s", "{}", " s at most"),
+        ("rate", "duration_s", "{}", " s at most"),
+        ("kicks", "first_s", "{}", " s at most"),
+        ("kicks", "every_s", "{}", " s at most"),
+        ("kicks", "jitter_s", "{}", " s at most"),
+        ("push_map", "settle_s", "{}", " s at most"),
+        ("push_map", "watch_s", "{}", " s at most"),
+        ("terrain", "slack", "{}", " at most"),
+        ("terrain", "speeds", "[1.0,{}]", " m/s at least"),
+        ("terrain", "robots", "{}", " at most"),
+        ("kicks", "robots", "{}", " at most"),
+        ("rate", "robots", "{}", " at most"),
+    ],
+)
+def test_a_protocol_that_does_not_fit_is_refused_by_its_key_with_what_fits(
+    name: str, key: str, value: str, unit: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is offered fits; a twentieth beyond it does not."""
+    monkeypatch.setattr(memory, "free", lambda: FREE)
+    whole, falling = key == "robots", key == "speeds"
+    wrong = "1000000000" if whole else "1e-9" if falling else "1e9"
+    with pytest.raises(TooLongError) as caught:
+        refuse(one(name, f"{key}={value.format(wrong)}"), stage)
+    (problem,) = caught.value.problems
+    offered = re.fullmatch(
+        rf"protocol\.{name}\.{key} = \S+: to play \S+ s with \d+ robots takes at least \S+ GB,"
+        rf" and 8\.0 GB are free in memory; (\S+){unit} would fit",
+        problem,
+    )
+    assert offered, problem
+    number = float(offered[1])
+    beyond = number * (0.95 if falling else 1.05)
+    given = (str(round(number)), str(round(beyond) + 1)) if whole else (f"{number!r}", f"{beyond!r}")
+    refuse(one(name, f"{key}={value.format(given[0])}"), stage)
+    with pytest.raises(TooLongError, match=rf"protocol\.{name}\."):  # by another key where that can mend it as well
+        refuse(one(name, f"{key}={value.format(given[1])}"), stage)
+
+
+def test_where_no_setting_alone_can_mend_it_all_are_named(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "free", lambda: FREE)
+    words = (
+        r"protocol\.kicks: first_s = 1e\+09, every_s = 1e\+09, jitter_s = 0\.4, robots = 200: .* s at most would fit"
+    )
+    with pytest.raises(TooLongError, match=words):
+        refuse(one("kicks", "first_s=1e9", "every_s=1e9"), stage)
+    monkeypatch.setattr(memory, "free", lambda: None)
+    refuse(one("kicks", "first_s=1e9"), stage)
+
+
+@pytest.mark.parametrize("measures", ["[]", "[stride_rate]"])
+@pytest.mark.parametrize("name", list(members("protocol")))
+def test_a_protocol_plays_the_lengths_that_it_says(
+    name: str, measures: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else what is refused would be another protocol than what is played."""
+
+    class Seen(Exception):
+        pass
+
+    plans: list[Plan] = []
+
+    def seen(self: Stage, plan: Plan) -> None:
+        plans.append(plan)
+        raise Seen
+
+    monkeypatch.setattr(Stage, "session", seen)
+    protocol = one(name, f"measures={measures}").protocol
+    with pytest.raises(Seen):
+        protocol.play(stage)
+    length, (plan,) = protocol.lengths()[0], plans
+    assert plan.robots == length.robots
+    assert len(plan.command) == stage.steps(length.seconds, length.policy_dt)
+    assert plan.policy_dt == length.policy_dt
+    if name != "push_map":  # which records none
+        assert (plan.listen_from is not None) == length.recorded
+    if plan.listen_from is not None:
+        assert plan.listen_from == stage.steps(length.settle_s, length.policy_dt)
+
+
+def test_a_step_takes_what_a_plan_and_its_motion_are_made_of(stage: Stage) -> None:
+    plan = Plan(np.zeros((3, 2, 3)))
+    motion = stage.run(plan)
+    arrays = [v for v in vars(motion).values() if isinstance(v, np.ndarray) and v.shape[:2] == (3, 2)]
+    assert sum(v.nbytes for v in [plan.command, *arrays]) == 3 * 2 * STEP_BYTES
+
+
+@pytest.mark.parametrize("value", ["-1.0", "0.0", ".nan", ".inf", "-.inf"])
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        *((name, "duration_s") for name in ("corners", "energy", "gait", "hardware", "sinusoid", "rate")),
+        *(("kicks", key) for key in ("first_s", "every_s", "push_s")),
+        *(("push_map", key) for key in ("settle_s", "watch_s", "push_s")),
+        ("terrain", "slack"),
+    ],
+)
+def test_a_duration_that_is_none_is_refused_by_its_key(name: str, key: str, value: str) -> None:
+    number = float(value.replace(".nan", "nan").replace(".inf", "inf"))
+    given = {**compose("eval", [f"protocol={name}"])["protocol"][name], key: number}
+    with pytest.raises(ConfigError, match=rf"^protocol\.{name}.*{key}\b"):
+        chosen({name: given})
+
+
+def test_a_report_asks_no_run_for_what_does_not_fit(
+    make_task: Callable[..., TaskConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is the call's settings that are wrong, so that it ends; what is wrong with a run is a remark."""
+
+    def too_long(*anything: Any) -> None:
+        raise TooLongError(["duration_s = 1e+09: too much"])
+
+    monkeypatch.setattr(evaluating, "evaluate_run", too_long)
+    monkeypatch.setattr(evaluating, "play_protocol", too_long)
+    run: Any = types.SimpleNamespace(folder=Path("run"), label="run")
+    show = lambda number, count, label: lambda done, total: None  # noqa: E731
+    settings: Any = None
+    with pytest.raises(TooLongError, match=r"^evaluation\.duration_s = "):
+        evaluating.evaluate_missing([evaluating.Wanted(run, None)], settings, show)
+    with pytest.raises(TooLongError, match=r"^duration_s = "):
+        evaluating.evaluate_missing([evaluating.Wanted(run, one("gait"))], settings, show)
+
+
+# ---------------------------------------------------------------------- too short, or without end
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("gait", ("duration_s=0.001", "settle_s=0.0")),
+        ("energy", ("duration_s=0.4", "settle_s=0.399")),
+        ("hardware", ("duration_s=0.4", "settle_s=0.399")),
+        ("rate", ("duration_s=0.02", "settle_s=0.019")),
+    ],
+)
+def test_a_protocol_without_a_step_that_counts_is_refused(name: str, overrides: tuple[str, ...], stage: Stage) -> None:
+    words = rf"^protocol\.{name}\.duration_s = 0\.\d+: of these 0\.\d+ s no step of the policy \(0\.0\d s\) is left"
+    with pytest.raises(ConfigError, match=words):
+        refuse(one(name, *overrides), stage)
+
+
+@pytest.mark.parametrize(("name", "rest"), [("kicks", "every_s"), ("push_map", "watch_s")])
+def test_a_push_that_outlasts_its_time_is_refused(name: str, rest: str) -> None:
+    """Its steps would not fit into memory, and the next kick would begin within it."""
+    with pytest.raises(ConfigError, match=rf"^protocol\.{name}\.push_s = 1000000000\.0: must be at most {rest} = "):
+        one(name, "push_s=1e9")
+
+
+def test_a_length_beyond_all_numbers_is_refused_too(stage: Stage) -> None:
+    with pytest.raises(TooLongError, match="takes at least inf GB"):
+        refuse(one("kicks", "first_s=1e308", "every_s=1e308"), stage)
+
+
+@pytest.mark.parametrize(
+    ("verb", "overrides", "words"),
+    [
+        ("eval", ("policy=trot", "duration_s=1e308"), "duration_s = 1e+308: input should be less than or equal to"),
+        ("eval", ("policy=trot", "duration_s=0.4", "settle_s=0.399"), "duration_s = 0.4: no step of the policy (0.02"),
+        ("play", ("policy=trot", "viewer=clip", "seconds=1e308"), "seconds = 1e+308: input should be less than or eq"),
+        ("play", ("policy=trot", "viewer=clip", "seconds=0.001"), "seconds = 0.001: shorter than a picture at fps ="),
+        ("record", ("seconds=0.0001",), "seconds = 0.0001: shorter than a sample of the motion at"),
+    ],
+)
+def test_a_time_without_an_end_or_without_a_step_is_refused(
+    verb: str, overrides: tuple[str, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    app = importlib.import_module(f"go1exp.cli.{'evaluate' if verb == 'eval' else verb}").APP
+    with pytest.raises(ConfigError) as caught:
+        app.task(begin(verb, compose(verb, list(overrides))))
+    assert caught.value.problems[0].startswith(words)
+
+
+def test_an_episode_without_an_end_is_no_multiple_of_a_step() -> None:
+    with pytest.raises(ConfigError, match=r"^sim\.episode_s = 1e\+308: must be a whole multiple of sim\.policy_dt"):
+        parse_train(compose("train", ["sim.episode_s=1e308"]))
