@@ -12,7 +12,7 @@ import pytest
 from go1exp.effects.tolerances import DECLARED
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.linear import Layout
-from go1exp.gap.search import evidence, places, tolerances
+from go1exp.gap.search import evidence, places, reduction, tolerances
 from go1exp.gap.search.screen import SHARES, Motion, Screened, Variant, library, rivals
 from go1exp.gap.search.tolerances import Freedom
 from go1exp.gap.search.trial import _choice
@@ -236,3 +236,41 @@ def test_a_spring_is_looked_for_at_rest_angles_of_the_whole_range() -> None:
         v.shapes["parallel_stiffness", "rest"] for v in library(MACHINE, motion) if v.effect == "parallel_stiffness"
     ]
     np.testing.assert_allclose(sorted(float(r[0]) for r in rests), [-0.7, 0.0, 0.4])
+
+
+@dataclass
+class Settled:
+    """A fitted state with one term, whose chi2 on held-out windows is known."""
+
+    terms: tuple[str, ...]
+    chi2: float
+    value: float
+    others: dict[str, tuple[float, float]] = field(default_factory=dict)
+    tolerances: Any = DECLARED
+
+    @property
+    def theta(self) -> Theta:
+        return {("link_mass", "scale"): np.full(12, self.value), ("armature", "added"): np.full(12, self.value - 1.0)}
+
+    def without(self, name: str, instead: str) -> Settled:
+        assert (name,) == self.terms
+        return Settled((instead,), *self.others[instead])
+
+    def settled(self, steps: int) -> Settled:
+        return self
+
+    def held_out(self, theta: Theta | None = None) -> np.ndarray:
+        noise = np.random.default_rng(0).normal(0.0, 0.02, (40, 4))
+        return np.exp(noise) * (10.0 if theta is not None else self.chi2)
+
+
+def test_equals_of_a_term_that_is_replaced_stay_equals_if_they_do_as_well_as_what_replaces_it() -> None:
+    state = Settled(("point_load",), 1.0, 1.0, {"link_mass": (1.001, 1.4), "armature": (1.5, 1.1)})
+    aliases = {"point_load": ("point_load", "link_mass", "armature")}
+    search: Any = SimpleNamespace(state=state, aliases=aliases, nominal={}, rng=np.random.default_rng(0))
+    rest: Any = Settled(("link_com",), 1.0, 1.0)
+    assert reduction.still_equal(search, "point_load", "link_com", rest) == ("link_mass",)
+    state.others["link_mass"] = (1.001, 1.04)  # within its tolerance: it would not be missing
+    assert reduction.still_equal(search, "point_load", "link_com", rest) == ()
+    search.aliases = {}
+    assert reduction.still_equal(search, "point_load", "link_com", rest) == ()

@@ -47,7 +47,7 @@ def simplify(search: Ledger) -> None:
         gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
         large = evidence.size(simpler, rest.theta, rest.tolerances) > 1.0
         if less > gain - significance.same(gain) and large:
-            replaced(search, name, simpler, rest)
+            replaced(search, name, simpler, rest, still_equal(search, name, simpler, rest))
 
 
 def prune(search: Ledger) -> None:
@@ -112,7 +112,22 @@ def symmetrical(search: Ledger) -> None:
             continue
         rest = instead_of(search.state, name).settled(2)
         if evidence.size(how.simpler, rest.theta, rest.tolerances) > 1.0:
-            replaced(search, name, how.simpler, rest)
+            replaced(search, name, how.simpler, rest, still_equal(search, name, how.simpler, rest))
+
+
+def still_equal(search: Ledger, name: str, instead: str, rest: State) -> tuple[str, ...]:
+    """Return which equals of a term do as well as the one that is to take its place (``rest``, fitted).
+
+    They were equals of the term, which says nothing of another: each is fitted in its place.
+    """
+    others = [n for n in search.aliases.get(name, ()) if n != instead and n not in search.state.terms]
+    if not others:
+        return ()
+    fitted = [search.state.without(name, other).settled(2) for other in others]
+    held_out = np.stack([rest.held_out(), *(state.held_out() for state in fitted)])
+    equal = significance.equals(significance.gains(search.state.held_out(search.nominal), held_out), 0, search.rng)
+    large = [evidence.size(n, s.theta, s.tolerances) > 1.0 for n, s in zip(others, fitted, strict=True)]
+    return tuple(n for n, e, out in zip(others, equal[1:], large, strict=True) if e and out)
 
 
 def instead_of(state: State, name: str) -> State:
@@ -145,10 +160,10 @@ def resampled(search: Ledger) -> list[Theta]:
     return draws
 
 
-def replaced(search: Ledger, name: str, instead: str, rest: State) -> None:
-    """Put a fitted model with another term in the place of the present one."""
+def replaced(search: Ledger, name: str, instead: str, rest: State, equals: tuple[str, ...] = ()) -> None:
+    """Put a fitted model with another term in the place of the present one; ``equals`` do as well as that."""
     search.state = rest
-    search.aliases[instead], search.shares[instead] = (instead,), search.shares[name]
+    search.aliases[instead], search.shares[instead] = (instead, *equals), search.shares[name]
     search.returned[instead] = search.returned.get(name, math.nan)
     search.select_chi2 = rest.held_out()
     search.steps.append((f"{instead} in place of {name}", excess(search.select_chi2)))
