@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from benchmarks import closed_loop, closed_loop_figures, commands
-from benchmarks.closed_loop import SIZES, Place
+from benchmarks.closed_loop import Place
 from benchmarks.closed_loop_figures import Walks
+from benchmarks.closed_loop_sizes import SIZES
 from benchmarks.gap import hidden
 from benchmarks.gap.motions import RATE
 from benchmarks.gap.truth import Truth
@@ -375,7 +376,7 @@ def test_robots_come_in_order_however_many_are_worked_on(
         assert steps.index("robot_of late") < steps.index("robot_of friction")
 
 
-ABOUT = ("benchmarks/closed_loop.py", "benchmarks/gap/", "go1exp/train/start.py", "go1exp/gap/stages/")
+ABOUT = ("benchmarks/closed_loop", "benchmarks/gap/", "go1exp/train/start.py", "go1exp/gap/stages/")
 
 
 @pytest.mark.slow(*ABOUT)
