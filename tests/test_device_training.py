@@ -211,6 +211,10 @@ def test_an_update_ends_before_the_step_at_which_the_policy_has_diverged_too_far
         mine, its = limited.policy.optimizer.state[parameter], adam.state[other]
         assert all(torch.equal(mine[key], its[key]) for key in ("step", "exp_avg", "exp_avg_sq"))
 
+    strict = learner("ppo.max_kl=1e-12")
+    strict.learn(48)
+    assert strict.log[0]["train/gradient_steps"] == 1
+
     limited.learn(48, reset_num_timesteps=False)  # the next one begins anew
     assert limited.log[1]["train/gradient_steps"] >= 2
     assert len(set(limited._kl)) > 1

@@ -26,8 +26,9 @@ class PPOConfig:
         schedule: ``adaptive`` steers the rate by the KL divergence (rsl_rl's rule), ``fixed`` keeps it, ``linear``
             lowers it to the least of ``learning_rate_range`` over the iterations.
         desired_kl: the divergence per update that ``adaptive`` aims at.
-        max_kl: an update ends before the first gradient step at which the divergence from the policy that collected the
-            rollout is above this; null for no such end. For fine-tuning, whose first updates can throw a policy away.
+        max_kl: an update ends before the gradient step, not its first, at which the divergence from the policy that
+            collected the rollout is above this; null for no such end. For fine-tuning, whose first updates can throw a
+            policy away.
         learning_rate_range: bounds of the learning rate.
         gamma: discount factor.
         gae_lambda: decay of the advantage estimator (GAE).

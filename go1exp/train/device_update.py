@@ -109,7 +109,7 @@ class DeviceUpdate:
         with torch.no_grad():
             kl = self._step_figures[-1]
             if c.max_kl is not None:
-                self._ended.logical_or_(kl > c.max_kl)
+                self._ended.logical_or_((kl > c.max_kl) & (self._position[0] > 0))  # the first step is always taken
             if c.schedule == "adaptive":
                 rate = adapted_rate(self._rate, kl, c.desired_kl, c.learning_rate_range)
                 self._rate.copy_(torch.where(self._ended, self._rate, rate))

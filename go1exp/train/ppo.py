@@ -283,10 +283,11 @@ class AdaptivePPO(PPO):
     def _gradient_step(self, batch: RolloutBufferSamples) -> list[float]:
         """Follow the loss of a minibatch downhill by one step; return the figures of the loss.
 
-        No figures, and no step, where the policy has diverged by more than ``max_kl``: the update ends.
+        No figures, and no step, where the policy has diverged by more than ``max_kl``: the update ends. Before its
+        first step it has not moved: what divergence there is comes of rounding.
         """
         loss = ppo_loss(self.policy, batch, self.config, self.mirror)
-        if self.config.max_kl is not None and self._divergence() > self.config.max_kl:
+        if self.config.max_kl is not None and self._kl and self._divergence() > self.config.max_kl:
             return []
         self.policy.optimizer.zero_grad()
         loss.total.backward()
