@@ -225,13 +225,18 @@ def solve(case: Path, out: Path) -> str:
     return f"{case.name}: {result['verdict']}, {result['seconds']:.0f} s. {result['sentence']}. {names}"
 
 
+def require() -> None:
+    """Raise SystemExit without the extra."""
+    if not hasattr(sysid, "optimize"):
+        raise SystemExit('mujoco.sysid lacks its own dependencies: pip install "mujoco[sysid]"')
+
+
 def main(arguments: Sequence[str]) -> None:
     """Solve all cases that have no verdict yet."""
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
     if "cases" not in given or len(given) != len(arguments) or set(given) - {"cases", "out", "jobs"}:
         raise SystemExit("usage: python benchmarks/gap_sysid.py cases=DIR [out=DIR] [jobs=2]")
-    if not hasattr(sysid, "optimize"):
-        raise SystemExit('mujoco.sysid lacks its own dependencies: pip install "mujoco[sysid]"')
+    require()
     cases, jobs = Path(given["cases"]), int(given.get("jobs", 2))
     out = Path(given.get("out", cases.parent / "sysid"))
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")

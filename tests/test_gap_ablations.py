@@ -83,6 +83,13 @@ def test_every_method_is_told_of_the_same_cases(tmp_path: Path, monkeypatch: pyt
     assert {*no_box} - {*whole} == {f"out={tmp_path / 'no_box'}", "calibrate=false"}
 
 
+def test_a_missing_extra_is_told_before_anything_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gap_ablations.gap_sysid, "sysid", object())
+    with pytest.raises(SystemExit, match=r"mujoco\[sysid\]"):
+        gap_ablations.main([f"out={tmp_path / 'x'}", "seed=1"])
+    assert not (tmp_path / "x").exists()
+
+
 def test_cases_are_drawn_once_and_their_answers_sealed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With one case of each kind, of which the simulation is left out."""
     monkeypatch.setattr(gap_ablations, "PLAN", {kind: (1, size) for kind, (_, size) in gap_ablations.PLAN.items()})

@@ -77,7 +77,7 @@ class DeviceUpdate:
             for rows in self._buffer.minibatches(len(self._rows)):
                 self._rows.copy_(rows)
                 self._step()
-        *figures, taken = self._figures.T
+        *figures, taken = self._figures.cpu().T
         return {name: values[taken > 0.0].tolist() for name, values in zip(FIGURES[:-1], figures, strict=True)}
 
     def _gradient_step(self) -> None:
