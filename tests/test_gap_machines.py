@@ -20,7 +20,7 @@ from go1exp.cli.files import choices_from_files
 from go1exp.compose import compose
 from go1exp.effects.tolerances import declared
 from go1exp.env.plant import Plant
-from go1exp.gap.answer import name_terms, resampled_values
+from go1exp.gap.answer import name_terms
 from go1exp.gap.comparison import NotComparable, compare, prepare
 from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, slope
 from go1exp.gap.data.windows import averaged
@@ -31,6 +31,7 @@ from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.hung import HungGo1
 from go1exp.gap.search import tolerances
+from go1exp.gap.search.last_fit import resampled_values
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.stages.explain import explain

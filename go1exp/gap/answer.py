@@ -16,11 +16,11 @@ from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score import angle_errors
-from go1exp.gap.score.linear import Layout
 from go1exp.gap.score.robust import excess, removed
-from go1exp.gap.search import reduction, significance, tolerances
+from go1exp.gap.search import reduction, tolerances
 from go1exp.gap.search.evidence import deviation, inaudible
-from go1exp.gap.search.fit import fit, residuals
+from go1exp.gap.search.fit import residuals
+from go1exp.gap.search.last_fit import resampled_values
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import SILENT, Search
 from go1exp.schema.registry import members
@@ -31,15 +31,8 @@ QUANTILES = (0.025, 0.975)
 MOST_WINDOWS = 0.9
 """Share of the held-out windows that must be within what the user accepts (chosen: one in ten may be off)."""
 
-FEWEST_BOOTSTRAPS = 20
-"""Resamples from which an interval can be read, also where the user asks for fewer."""
-
 MUCH = 0.5
 """Share of the largest deviation of a term from which a joint is named although its interval reaches the tolerance."""
-
-LAW = 0.04
-"""Relative standard deviation of a value because no robot follows a law of the library exactly: the intervals of sealed
-effects (265 values), widened to it, hold 89 % of the truths; with 2 %, 76 %."""
 
 
 def can_stand(robot: Robot) -> bool:
@@ -111,7 +104,7 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
             warnings.append(f"On windows kept for a last check the error is {1 + confirmed:.3g} times the floor.")
     unsure = {n.effect for n in named if n.status != "certified"}
     certain = {key: value for key, value in theta.items() if key[0] not in unsure}
-    reached["written"] = excess(search.state.held_out(certain, search.splits.judged))
+    reached["written"] = excess(search.state.finer().held_out(certain, search.splits.judged))
     return Answer(verdict, named, theta, reached, removed(first, final) if named else math.nan, within)
 
 
@@ -141,41 +134,6 @@ def share_accepted(search: Search) -> float:
             (residual,) = residuals(scorer, [search.state.theta], windows, search.dt)
             shares.append(angle_errors.within(scorer, residual, windows, accept))
     return min(shares)
-
-
-def resampled_values(search: Search) -> tuple[Theta, dict[Key, np.ndarray]]:
-    """Fit once more, on all windows but those for the last check, and bootstrap the fit; nothing to do without terms.
-
-    Returns:
-        The values, and by fitted parameter of the terms their resampled values (B, J) or (B, 1). A value that is held,
-        such as that of a law, has none.
-    """
-    scorer, machine = search.state.scorer, search.state.machine
-    if not search.state.terms:
-        return search.state.theta, {}
-    fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
-    linear = search.state.linear(search.state.theta, fitted)
-    (best,) = fit(scorer, [search.state.model(search.state.theta)], linear, 1, search.dt)
-    assert best.chi2 is not None
-    layout = Layout.from_probes(machine, linear.probes)
-    grams = linear.grams(scorer) / np.maximum(best.chi2, 1.0)[..., None, None]
-    limits = tolerances.bounds(layout, linear.probes, search.state.theta, search.state.may)
-    episode = scorer.windows.episode[fitted]
-    drawn: dict[Key, list[np.ndarray]] = {}
-    spread = 1.0 / np.sqrt(limits.weight)
-    of_terms = [key for key in search.state.keys if key[0] in search.state.terms]
-    for _ in range(max(search.settings.bootstraps, FEWEST_BOOTSTRAPS)):
-        matrix, right = layout.total(grams[significance.resampled(episode, search.rng)])
-        # The nominal values are themselves uncertain by their tolerances, and motion fixes many of them only relative
-        # to each other: drawing where they lie puts that uncertainty into the interval.
-        centre = limits.centre + spread * search.rng.standard_normal(layout.size)
-        x = tolerances.solve(matrix, right, replace(limits, centre=centre))
-        values = tolerances.moved(search.state.theta, layout, linear.probes, x, machine)
-        for key in of_terms:
-            null = search.state.tolerances.param(key).null
-            law = 1.0 + LAW * search.rng.standard_normal(values[key].shape)
-            drawn.setdefault(key, []).append(null + (values[key] - null) * law)
-    return best.theta, {key: np.stack([np.ravel(v) for v in values]) for key, values in drawn.items()}
 
 
 def name_terms(

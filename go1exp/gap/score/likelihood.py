@@ -55,6 +55,7 @@ class Scorer:
             and of the clock.
         renewed: returns a scorer whose floors and initial states suit other values of the model.
         clock_s: what the clock was taken to be off by, s.
+        finer: residuals are replayed at this part of the step that columns and floors are measured at.
         expected: the windows with their initial states as sensors tell them, where those were moved; None if not.
         common: (k,) bool, which columns of ``state`` are of a trunk on a mount, which all groups feel. In scores each
             group has it to itself.
@@ -66,6 +67,7 @@ class Scorer:
     renewed: Callable[[Theta], Scorer] | None = None
     clock_s: float = 0.0
     expected: Windows | None = None
+    finer: int = 1
     common: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
@@ -87,7 +89,7 @@ class Scorer:
 
     def residual(self, rows: Rows, dt: float) -> np.ndarray:
         """Return what was measured minus what each row says, (R, G, m) in units of the noise."""
-        return self.unit(self.windows.y[rows.window] - self.replayer.run(rows, dt), rows.window)
+        return self.unit(self.windows.y[rows.window] - self.replayer.run(rows, dt / self.finer), rows.window)
 
     def chi2(self, residual: np.ndarray, window: np.ndarray) -> np.ndarray:
         """Return chi2 per value (R, G) of residuals (R, G, m)."""

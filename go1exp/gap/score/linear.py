@@ -88,6 +88,27 @@ class Table:
         return gram(np.concatenate([self.columns, self.residual[..., None]], axis=-1), scorer.state[self.windows])
 
 
+def unbiased_grams(scorer: Scorer, one: Table, other: Table) -> np.ndarray:
+    """Return the Gram matrices (V, G, p+1, p+1) of columns that were measured twice, by other changes.
+
+    Errors that the two do not share add nothing to the products of one with the other, as they do to squares (errors in
+    variables; Fuller, Measurement Error Models, 1987): with the mean c of both and half their difference d,
+    (a'b + b'a) / 2 = c'c - d'd.
+
+    Args:
+        scorer: of the windows.
+        one: with the residual that counts.
+        other: of the same windows and parameters.
+    """
+    count = one.columns.shape[-1]
+    mean, half = 0.5 * (one.columns + other.columns), 0.5 * (one.columns - other.columns)
+    every = np.concatenate([mean, one.residual[..., None], half], axis=-1)
+    products = gram(every, scorer.state[one.windows])
+    unbiased = products[..., : count + 1, : count + 1].copy()
+    unbiased[..., :count, :count] -= products[..., count + 1 :, count + 1 :]
+    return unbiased
+
+
 def differences(scorer: Scorer, y: np.ndarray, window: np.ndarray, probes: Sequence[Probe]) -> np.ndarray:
     """Return columns (V, G, m, p) from readings (V, 1 + p, n, C, J): changes per unit of the parameters."""
     groups = np.array(scorer.replayer.machine.groups)

@@ -1,0 +1,82 @@
+"""The last fit of ``go1exp gap``: what the physics step and columns err by is taken for nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from go1exp.compose import compose
+from go1exp.config import parse_parts
+from go1exp.gap.comparison import compare, robot_from
+from go1exp.gap.replay.rows import Theta
+from go1exp.gap.result import GapSettings
+from go1exp.gap.score.likelihood import Scorer
+from go1exp.gap.score.linear import Table, unbiased_grams
+from go1exp.gap.search import state
+from go1exp.gap.search.last_fit import resampled_values, semidefinite
+from go1exp.gap.search.stepwise import Search
+from tests.laboratory import recorded
+
+HIDDEN_S = 0.005
+QUICK = GapSettings(stride_s=0.4, window_s=0.2, effects=("command_delay",), bootstraps=40)
+
+
+def delays(monkeypatch: pytest.MonkeyPatch, finer: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the delay (J,) and its resamples (B, J), s, of a robot whose drives obey late, stepped finely."""
+    monkeypatch.setattr(state, "FINER", finer)
+    hidden = ["effect=command_delay", f"effect.command_delay.delay={HIDDEN_S}", "physics_dt=0.000125"]
+    _, logs = recorded(["seconds=2", "excitation=[steps]", "gains=[[20,0.5],[35,0.6],[35,1.2]]", *hidden])
+    config = parse_parts(compose("gap", ["logs=none"]), ("robot",))[0]["robot"]
+    rng = np.random.default_rng(0)
+    comparison = compare(list(logs), robot_from(config), QUICK)
+    parts = comparison.split(rng)
+    search = Search(comparison.scorer, parts, comparison.settings, comparison.dt, rng, lambda what, share: None)
+    key = ("command_delay", "delay")
+    theta: Theta = {key: np.full(12, HIDDEN_S)}
+    search.state = replace(search.state, terms=("command_delay",), theta=theta).settled(1)
+    fitted, drawn = resampled_values(search)
+    return fitted[key], drawn[key]
+
+
+def test_errors_of_columns_tell_nothing() -> None:
+    """Two columns that are the same but for errors look as if their difference were known; without these it is not."""
+    rng = np.random.default_rng(0)
+    true = np.repeat(rng.standard_normal((40, 1, 300, 1)), 2, axis=-1)
+    one, other = (true + 0.3 * rng.standard_normal(true.shape) for _ in range(2))
+    residual = rng.standard_normal((40, 1, 300))
+    score = cast(Scorer, SimpleNamespace(state=np.zeros((40, 1, 300, 1))))
+    tables = [Table(np.arange(40), (), residual, columns, {}) for columns in (one, other)]
+    biased, unbiased = tables[0].grams(score).sum(0)[0], unbiased_grams(score, *tables).sum(0)[0]
+    along, against = np.array([1.0, 1.0, 0.0]), np.array([1.0, -1.0, 0.0])
+    errors = 40 * 300 * 2 * 0.3**2
+    assert against @ biased @ against == pytest.approx(errors, rel=0.05)
+    assert abs(against @ unbiased @ against) < 0.05 * errors
+    assert along @ unbiased @ along == pytest.approx(4 * np.sum(true[..., 0] ** 2), rel=0.02)
+    np.testing.assert_allclose(unbiased, unbiased.T)
+
+
+def test_the_nearest_matrix_without_negative_eigenvalues() -> None:
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((5, 9))
+    positive = root @ root.T
+    np.testing.assert_allclose(semidefinite(positive), positive)
+    wrong = positive - 1.2 * np.linalg.eigvalsh(positive)[0] * np.eye(5)
+    wrong[4], wrong[:, 4] = 0.0, 0.0  # a value that nothing shows
+    values = np.linalg.eigvalsh(semidefinite(wrong))
+    assert values.min() > -1e-12 * values.max()
+    assert not semidefinite(wrong)[4].any()
+
+
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+def test_what_the_step_errs_by_is_taken_for_no_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps of 1 ms make commands that jump act late, so a fit at them takes a delay for shorter than it is."""
+    fine, drawn = delays(monkeypatch, 4)
+    coarse, _ = delays(monkeypatch, 1)
+    assert np.median(coarse) < HIDDEN_S
+    assert abs(np.median(fine) - HIDDEN_S) < 0.6 * abs(np.median(coarse) - HIDDEN_S)
+    low, high = np.quantile(drawn, (0.025, 0.975), axis=0)
+    assert np.mean((low <= HIDDEN_S) & (high >= HIDDEN_S)) >= 0.9
