@@ -17,7 +17,7 @@ from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
 from go1exp.report.settings import ReportSettings
 from go1exp.schema import settings as schema
-from go1exp.schema.registry import Duration, FolderName, NonNegative, Positive
+from go1exp.schema.registry import Duration, FolderName, NonNegative, Positive, Speed
 from go1exp.schema.settings import settings
 from go1exp.sim_robot.settings import SimConfig, SimSettings
 from go1exp.sweep.settings import TuneSettings
@@ -38,9 +38,9 @@ class Grid:
         cross: every combination of the three axes; false: one axis at a time, the others zero.
     """
 
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-    yaw: tuple[float, ...]
+    x: tuple[Speed, ...]
+    y: tuple[Speed, ...]
+    yaw: tuple[Speed, ...]
     cross: bool
 
 
