@@ -126,8 +126,7 @@ class RecordSettings(Wishes):
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
-        lists = ("gains", "seeds", "hang")
-        wrong = [f"{name} = []: at least one is needed" for name in lists if not getattr(self, name)]
+        wrong = self.empty()
         ratio = 1.0 / (self.sensors.rate_hz * self.physics_dt)
         if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6:
             period = 1 / self.sensors.rate_hz
@@ -165,7 +164,7 @@ class ImportSettings:
     path: str
     options: dict[str, Any] | str | None
     columns: dict[str, Any] | str | None
-    out: str
+    out: FolderName
 
 
 @settings

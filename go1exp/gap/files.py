@@ -69,6 +69,8 @@ def load(folder: Path) -> GapResult:
         GapFileError: if there is none, or it is not one.
     """
     path = folder / RESULT
+    if folder.is_file():
+        raise GapFileError(f"{folder}: is a file; out must be the folder of an answer, with {RESULT}")
     if not path.is_file():
         raise GapFileError(f"{path}: no such file; run go1exp gap explain first")
     try:

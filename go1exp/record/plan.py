@@ -77,6 +77,11 @@ class Wishes:
     seed: Annotated[int, Field(ge=0)]
     sensors: SensorConfig
 
+    def empty(self) -> list[str]:
+        """Return what is wrong with lists that are empty: nothing would be recorded."""
+        lists = ("gains", "seeds", "hang")
+        return [f"{name} = []: at least one is needed" for name in lists if not getattr(self, name)]
+
 
 def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion:
     """Return the motion of an excitation for the Go1, about its nominal stance.
