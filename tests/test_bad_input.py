@@ -103,6 +103,9 @@ def test_a_file_in_place_of_recordings_an_answer_or_options_is_called_one(run: R
     assert err.endswith("; a log of another format becomes a recording by go1exp record import\n")
     said = "notes.txt: is a file; out must be the folder of an answer, with verdict.json"
     assert run("gap", "report", "out=notes.txt") == (1, f"go1exp gap: {said}\n")
+    (tmp_path / "verdict.json").write_text("{}")
+    said = "verdict.json: not a result of go1exp gap (has no 'named'); run go1exp gap explain again"
+    assert run("gap", "report", "out=.") == (1, f"go1exp gap: {said}\n")
     status, err = run("record", "import", "csv", "notes.txt", "options=notes.txt")
     assert (status, err.startswith("go1exp record import: options=notes.txt: must be a mapping")) == (2, True), err
     (tmp_path / "log.csv").write_text("t,q,qt\n" + "".join(f"{k / 100},0.1,0.2\n" for k in range(9)))

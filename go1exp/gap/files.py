@@ -76,7 +76,8 @@ def load(folder: Path) -> GapResult:
     try:
         return from_dict(json.loads(path.read_text()))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise GapFileError(f"{path}: not a result of go1exp gap ({error})") from None
+        why = f"has no {error}" if isinstance(error, KeyError) else str(error)
+        raise GapFileError(f"{path}: not a result of go1exp gap ({why}); run go1exp gap explain again") from None
 
 
 def from_dict(plain: Mapping[str, Any]) -> GapResult:
