@@ -287,6 +287,9 @@ def _stop(where: Path | str, complaints: Iterable[str]) -> None:
 # ---------------------------------------------------------------------- files
 
 
+IMPORT = "; a log of another format becomes a recording by go1exp record import"
+
+
 def read(path: Path) -> Recording:
     """Read and check one recording; nothing is corrected.
 
@@ -303,11 +306,14 @@ def read(path: Path) -> Recording:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             text = (file.metadata.metadata or {}).get(KEY)
             if text is None:
-                raise RecordingError(f"{path}: no schema metadata {KEY.decode()!r}; not a recording of this format")
+                raise RecordingError(
+                    f"{path}: no schema metadata {KEY.decode()!r}; not a recording of this format{IMPORT}"
+                )
             _stop(path, _schema_problems(file))
             table = file.read()
     except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{path}: not a whole Parquet file ({str(error).splitlines()[0]})") from error
+        why = f"not a whole Parquet file ({str(error).splitlines()[0]})"
+        raise RecordingError(f"{path}: {why}{'' if _begins_as_parquet(path) else IMPORT}") from error
     try:
         meta = _META.validate_json(text)
     except ValidationError as error:
@@ -317,6 +323,12 @@ def read(path: Path) -> Recording:
     recording = Recording(meta, {name: np.array(table.column(name).to_numpy()) for name in table.column_names})
     _stop(path, problems(recording))
     return recording
+
+
+def _begins_as_parquet(path: Path) -> bool:
+    """Return whether a file begins with the four bytes that every Parquet file begins with."""
+    with path.open("rb") as file:
+        return file.read(4) == b"PAR1"
 
 
 def _schema_problems(file: pq.ParquetFile) -> list[str]:

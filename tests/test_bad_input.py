@@ -20,7 +20,9 @@ from go1exp.cli.files import choices_from_files
 from go1exp.cli.logs import remove_empty
 from go1exp.cli.quoting import command, protected
 from go1exp.compose import compose, compose_checked
-from go1exp.recording import Meta, Recording
+from go1exp.gap.data.cutting import cut
+from go1exp.gap.result import GapSettings
+from go1exp.recording import Meta, Recording, RecordingError
 from go1exp.robot import JOINTS
 from go1exp.schema.registry import ConfigError
 
@@ -58,6 +60,79 @@ def made(folder: Path, episode: str, rows: int, kp: float = 20.0) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     recording.write(folder / f"{episode}.parquet", Recording(meta, {"t": t, **wave}))
     return folder
+
+
+LOGS_NEEDED = "a folder of recordings is needed, such as logs=recordings"
+ANGLE = "must be from 0 to 1 rad; with a unit such as 2mrad or 0.1deg"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("gap prove", "stage: unknown stage 'prove'; known: all, "),
+        ("gap logs=[]", f"logs = []: {LOGS_NEEDED}"),
+        ("gap logs=", f"logs = '': {LOGS_NEEDED}"),
+        ("gap logs=[a,'']", f"logs = ['a', '']: {LOGS_NEEDED}"),
+        ("gap next logs=", f"logs = '': {LOGS_NEEDED}"),
+        ("gap logs=x out=", "out = '': "),
+        ("gap logs=x accept=-1", f"accept = -1: {ANGLE}"),
+        ("gap logs=x accept=-2mrad", f"accept = '-2mrad': {ANGLE}"),
+        ("gap logs=x accept=2", f"accept = 2: {ANGLE}"),
+        ("gap logs=x accept=..mrad", "accept = '..mrad': must be a number of rad, or one with rad, mrad, deg"),
+        ("gap logs=x +search.effects=[coulmb]", "search.effects: unknown effect 'coulmb'; did you mean 'coulomb'?"),
+        ("gap logs=x search.physics_dt=1e-9", "search.physics_dt = 1e-09: input should be greater than or equal to"),
+        ("gap replay logs=x train_dt=1e-9", "train_dt = 1e-09: input should be greater than or equal to"),
+        ("gap loop gains=[]", "gains = []: at least one is needed"),
+        ("gap loop seeds=[]", "seeds = []: at least one is needed"),
+        ("gap loop seconds=0.1", "seconds = 0.1: shorter than a window, search.burn_s + search.window_s = 0.37 s"),
+        ("record import go2_in_air x out=", "out = '': "),
+    ],
+)
+def test_a_wrong_setting_about_recordings_is_refused_by_its_key(words: str, said: str, run: Run) -> None:
+    verb = words.split(maxsplit=2)[:2]
+    title = " ".join(verb) if verb[1] in ("next", "loop", "import") else verb[0]
+    status, err = run(*words.split())
+    assert (status, err.startswith(f"go1exp {title}: {said}")) == (2, True), err
+
+
+def test_a_file_in_place_of_recordings_an_answer_or_options_is_called_one(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("<xml>no key</xml>")
+    status, err = run("gap", "logs=notes.txt")
+    assert status == 1
+    assert err.startswith("go1exp gap: notes.txt: not a whole Parquet file (")
+    assert err.endswith("; a log of another format becomes a recording by go1exp record import\n")
+    said = "notes.txt: is a file; out must be the folder of an answer, with verdict.json"
+    assert run("gap", "report", "out=notes.txt") == (1, f"go1exp gap: {said}\n")
+    (tmp_path / "verdict.json").write_text("{}")
+    said = "verdict.json: not a result of go1exp gap (has no 'named'); run go1exp gap explain again"
+    assert run("gap", "report", "out=.") == (1, f"go1exp gap: {said}\n")
+    status, err = run("record", "import", "csv", "notes.txt", "options=notes.txt")
+    assert (status, err.startswith("go1exp record import: options=notes.txt: must be a mapping")) == (2, True), err
+    (tmp_path / "log.csv").write_text("t,q,qt\n" + "".join(f"{k / 100},0.1,0.2\n" for k in range(9)))
+    options = "options={robot: arm, columns: {t: t, q_hip: q, q_target_hip: qt}}"
+    status, err = run("record", "import", "csv", "log.csv", options, "out=notes.txt")
+    assert (status, err) == (2, "go1exp record import: out = 'notes.txt': cannot be written to (File exists)\n")
+    whole = (made(tmp_path / "whole", "a", 200) / "a.parquet").read_bytes()
+    (tmp_path / "cut.parquet").write_bytes(whole[:-100])
+    _, err = run("gap", "logs=cut.parquet")
+    assert "not a whole Parquet file" in err
+    assert "record import" not in err  # it was a recording
+
+
+@pytest.mark.parametrize(
+    ("rows", "settings", "said"),
+    [
+        (1000, {"window_s": 0.001}, "search.window_s = 0.001: a window must have two steps of the recordings, 0.004 s"),
+        (1000, {"stride_s": 1e3}, "fits into these recordings with one in 1000 s (search.stride_s); record longer"),
+        (45, {"window_s": 0.01}, "the longest recording has 45 rows; 53 are needed to tell the noise"),
+    ],
+)
+def test_windows_that_do_not_fit_are_told_by_what_is_in_the_way(
+    rows: int, settings: dict[str, float], said: str, tmp_path: Path
+) -> None:
+    log = recording.read(made(tmp_path, "a", rows) / "a.parquet")
+    with pytest.raises(RecordingError, match=re.escape(said)):
+        cut([log], GapSettings(**settings))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

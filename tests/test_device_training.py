@@ -106,14 +106,16 @@ def test_minibatches_hold_every_sample_once(learner: Callable[..., DevicePPO]) -
 
 
 def through_sb3(ppo: AdaptivePPO) -> None:
-    """An update by SB3's own loop and loss, with the hooks of ``AdaptivePPO``."""
+    """An update by SB3's own loop and loss, which is steered as ``AdaptivePPO`` is."""
     ppo._old_log_std, ppo._kl = ppo.policy.log_std.detach().clone(), []
     if ppo.config.schedule == "linear":
         ppo.policy.optimizer.param_groups[0]["lr"] = linear_rate(ppo.config, ppo.iteration)
     if ppo.mirror is not None:
         minibatches, joined = type(ppo.rollout_buffer).get, ppo.mirror.joined
         ppo.rollout_buffer.get = lambda size: map(joined, minibatches(ppo.rollout_buffer, size))  # type: ignore
+    steered = ppo.policy.optimizer.register_step_pre_hook(lambda *_: ppo._steer(float(ppo._divergence())))
     PPO.train(ppo)
+    steered.remove()
     ppo._close_iteration()
 
 
@@ -125,7 +127,6 @@ class Sb3UpdateOnDevice(DevicePPO):
     """The buffer of the device, and SB3's own update."""
 
     train = through_sb3
-    _before_gradient_step = AdaptivePPO._before_gradient_step
     _check_gradient = AdaptivePPO._check_gradient
 
     def collect_rollouts(self, *arguments: Any, **named: Any) -> bool:

@@ -17,6 +17,7 @@ import go1exp.protocol.kinds  # noqa: F401  (registers them)
 from go1exp import memory
 from go1exp.cli.play import APP as PLAY
 from go1exp.cli.plugins import begin
+from go1exp.cli.record import APP as RECORD
 from go1exp.compose import compose
 from go1exp.config import TaskConfig, parse_train
 from go1exp.evaluate import video
@@ -25,6 +26,7 @@ from go1exp.protocol.base import Chosen, chosen
 from go1exp.protocol.plan import STEP_BYTES, Plan
 from go1exp.protocol.refusing import refuse
 from go1exp.protocol.stage import Setting, Stage
+from go1exp.record.plan import ROW_BYTES
 from go1exp.report import evaluating
 from go1exp.schema.registry import ConfigError, TooLongError, members
 
@@ -42,6 +44,37 @@ def test_a_gif_that_does_not_fit_is_refused_by_its_key_and_a_film_is_not(
         PLAY.task(begin("play", compose("play", [*clip, f"out={tmp_path / 'clip.gif'}"])))
     with pytest.raises(ValueError, match="at least one frame"):  # none came, and the length was not in the way
         PLAY.task(begin("play", compose("play", [*clip, f"out={tmp_path / 'clip.mp4'}"])))
+
+
+# ---------------------------------------------------------------------- go1exp record
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (
+            ("repeats=1000",),
+            "repeats = 1000: 1003 recordings of 20 s: it takes at least .*; 7 at most would fit",
+        ),
+        (("gains=[[20,0.5],[35,0.6]]", "repeats=9"), "repeats = 9: 24 recordings of 20 s: .*; 2 at most would fit"),
+        (("seconds=1e9",), "seconds = 1e\\+09: with 3 recordings it takes .*; 66 s at most would fit"),
+        (("seconds=100", "repeats=2"), "seconds = 100: with 5 recordings .*; 40 s at most would fit"),
+        (("seconds=1e308",), "seconds = 1e\\+308: with 3 recordings it takes at least inf GB, .*; 66 s at most would"),
+        (
+            ("excitation=[policy]", "policy=trot", "episodes=11"),
+            "episodes = 11: 11 .*; 10 at most would fit",
+        ),
+        (("excitation=[policy]", "policy=trot", "seconds=201"), "seconds = 201: with 4 recordings .*; 50 s at most"),
+    ],
+)
+def test_recordings_that_do_not_fit_are_refused_by_the_key_that_asks_for_so_many(
+    overrides: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(memory, "free", lambda: 200 * 500 * ROW_BYTES)  # 200 s at 500 Hz, in all recordings together
+    with pytest.raises(ConfigError, match="^" + said):
+        RECORD.task(begin("record", compose("record", list(overrides))))
+    assert not list(tmp_path.iterdir())
 
 
 # ---------------------------------------------------------------------- protocols

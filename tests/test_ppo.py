@@ -204,7 +204,7 @@ class Watched:
             return evaluate_actions(obs, actions)
 
         def before_step(optimizer: torch.optim.Optimizer, *_: Any) -> None:
-            """Runs after the learner's own hook, because it was registered after it."""
+            """Runs when the learner has set the rate."""
             self.rates[-1].append(optimizer.param_groups[0]["lr"])
             with torch.no_grad():
                 old, new = gaussian(self._old, self._seen), gaussian(ppo.policy, self._seen)
@@ -239,6 +239,20 @@ def test_the_first_minibatch_of_every_update_has_diverged_by_exactly_nothing(
     _, watched = adaptive
     assert [k[0] for k in watched.kl] == [0.0] * 12
     assert all(k[-1] > 0.0 for k in watched.kl)
+
+
+def test_the_divergence_of_a_minibatch_is_worked_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    ppo = slider_ppo("ppo.epochs=3", "ppo.minibatches=4", "ppo.max_kl=100")
+    divergence, calls = ppo._divergence, [0]
+
+    def counted() -> Tensor:
+        calls[0] += 1
+        return divergence()
+
+    monkeypatch.setattr(ppo, "_divergence", counted)
+    learn(ppo, 2)
+    assert calls == [2 * 3 * 4]
+    assert len(ppo._kl) == 3 * 4
 
 
 def test_the_rate_of_every_gradient_step_follows_from_the_divergences(adaptive: tuple[AdaptivePPO, Watched]) -> None:

@@ -349,6 +349,17 @@ def test_a_robot_comes_back_when_it_does(driver: PolicyDriver) -> None:
         ("hardware protocol.hardware.delays_ms=[20.0,10.0]", "delays_ms = [20.0, 10.0]: must rise"),
         ("hardware protocol.hardware.settle_s=9.0", "settle_s = 9.0: must lie between"),
         ("kicks +protocol.nothing={}", "protocol.nothing: unknown protocol 'nothing'"),
+        ("kicks protocol.kicks.impulses=[6.4,1e300]", "protocol.kicks.impulses.1 = 1e+300: must be from 0 to 500 N s"),
+        ("kicks protocol.kicks.point=[0.0,0.0,-1e300]", "protocol.kicks.point.2 = -1e+300: must be from -0.5 to 0.5 m"),
+        ("push_map protocol.push_map.largest=1e300", "protocol.push_map.largest = 1e+300: must be from 0 to 500 N s"),
+        (
+            "terrain protocol.terrain.speeds=[1e30]",
+            "protocol.terrain.speeds.0 = 1e+30: must be from -100 to 100 (m/s or rad/s)",
+        ),
+        (
+            "gait protocol.gait.commands=[[0.0,1e30,0.0]]",
+            "protocol.gait.commands.0.1 = 1e+30: must be from -100 to 100",
+        ),
     ],
 )
 def test_a_wrong_protocol_is_refused_in_words(overrides: str, said: str) -> None:

@@ -354,9 +354,11 @@ def test_a_protocols_rows_are_compared_by_its_claims(tmp_path: Path) -> None:
 
 def test_folders_without_runs_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
+    (tmp_path / "text.txt").write_text("no run")
     for folder, words in (
         (tmp_path / "none", "there is no such folder"),
         (tmp_path / "empty", "there is no run in it"),
+        (tmp_path / "text.txt", r"text.txt': is a file; give a run folder \(with config.yaml\), a sweep, or"),
     ):
         with pytest.raises(ConfigError, match=words):
             study([str(folder)], False)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
@@ -107,7 +108,8 @@ def _mapping(path: Path, key: str, when_empty: str, like: str) -> DictConfig:
         raise ConfigError([f"{key}: {why_unreadable(error)}"]) from None
     if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
         raise ConfigError([f"{key}: is empty; {when_empty}"])
-    if not isinstance(content, DictConfig):
+    # OmegaConf takes a file that is one text, such as XML, for a key without a value.
+    if not isinstance(content, DictConfig) or isinstance(yaml.safe_load("\n".join(lines)), str):
         raise ConfigError([f"{key}: must be a mapping, {like}"])
     return content
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,7 +39,8 @@ def with_logs(container: dict[str, Any]) -> dict[str, Any]:
     from go1exp.schema.settings import MISSING
 
     words, stage = ("all", *STAGES, *SUBVERBS["gap"]), str(container.get("stage", "all"))
-    if stage not in words and nearest(stage, words, 1) in [[verb] for verb in SUBVERBS["gap"]]:
+    is_verb = nearest(stage, words, 1) in [[verb] for verb in SUBVERBS["gap"]]
+    if stage not in words and (is_verb or container.get("logs") == MISSING):
         raise ConfigError([unknown_name("stage", stage, words, "stage")])  # other words are told with all problems
     if container.get("stage") in ("report", "view") and container.get("logs") == MISSING:
         return {**container, "logs": []}
@@ -53,6 +54,7 @@ def _task(container: dict[str, Any]) -> int:
 
     groups = ("robot",) if container.get("contact") is None else ("robot", "contact")
     settings, parts = parse_with_groups(GapVerb, with_logs(container), groups, model=parse_model)
+    _refuse_unknown(settings.search.effects)
     if settings.accept:
         settings = replace(settings, search=replace(settings.search, accept=settings.accept))
     out, where = Path(settings.out), address(settings.host, settings.port)
@@ -95,6 +97,16 @@ def _task(container: dict[str, Any]) -> int:
     if settings.stage == "all" and result.verdict != "bad log":
         _apply(result, recordings, robot, settings)
     return _report(result, out) if settings.stage == "all" else result.exit_code
+
+
+def _refuse_unknown(effects: Sequence[str]) -> None:
+    """Raise ConfigError if there is no effect of one of these names."""
+    import go1exp.effects  # noqa: F401  (registers them)
+    from go1exp.schema.registry import ConfigError, members, unknown_name
+
+    known = members("effect")
+    if wrong := [unknown_name("search.effects", name, known, "effect") for name in effects if name not in known]:
+        raise ConfigError(wrong)
 
 
 def _view(settings: GapVerb, parts: dict[str, Any], where: tuple[str, int]) -> int:

@@ -10,7 +10,18 @@ from go1exp.cli.play_settings import Port
 from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.result import Angle, GapSettings
 from go1exp.record.plan import Wishes
+from go1exp.schema.registry import FolderName
 from go1exp.schema.settings import settings
+
+Logs = str | tuple[str, ...]
+"""A folder of recordings, or folders and files."""
+
+
+def refuse_no_logs(logs: Logs) -> None:
+    """Raise ValueError if no recordings are named: an empty name, as an unset variable leaves it, is a mistake."""
+    if not logs or ("" in logs and not isinstance(logs, str)):
+        given = list(logs) if isinstance(logs, tuple) else logs
+        raise ValueError(f"logs = {given!r}: a folder of recordings is needed, such as logs=recordings")
 
 
 @settings
@@ -28,14 +39,19 @@ class GapVerb:
         search: how the missing effect is searched for.
     """
 
-    logs: str | tuple[str, ...]
+    logs: Logs
     stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report", "view"]
-    out: str
-    train_dt: Annotated[float, Field(gt=0, le=0.02)]
+    out: FolderName
+    train_dt: Annotated[float, Field(ge=1e-5, le=0.02)]
     host: str
     port: Port
     accept: Angle
     search: GapSettings
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.stage not in ("report", "view"):  # which read the answer alone
+            refuse_no_logs(self.logs)
 
 
 @settings
@@ -48,9 +64,13 @@ class GapNextSettings:
         design: what may be designed.
     """
 
-    logs: str | tuple[str, ...]
-    out: str
+    logs: Logs
+    out: FolderName
     design: DesignSettings
+
+    def __post_init__(self) -> None:
+        """Check what a type does not."""
+        refuse_no_logs(self.logs)
 
 
 @settings
@@ -71,4 +91,13 @@ class GapLoopSettings(Wishes):
     rounds: Annotated[int, Field(ge=0)]
     search: GapSettings
     design: DesignSettings
-    out: str
+    out: FolderName
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        wrong, window = self.empty(), self.search.burn_s + self.search.window_s
+        if self.seconds < window:
+            needed = f"search.burn_s + search.window_s = {window:g} s"
+            wrong.append(f"seconds = {self.seconds:g}: shorter than a window, {needed}")
+        if wrong:
+            raise ValueError("\n".join(wrong))

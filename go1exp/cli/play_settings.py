@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from go1exp.schema.registry import Duration, FolderName
+from go1exp.schema.registry import Duration, FolderName, Speed
 from go1exp.schema.settings import settings
 
 Port = Annotated[int, Field(ge=0, le=65535)]
@@ -45,7 +45,7 @@ class PlaySettings:
     bundle: str | None
     log: str | None
     checkpoint: str | None
-    velocity: tuple[float, float, float]
+    velocity: tuple[Speed, Speed, Speed]
     seconds: Duration
     viewer: Literal["auto", "clip", "live", "web"]
     host: str

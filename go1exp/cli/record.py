@@ -90,7 +90,7 @@ def _task(container: dict[str, Any]) -> None:
     driven = [m for m in motions if m.entry.name not in (POLICY, MPC)]
     episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
     if names & {POLICY, MPC}:
-        plan.refuse_too_long(settings, settings.episodes)
+        plan.refuse_too_long(settings, "episodes", settings.episodes)
     from go1exp.record.simulate import Rig
 
     rig = Rig(**{name: parts[name] for name in groups}, physics_dt=settings.physics_dt)

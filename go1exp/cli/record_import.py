@@ -19,6 +19,7 @@ NAMED = 3
 def _task(container: dict[str, Any]) -> None:
     from go1exp import recording
     from go1exp.cli.files import mapping_of
+    from go1exp.cli.logs import writable
     from go1exp.cli.settings import ImportSettings, parse
     from go1exp.importers import import_recordings
     from go1exp.wording import counted
@@ -28,8 +29,8 @@ def _task(container: dict[str, Any]) -> None:
     if settings.columns is not None:
         options["columns"] = mapping_of(settings.columns, "columns")
     recordings = import_recordings(settings.source, Path(settings.path), options)
-    out = Path(settings.out)
     _refuse_one_name(settings.path, [r.meta.episode for r in recordings])
+    out = writable(settings.out)
     files = [out / f"{r.meta.episode}.parquet" for r in recordings]
     if present := [file.name for file in files if file.exists()]:
         print(f"note: {out} holds {_listed(present)} of an earlier call; new ones replace them (or: out=FOLDER)")

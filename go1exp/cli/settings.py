@@ -17,7 +17,7 @@ from go1exp.protocol.settings import CompareSettings
 from go1exp.record.plan import Wishes
 from go1exp.report.settings import ReportSettings
 from go1exp.schema import settings as schema
-from go1exp.schema.registry import Duration, FolderName, NonNegative, Positive
+from go1exp.schema.registry import Duration, FolderName, NonNegative, Positive, Speed
 from go1exp.schema.settings import settings
 from go1exp.sim_robot.settings import SimConfig, SimSettings
 from go1exp.sweep.settings import TuneSettings
@@ -38,9 +38,9 @@ class Grid:
         cross: every combination of the three axes; false: one axis at a time, the others zero.
     """
 
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-    yaw: tuple[float, ...]
+    x: tuple[Speed, ...]
+    y: tuple[Speed, ...]
+    yaw: tuple[Speed, ...]
     cross: bool
 
 
@@ -126,8 +126,7 @@ class RecordSettings(Wishes):
 
     def __post_init__(self) -> None:
         """Check what concerns two settings."""
-        lists = ("gains", "seeds", "hang")
-        wrong = [f"{name} = []: at least one is needed" for name in lists if not getattr(self, name)]
+        wrong = self.empty()
         ratio = 1.0 / (self.sensors.rate_hz * self.physics_dt)
         if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6:
             period = 1 / self.sensors.rate_hz
@@ -165,7 +164,7 @@ class ImportSettings:
     path: str
     options: dict[str, Any] | str | None
     columns: dict[str, Any] | str | None
-    out: str
+    out: FolderName
 
 
 @settings

@@ -69,12 +69,15 @@ def load(folder: Path) -> GapResult:
         GapFileError: if there is none, or it is not one.
     """
     path = folder / RESULT
+    if folder.is_file():
+        raise GapFileError(f"{folder}: is a file; out must be the folder of an answer, with {RESULT}")
     if not path.is_file():
         raise GapFileError(f"{path}: no such file; run go1exp gap explain first")
     try:
         return from_dict(json.loads(path.read_text()))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise GapFileError(f"{path}: not a result of go1exp gap ({error})") from None
+        why = f"has no {error}" if isinstance(error, KeyError) else str(error)
+        raise GapFileError(f"{path}: not a result of go1exp gap ({why}); run go1exp gap explain again") from None
 
 
 def from_dict(plain: Mapping[str, Any]) -> GapResult:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from go1exp.schema.contact import ContactConfig
 from go1exp.schema.registry import STRICT, Fraction, NonNegative, Positive
@@ -50,13 +50,23 @@ def in_rad(given: Any) -> Any:
     """Return an angle with a unit, such as ``2mrad``, in rad; anything else as it is."""
     if not isinstance(given, str):
         return given
-    match = re.fullmatch(r"\s*([\d.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", given)
+    match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", given)
     if match is None or match[2] not in ANGLES:
         raise ValueError(f"must be a number of rad, or one with {', '.join(ANGLES)}, such as 2mrad")
     return float(match[1]) * ANGLES[match[2]]
 
 
-Angle = Annotated[float, BeforeValidator(in_rad), Field(ge=0)]
+def small(angle: float) -> float:
+    """Refuse an angle (rad) that is no error of an angle: 2 was meant in mrad or degrees."""
+    if not 0 <= angle <= LARGEST:
+        raise ValueError(f"must be from 0 to {LARGEST:g} rad; with a unit such as 2mrad or 0.1deg")
+    return angle
+
+
+LARGEST = 1.0
+"""Largest error of an angle that can be accepted, rad."""
+
+Angle = Annotated[float, BeforeValidator(in_rad), AfterValidator(small)]
 
 
 @dataclass(frozen=True)
@@ -102,7 +112,7 @@ class GapSettings:
     window_s: Positive = 0.3
     burn_s: NonNegative = 0.07
     stride_s: Positive = 0.4
-    physics_dt: Annotated[float, Field(gt=0, le=0.002)] = 0.001
+    physics_dt: Annotated[float, Field(ge=1e-5, le=0.002)] = 0.001
     clock_s: NonNegative = 0.00015
     phase: Phase = "auto"
     torque: bool = False

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from go1exp.schema.registry import Fraction, Positive, PositiveRange, Range, command
+from go1exp.schema.registry import Fraction, Positive, PositiveRange, Speed, SpeedRange, command
 from go1exp.tensors.memory import Memory
 from go1exp.tensors.randomness import Stream
 
@@ -27,9 +27,9 @@ class UniformVelocity(Memory):
         self,
         stream: Stream,
         *,
-        lin_vel_x: Range = (-2.0, 3.0),
-        lin_vel_y: Range = (-1.5, 1.5),
-        ang_vel_z: Range = (-1.5, 1.5),
+        lin_vel_x: SpeedRange = (-2.0, 3.0),
+        lin_vel_y: SpeedRange = (-1.5, 1.5),
+        ang_vel_z: SpeedRange = (-1.5, 1.5),
         hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
         zero_fraction: Fraction = 0.0,
@@ -95,9 +95,9 @@ class WideningVelocity(UniformVelocity):
         *,
         start: Fraction = 0.35,
         over: Positive = 500.0,
-        lin_vel_x: Range = (-2.0, 3.0),
-        lin_vel_y: Range = (-1.5, 1.5),
-        ang_vel_z: Range = (-1.5, 1.5),
+        lin_vel_x: SpeedRange = (-2.0, 3.0),
+        lin_vel_y: SpeedRange = (-1.5, 1.5),
+        ang_vel_z: SpeedRange = (-1.5, 1.5),
         hold_time: PositiveRange = (0.3, 10.0),
         standing_fraction: Fraction = 0.1,
         zero_fraction: Fraction = 0.0,
@@ -134,7 +134,7 @@ class FixedVelocity(Memory):
     memory = ("value",)
 
     def __init__(
-        self, stream: Stream, *, lin_vel_x: float = 0.5, lin_vel_y: float = 0.0, ang_vel_z: float = 0.0
+        self, stream: Stream, *, lin_vel_x: Speed = 0.5, lin_vel_y: Speed = 0.0, ang_vel_z: Speed = 0.0
     ) -> None:
         """Keep the velocity (m/s, m/s, rad/s); ``stream`` only tells the number of environments."""
         velocity = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z], device=stream.key.device)

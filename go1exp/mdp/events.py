@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.schema.registry import PositiveRange, Range, event
+from go1exp.schema.registry import PositiveRange, SpeedRange, event
 from go1exp.tensors.memory import Memory
 from go1exp.tensors.randomness import Stream
 
@@ -25,7 +25,7 @@ class Push(Memory):
     memory = ("time_left",)
 
     def __init__(
-        self, stream: Stream, *, interval: PositiveRange = (10.0, 15.0), velocity: Range = (-1.0, 1.0)
+        self, stream: Stream, *, interval: PositiveRange = (10.0, 15.0), velocity: SpeedRange = (-1.0, 1.0)
     ) -> None:
         """Keep the ranges: ``interval`` between pushes in s, ``velocity`` per axis in m/s."""
         self._stream, self._interval, self._velocity = stream, interval, velocity

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field
 from go1exp import robot
 from go1exp.drive import ModelFields
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.schema.registry import PositiveRange, Range, ordered, randomization
+from go1exp.schema.registry import PositiveRange, Range, SpeedRange, ordered, randomization
 from go1exp.tensors.constants import constant_like
 from go1exp.tensors.randomness import Stream
 from go1exp.tensors.restitution import damping_ratio
@@ -137,7 +137,7 @@ def link_mass(model: ModelFields, stream: Stream, mask: Tensor, *, range: Positi
 
 
 @randomization("body_velocity", kind="state")
-def body_velocity(state: KinematicState, stream: Stream, *, range: Range = (-0.25, 0.25)) -> None:
+def body_velocity(state: KinematicState, stream: Stream, *, range: SpeedRange = (-0.25, 0.25)) -> None:
     """Initial trunk velocity: all six components, m/s and rad/s. Table I: add, (-0.25, 0.25)."""
     draw = stream.uniform(6, low=range[0], high=range[1])
     state.base_lin_vel_w.add_(draw[:, :3])

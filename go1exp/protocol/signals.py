@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from go1exp.schema.registry import NonNegative, Positive
+from go1exp.schema.registry import NonNegative, Positive, Speed
 from go1exp.schema.settings import settings
 
-Velocity = tuple[float, float, float]
+Velocity = tuple[Speed, Speed, Speed]
 """x and y in m/s, yaw rate in rad/s, body frame."""
 
 

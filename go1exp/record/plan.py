@@ -77,6 +77,11 @@ class Wishes:
     seed: Annotated[int, Field(ge=0)]
     sensors: SensorConfig
 
+    def empty(self) -> list[str]:
+        """Return what is wrong with lists that are empty: nothing would be recorded."""
+        lists = ("gains", "seeds", "hang")
+        return [f"{name} = []: at least one is needed" for name in lists if not getattr(self, name)]
+
 
 def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion:
     """Return the motion of an excitation for the Go1, about its nominal stance.
@@ -91,10 +96,28 @@ def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion
     return motion
 
 
-def refuse_too_long(wishes: Wishes, recordings: int) -> None:
-    """Raise ConfigError if so many recordings do not fit into memory."""
-    if wrong := memory.too_long(wishes.seconds, recordings * wishes.sensors.rate_hz * ROW_BYTES):
-        raise ConfigError([f"seconds = {wishes.seconds:g}: with {counted(recordings, 'recording')} it {wrong}"])
+def refuse_too_long(wishes: Wishes, key: str, count: int, each: int = 1, others: int = 0) -> None:
+    """Raise ConfigError if so many recordings do not fit into memory, by ``key`` if fewer of it would.
+
+    Args:
+        wishes: what is to be recorded.
+        key: the setting that says how many recordings there are.
+        count: its value.
+        each: recordings for each of it.
+        others: recordings that there are without it; if none, a recording is needed that ``key`` asks for.
+    """
+    recordings = others + each * count
+    rate = wishes.sensors.rate_hz * ROW_BYTES  # B/s
+    one = wishes.seconds * rate  # B, of a recording
+    available = memory.free()
+    if available is None or recordings * one <= available:
+        return
+    fitting = (int(available / one) - others) // each  # of the key
+    made, much = counted(recordings, "recording"), memory.too_much(recordings * one, available)
+    if fitting >= (0 if others else 1) and count > fitting:
+        raise ConfigError([f"{key} = {count}: {made} of {wishes.seconds:g} s: it {much}; {fitting} at most would fit"])
+    most = max(available / rate / recordings, 0.0)
+    raise ConfigError([f"seconds = {wishes.seconds:g}: with {made} it {much}; {int(most)} s at most would fit"])
 
 
 def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
@@ -107,7 +130,8 @@ def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
             fit into memory.
     """
     if terms:  # as many as there are at least: where a motion is hung is not known yet
-        refuse_too_long(wishes, len(wishes.gains) * (len(terms) * len(wishes.seeds) + wishes.repeats))
+        sets = len(wishes.gains)
+        refuse_too_long(wishes, "repeats", wishes.repeats, sets, sets * len(terms) * len(wishes.seeds))
     planned: list[Episode] = []
     for term in terms:
         for seed in wishes.seeds:
@@ -128,8 +152,8 @@ def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
         raise ConfigError(
             [f"{name}: two recordings of this name; leave out one, or record them into two folders" for name in twice]
         )
-    sets = dict.fromkeys((e.kp, e.kd) for e in planned)
-    firsts = [next(e for e in planned if (e.kp, e.kd) == gains) for gains in sets]
+    pairs = dict.fromkeys((e.kp, e.kd) for e in planned)
+    firsts = [next(e for e in planned if (e.kp, e.kd) == gains) for gains in pairs]
     for e in firsts:
         for k in range(wishes.repeats):
             name = f"{e.name}_repeat{k + 1}"

@@ -84,7 +84,7 @@ def study(folders: Sequence[str], unfinished: bool) -> Study:
         ConfigError: if a folder is not there or holds no run, or if none of them has begun.
     """
     given = [Path(folder) for folder in folders]
-    if missing := [f"folders: {str(f)!r}: there is no such folder" for f in given if not f.is_dir()]:
+    if missing := [f"folders: {str(f)!r}: {_why_none(f)}" for f in given if not f.is_dir()]:
         raise ConfigError(missing)
     jobs: dict[Path, _Job] = {}
     notes: list[str] = []
@@ -101,6 +101,14 @@ def study(folders: Sequence[str], unfinished: bool) -> Study:
     counted = _counted(runs, damaged, jobs, places, unfinished)
     counted.notes += dict.fromkeys(notes)  # folders that were given may cover each other
     return counted
+
+
+def _why_none(place: Path) -> str:
+    """Return why a place that is no folder holds no runs, and what would be right."""
+    if not place.exists():
+        return "there is no such folder"
+    right = "a run folder (with config.yaml), a sweep, or a folder above them, such as runs"
+    return f"is a file; give {right}"
 
 
 def _below(folder: Path, jobs: dict[Path, _Job], notes: list[str]) -> Iterator[Path]:

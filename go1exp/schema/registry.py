@@ -50,6 +50,22 @@ Range = Annotated[tuple[float, float], AfterValidator(ordered)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
 
 
+def within(low: float, high: float, unit: str) -> AfterValidator:
+    """Return a check that a number is from ``low`` to ``high``, in ``unit``; the message says both."""
+
+    def check(value: float) -> float:
+        if not low <= value <= high:
+            raise ValueError(f"must be from {low:g} to {high:g} {unit}")
+        return value
+
+    return AfterValidator(check)
+
+
+Speed = Annotated[float, within(-100.0, 100.0, "(m/s or rad/s)")]
+"""A velocity, m/s, or turning rate, rad/s: no robot reaches the ends, and squares stay finite far beyond them."""
+SpeedRange = Annotated[tuple[Speed, Speed], AfterValidator(ordered)]
+
+
 class ConfigError(ValueError):
     """Things wrong with a configuration; the message has one line for each, starting with its key path."""
 

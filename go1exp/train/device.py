@@ -9,7 +9,6 @@ costs). Policy, optimiser, saving, callbacks and logger are SB3's here too; adva
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -127,9 +126,6 @@ class DevicePPO(AdaptivePPO):
 
     def _check_gradient(self, name: str, parameter: Tensor) -> None:
         """Do nothing as each gradient arrives: ``train`` looks at all of them in the end."""
-
-    def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *arguments: Any) -> None:
-        """Do nothing: the update sets its rate itself."""
 
     def train(self) -> None:
         """Update on the rollout, wait for the device once, then close the iteration.

@@ -2,8 +2,8 @@
 
 SB3's policy, rollouts and logger are used as they are; advantages and loss are in ``go1exp.train.loss``, where the
 learner on the GPU has them from too. The rule needs two things that SB3 does not keep: the action means at collection
-(the buffer below stores them) and a look at every minibatch between forward pass and gradient step (a hook on the
-optimiser).
+(the buffer below stores them) and a look at every minibatch between forward pass and gradient step (a loop over
+minibatches in place of SB3's).
 """
 
 from __future__ import annotations
@@ -236,7 +236,6 @@ class AdaptivePPO(PPO):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.rollout_buffer.policy = self.policy
-        self.policy.optimizer.register_step_pre_hook(self._before_gradient_step)
         for name, parameter in self.policy.named_parameters():
             # Before the gradients' norm is clipped, which would spread a NaN to all of them.
             parameter.register_post_accumulate_grad_hook(partial(self._check_gradient, name))
@@ -252,12 +251,12 @@ class AdaptivePPO(PPO):
         if parameter.grad is not None and not torch.isfinite(parameter.grad.sum()):
             raise NumericalFault(f"gradient of policy.{name}", f"in iteration {self.iteration + 1}", {})
 
-    def _before_gradient_step(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
-        """Set the learning rate of the step about to be taken."""
-        self._kl.append(float(self._divergence()))
+    def _steer(self, divergence: float) -> None:
+        """Note the divergence before the gradient step that is about to be taken, and set the rate of that step."""
+        self._kl.append(divergence)
         if self.config.schedule == "adaptive":
-            group, c = optimizer.param_groups[0], self.config
-            rate, kl = torch.tensor([group["lr"], self._kl[-1]], dtype=torch.float64)
+            group, c = self.policy.optimizer.param_groups[0], self.config
+            rate, kl = torch.tensor([group["lr"], divergence], dtype=torch.float64)
             group["lr"] = float(adapted_rate(rate, kl, c.desired_kl, c.learning_rate_range))
 
     def _divergence(self) -> Tensor:
@@ -287,8 +286,10 @@ class AdaptivePPO(PPO):
         first step it has not moved: what divergence there is comes of rounding.
         """
         loss = ppo_loss(self.policy, batch, self.config, self.mirror)
-        if self.config.max_kl is not None and self._kl and self._divergence() > self.config.max_kl:
+        divergence = float(self._divergence())
+        if self.config.max_kl is not None and self._kl and divergence > self.config.max_kl:
             return []
+        self._steer(divergence)
         self.policy.optimizer.zero_grad()
         loss.total.backward()
         nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.max_grad_norm)

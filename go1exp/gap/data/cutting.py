@@ -75,6 +75,9 @@ def noise_of(series: Sequence[np.ndarray]) -> np.ndarray:
             blocks.append(np.sqrt(np.mean(cut**2, axis=1) / THIRD))
         change = np.abs(np.diff(values, axis=0))
         steps.append([float(np.min(c[c > 1e-12], initial=np.inf)) for c in change.T])
+    if not blocks:
+        rows = max(map(len, series))
+        raise RecordingError(f"the longest recording has {rows} rows; 53 are needed to tell the noise; record longer")
     white = np.quantile(np.concatenate(blocks), 0.3, axis=0) / BLOCK_QUANTILE
     step = np.min(steps, axis=0)
     return np.maximum(white, np.where(np.isfinite(step), step, 0.0) / np.sqrt(12.0)).clip(1e-9)
@@ -264,6 +267,9 @@ def cut(
     sd = np.stack([noise(recordings, name) for name in quantities])
     clocks = [even_clock(r) for r in recordings]
     period = float(np.median([np.median(np.diff(t)) for t in clocks]))
+    if settings.window_s < 2.0 * period:
+        least = f"a window must have two steps of the recordings, {2.0 * period:g} s"
+        raise RecordingError(f"search.window_s = {settings.window_s:g}: {least}")
     samples = int(np.ceil(settings.window_s / period)) + 1
     cutter = _Cutter(settings, sd, max(FIT_S, FIT_SAMPLES * period), samples, doubt)
     tracks = (
@@ -276,8 +282,10 @@ def cut(
         for window in cutter.windows(track, cutter.evenly(track) if places is None else places[track.number])
     ]
     if not rows:
+        spaced = f" with one in {settings.stride_s:g} s (search.stride_s)" if places is None else ""
         raise RecordingError(
-            f"no window of {settings.burn_s:g} + {settings.window_s:g} s fits into these recordings; record longer ones"
+            f"no window of {settings.burn_s:g} + {settings.window_s:g} s fits into these recordings{spaced}; "
+            "record longer ones"
         )
     plain = {key: np.stack([row[key] for row in rows]) for key in rows[0] if key not in ("edges", "switches")}
     return Windows(

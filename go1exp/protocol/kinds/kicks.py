@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from go1exp.protocol.base import Drawing, Played, Protocol, lives, repeated
+from go1exp.protocol.base import Drawing, Impulse, Played, Point, Protocol, lives, repeated
 from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Row
 from go1exp.protocol.report import paint
@@ -73,10 +73,10 @@ class Kicks(Protocol):
     """
 
     command: Signal
-    impulses: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    impulses: Annotated[tuple[Impulse, ...], Field(min_length=1)]
     push_s: Positive
     direction_deg: float
-    point: tuple[float, float, float]
+    point: Point
     first_s: Annotated[float, Field(ge=LEAST)]
     every_s: Annotated[float, Field(ge=LEAST)]
     jitter_s: NonNegative

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from go1exp.protocol.base import Count, Drawing, Played, Protocol, lives
+from go1exp.protocol.base import Count, Drawing, Impulse, Played, Point, Protocol, lives
 from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
@@ -61,8 +61,8 @@ class PushMap(Protocol):
     phases: Count
     settle_s: Annotated[float, Field(ge=LEAST_SETTLE)]
     push_s: Positive
-    point: tuple[float, float, float]
-    largest: Positive
+    point: Point
+    largest: Impulse
     halvings: Count
     watch_s: Annotated[float, Field(ge=LEAST_WATCH)]
 

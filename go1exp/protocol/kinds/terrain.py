@@ -14,7 +14,7 @@ from go1exp.protocol.ground import UNITS, GroundName, Lanes, goal
 from go1exp.protocol.lengths import Cause, Length
 from go1exp.protocol.quantities import Column, Derived, Row, values
 from go1exp.protocol.report import paint
-from go1exp.schema.registry import NonNegative, Positive, PositiveRange, protocol
+from go1exp.schema.registry import NonNegative, PositiveRange, Speed, protocol
 from go1exp.schema.settings import settings
 from go1exp.statistics.intervals import Logistic, logistic_fit
 
@@ -48,7 +48,7 @@ class OnTerrain(Protocol):
     """
 
     grounds: dict[GroundName, Annotated[tuple[NonNegative, ...], Field(min_length=2)] | None]
-    speeds: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    speeds: Annotated[tuple[Annotated[Speed, Field(gt=0)], ...], Field(min_length=1)]
     slack: Annotated[float, Field(ge=LEAST_SLACK)]
     steer: tuple[NonNegative, NonNegative]
     gravel_friction: PositiveRange
