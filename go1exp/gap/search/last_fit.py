@@ -8,7 +8,7 @@ change no motion, but columns with such errors do not add up to zero, and the sc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,33 +40,47 @@ def resampled_values(search: Ledger) -> tuple[Theta, dict[Key, np.ndarray]]:
     """
     if not search.state.terms:
         return search.state.theta, {}
-    state, machine = search.state.finer(), search.state.machine
-    scorer = state.scorer
+    state = search.state.finer()
     fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
     linear = state.linear(state.theta, fitted)
-    (best,) = fit(scorer, [state.model(state.theta)], linear, STEPS if scorer.finer > 1 else 1, search.dt)
+    (best,) = fit(state.scorer, [state.model(state.theta)], linear, STEPS if state.scorer.finer > 1 else 1, search.dt)
     assert best.chi2 is not None
     assert best.residual is not None
     about = replace(linear, residual=best.residual, theta=best.theta)
-    layout = Layout.from_probes(machine, linear.probes)
-    grams = _grams(state, about) / np.maximum(best.chi2, 1.0)[..., None, None]
-    limits = tolerances.bounds(layout, linear.probes, best.theta, state.may)
-    episode = scorer.windows.episode[fitted]
+    count = max(search.settings.bootstraps, FEWEST_BOOTSTRAPS)
     drawn: dict[Key, list[np.ndarray]] = {}
-    spread = 1.0 / np.sqrt(limits.weight)
     of_terms = [key for key in state.keys if key[0] in state.terms]
-    for _ in range(max(search.settings.bootstraps, FEWEST_BOOTSTRAPS)):
-        matrix, right = layout.total(grams[significance.resampled(episode, search.rng)])
-        # The nominal values are themselves uncertain by their tolerances, and motion fixes many of them only relative
-        # to each other: drawing where they lie puts that uncertainty into the interval.
-        centre = limits.centre + spread * search.rng.standard_normal(layout.size)
-        x = tolerances.solve(semidefinite(matrix), right, replace(limits, centre=centre))
-        values = tolerances.moved(best.theta, layout, linear.probes, x, machine)
+    for values in bootstrapped(state, about, best.chi2, search.rng, count, nominal=True):
         for key in of_terms:
             null = state.tolerances.param(key).null
             law = 1.0 + LAW * search.rng.standard_normal(values[key].shape)
             drawn.setdefault(key, []).append(null + (values[key] - null) * law)
     return best.theta, {key: np.stack([np.ravel(v) for v in values]) for key, values in drawn.items()}
+
+
+def bootstrapped(
+    state: State, linear: Table, chi2: np.ndarray, rng: np.random.Generator, count: int, nominal: bool
+) -> Iterator[Theta]:
+    """Yield values of the model by bootstraps of episodes, to first order.
+
+    Args:
+        state: the model; the columns are those about its values.
+        linear: of the windows that are resampled, about the values that are.
+        chi2: (V, G) per value there.
+        rng: of the bootstraps.
+        count: of bootstraps.
+        nominal: whether the nominal values are drawn, too. They are themselves uncertain by their tolerances, and
+            motion fixes many of them only relative to each other: that belongs into an interval.
+    """
+    layout, theta = Layout.from_probes(state.machine, linear.probes), linear.theta
+    grams = _grams(state, linear) / np.maximum(chi2, 1.0)[..., None, None]
+    limits = tolerances.bounds(layout, linear.probes, theta, state.may)
+    episode, spread = state.scorer.windows.episode[linear.windows], 1.0 / np.sqrt(limits.weight)
+    for _ in range(count):
+        matrix, right = layout.total(grams[significance.resampled(episode, rng)])
+        moved = spread * rng.standard_normal(layout.size) if nominal else 0.0
+        x = tolerances.solve(semidefinite(matrix), right, replace(limits, centre=limits.centre + moved))
+        yield tolerances.moved(theta, layout, linear.probes, x, state.machine)
 
 
 def _grams(state: State, linear: Table) -> np.ndarray:

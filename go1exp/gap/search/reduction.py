@@ -10,9 +10,9 @@ from scipy.stats import norm
 
 from go1exp.effects.tolerances import sizes
 from go1exp.gap.replay.rows import Theta
-from go1exp.gap.score.linear import Layout
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import evidence, places, significance, tolerances
+from go1exp.gap.search.last_fit import bootstrapped
 from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.state import State
 
@@ -147,17 +147,7 @@ def instead_of(state: State, name: str) -> State:
 def resampled(search: Ledger) -> list[Theta]:
     """Return values of the model by bootstraps of the windows of the fit, to first order."""
     state = search.state
-    linear, scorer = state.table, state.scorer
-    layout = Layout.from_probes(state.machine, linear.probes)
-    grams = linear.grams(scorer) / np.maximum(state.train_chi2, 1.0)[..., None, None]
-    limits = tolerances.bounds(layout, linear.probes, state.theta, state.may)
-    episode = scorer.windows.episode[linear.windows]
-    draws = []
-    for _ in range(DRAWS):
-        matrix, right = layout.total(grams[significance.resampled(episode, search.rng)])
-        x = tolerances.solve(matrix, right, limits)
-        draws.append(tolerances.moved(state.theta, layout, linear.probes, x, state.machine))
-    return draws
+    return list(bootstrapped(state, state.table, state.train_chi2, search.rng, DRAWS, nominal=False))
 
 
 def replaced(search: Ledger, name: str, instead: str, rest: State, equals: tuple[str, ...] = ()) -> None:
