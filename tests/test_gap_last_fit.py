@@ -11,13 +11,15 @@ import pytest
 
 from go1exp.compose import compose
 from go1exp.config import parse_parts
+from go1exp.effects.tolerances import DECLARED
 from go1exp.gap.comparison import compare, robot_from
-from go1exp.gap.replay.rows import Theta
+from go1exp.gap.replay.rows import Probe, Theta
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Table, unbiased_grams
 from go1exp.gap.search import state
-from go1exp.gap.search.last_fit import resampled_values, semidefinite
+from go1exp.gap.search.last_fit import opposite, resampled_values, semidefinite
+from go1exp.gap.search.state import State
 from go1exp.gap.search.stepwise import Search
 from tests.laboratory import recorded
 
@@ -69,6 +71,16 @@ def test_the_nearest_matrix_without_negative_eigenvalues() -> None:
     values = np.linalg.eigvalsh(semidefinite(wrong))
     assert values.min() > -1e-12 * values.max()
     assert not semidefinite(wrong)[4].any()
+
+
+def test_the_other_change_is_the_other_way_where_there_is_room_and_shapes_keep_theirs() -> None:
+    """A friction of 0 has no room below; the phase of a cogging torque has no tolerance."""
+    present: Theta = {("coulomb", "bound"): np.r_[0.0, np.full(11, 0.3)], ("cogging", "phase"): np.full(12, 0.5)}
+    given = [Probe(("coulomb", "bound"), 0, np.full(12, 0.005)), Probe(("cogging", "phase"), 0, np.full(12, 0.02))]
+    model = cast(State, SimpleNamespace(tolerances=DECLARED, theta=present))
+    friction, phase = opposite(model, given)
+    np.testing.assert_allclose(friction.delta, np.r_[0.0025, np.full(11, -0.005)])
+    np.testing.assert_allclose(phase.delta, given[1].delta)
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")

@@ -8,6 +8,7 @@ change no motion, but columns with such errors do not add up to zero, and the sc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -94,14 +95,19 @@ def _grams(state: State, linear: Table) -> np.ndarray:
 
 
 def opposite(state: State, probes: Sequence[Probe]) -> list[Probe]:
-    """Return other changes of the same parameters: the other way, or half as far where a bound is in the way."""
+    """Return other changes of the same parameters: the other way, or half as far where a bound is in the way.
+
+    Shapes (a place, a phase) have no tolerance and are changed by much more. Two such changes differ because what they
+    do is curved, which is no error: their changes stay as they are.
+    """
     turned = []
     for probe in probes:
         assert isinstance(probe.key, tuple)
         p = state.tolerances.param(probe.key)
         back = state.theta.get(probe.key, np.array([p.null])) - probe.delta
         room = (back >= p.low) & (back <= p.high)
-        turned.append(Probe(probe.key, probe.place, np.where(room, -probe.delta, 0.5 * probe.delta)))
+        other = np.where(room, -probe.delta, 0.5 * probe.delta)
+        turned.append(Probe(probe.key, probe.place, other if math.isfinite(p.tolerance) else probe.delta))
     return turned
 
 
