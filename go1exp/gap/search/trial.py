@@ -78,6 +78,8 @@ class Trial:
             return "rejected", f"fits within its tolerance ({self.sizes[k]:.2g} of it)"
         if p >= self.alpha and share > FEW and self.mean[k] > 0:
             return "rejected", f"removes {share:.1%} of the excess, but too few windows show it (p = {p:.2g})"
+        if p < self.alpha and share > self.needed and self.mean[k] <= 0:
+            return "rejected", f"removes {share:.1%} of the excess, but as many windows lose by it as gain"
         if p >= self.alpha or self.mean[k] <= 0:
             return "rejected", f"no significant gain on held-out windows (p = {p:.2g})"
         if chosen is None and self.helps[k]:
