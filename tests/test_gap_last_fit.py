@@ -61,6 +61,18 @@ def test_errors_of_columns_tell_nothing() -> None:
     np.testing.assert_allclose(unbiased, unbiased.T)
 
 
+def test_a_column_that_differs_nearly_altogether_stays_known() -> None:
+    """A small change of a dead band acts or does not: what two of them share says too little of what is known."""
+    rng = np.random.default_rng(2)
+    smooth, acts = rng.standard_normal((10, 1, 200, 1)), rng.standard_normal((10, 1, 200, 1))
+    residual = rng.standard_normal((10, 1, 200))
+    score = cast(Scorer, SimpleNamespace(state=np.zeros((10, 1, 200, 1))))
+    one, other = (np.concatenate([smooth, share * acts], axis=-1) for share in (1.0, 0.05))
+    products = unbiased_grams(score, *(Table(np.arange(10), (), residual, c, {}) for c in (one, other))).sum(0)[0]
+    assert products[0, 0] == pytest.approx(np.sum(smooth**2), rel=1e-3)
+    assert products[1, 1] == pytest.approx(np.sum((0.525 * acts) ** 2), rel=1e-3)
+
+
 def test_the_nearest_matrix_without_negative_eigenvalues() -> None:
     rng = np.random.default_rng(1)
     root = rng.standard_normal((5, 9))

@@ -88,6 +88,11 @@ class Table:
         return gram(np.concatenate([self.columns, self.residual[..., None]], axis=-1), scorer.state[self.windows])
 
 
+ROUGH = 0.5
+"""Share of a column's square by which two measurements of it may differ for that to be errors: a small change of a dead
+band acts or does not, so nearly all of its columns differs, and yet its value is well known."""
+
+
 def unbiased_grams(scorer: Scorer, one: Table, other: Table) -> np.ndarray:
     """Return the Gram matrices (V, G, p+1, p+1) of columns that were measured twice, by other changes.
 
@@ -102,6 +107,8 @@ def unbiased_grams(scorer: Scorer, one: Table, other: Table) -> np.ndarray:
     """
     count = one.columns.shape[-1]
     mean, half = 0.5 * (one.columns + other.columns), 0.5 * (one.columns - other.columns)
+    rough = (half**2).sum((0, 1, 2)) > ROUGH * (mean**2).sum((0, 1, 2))
+    half = np.where(rough, 0.0, half).astype(np.float32)
     every = np.concatenate([mean, one.residual[..., None], half], axis=-1)
     products = gram(every, scorer.state[one.windows])
     unbiased = products[..., : count + 1, : count + 1].copy()
