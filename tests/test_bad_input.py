@@ -82,6 +82,7 @@ ANGLE = "must be from 0 to 1 rad; with a unit such as 2mrad or 0.1deg"
         ("gap logs=x +search.effects=[coulmb]", "search.effects: unknown effect 'coulmb'; did you mean 'coulomb'?"),
         ("gap logs=x search.physics_dt=1e-9", "search.physics_dt = 1e-09: input should be greater than or equal to"),
         ("gap replay logs=x train_dt=1e-9", "train_dt = 1e-09: input should be greater than or equal to"),
+        ("gap loop +search.effects=[coulmb]", "search.effects: unknown effect 'coulmb'; did you mean 'coulomb'?"),
         ("gap loop gains=[]", "gains = []: at least one is needed"),
         ("gap loop seeds=[]", "seeds = []: at least one is needed"),
         ("gap loop seconds=0.1", "seconds = 0.1: shorter than a window, search.burn_s + search.window_s = 0.37 s"),

@@ -15,10 +15,28 @@ from go1exp.gap.answer import Answer, weak_joints
 from go1exp.gap.certainty import doubt
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.ledger import LastCheck, Ledger
+from go1exp.gap.search.trial import Trial
 from go1exp.gap.sentence import sentence
 
 JOINTS = ("a_hip", "a_thigh", "b_hip", "b_thigh")
 BORNE_OUT = LastCheck(True, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("gain", "p", "why"),
+    [
+        ((0.9, -1.0), 0.004, "removes 52.0% of the excess, but other windows lose as much in log chi2"),
+        ((0.9, -1.0), 0.5, "no significant gain on held-out windows (p = 0.5)"),
+        ((0.9, 0.1), 0.5, "removes 52.0% of the excess, but too few windows show it (p = 0.5)"),
+    ],
+)
+def test_why_what_removes_half_of_a_gap_is_rejected(gain: tuple[float, ...], p: float, why: str) -> None:
+    one: dict[str, Any] = {"after": [0.33], "gain": np.array([gain]), "p": np.array([p]), "share": np.array([0.52])}
+    no = np.array([False])
+    trial = Trial(
+        ["viscous"], **one, sizes=np.array([2.7]), needed=0.1, alpha=0.01, helps=no, alias=no, aside=no, chosen=None
+    )
+    assert trial.reason(0) == ("rejected", why)
 
 
 @dataclass

@@ -73,7 +73,7 @@ def test_a_column_that_differs_nearly_altogether_stays_known() -> None:
     assert products[1, 1] == pytest.approx(np.sum((0.525 * acts) ** 2), rel=1e-3)
 
 
-def test_the_nearest_matrix_without_negative_eigenvalues() -> None:
+def test_a_matrix_loses_its_negative_eigenvalues_and_nothing_else() -> None:
     rng = np.random.default_rng(1)
     root = rng.standard_normal((5, 9))
     positive = root @ root.T

@@ -54,7 +54,7 @@ def _task(container: dict[str, Any]) -> int:
 
     groups = ("robot",) if container.get("contact") is None else ("robot", "contact")
     settings, parts = parse_with_groups(GapVerb, with_logs(container), groups, model=parse_model)
-    _refuse_unknown(settings.search.effects)
+    refuse_unknown(settings.search.effects)
     if settings.accept:
         settings = replace(settings, search=replace(settings.search, accept=settings.accept))
     out, where = Path(settings.out), address(settings.host, settings.port)
@@ -99,8 +99,8 @@ def _task(container: dict[str, Any]) -> int:
     return _report(result, out) if settings.stage == "all" else result.exit_code
 
 
-def _refuse_unknown(effects: Sequence[str]) -> None:
-    """Raise ConfigError if there is no effect of one of these names."""
+def refuse_unknown(effects: Sequence[str]) -> None:
+    """Raise ConfigError if no effect has one of the names of ``search.effects``."""
     import go1exp.effects  # noqa: F401  (registers them)
     from go1exp.schema.registry import ConfigError, members, unknown_name
 

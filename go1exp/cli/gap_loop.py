@@ -20,7 +20,7 @@ def _task(container: dict[str, Any]) -> int:
     import go1exp.excitations
     import go1exp.record.policy  # noqa: F401  (registers every excitation)
     from go1exp import robot as go1
-    from go1exp.cli.gap import _progress
+    from go1exp.cli.gap import _progress, refuse_unknown
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.record import RIG, _motions
     from go1exp.cli.settings import GapLoopSettings
@@ -29,6 +29,7 @@ def _task(container: dict[str, Any]) -> int:
 
     readers: dict[str, Any] = {"excitation": _motions, "model": parse_model}
     settings, parts = parse_with_groups(GapLoopSettings, container, RIG, **readers)
+    refuse_unknown(settings.search.effects)
     problems = drive_problems(parts["actuator"], parts["effect"], go1.JOINTS)
     if not isinstance(parts["model"], Go1Model):
         problems.append("model: the simulated robot is a Go1; only model.tolerances can be changed here")

@@ -79,7 +79,7 @@ class Trial:
         if p >= self.alpha and share > FEW and self.mean[k] > 0:
             return "rejected", f"removes {share:.1%} of the excess, but too few windows show it (p = {p:.2g})"
         if p < self.alpha and share > self.needed and self.mean[k] <= 0:
-            return "rejected", f"removes {share:.1%} of the excess, but as many windows lose by it as gain"
+            return "rejected", f"removes {share:.1%} of the excess, but other windows lose as much in log chi2"
         if p >= self.alpha or self.mean[k] <= 0:
             return "rejected", f"no significant gain on held-out windows (p = {p:.2g})"
         if chosen is None and self.helps[k]:
