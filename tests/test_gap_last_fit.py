@@ -51,7 +51,7 @@ def test_errors_of_columns_tell_nothing() -> None:
     one, other = (true + 0.3 * rng.standard_normal(true.shape) for _ in range(2))
     residual = rng.standard_normal((40, 1, 300))
     score = cast(Scorer, SimpleNamespace(state=np.zeros((40, 1, 300, 1))))
-    tables = [Table(np.arange(40), (), residual, columns, {}) for columns in (one, other)]
+    tables = [Table(np.arange(40), (), residual, columns, {}, np.ones((40, 1, 1))) for columns in (one, other)]
     biased, unbiased = tables[0].grams(score).sum(0)[0], unbiased_grams(score, *tables).sum(0)[0]
     along, against = np.array([1.0, 1.0, 0.0]), np.array([1.0, -1.0, 0.0])
     errors = 40 * 300 * 2 * 0.3**2
@@ -68,7 +68,9 @@ def test_a_column_that_differs_nearly_altogether_stays_known() -> None:
     residual = rng.standard_normal((10, 1, 200))
     score = cast(Scorer, SimpleNamespace(state=np.zeros((10, 1, 200, 1))))
     one, other = (np.concatenate([smooth, share * acts], axis=-1) for share in (1.0, 0.05))
-    products = unbiased_grams(score, *(Table(np.arange(10), (), residual, c, {}) for c in (one, other))).sum(0)[0]
+    products = unbiased_grams(
+        score, *(Table(np.arange(10), (), residual, c, {}, np.ones((10, 1, 1))) for c in (one, other))
+    ).sum(0)[0]
     assert products[0, 0] == pytest.approx(np.sum(smooth**2), rel=1e-3)
     assert products[1, 1] == pytest.approx(np.sum((0.525 * acts) ** 2), rel=1e-3)
 

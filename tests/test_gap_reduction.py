@@ -33,7 +33,7 @@ class Known:
     )
     tolerances: Any = DECLARED
 
-    def settled(self, rounds: int) -> Known:
+    def settled(self, rounds: int, rival: Known | None = None) -> Known:
         return self
 
     def without(self, term: str, instead: str = "") -> Known:

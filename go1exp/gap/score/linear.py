@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from go1exp.gap.replay.machine import Machine
-from go1exp.gap.replay.rows import Probe, Theta, variants
-from go1exp.gap.score.likelihood import Scorer, gram
+from go1exp.gap.replay.rows import Key, Probe, Theta, variants
+from go1exp.gap.score.likelihood import Scorer, gram, grouped
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ class Table:
         residual: (V, G, m) in units of the noise.
         columns: (V, G, m, p) fall of the residual per unit of each parameter.
         theta: where.
+        scale: (V, C, J) the noise that is the unit.
     """
 
     windows: np.ndarray
@@ -76,11 +77,16 @@ class Table:
     residual: np.ndarray
     columns: np.ndarray
     theta: Theta
+    scale: np.ndarray
 
     def part(self, which: np.ndarray) -> Table:
         """Return the model of some of the windows (numbers within it)."""
         return dataclasses.replace(
-            self, windows=self.windows[which], residual=self.residual[which], columns=self.columns[which]
+            self,
+            windows=self.windows[which],
+            residual=self.residual[which],
+            columns=self.columns[which],
+            scale=self.scale[which],
         )
 
     def grams(self, scorer: Scorer) -> np.ndarray:
@@ -135,10 +141,58 @@ def table(scorer: Scorer, theta: Theta, windows: np.ndarray, probes: Sequence[Pr
     Changes are taken at the same step as residuals: at twice that they no longer cancel where they should.
     """
     machine, replayer = scorer.replayer.machine, scorer.replayer
-    residual = scorer.residual(variants(machine, theta, windows, []), dt)
     y = replayer.run(variants(machine, theta, windows, probes), dt)
     y = y.reshape(len(windows), 1 + len(probes), *scorer.windows.y.shape[1:])
-    return Table(windows, tuple(probes), residual, differences(scorer, y, windows, probes), theta)
+    if scorer.finer == 1:
+        residual = scorer.unit(scorer.windows.y[windows] - y[:, 0], windows)
+    else:
+        residual = scorer.residual(variants(machine, theta, windows, []), dt)
+    columns = differences(scorer, y, windows, probes)
+    return Table(windows, tuple(probes), residual, columns, theta, scorer.scale[windows])
+
+
+def borrowed(known: Table, scorer: Scorer, theta: Theta, probes: Sequence[Probe], fresh: set[Key], dt: float) -> Table:
+    """Return a linear model about other values whose columns are those of ``known``, but for some that are measured.
+
+    Args:
+        known: of the same windows, about values that are not far; perhaps in units of another noise.
+        scorer: that counts.
+        theta: the values.
+        probes: all columns.
+        fresh: parameters whose columns are measured; those that ``known`` has not among them.
+        dt: physics step, s.
+    """
+    measured = table(scorer, theta, known.windows, [p for p in probes if p.key in fresh], dt)
+    at = {(p.key, p.place): k for k, p in enumerate(known.probes)}
+    of_measured = iter(range(len(measured.probes)))
+    ratio = np.nan_to_num(known.scale / measured.scale)[:, None]
+    unit = grouped(scorer.replayer.machine, np.repeat(ratio, scorer.windows.t.shape[1], axis=1)).astype(np.float32)
+    columns = [
+        measured.columns[..., next(of_measured)] if p.key in fresh else known.columns[..., at[p.key, p.place]] * unit
+        for p in probes
+    ]
+    return dataclasses.replace(measured, probes=tuple(probes), columns=np.stack(columns, axis=-1))
+
+
+def corrected(linear: Table, layout: Layout, step: np.ndarray, unit: np.ndarray, residual: np.ndarray) -> Table:
+    """Return columns that also say what a step did: the nearest to the present ones that do (Broyden, 1965).
+
+    Args:
+        linear: before the step.
+        layout: of its unknowns.
+        step: (size,) what was added to them.
+        unit: (size,) what counts as much for one unknown as for another, such as their tolerances.
+        residual: (V, G, m) after the step.
+    """
+    columns = linear.columns.copy()
+    for g, at in enumerate(layout.index):
+        scaled = step[at] / unit[at]
+        if not scaled.any():
+            continue
+        missed = linear.residual[:, g] - residual[:, g] - linear.columns[:, g] @ step[at].astype(np.float32)
+        share = scaled / unit[at] / (scaled @ scaled)
+        columns[:, g] += missed[..., None] * share.astype(np.float32)
+    return dataclasses.replace(linear, columns=columns, residual=residual)
 
 
 def predicted(grams: np.ndarray, layout: Layout, x: np.ndarray) -> np.ndarray:

@@ -11,12 +11,15 @@ from go1exp.effects.tolerances import Tolerances
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Rows, Theta, null, variants
 from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.score.linear import Layout, Table, differences
+from go1exp.gap.score.linear import Layout, Table, corrected, differences
 from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import tolerances
 
 STEPS = (1.0, 0.3)
 """Lengths of a Gauss-Newton step that are tried."""
+
+LITTLE = 0.003
+"""Fall of the mean log chi2 in a step after which columns that only learn from steps have no more to give."""
 
 HOPELESS = 0.4
 """Share of the best gain below which a candidate is not fitted further."""
@@ -100,6 +103,47 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
     return best
 
 
+@dataclass(frozen=True)
+class Descent:
+    """A fit of one model.
+
+    Attributes:
+        model: fitted.
+        linear: the linear model there, with what its columns learned on the way.
+        last: fall of the mean log chi2 in the last step.
+    """
+
+    model: Model
+    linear: Table
+    last: float
+
+
+def descend(scorer: Scorer, model: Model, linear: Table, steps: int, dt: float) -> Descent:
+    """Fit one model by columns that learn from each step (Broyden's method), as long as steps gain something.
+
+    Args:
+        scorer: of the windows.
+        model: begins where ``linear`` was measured.
+        linear: all columns that may move.
+        steps: at most.
+        dt: physics step of the residuals, s.
+    """
+    layout, known = Layout.from_probes(scorer.replayer.machine, linear.probes), model.may.tolerances
+    reached = float(log_chi2(scorer.chi2(linear.residual, linear.windows)).mean())
+    gain = 0.0
+    for turn in range(steps):
+        (model,) = fit(scorer, [replace(model, theta=linear.theta)], linear, 1, dt)
+        assert model.residual is not None
+        before, unit = tolerances.unknowns(layout, linear.probes, linear.theta, known)
+        after, _ = tolerances.unknowns(layout, linear.probes, model.theta, known)
+        linear = replace(corrected(linear, layout, after - before, unit, model.residual), theta=model.theta)
+        last, reached = reached, float(log_chi2(_chi2(model)).mean())
+        gain = last - reached
+        if turn and gain < LITTLE:
+            break
+    return Descent(model, linear, gain)
+
+
 def misfit(model: Model) -> float:
     """Return what a fit makes small: the sum of log chi2 over windows and groups."""
     return float(log_chi2(_chi2(model)).sum())
@@ -129,7 +173,8 @@ def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) ->
         assert model.residual is not None
         columns = common.columns if len(kept) == len(common.probes) else common.columns[..., kept]
         whole = np.concatenate([columns, fresh], axis=-1) if probes else columns
-        grams = Table(windows, tuple(every), model.residual, whole, model.theta).grams(scorer)
+        own = replace(common, probes=tuple(every), residual=model.residual, columns=whole, theta=model.theta)
+        grams = own.grams(scorer)
         weight = 1.0 / np.maximum(_chi2(model), 1.0)
         matrix, right = layout.total(grams * weight[..., None, None])
         limits = tolerances.bounds(layout, every, model.theta, model.may)

@@ -17,7 +17,7 @@ import numpy as np
 from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.linear import Layout, Table, table, unbiased_grams
 from go1exp.gap.search import significance, tolerances
-from go1exp.gap.search.fit import fit
+from go1exp.gap.search.fit import descend
 from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.state import State
 
@@ -44,7 +44,8 @@ def resampled_values(search: Ledger) -> tuple[Theta, dict[Key, np.ndarray]]:
     state = search.state.finer()
     fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
     linear = state.linear(state.theta, fitted)
-    (best,) = fit(state.scorer, [state.model(state.theta)], linear, STEPS if state.scorer.finer > 1 else 1, search.dt)
+    steps = STEPS if state.scorer.finer > 1 else 1
+    best = descend(state.scorer, state.model(state.theta), linear, steps, search.dt).model
     assert best.chi2 is not None
     assert best.residual is not None
     about = replace(linear, residual=best.residual, theta=best.theta)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -47,15 +48,21 @@ class Linear:
     """The linear model of a settled state, on the windows of the fit and on those that no fit has seen."""
 
     def __init__(self, state: State) -> None:
-        """Measure it on held-out windows; on those of the fit it is known."""
+        """Take it as it is known on the windows of the fit; on held-out ones it is measured where it is asked for."""
         scorer, self.train, self.may = state.scorer, state.table, state.may
         self.machine, self.theta = state.machine, state.theta
         self.layout = Layout.from_probes(self.machine, self.train.probes)
         chi2 = scorer.chi2(self.train.residual, self.train.windows)
         grams = self.train.grams(scorer) / np.maximum(chi2, 1.0)[..., None, None]
         self.matrix, self.right = self.layout.total(grams)
+        self._state = state
+
+    @cached_property
+    def _held(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gram matrices and sizes of held-out windows: measured when first asked for, which is seldom."""
+        state = self._state
         held = state.linear(state.theta, state.splits.select)
-        self.held, self.size = held.grams(scorer), scorer.size[held.windows][:, None]
+        return held.grams(state.scorer), state.scorer.size[held.windows][:, None]
 
     def _solved(self, kept: frozenset[tuple[str, int]]) -> tuple[np.ndarray, tolerances.Bounds]:
         may = replace(self.may, kept=kept)
@@ -68,8 +75,9 @@ class Linear:
 
     def held_out(self, kept: frozenset[tuple[str, int]]) -> np.ndarray:
         """Return log chi2 (V, G) on held-out windows, fitted on the others so."""
-        after = np.maximum(predicted(self.held, self.layout, self._solved(kept)[0]), 0.0)
-        return log_chi2(after / self.size)
+        held, size = self._held
+        after = np.maximum(predicted(held, self.layout, self._solved(kept)[0]), 0.0)
+        return log_chi2(after / size)
 
 
 def chosen(linear: Linear, name: str, kept: frozenset[tuple[str, int]], rng: np.random.Generator) -> frozenset[int]:

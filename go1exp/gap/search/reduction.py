@@ -70,7 +70,7 @@ def concentrate(search: Ledger, name: str) -> None:
     outside = np.flatnonzero(evidence.beyond(name, search.state.theta, joints, search.state.tolerances))
     for inside in places.fewer(linear, name, search.state.kept):
         others = frozenset((name, int(j)) for j in outside if j not in inside)
-        sparse = search.state.keeping(search.state.kept | others).settled(3)
+        sparse = search.state.keeping(search.state.kept | others).settled(3, rival=search.state)
         chi2 = sparse.held_out()
         loss = -significance.gains(search.select_chi2, chi2[None])
         worse = significance.max_t(loss, search.rng, len(search.state.machine.groups))[0]

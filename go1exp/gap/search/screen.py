@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -223,7 +223,7 @@ def screen(
     every = [p for v in library for p in v.probes]
     columns = _columns(scorer, theta, present.windows, every, dt)
     whole = np.concatenate([present.columns, columns], axis=-1)
-    full = Table(present.windows, (*present.probes, *every), present.residual, whole, theta)
+    full = replace(present, probes=(*present.probes, *every), columns=whole, theta=theta)
     ranking = _Ranking(scorer, present, full, may)
     screened, at = [], len(present.probes)
     for variant in library:

@@ -13,18 +13,25 @@ from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import GapSettings
 from go1exp.gap.score.likelihood import Scorer
-from go1exp.gap.score.linear import Table, table
+from go1exp.gap.score.linear import Table, borrowed, table
 from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import tolerances
-from go1exp.gap.search.fit import Model, fit, scores
+from go1exp.gap.search.fit import LITTLE, Model, descend, scores
 from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.tolerances import Freedom
 
-SETTLED = 0.01
-"""Fall of log chi2 in a round of fitting, and log chi2 itself, below which more rounds are not worth their time."""
+SETTLED = 0.03
+"""Fall of log chi2 in a round of fitting below which the next one is not worth its time: it gains an eighth or so."""
 
-STEPS_PER_ROUND = 2
-"""Gauss-Newton steps before the linear model is measured again."""
+SETTLED_SHARE = 0.01
+"""Share of log chi2 by which the last step of a round must still fall for another round: where much is missing, less
+does not decide anything."""
+
+GOOD = 0.01
+"""Log chi2 below which a model without terms needs no more rounds."""
+
+STEPS_PER_ROUND = 5
+"""Gauss-Newton steps before the linear model is measured again, at most."""
 
 FINER = 4
 """Part of the physics step at which residuals of the last fit are replayed. What steps of 1 ms err by can look like
@@ -44,7 +51,8 @@ class State:
         terms: accepted effects.
         loosened: effects that may move within their tolerances beside those of the tolerance box.
         kept: effects and joints that stay within tolerance although their effect is a term.
-        fitted: the linear model of what may move about ``theta``; None before the first fit.
+        nominal: the linear model of what may move about the nominal values; None before the first fit.
+        fitted: that about ``theta``; None before the first fit.
         chi2: (V, G) per value on the windows of the fit; None before it.
     """
 
@@ -56,6 +64,7 @@ class State:
     terms: tuple[str, ...] = ()
     loosened: tuple[str, ...] = ()
     kept: frozenset[tuple[str, int]] = frozenset()
+    nominal: Table | None = None
     fitted: Table | None = None
     chi2: np.ndarray | None = None
 
@@ -102,20 +111,60 @@ class State:
         """Return a model with all terms, to fit."""
         return Model("", theta, self.may, ())
 
-    def settled(self, rounds: int) -> State:
-        """Return the state with all that may move fitted on the windows for training."""
-        theta, reached = self.theta, np.inf
-        for _ in range(rounds):
-            linear = self.linear(theta, self.splits.train)
-            (best,) = fit(self.scorer, [self.model(theta)], linear, STEPS_PER_ROUND, self.dt)
-            theta = best.theta
-            assert best.chi2 is not None
-            before, reached = reached, float(log_chi2(best.chi2).mean())
-            if reached > before - SETTLED or (reached < SETTLED and not self.terms):
+    def settled(self, rounds: int, rival: State | None = None) -> State:
+        """Return the state with all that may move fitted on the windows for training.
+
+        Args:
+            rounds: of measuring the linear model and fitting by it, at most.
+            rival: whose fit is to be reached: once a round that gains as much as the last would not come there, no more
+                are made.
+        """
+        worst = math.inf if rival is None else float(log_chi2(rival.train_chi2).mean())
+        state, nearby = self, self._nearby() if rounds > 1 else None
+        for turn in range(rounds):
+            borrowing = not turn and nearby is not None
+            linear = nearby if borrowing else state.linear(state.theta, self.splits.train)
+            assert linear is not None
+            before = float(log_chi2(self.scorer.chi2(linear.residual, linear.windows)).mean())
+            fall = descend(self.scorer, self.model(state.theta), linear, STEPS_PER_ROUND, self.dt)
+            state = replace(state, theta=fall.model.theta, fitted=fall.linear, chi2=fall.model.chi2)
+            if state.nominal is None and not self.theta:
+                state = replace(state, nominal=linear)
+            reached = float(log_chi2(state.train_chi2).mean())
+            gain = before - reached
+            if reached - gain > worst:
                 break
-        assert best.residual is not None
-        fitted = replace(linear, residual=best.residual, theta=theta)
-        return replace(self, theta=theta, fitted=fitted, chi2=best.chi2)
+            if borrowing:
+                if self._beside and gain < LITTLE:
+                    break
+            elif gain < SETTLED or fall.last < SETTLED_SHARE * reached or (reached < GOOD and not self.terms):
+                break
+        return state
+
+    @property
+    def _beside(self) -> bool:
+        """Whether the values are about those of the last linear model, and not nominal but for the terms."""
+        return any(key[0] not in (*self.terms, *self.loosened) for key in self.theta)
+
+    def _nearby(self) -> Table | None:
+        """Return a linear model about the values for a first round, with columns of a model that was measured before.
+
+        That is the nominal one where all but the terms is nominal, else the last one. What differs from it by more than
+        a tolerance has columns of its own. None on the ground, where columns of other values mean little.
+        """
+        known = self.fitted if self._beside else self.nominal
+        if known is None or self.machine.on_ground:
+            return None
+        probes = tolerances.probes(self.machine, self.keys, self.theta)
+        have = {p.key for p in known.probes}
+        fresh = {key for key in self.keys if key not in have or self._far(key, known.theta)}
+        return borrowed(known, self.scorer, self.theta, probes, fresh, self.dt)
+
+    def _far(self, key: Key, other: Theta) -> bool:
+        """Return whether a parameter differs from other values by more than its tolerance; a shape by anything."""
+        p = self.tolerances.param(key)
+        one, two = (theta.get(key, np.array([p.null])) for theta in (self.theta, other))
+        return bool(np.any(np.abs(one - two) > (p.tolerance if math.isfinite(p.tolerance) else 0.0)))
 
     def at(self, theta: Theta) -> State:
         """Return the state with other values, as they are."""

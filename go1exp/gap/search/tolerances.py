@@ -152,6 +152,26 @@ def _beyond_tolerance(effect: str, theta: Mapping[Key, np.ndarray], joint: int, 
     return False
 
 
+def unknowns(
+    layout: Layout, columns: Sequence[Probe], theta: Mapping[Key, np.ndarray], tolerances: Tolerances
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values of unknowns (size,), and what counts as one of each: its tolerance, or else its range."""
+    values, unit = np.empty(layout.size), np.empty(layout.size)
+    for i in range(layout.size):
+        probe = columns[layout.probe[i]]
+        assert isinstance(probe.key, tuple)
+        p = tolerances.param(probe.key)
+        by_joint = np.ravel(theta.get(probe.key, np.array([p.null])))
+        values[i] = by_joint[_joint(layout, probe, i) if by_joint.size > 1 else 0]
+        unit[i] = p.tolerance if math.isfinite(p.tolerance) else p.high - p.low
+    return values, unit
+
+
+def _joint(layout: Layout, probe: Probe, i: int) -> int:
+    """Return the joint at which unknown ``i`` is read off: of one that several joints share, any of them."""
+    return int(layout.joint[i]) if layout.joint[i] >= 0 else int(np.argmax(np.abs(probe.delta)))
+
+
 def bounds(
     layout: Layout, columns: Sequence[Probe], theta: Mapping[Key, np.ndarray], may: Freedom, back: bool = False
 ) -> Bounds:
@@ -167,23 +187,17 @@ def bounds(
     A shape stays as it is where its effect is within tolerance.
     """
     low, high, centre, weight = (np.zeros(layout.size) for _ in range(4))
-    for i in range(layout.size):
+    values, unit = unknowns(layout, columns, theta, may.tolerances)
+    for i, value in enumerate(values):
         probe = columns[layout.probe[i]]
         assert isinstance(probe.key, tuple)
-        p = may.tolerances.param(probe.key)
-        j = int(layout.joint[i]) if layout.joint[i] >= 0 else int(np.argmax(np.abs(probe.delta)))
-        value = float(
-            np.ravel(theta.get(probe.key, np.array([p.null])))[
-                j if probe.key in theta and theta[probe.key].size > 1 else 0
-            ]
-        )
+        p, j = may.tolerances.param(probe.key), _joint(layout, probe, i)
         reach = may.reach(probe.key, int(layout.joint[i]))
         wide = not math.isfinite(reach)
         low[i] = max(p.low, p.null - reach) - value
         high[i] = min(p.high, p.null + reach) - value
         centre[i] = p.null - value
-        scale = p.tolerance if math.isfinite(p.tolerance) else p.high - p.low
-        weight[i] = 1.0 / ((WIDE if wide else PRIOR) * scale) ** 2
+        weight[i] = 1.0 / ((WIDE if wide else PRIOR) * unit[i]) ** 2
         if not math.isfinite(p.tolerance) and not _beyond_tolerance(probe.key[0], theta, j, may.tolerances):
             low[i] = high[i] = 0.0
     if not back:
