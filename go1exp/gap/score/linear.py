@@ -165,7 +165,8 @@ def borrowed(known: Table, scorer: Scorer, theta: Theta, probes: Sequence[Probe]
     measured = table(scorer, theta, known.windows, [p for p in probes if p.key in fresh], dt)
     at = {(p.key, p.place): k for k, p in enumerate(known.probes)}
     of_measured = iter(range(len(measured.probes)))
-    ratio = np.nan_to_num(known.scale / measured.scale)[:, None]
+    one = np.ones_like(measured.scale)
+    ratio = np.divide(known.scale, measured.scale, out=one, where=np.isfinite(measured.scale))[:, None]
     unit = grouped(scorer.replayer.machine, np.repeat(ratio, scorer.windows.t.shape[1], axis=1)).astype(np.float32)
     columns = [
         measured.columns[..., next(of_measured)] if p.key in fresh else known.columns[..., at[p.key, p.place]] * unit
