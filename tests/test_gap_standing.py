@@ -257,3 +257,12 @@ def test_drives_that_are_all_weaker_than_tolerances_allow_are_one_cause() -> Non
     assert cause is not None
     assert cause.name == "strength"
     assert cause.theta["strength", "scale"] == pytest.approx(np.full(12, 0.8), abs=0.02)
+
+
+@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+def test_encoders_that_are_all_off_alike_are_one_cause_and_within_their_tolerance_none() -> None:
+    cause = search_in("+effect.encoder_offset.offset=0.009").single_cause()
+    assert cause is not None
+    assert cause.name == "encoder_offset"
+    assert cause.theta["encoder_offset", "offset"] == pytest.approx(np.full(12, 0.009), abs=0.003)
+    assert search_in("+effect.encoder_offset.offset=0.0025").single_cause() is None
