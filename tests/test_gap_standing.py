@@ -260,7 +260,7 @@ def test_drives_that_are_all_weaker_than_tolerances_allow_are_one_cause() -> Non
     assert cause.theta["strength", "scale"] == pytest.approx(np.full(12, 0.8), abs=0.02)
 
 
-@pytest.mark.parametrize(("offset", "named"), [(0.009, True), (0.0045, True), (0.0025, False), (0.0, False)])
+@pytest.mark.parametrize(("offset", "named"), [(0.009, True), (0.0045, True), (0.0031, False), (0.0025, False)])
 def test_offsets_that_are_alike_are_one_cause_where_their_tolerance_does_not_reach(
     monkeypatch: pytest.MonkeyPatch, offset: float, named: bool
 ) -> None:
