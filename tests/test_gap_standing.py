@@ -17,7 +17,7 @@ from go1exp.gap.data.splits import splits
 from go1exp.gap.data.standing import StandingWindows
 from go1exp.gap.data.trunk import AGREE, Base, Log, base_state
 from go1exp.gap.replay.replayer import Replayer
-from go1exp.gap.replay.rows import Probe, variants
+from go1exp.gap.replay.rows import Probe, Theta, variants
 from go1exp.gap.replay.standing import StandingReplayer
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.hung import HungGo1
@@ -26,8 +26,9 @@ from go1exp.gap.score.initial_state import settled
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import ON_FEET, REGIMES, localise
 from go1exp.gap.score.robust import excess
-from go1exp.gap.search import profile_likelihood
+from go1exp.gap.search import profile_likelihood, single_cause
 from go1exp.gap.search.fit import residuals
+from go1exp.gap.search.state import State
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.stages.explain import explain
 from go1exp.physics.legs import Legs
@@ -257,3 +258,24 @@ def test_drives_that_are_all_weaker_than_tolerances_allow_are_one_cause() -> Non
     assert cause is not None
     assert cause.name == "strength"
     assert cause.theta["strength", "scale"] == pytest.approx(np.full(12, 0.8), abs=0.02)
+
+
+@pytest.mark.parametrize(("offset", "named"), [(0.009, True), (0.0045, True), (0.0031, False), (0.0025, False)])
+def test_offsets_that_are_alike_are_one_cause_where_their_tolerance_does_not_reach(
+    monkeypatch: pytest.MonkeyPatch, offset: float, named: bool
+) -> None:
+    score, _ = scored()
+    _, recordings = recorded("excitation=[squat,gait]")
+    parts = splits([r.meta for r in recordings], score.windows.episode, 0.2, np.random.default_rng(0))
+    (key,) = sizes("encoder_offset")
+
+    def made_up(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndarray:
+        missed = (theta.get(key, np.zeros(12)) - offset) / 0.001
+        return np.full((len(windows), 1), 1.0 + np.mean(missed**2))
+
+    monkeypatch.setattr(profile_likelihood, "chi2", made_up)
+    best = single_cause.clearest(score, State(score, parts, QUICK, 0.002))
+    assert (best is not None) == named
+    if best is not None:
+        assert best.name == "encoder_offset"
+        assert best.theta[key] == pytest.approx(np.full(12, offset), abs=1e-3)

@@ -25,6 +25,7 @@ class EncoderOffset(Effect):
     identification = Identification(
         nominal=True,
         rank=8,
+        alike=True,
         excitation="slow_ramps",
         confounded=("base_tilt", "link_com"),
         told_apart_by=TWO_ATTITUDES,

@@ -26,6 +26,7 @@ class KpScale(Effect):
         nominal=True,
         rank=0,
         weighs_on_legs=True,
+        alike=True,
         confounded=("armature", "link_mass", "strength"),
         told_apart_by=TWO_GAIN_SETS,
     )

@@ -27,6 +27,7 @@ class LinkMass(Effect):
         nominal=True,
         rank=6,
         weighs_on_legs=True,
+        alike=True,
         confounded=("armature", "kp_scale", "strength"),
         told_apart_by=TWO_GAIN_SETS,
     )

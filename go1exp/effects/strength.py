@@ -26,6 +26,7 @@ class Strength(Effect):
         nominal=True,
         rank=2,
         weighs_on_legs=True,
+        alike=True,
         confounded=("armature", "kp_scale", "link_mass"),
         told_apart_by=TWO_GAIN_SETS,
     )

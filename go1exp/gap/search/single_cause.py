@@ -5,8 +5,9 @@ the tolerances of twelve joints together imitate any effect on the trunk up to s
 search that lets them move first finds no gap. An effect of the whole robot has a few numbers, and so has one that is
 alike at all joints, such as drives on a low battery. If one of them alone, all else at its nominal value, removes
 nearly all of the error, and no other does as well, then it is the explanation, not a hundred numbers that happen to
-agree. One of the joints must also do better than all that drives and legs may be off alike within their tolerances,
-and stay alike where each joint is fitted by itself: what is wrong in two ways takes other values at each.
+agree. One of the joints must also do better than all that it, drives and legs may be off alike within their tolerances,
+and stay alike where each joint is fitted by itself: what is wrong in two ways takes other values at each. How well a
+recording tells each of them is counted (``alike.py``).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import table
 from go1exp.gap.score.robust import excess, log_chi2, removed
-from go1exp.gap.search import profile_likelihood, significance, tolerances
+from go1exp.gap.search import alike, profile_likelihood, significance, tolerances
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.state import State
 from go1exp.schema.registry import members
@@ -80,7 +81,7 @@ def clearest(begun: Scorer, state: State) -> Model | None:
     train, select, dt = state.splits.train, state.splits.select, state.dt
     none = profile_likelihood.cost(begun, {}, train, dt)
     of_trunk = [n for n in tolerances.nominal(begun.replayer.machine) if tolerances.identification(n).needs_ground]
-    of_joints = [effect for effect in members("effect") if tolerances.identification(effect).weighs_on_legs]
+    of_joints = [effect for effect in members("effect") if tolerances.identification(effect).alike]
     fits = {
         effect: profile_likelihood.fitted(begun, sizes(effect), train, dt, none) for effect in (*of_trunk, *of_joints)
     }
@@ -102,21 +103,15 @@ def clearest(begun: Scorer, state: State) -> Model | None:
 
 
 def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Theta:
-    """Return what does most of what ``best`` does within tolerances: drives and legs that are all off alike."""
+    """Return what does most of what ``best`` does within tolerances: it, drives and legs, all off alike."""
     known = members("effect")
     effects = [
         name
         for name in tolerances.nominal(begun.replayer.machine)
         if tolerances.identification(name).weighs_on_legs or known[name].traits.get("gains")
     ]
-    keys = [key for name in effects for key in sizes(name)]
+    keys = list(dict.fromkeys([*(key for name in effects for key in sizes(name)), *best]))
     return profile_likelihood.within_tolerances(begun, best, keys, windows, dt)
-
-
-def _alike(model: Model) -> bool:
-    """Return whether each parameter of a cause is the same at all joints, to one tolerance."""
-    known = model.may.tolerances
-    return all(np.ptp(model.theta[key]) <= known.param(key).tolerance for key in model.keys if key in model.theta)
 
 
 Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model | None, Model | None]]
@@ -145,7 +140,7 @@ def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -
     for _ in range(TURNS):
         state = replace(state, theta=best.theta).renewed()
         best = refitted(state.scorer, best, train, dt)
-    if not _alike(best):
+    if not alike.may_be(best, state):
         return None
     share = removed(excess(now), excess(state.held_out(best.theta)))
     accepted, _ = judged([best], state, plain, now)
