@@ -274,7 +274,7 @@ def test_offsets_that_are_alike_are_one_cause_where_their_tolerance_does_not_rea
         return np.full((len(windows), 1), 1.0 + np.mean(missed**2))
 
     monkeypatch.setattr(profile_likelihood, "chi2", made_up)
-    best = single_cause.clearest(score, State(score, parts, QUICK, 0.002))
+    best = single_cause.clearest(score, State(score, parts, QUICK, 0.002)).best
     assert (best is not None) == named
     if best is not None:
         assert best.name == "encoder_offset"

@@ -52,6 +52,7 @@ class Ledger:
         signal: effect -> chi2 that it would add at twice its tolerance.
         steps: (what, held-out excess) after every accepted term.
         single: the term that explains nearly everything alone, if there is one (``gap/search/single_cause.py``).
+        within: values within tolerances, alike at all joints, at which the fit of the tolerances begins; on the ground.
         strained: whether the first term was accepted although the tolerances explain the data nearly as well.
         rivals: fitted models that nearly did as well as the first term, best first.
         returned: term -> share of the excess within the tolerances that came back without it, as it was last looked at.
@@ -73,6 +74,7 @@ class Ledger:
     signal: dict[str, float] = field(default_factory=dict)
     steps: list[tuple[str, float]] = field(default_factory=list)
     single: str = ""
+    within: Theta = field(default_factory=dict)
     strained: bool = False
     rivals: list[Model] = field(default_factory=list)
     returned: dict[str, float] = field(default_factory=dict)

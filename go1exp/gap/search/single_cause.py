@@ -13,7 +13,7 @@ recording tells each of them is counted (``alike.py``).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,7 +67,20 @@ def refitted(scorer: Scorer, model: Model, windows: np.ndarray, dt: float) -> Mo
     return stretched(scorer, fitted, windows, dt)
 
 
-def clearest(begun: Scorer, state: State) -> Model | None:
+@dataclass(frozen=True)
+class Sought:
+    """What comes of looking for one cause by initial states of its own.
+
+    Attributes:
+        best: the clearest cause, or None.
+        within: values within tolerances, alike at all joints, that do most of what the best cause does.
+    """
+
+    best: Model | None
+    within: Theta
+
+
+def clearest(begun: Scorer, state: State) -> Sought:
     """Return the effect of the whole robot, or alike at all joints, that does best by initial states of its own.
 
     Args:
@@ -75,8 +88,8 @@ def clearest(begun: Scorer, state: State) -> Model | None:
         state: of the search, whose windows count.
 
     Returns:
-        None unless, on windows that no fit has seen, it does clearly better than all others and nothing at all; one of
-        the joints also better than joints that are all off alike within their tolerances.
+        No cause unless, on windows that no fit has seen, it does clearly better than all others and nothing at all; one
+        of the joints also better than joints that are all off alike within their tolerances.
     """
     train, select, dt = state.splits.train, state.splits.select, state.dt
     none = profile_likelihood.cost(begun, {}, train, dt)
@@ -88,18 +101,18 @@ def clearest(begun: Scorer, state: State) -> Model | None:
     name = min(fits, key=lambda effect: fits[effect][1])
     best = fits.pop(name)[0]
     if not best:
-        return None
+        return Sought(None, {})
     chi2 = profile_likelihood.chi2(begun, best, select, dt)
 
     def loses(rival: Theta) -> bool:
         other = profile_likelihood.chi2(begun, rival, select, dt)
         return bool(significance.gains(chi2, other[None]).mean() < -significance.SAME)
 
-    if not loses({}) or not all(loses(rival) for rival, _ in fits.values() if rival):
-        return None
-    if name in of_joints and not loses(_off_alike(begun, best, train, dt)):
-        return None
-    return Model(name, best, state.may.also(name), sizes(name))
+    within = _off_alike(begun, best, train, dt)
+    clear = loses({}) and all(loses(rival) for rival, _ in fits.values() if rival)
+    if not clear or (name in of_joints and not loses(within)):
+        return Sought(None, within)
+    return Sought(Model(name, best, state.may.also(name), sizes(name)), within)
 
 
 def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Theta:
@@ -118,7 +131,7 @@ Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model |
 """Tests fitted candidates on held-out windows and notes the evidence (``Search._judged``)."""
 
 
-def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -> Model | None:
+def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -> Sought:
     """Return the effect of the whole robot, or alike at all joints, that explains nearly everything by itself, if any.
 
     Initial states that suit the nominal model hide a part of what is missing. So effects are compared by initial states
@@ -132,16 +145,17 @@ def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -
     train, select, dt, settings = state.splits.train, state.splits.select, state.dt, state.settings
     plain, now = (scores(state.scorer, [{}], part, dt)[0] for part in (train, select))
     if excess(now) < settings.material:
-        return None
+        return Sought(None, {})
     progress("looking for one cause alone", 0.08)
-    best = clearest(profile_likelihood.begun(state.scorer, dt), state)
+    sought = clearest(profile_likelihood.begun(state.scorer, dt), state)
+    best, none = sought.best, Sought(None, sought.within)
     if best is None or (settings.effects and best.name not in settings.effects):
-        return None
+        return none
     for _ in range(TURNS):
         state = replace(state, theta=best.theta).renewed()
         best = refitted(state.scorer, best, train, dt)
     if not alike.may_be(best, state):
-        return None
+        return none
     share = removed(excess(now), excess(state.held_out(best.theta)))
     accepted, _ = judged([best], state, plain, now)
-    return best if accepted is not None and share >= NEARLY_ALL else None
+    return Sought(best, {}) if accepted is not None and share >= NEARLY_ALL else none
