@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from go1exp.effects.tolerances import DECLARED, declared
-from go1exp.gap.answer import Answer, weak_joints
+from go1exp.gap.answer import Answer, bounded_joints, weak_joints
 from go1exp.gap.certainty import doubt
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.ledger import LastCheck, Ledger
@@ -157,3 +157,15 @@ def test_a_joint_a_little_beyond_its_tolerance_is_weak_beside_a_strong_one() -> 
     assert weak((0.70, 1.06, 1.10, 0.85), (0.03, 0.03, 0.03, 0.15)) == (1,)
     assert weak((1.0, 1.06, 1.0, 1.0), (0.03, 0.03, 0.03, 0.03)) == ()
     assert weak((0.70, 1.04, 1.0, 1.0), (0.03, 0.03, 0.03, 0.03)) == ()
+
+
+@pytest.mark.parametrize(
+    ("scale", "joints"),
+    [((0.5, 0.8, 1.0, 2.0), (0, 3)), ((0.5, 1.0, 1.0, 2.0), ()), ((0.6, 0.8, 1.0, 1.3), ())],
+    ids=["two of three", "all that leave it", "none"],
+)
+def test_joints_on_a_bound_are_doubted_unless_all_are(scale: tuple[float, ...], joints: tuple[int, ...]) -> None:
+    p = DECLARED.param(("link_mass", "scale"))
+    assert (p.low, p.high) == (0.5, 2.0)
+    asked: Any = Stub()
+    assert bounded_joints(asked, "link_mass", {("link_mass", "scale"): np.array(scale)}) == joints

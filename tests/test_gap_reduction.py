@@ -108,6 +108,24 @@ def test_a_simpler_effect_that_is_named_in_the_set_of_a_small_gap_takes_no_place
     assert asked.state.terms == (name,)
 
 
+@pytest.mark.parametrize(
+    ("both_ways", "name"),
+    [((3.5, 2.5), "asymmetric_friction"), ((3.2, 2.4), "coulomb"), ((4.0, 2.0), "coulomb")],
+    ids=["only the simpler one is at its bound", "neither is", "both are"],
+)
+def test_a_simpler_effect_at_its_bound_takes_no_place_of_one_that_is_at_none(
+    both_ways: tuple[float, float], name: str
+) -> None:
+    """The simpler one is half-way between two parameters that lie beyond their bounds, of 3 and of 2 N m."""
+    highs = [DECLARED.param(key).high for key in (("coulomb", "bound"), ("asymmetric_friction", "forward"))]
+    assert highs == [3.0, 2.0]
+    values = dict(zip(("forward", "backward"), both_ways, strict=True))
+    theta = {("asymmetric_friction", way): np.full(12, value) for way, value in values.items()}
+    asked = search(Known(lambda terms: 1.0, ("asymmetric_friction",), theta))
+    reduction.simplify(asked)
+    assert asked.state.terms == (name,)
+
+
 @pytest.mark.parametrize(("alone", "names"), [(1.01, ("payload",)), (2.0, ("strength", "link_mass"))])
 def test_one_cause_takes_the_place_of_two_if_it_does_as_well(alone: float, names: tuple[str, ...]) -> None:
     two = Known(lambda terms: alone if terms == ("payload",) else 1.0, ("strength", "link_mass"), {})

@@ -18,7 +18,7 @@ from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score import angle_errors
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import reduction, tolerances
-from go1exp.gap.search.evidence import deviation, inaudible
+from go1exp.gap.search.evidence import beyond, bounded, deviation, inaudible
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.last_fit import resampled_values
 from go1exp.gap.search.ledger import LastCheck
@@ -83,7 +83,9 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
         search.withdraw("the last check does not bear it out")
     theta, drawn = resampled_values(search)
     weak = frozenset((effect, j) for effect in search.state.terms for j in weak_joints(search, effect, theta, drawn))
-    if weak and reduction.keep_within(search, search.state.kept | weak):
+    at_bound = frozenset((effect, j) for effect in search.state.terms for j in bounded_joints(search, effect, theta))
+    parts = [part for part in (weak, at_bound - weak) if part]
+    if any([reduction.keep_within(search, search.state.kept | part) for part in parts]):
         check = search.last_check()
         theta, drawn = resampled_values(search)
     first, final = search.first, search.steps[-1][1]
@@ -194,7 +196,7 @@ def weak_joints(search: Search, effect: str, theta: Theta, drawn: Mapping[Key, n
         drawn: resampled values by parameter (B, J) or (B, 1).
     """
     joints, known = search.state.scorer.windows.joints, search.state.tolerances
-    beyond, strong = np.zeros(len(joints), dtype=bool), np.zeros(len(joints), dtype=bool)
+    outside, strong = np.zeros(len(joints), dtype=bool), np.zeros(len(joints), dtype=bool)
     if tolerances.identification(effect).common:
         return ()
     for key in sizes(effect):
@@ -203,9 +205,23 @@ def weak_joints(search: Search, effect: str, theta: Theta, drawn: Mapping[Key, n
             low, high = np.quantile(drawn[key], QUANTILES, axis=0)
             away = np.broadcast_to(deviation(theta, key, known), len(joints))
             sure = (low > p.null + p.tolerance) | (high < p.null - p.tolerance)
-            beyond |= away > 1.0
+            outside |= away > 1.0
             strong |= (away > 1.0) & (sure | (away >= MUCH * away.max()))
-    return tuple(int(j) for j in np.flatnonzero(beyond & ~strong))
+    return tuple(int(j) for j in np.flatnonzero(outside & ~strong))
+
+
+def bounded_joints(search: Search, effect: str, theta: Theta) -> tuple[int, ...]:
+    """Return the joints at which a term lies on a bound of its parameter, unless it does at all of its joints.
+
+    A joint of which a recording tells little goes there, since others want it so: a hip of half its mass. If held-out
+    windows do not miss it, the rest of the term is worth its name.
+    """
+    joints, known = search.state.scorer.windows.joints, search.state.tolerances
+    if tolerances.identification(effect).common:
+        return ()
+    at_bound = bounded(effect, theta, joints, known)
+    free = beyond(effect, theta, joints, known) & ~at_bound
+    return tuple(int(j) for j in np.flatnonzero(at_bound)) if free.any() else ()
 
 
 def beyond_doubt(effect: NamedEffect, known: Tolerances) -> bool:

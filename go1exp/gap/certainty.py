@@ -9,6 +9,7 @@ import numpy as np
 
 from go1exp.effects.tolerances import sizes
 from go1exp.gap.replay.rows import Theta
+from go1exp.gap.search.evidence import at_bound
 from go1exp.gap.search.ledger import LastCheck, Ledger
 
 MOST = 0.75
@@ -17,9 +18,6 @@ MOST = 0.75
 HALF = 0.5
 """Share of the excess that is most of it: what removes more is not withdrawn, and must remove as much on the last check
 to be certified."""
-
-AT_BOUND = 0.02
-"""Distance from a bound, in tolerances, that counts as being there: the data would have the value go further."""
 
 
 def on_bound(search: Ledger, effect: str, theta: Theta, joints: Sequence[str]) -> str:
@@ -35,15 +33,14 @@ def on_bound(search: Ledger, effect: str, theta: Theta, joints: Sequence[str]) -
     for key in sizes(effect):
         p = search.state.tolerances.param(key)
         of_joint = p.per == "joint"
-        values = np.broadcast_to(theta.get(key, np.array([p.null])), len(everyone) if of_joint else 1)
-        for k, value in enumerate(values):
+        for k in np.flatnonzero(np.broadcast_to(at_bound(key, theta, search.state.tolerances), len(everyone))):
             if of_joint and everyone[k] not in joints:
                 continue
-            near = [b for b in (p.low, p.high) if abs(value - b) <= AT_BOUND * p.tolerance]
-            if near and abs(value - p.null) > p.tolerance:
-                unit = "" if p.unit == "-" else f" {p.unit}"
-                at = f" at {everyone[k]}" if of_joint else ""
-                return f"{p.name}{at} lies on its bound, {near[0]:g}{unit}"
+            value = np.ravel(theta[key])[k if theta[key].size > 1 else 0]
+            nearest = min((p.low, p.high), key=lambda bound: abs(value - bound))
+            unit = "" if p.unit == "-" else f" {p.unit}"
+            at = f" at {everyone[k]}" if of_joint else ""
+            return f"{p.name}{at} lies on its bound, {nearest:g}{unit}"
     return ""
 
 

@@ -42,6 +42,24 @@ def beyond(effect: str, theta: Theta, joints: Sequence[str], tolerances: Toleran
     return outside
 
 
+AT_BOUND = 0.02
+"""Distance from a bound, in tolerances, that counts as being there: the data would have the value go further."""
+
+
+def at_bound(key: Key, theta: Theta, tolerances: Tolerances) -> np.ndarray:
+    """Return which values of a parameter (J,) or (1,) leave their tolerance and lie on a bound of the parameter."""
+    p = tolerances.param(key)
+    values = np.ravel(theta.get(key, np.array([p.null])))
+    near = [np.abs(values - bound) <= AT_BOUND * p.tolerance for bound in (p.low, p.high)]
+    return np.asarray((near[0] | near[1]) & (np.abs(values - p.null) > p.tolerance))
+
+
+def bounded(effect: str, theta: Theta, joints: Sequence[str], tolerances: Tolerances) -> np.ndarray:
+    """Return at which joints (J,) a value of an effect lies on its bound, beyond its tolerance."""
+    per_key = [at_bound(key, theta, tolerances) for key in sizes(effect)]
+    return np.any([np.broadcast_to(one, len(joints)) for one in per_key], axis=0)
+
+
 def count(effect: str, theta: Theta, machine: Machine) -> int:
     """Return how many values of an effect leave their tolerance, at least 1; one for all joints counts once."""
     beyond_it = 0

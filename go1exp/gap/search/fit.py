@@ -173,8 +173,8 @@ def _moves(scorer: Scorer, models: Sequence[Model], common: Table, dt: float) ->
         assert model.residual is not None
         columns = common.columns if len(kept) == len(common.probes) else common.columns[..., kept]
         whole = np.concatenate([columns, fresh], axis=-1) if probes else columns
-        own = replace(common, probes=tuple(every), residual=model.residual, columns=whole, theta=model.theta)
-        grams = own.grams(scorer)
+        linear = replace(common, probes=tuple(every), residual=model.residual, columns=whole, theta=model.theta)
+        grams = linear.grams(scorer)
         weight = 1.0 / np.maximum(_chi2(model), 1.0)
         matrix, right = layout.total(grams * weight[..., None, None])
         limits = tolerances.bounds(layout, every, model.theta, model.may)

@@ -46,7 +46,11 @@ def simplify(search: Ledger) -> None:
         before, after = search.state.held_out(search.nominal), search.state.held_out()
         gain, less = significance.gains(before, np.stack([after, rest.held_out()])).mean(axis=1)
         large = evidence.size(simpler, rest.theta, rest.tolerances) > 1.0
-        if less > gain - significance.same(gain) and large:
+        joints, known = rest.machine.joints, rest.tolerances
+        strains = evidence.bounded(simpler, rest.theta, joints, known).any()
+        strained = evidence.bounded(name, search.state.theta, joints, known).any()
+        # What would go beyond its bound is a worse name than what need not: a hip of twice its mass, for a load.
+        if less > gain - significance.same(gain) and large and (strained or not strains):
             replaced(search, name, simpler, rest, still_equal(search, name, simpler, rest))
 
 
