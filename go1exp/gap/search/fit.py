@@ -103,22 +103,7 @@ def fit(scorer: Scorer, models: Sequence[Model], common: Table, iterations: int,
     return best
 
 
-@dataclass(frozen=True)
-class Descent:
-    """A fit of one model.
-
-    Attributes:
-        model: fitted.
-        linear: the linear model there, with what its columns learned on the way.
-        last: fall of the mean log chi2 in the last step.
-    """
-
-    model: Model
-    linear: Table
-    last: float
-
-
-def descend(scorer: Scorer, model: Model, linear: Table, steps: int, dt: float) -> Descent:
+def descend(scorer: Scorer, model: Model, linear: Table, steps: int, dt: float) -> Model:
     """Fit one model by columns that learn from each step (Broyden's method), as long as steps gain something.
 
     Args:
@@ -130,7 +115,6 @@ def descend(scorer: Scorer, model: Model, linear: Table, steps: int, dt: float) 
     """
     layout, known = Layout.from_probes(scorer.replayer.machine, linear.probes), model.may.tolerances
     reached = float(log_chi2(scorer.chi2(linear.residual, linear.windows)).mean())
-    gain = 0.0
     for turn in range(steps):
         (model,) = fit(scorer, [replace(model, theta=linear.theta)], linear, 1, dt)
         assert model.residual is not None
@@ -138,10 +122,9 @@ def descend(scorer: Scorer, model: Model, linear: Table, steps: int, dt: float) 
         after, _ = tolerances.unknowns(layout, linear.probes, model.theta, known)
         linear = replace(corrected(linear, layout, after - before, unit, model.residual), theta=model.theta)
         last, reached = reached, float(log_chi2(_chi2(model)).mean())
-        gain = last - reached
-        if turn and gain < LITTLE:
+        if turn and last - reached < LITTLE:
             break
-    return Descent(model, linear, gain)
+    return model
 
 
 def misfit(model: Model) -> float:

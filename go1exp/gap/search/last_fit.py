@@ -45,7 +45,7 @@ def resampled_values(search: Ledger) -> tuple[Theta, dict[Key, np.ndarray]]:
     fitted = np.sort(np.concatenate([search.splits.train, search.splits.select]))
     linear = state.linear(state.theta, fitted)
     steps = STEPS if state.scorer.finer > 1 else 1
-    best = descend(state.scorer, state.model(state.theta), linear, steps, search.dt).model
+    best = descend(state.scorer, state.model(state.theta), linear, steps, search.dt)
     assert best.chi2 is not None
     assert best.residual is not None
     about = replace(linear, residual=best.residual, theta=best.theta)

@@ -24,8 +24,7 @@ SETTLED = 0.03
 """Fall of log chi2 in a round of fitting below which the next one is not worth its time: it gains an eighth or so."""
 
 SETTLED_SHARE = 0.01
-"""Share of log chi2 by which the last step of a round must still fall for another round: where much is missing, less
-does not decide anything."""
+"""The same as a share of log chi2: where much is missing, less does not decide anything."""
 
 GOOD = 0.01
 """Log chi2 below which a model without terms needs no more rounds."""
@@ -126,8 +125,11 @@ class State:
             linear = nearby if borrowing else state.linear(state.theta, self.splits.train)
             assert linear is not None
             before = float(log_chi2(self.scorer.chi2(linear.residual, linear.windows)).mean())
-            fall = descend(self.scorer, self.model(state.theta), linear, STEPS_PER_ROUND, self.dt)
-            state = replace(state, theta=fall.model.theta, fitted=fall.linear, chi2=fall.model.chi2)
+            best = descend(self.scorer, self.model(state.theta), linear, STEPS_PER_ROUND, self.dt)
+            assert best.residual is not None
+            # Columns as they were measured: what they learned holds for the steps that were made, and for no others.
+            fitted = replace(linear, residual=best.residual, theta=best.theta)
+            state = replace(state, theta=best.theta, fitted=fitted, chi2=best.chi2)
             if state.nominal is None and not self.theta:
                 state = replace(state, nominal=linear)
             reached = float(log_chi2(state.train_chi2).mean())
@@ -137,7 +139,7 @@ class State:
             if borrowing:
                 if self._beside and gain < LITTLE:
                     break
-            elif gain < SETTLED or fall.last < SETTLED_SHARE * reached or (reached < GOOD and not self.terms):
+            elif gain < max(SETTLED, SETTLED_SHARE * reached) or (reached < GOOD and not self.terms):
                 break
         return state
 
