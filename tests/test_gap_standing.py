@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import mujoco
@@ -249,7 +250,16 @@ def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
     ids=["strength", "strength and gain"],
 )
 def test_drives_that_are_all_a_little_weak_are_no_payload_and_within_tolerances(hidden: tuple[str, ...]) -> None:
-    assert search_in(*hidden).single_cause() is None
+    search = search_in(*hidden)
+    plain = excess(search.state.held_out({}))
+    assert search.single_cause() is None
+    # Where the tolerances reach, what they do alike is all but the answer, and the fit of all joints begins there.
+    for key, values in search.within.items():
+        p = search.state.tolerances.param(key)
+        assert np.ptp(values) == 0.0
+        assert np.abs(values - p.null).max() <= p.tolerance * (1.0 + 1e-9)
+    begun = replace(search.state, theta=search.within).renewed()
+    assert excess(begun.held_out()) < 0.2 * plain
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
@@ -274,8 +284,40 @@ def test_offsets_that_are_alike_are_one_cause_where_their_tolerance_does_not_rea
         return np.full((len(windows), 1), 1.0 + np.mean(missed**2))
 
     monkeypatch.setattr(profile_likelihood, "chi2", made_up)
-    best = single_cause.clearest(score, State(score, parts, QUICK, 0.002)).best
+    sought = single_cause.clearest(score, State(score, parts, QUICK, 0.002))
+    best, tolerance = sought.best, declared(key).tolerance
+    if offset > tolerance:
+        assert sought.within[key] == pytest.approx(np.full(12, tolerance), abs=1e-4)
     assert (best is not None) == named
     if best is not None:
         assert best.name == "encoder_offset"
         assert best.theta[key] == pytest.approx(np.full(12, offset), abs=1e-3)
+
+
+def test_the_fit_within_tolerances_begins_at_what_is_off_alike_where_nothing_alone_explains_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    score, _ = scored()
+    _, recordings = recorded("excitation=[squat,gait]")
+    rng = np.random.default_rng(0)
+    parts = splits([r.meta for r in recordings], score.windows.episode, 0.2, rng)
+    search = Search(score, parts, QUICK, 0.002, rng, lambda what, share: None)
+    within: Theta = {("strength", "scale"): np.full(12, 0.96)}
+    begun: list[Theta] = []
+
+    class Stopped(Exception):
+        pass
+
+    def stopped(self: State, rounds: int) -> State:
+        begun.append(self.theta)
+        raise Stopped
+
+    monkeypatch.setattr(single_cause, "cause", lambda *_: single_cause.Sought(None, within))
+    monkeypatch.setattr(State, "renewed", lambda self: self)
+    monkeypatch.setattr(State, "settled", stopped)
+    for settings in (QUICK, replace(QUICK, calibrate=False)):
+        search.settings = settings
+        search.state = replace(search.state, theta={})
+        with pytest.raises(Stopped):
+            search.run()
+    assert begun == [within, {}]
