@@ -29,7 +29,7 @@ SETTLED_SHARE = 0.01
 GOOD = 0.01
 """Log chi2 below which a model without terms needs no more rounds."""
 
-STEPS_PER_ROUND = 5
+STEPS_PER_ROUND = 2
 """Gauss-Newton steps before the linear model is measured again, at most."""
 
 FINER = 4
