@@ -85,7 +85,7 @@ def test_a_quantity_that_is_not_compared_has_columns_of_zero(hung: State) -> Non
     np.testing.assert_array_equal(near.columns, linear.columns)
 
 
-def test_columns_that_learn_come_further_than_columns_that_stay(hung: State) -> None:
+def test_columns_that_learn_come_as_far_as_columns_that_stay(hung: State) -> None:
     linear = hung.linear({}, hung.splits.train)
     (stays,) = fit(hung.scorer, [hung.model({})], linear, 4, hung.dt)
     learns = descend(hung.scorer, hung.model({}), linear, 4, hung.dt)

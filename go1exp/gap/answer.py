@@ -85,7 +85,8 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
     weak = frozenset((effect, j) for effect in search.state.terms for j in weak_joints(search, effect, theta, drawn))
     at_bound = frozenset((effect, j) for effect in search.state.terms for j in bounded_joints(search, effect, theta))
     parts = [part for part in (weak, at_bound - weak) if part]
-    if any([reduction.keep_within(search, search.state.kept | part) for part in parts]):
+    kept = [reduction.keep_within(search, search.state.kept | part) for part in parts]  # each on what the last one left
+    if any(kept):
         check = search.last_check()
         theta, drawn = resampled_values(search)
     first, final = search.first, search.steps[-1][1]

@@ -163,16 +163,13 @@ def borrowed(known: Table, scorer: Scorer, theta: Theta, probes: Sequence[Probe]
         dt: physics step, s.
     """
     measured = table(scorer, theta, known.windows, [p for p in probes if p.key in fresh], dt)
-    at = {(p.key, p.place): k for k, p in enumerate(known.probes)}
-    of_measured = iter(range(len(measured.probes)))
     one = np.ones_like(measured.scale)
     ratio = np.divide(known.scale, measured.scale, out=one, where=np.isfinite(measured.scale))[:, None]
     unit = grouped(scorer.replayer.machine, np.repeat(ratio, scorer.windows.t.shape[1], axis=1)).astype(np.float32)
-    columns = [
-        measured.columns[..., next(of_measured)] if p.key in fresh else known.columns[..., at[p.key, p.place]] * unit
-        for p in probes
-    ]
-    return dataclasses.replace(measured, probes=tuple(probes), columns=np.stack(columns, axis=-1))
+    sources = {(p.key, p.place): known.columns[..., k] * unit for k, p in enumerate(known.probes) if p.key not in fresh}
+    sources |= {(p.key, p.place): measured.columns[..., k] for k, p in enumerate(measured.probes)}
+    columns = np.stack([sources[p.key, p.place] for p in probes], axis=-1)
+    return dataclasses.replace(measured, probes=tuple(probes), columns=columns)
 
 
 def corrected(linear: Table, layout: Layout, step: np.ndarray, unit: np.ndarray, residual: np.ndarray) -> Table:

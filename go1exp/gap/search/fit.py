@@ -117,13 +117,13 @@ def descend(scorer: Scorer, model: Model, linear: Table, steps: int, dt: float) 
     reached = float(log_chi2(scorer.chi2(linear.residual, linear.windows)).mean())
     for turn in range(steps):
         (model,) = fit(scorer, [replace(model, theta=linear.theta)], linear, 1, dt)
-        assert model.residual is not None
+        last, reached = reached, float(log_chi2(_chi2(model)).mean())
+        if turn == steps - 1 or (turn and last - reached < LITTLE):
+            break
         before, unit = tolerances.unknowns(layout, linear.probes, linear.theta, known)
         after, _ = tolerances.unknowns(layout, linear.probes, model.theta, known)
+        assert model.residual is not None
         linear = replace(corrected(linear, layout, after - before, unit, model.residual), theta=model.theta)
-        last, reached = reached, float(log_chi2(_chi2(model)).mean())
-        if turn and last - reached < LITTLE:
-            break
     return model
 
 
