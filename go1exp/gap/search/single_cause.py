@@ -73,7 +73,8 @@ class Sought:
 
     Attributes:
         best: the clearest cause, or None.
-        within: values within tolerances, alike at all joints, that do most of what the best cause does.
+        within: values within tolerances, alike at all joints, that do most of what the best cause does; empty where
+            nothing had to be asked of them.
     """
 
     best: Model | None
@@ -108,11 +109,12 @@ def clearest(begun: Scorer, state: State) -> Sought:
         other = profile_likelihood.chi2(begun, rival, select, dt)
         return bool(significance.gains(chi2, other[None]).mean() < -significance.SAME)
 
-    within = _off_alike(begun, best, train, dt)
     clear = loses({}) and all(loses(rival) for rival, _ in fits.values() if rival)
-    if not clear or (name in of_joints and not loses(within)):
-        return Sought(None, within)
-    return Sought(Model(name, best, state.may.also(name), sizes(name)), within)
+    of_trunk_alone = clear and name in of_trunk
+    within = {} if of_trunk_alone else _off_alike(begun, best, train, dt)
+    if of_trunk_alone or (clear and loses(within)):
+        return Sought(Model(name, best, state.may.also(name), sizes(name)), within)
+    return Sought(None, within)
 
 
 def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Theta:
@@ -147,15 +149,33 @@ def cause(state: State, progress: Callable[[str, float], None], judged: Judge) -
     if excess(now) < settings.material:
         return Sought(None, {})
     progress("looking for one cause alone", 0.08)
-    sought = clearest(profile_likelihood.begun(state.scorer, dt), state)
-    best, none = sought.best, Sought(None, sought.within)
-    if best is None or (settings.effects and best.name not in settings.effects):
-        return none
+    begun = profile_likelihood.begun(state.scorer, dt)
+    sought = clearest(begun, state)
+    if sought.best is None:
+        return sought
+    best = _confirmed(sought.best, state, judged, plain, now)
+    if best is not None:
+        return Sought(best, {})
+    return Sought(None, sought.within or _off_alike(begun, sought.best.theta, train, dt))
+
+
+def _confirmed(best: Model, state: State, judged: Judge, plain: np.ndarray, now: np.ndarray) -> Model | None:
+    """Return the clearest cause fitted joint by joint at states that suit it, if it still is the one cause.
+
+    Args:
+        best: the cause.
+        state: of a search that has not begun.
+        judged: tests it.
+        plain: (V, G) chi2 of the nominal model on the windows of the fit.
+        now: the same on held-out windows.
+    """
+    if state.settings.effects and best.name not in state.settings.effects:
+        return None
     for _ in range(TURNS):
         state = replace(state, theta=best.theta).renewed()
-        best = refitted(state.scorer, best, train, dt)
+        best = refitted(state.scorer, best, state.splits.train, state.dt)
     if not alike.may_be(best, state):
-        return none
+        return None
     share = removed(excess(now), excess(state.held_out(best.theta)))
     accepted, _ = judged([best], state, plain, now)
-    return Sought(best, {}) if accepted is not None and share >= NEARLY_ALL else none
+    return best if accepted is not None and share >= NEARLY_ALL else None
