@@ -99,17 +99,31 @@ ROUGH = 0.5
 band acts or does not, so nearly all of its columns differs, and yet its value is well known."""
 
 
-def unbiased_grams(scorer: Scorer, one: Table, other: Table) -> np.ndarray:
+JUMPS = 0.03
+"""Share of what a window's columns say, in units of tolerances, that may be errors. Beyond it something jumps there,
+such as a stop that is met a step later. Most windows are far below it, and few near it."""
+
+KEPT = 0.2
+"""Share of what a column says that windows without jumps must hold for those with jumps to be left out: what a stop
+does is seen nowhere else."""
+
+
+def unbiased_grams(scorer: Scorer, one: Table, other: Table, unit: np.ndarray, needed: np.ndarray) -> np.ndarray:
     """Return the Gram matrices (V, G, p+1, p+1) of columns that were measured twice, by other changes.
 
     Errors that the two do not share add nothing to the products of one with the other, as they do to squares (errors in
     variables; Fuller, Measurement Error Models, 1987): with the mean c of both and half their difference d,
     (a'b + b'a) / 2 = c'c - d'd.
 
+    Where much is taken away, what is left is itself uncertain, and along what the data hardly tell it can be less than
+    nothing. So a group's windows with jumps say nothing (zeros), unless a column that is needed lives there.
+
     Args:
         scorer: of the windows.
         one: with the residual that counts.
         other: of the same windows and parameters.
+        unit: (p,) tolerance of each parameter; 0 for one without.
+        needed: (p,) bool, columns whose intervals are wanted.
     """
     count = one.columns.shape[-1]
     mean, half = 0.5 * (one.columns + other.columns), 0.5 * (one.columns - other.columns)
@@ -117,8 +131,14 @@ def unbiased_grams(scorer: Scorer, one: Table, other: Table) -> np.ndarray:
     half = np.where(rough, 0.0, half).astype(np.float32)
     every = np.concatenate([mean, one.residual[..., None], half], axis=-1)
     products = gram(every, scorer.state[one.windows])
-    unbiased = products[..., : count + 1, : count + 1].copy()
-    unbiased[..., :count, :count] -= products[..., count + 1 :, count + 1 :]
+    errors, unbiased = products[..., count + 1 :, count + 1 :], products[..., : count + 1, : count + 1].copy()
+    column = np.arange(count)
+    spoken, erring = unbiased[..., column, column], errors[..., column, column]  # V G p
+    jumps = erring @ unit**2 > JUMPS * (spoken @ unit**2)  # V G
+    left, all_of_it = ((spoken * keep).sum(0)[:, needed] for keep in (~jumps[..., None], 1.0))
+    jumps &= np.all(left >= KEPT * all_of_it, axis=1)
+    unbiased[..., :count, :count] -= errors
+    unbiased[jumps] = 0.0
     return unbiased
 
 

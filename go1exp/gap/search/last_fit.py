@@ -92,7 +92,10 @@ def _grams(state: State, linear: Table) -> np.ndarray:
         return linear.grams(scorer)
     probes = opposite(state, linear.probes)
     other = table(scorer, state.theta, linear.windows, probes, state.dt)
-    return unbiased_grams(scorer, linear, other)
+    keys = [p.key for p in probes if isinstance(p.key, tuple)]  # all of them
+    tolerance = np.array([state.tolerances.param(key).tolerance for key in keys])
+    needed = np.array([effect in state.terms for effect, _ in keys])
+    return unbiased_grams(scorer, linear, other, np.where(np.isfinite(tolerance), tolerance, 0.0), needed)
 
 
 def opposite(state: State, probes: Sequence[Probe]) -> list[Probe]:
