@@ -98,7 +98,6 @@ ROUGH = 0.5
 """Share of a column's square by which two measurements of it may differ for that to be errors: a small change of a dead
 band acts or does not, so nearly all of its columns differs, and yet its value is well known."""
 
-
 JUMPS = 0.03
 """Share of what a window's columns say, in units of tolerances, that may be errors. Beyond it something jumps there,
 such as a stop that is met a step later. Most windows are far below it, and few near it."""
@@ -133,10 +132,11 @@ def unbiased_grams(scorer: Scorer, one: Table, other: Table, unit: np.ndarray, n
     products = gram(every, scorer.state[one.windows])
     errors, unbiased = products[..., count + 1 :, count + 1 :], products[..., : count + 1, : count + 1].copy()
     column = np.arange(count)
-    spoken, erring = unbiased[..., column, column], errors[..., column, column]  # V G p
-    jumps = erring @ unit**2 > JUMPS * (spoken @ unit**2)  # V G
-    left, all_of_it = ((spoken * keep).sum(0)[:, needed] for keep in (~jumps[..., None], 1.0))
-    jumps &= np.all(left >= KEPT * all_of_it, axis=1)
+    signal, error = (g[..., column, column] * unit**2 for g in (unbiased, errors))  # V G p, of one tolerance
+    jumps = error.sum(-1) > JUMPS * signal.sum(-1)  # V G
+    total, elsewhere = signal.sum(0), (signal * ~jumps[..., None]).sum(0)  # G p
+    shown = needed & (total > 1.0)  # beyond the noise
+    jumps &= np.all((elsewhere >= KEPT * total) | ~shown, axis=1)
     unbiased[..., :count, :count] -= errors
     unbiased[jumps] = 0.0
     return unbiased
