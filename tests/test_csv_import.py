@@ -95,13 +95,16 @@ def test_the_same_table_in_other_notations_is_the_same_recording(tmp_path: Path)
     usual = imported(lay(tmp_path / "a.csv"))
     european = imported(lay(tmp_path / "b.csv", ";", ",", "made by X\n\n"), delimiter=";", decimal=",", skip_lines=2)
     numbered = {
-        name: {**value, "column": str(list(TABLE).index(value["column"]) + 1)} if isinstance(value, dict) else 3
+        name: {**value, "column": list(TABLE).index(value["column"]) + 1} if isinstance(value, dict) else 3
         for name, value in COLUMNS.items()
     }
-    nameless = imported(lay(tmp_path / "c.csv", header=False), columns=numbered, header=False)
+    quoted = {k: {**v, "column": str(v["column"])} if isinstance(v, dict) else v for k, v in numbered.items()}
+    nameless, as_text = (
+        imported(lay(tmp_path / "c.csv", header=False), columns=columns, header=False) for columns in (numbered, quoted)
+    )
     marked = tmp_path / "d.csv"
     marked.write_text("\ufeff" + lay(tmp_path / "a.csv").read_text().replace(",", " , ", 4), encoding="utf-8")
-    for other in (european, nameless, imported(marked)):
+    for other in (european, nameless, as_text, imported(marked)):
         assert other.channels.keys() == usual.channels.keys()
         for name, values in usual.channels.items():
             np.testing.assert_array_equal(other.channels[name], values, name)

@@ -53,7 +53,10 @@ def test_errors_of_columns_tell_nothing() -> None:
     residual = rng.standard_normal((40, 1, 300))
     score = cast(Scorer, SimpleNamespace(state=np.zeros((40, 1, 300, 1))))
     tables = [Table(np.arange(40), (), residual, columns, {}, np.ones((40, 1, 1))) for columns in (one, other)]
-    biased, unbiased = tables[0].grams(score).sum(0)[0], unbiased_grams(score, *tables, np.ones(2), ALL).sum(0)[0]
+    biased, unbiased = (
+        tables[0].grams(score).sum(0)[0],
+        unbiased_grams(score, tables[0], tables[1], np.ones(2), ALL).sum(0)[0],
+    )
     along, against = np.array([1.0, 1.0, 0.0]), np.array([1.0, -1.0, 0.0])
     errors = 40 * 300 * 2 * 0.3**2
     assert against @ biased @ against == pytest.approx(errors, rel=0.05)
@@ -70,7 +73,7 @@ def test_a_column_that_differs_nearly_altogether_stays_known() -> None:
     score = cast(Scorer, SimpleNamespace(state=np.zeros((10, 1, 200, 1))))
     one, other = (np.concatenate([smooth, share * acts], axis=-1) for share in (1.0, 0.05))
     tables = [Table(np.arange(10), (), residual, c, {}, np.ones((10, 1, 1))) for c in (one, other)]
-    products = unbiased_grams(score, *tables, np.ones(2), ALL).sum(0)[0]
+    products = unbiased_grams(score, tables[0], tables[1], np.ones(2), ALL).sum(0)[0]
     assert products[0, 0] == pytest.approx(np.sum(smooth**2), rel=1e-3)
     assert products[1, 1] == pytest.approx(np.sum((0.525 * acts) ** 2), rel=1e-3)
 
@@ -85,12 +88,12 @@ def test_windows_with_jumps_say_nothing_unless_nothing_else_does(elsewhere: floa
     score = cast(Scorer, SimpleNamespace(state=np.zeros((10, 1, 200, 1))))
     jump = np.zeros_like(smooth)
     jump[:2] = 0.5 * rng.standard_normal((2, 1, 200, 1))
-    tables = [Table(np.arange(10), (), residual, smooth + s * jump, {}, np.ones((10, 1, 1))) for s in (1.0, -1.0)]
-    products = unbiased_grams(score, *tables, np.ones(2), np.array([True, False]))
+    one, other = (Table(np.arange(10), (), residual, smooth + s * jump, {}, np.ones((10, 1, 1))) for s in (1.0, -1.0))
+    products = unbiased_grams(score, one, other, np.ones(2), np.array([True, False]))
     assert products[:2].any() == kept
     plain = np.concatenate([smooth, residual[..., None]], axis=-1)[2:, 0]
     np.testing.assert_allclose(products[2:, 0], np.swapaxes(plain, 1, 2) @ plain, rtol=1e-3, atol=1e-2)
-    unasked = unbiased_grams(score, *tables, np.ones(2), np.zeros(2, dtype=bool))
+    unasked = unbiased_grams(score, one, other, np.ones(2), np.zeros(2, dtype=bool))
     assert not unasked[:2].any()
 
 

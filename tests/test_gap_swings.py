@@ -203,6 +203,18 @@ def test_the_whole_robot_is_compared_unless_legs_in_the_air_name_something(
     assert all(note in line for line in found.warnings)
 
 
+@pytest.mark.parametrize(
+    ("effect", "on_ground", "warned"),
+    [("encoder_offset", True, True), ("encoder_offset", False, False), ("payload", True, False)],
+)
+def test_an_offset_that_only_a_robot_on_its_feet_shows_comes_with_a_warning(
+    effect: str, on_ground: bool, warned: bool
+) -> None:
+    one = NamedEffect(effect, ("FR_calf",), {}, {}, (effect,), "certified")
+    lines = stages_explain.doubts([one], on_ground)
+    assert [("record it hung" in line) for line in lines] == [True] * warned
+
+
 def test_a_robot_that_never_lifts_a_foot_is_told_so() -> None:
     config, recordings = recorded("excitation=[squat]")
     with pytest.raises(NotComparable, match="no leg swings"):

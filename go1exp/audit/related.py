@@ -165,7 +165,9 @@ def rotation(log: Log) -> Iterator[Finding]:
         whole = signals.antiderivative(log.t, log.recording.block(*names))
         integral = whole[last] - whole[first]
         match = _correlations(change, integral)
-        moves = (np.std(change, axis=0) > 1e-3) & (np.std(integral, axis=0) > 0)
+        # Turning is twice the vector part of a quaternion; noise of what is compared with makes a scale look too small.
+        blur = 2.0 * np.sqrt(2.0) * max(log.noise(channel) for channel in VECTORS[attitude])
+        moves = (np.std(change, axis=0) > max(limits.MOTION * blur, 1e-3)) & (np.std(integral, axis=0) > 0)
         if not moves.any():
             continue
         partner = signals.mixed_up(match.T)

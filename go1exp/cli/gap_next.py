@@ -83,7 +83,7 @@ def text(result: NextResult, file: Path) -> str:
         ]
     lines += [f"  {pair.text}" for pair in result.pairs]
     if best is not None and best.design.attitude.roll is not None:
-        lines.append(f"on the simulated robot: {record_command(result, file)}")
+        lines.append(f"on the simulated robot (with the effect=... that it has): {record_command(result, file)}")
     return "\n".join(lines)
 
 

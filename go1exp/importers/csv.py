@@ -70,12 +70,16 @@ class Column:
 _COLUMN = TypeAdapter(Column)
 
 
+def _is_number(column: object) -> bool:
+    """Return whether a column is given by its number, as in a file without names."""
+    return isinstance(column, int) and not isinstance(column, bool)
+
+
 def _columns(given: Mapping[str, Any]) -> tuple[dict[str, Column], list[str]]:
     """Return channel -> column, and what is wrong with them as they are written."""
     mapping, wrong = {}, []
     for name, value in given.items():
-        numbered = isinstance(value, int) and not isinstance(value, bool)
-        if numbered or isinstance(value, str):
+        if isinstance(value, str) or _is_number(value):
             mapping[name] = Column(str(value))
         elif not isinstance(value, Mapping):
             wrong.append(
@@ -83,7 +87,8 @@ def _columns(given: Mapping[str, Any]) -> tuple[dict[str, Column], list[str]]:
             )
         else:
             try:
-                mapping[name] = _COLUMN.validate_json(as_json(dict(value)))
+                by_number = {"column": str(value["column"])} if _is_number(value.get("column")) else {}
+                mapping[name] = _COLUMN.validate_json(as_json({**value, **by_number}))
             except ValidationError as error:
                 wrong += explain(error, f"{PATH}.columns.{name}", [f.name for f in fields(Column)])
     return mapping, wrong
