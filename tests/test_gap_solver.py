@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import go1exp.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import RIG
 from go1exp.compose import compose
 from go1exp.config import parse_parts
+from go1exp.effects.tolerances import DECLARED
 from go1exp.gap.comparison import compare
 from go1exp.gap.data.cutting import even_clock, noise
 from go1exp.gap.data.splits import splits
@@ -23,10 +25,10 @@ from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
 from go1exp.gap.robots.hung import HungGo1, hung
 from go1exp.gap.score.likelihood import gram
 from go1exp.gap.score.linear import Layout, predicted
-from go1exp.gap.search import strain
-from go1exp.gap.search.fit import scores
+from go1exp.gap.search import stepwise, strain
+from go1exp.gap.search.fit import Model, scores
 from go1exp.gap.search.significance import max_t
-from go1exp.gap.search.tolerances import Bounds, solve
+from go1exp.gap.search.tolerances import Bounds, Freedom, solve
 from go1exp.gap.stages.explain import explain
 from go1exp.record import simulate
 from go1exp.recording import Meta, Recording
@@ -275,6 +277,28 @@ def test_what_strains_most_is_tried_with_its_rivals() -> None:
     assert strain.straining(relief | {"link_mass": 601.0}, values, []) == ["armature", "link_mass"]
     assert strain.straining(relief | {"armature": 3000.0, "link_mass": 900.0}, values, []) == ["armature"]
     assert strain.straining({}, values, []) == []
+
+
+@pytest.mark.parametrize(("third", "expected"), [(1.0, ["viscous", "kd_scale"]), (300.0, [])])
+def test_candidates_that_leave_next_to_nothing_are_fitted_to_their_end(
+    monkeypatch: pytest.MonkeyPatch, third: float, expected: list[str]
+) -> None:
+    """A speed gain that was left at 1.2 times the noise was called worse than viscous friction at 1.0."""
+    rounds: list[str] = []
+
+    def further(scorer: object, models: list[Model], table: object, iterations: int, dt: float) -> list[Model]:
+        rounds.extend(m.name for m in models)
+        return [replace(m, theta={("coulomb", "bound"): np.ones(12)}) for m in models]
+
+    monkeypatch.setattr(stepwise, "fit", further)
+    left = {"viscous": 1.0, "lag": 90.0, "kd_scale": 1.2 * third}
+    may = Freedom(DECLARED, frozenset())
+    models = [Model(name, {}, may, (), np.full((8, 4), chi2)) for name, chi2 in left.items()]
+    search = SimpleNamespace(settings=QUICK, state=SimpleNamespace(scorer=None, table=None), dt=1e-3)
+    candidates = stepwise.Search._fitted_on(cast(stepwise.Search, search), models)
+    assert [m.name for m in candidates] == [*left]
+    assert rounds == expected
+    assert [m.name for m in candidates if m.theta] == expected
 
 
 @pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")

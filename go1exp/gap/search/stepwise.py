@@ -237,6 +237,7 @@ class Search(Ledger):
         may = self.state.may
         models = [Model(effect, s.theta, may.also(effect), s.variant.free) for effect, s in chosen.items()]
         fitted = fit(self.state.scorer, models, self.state.table, self.settings.iterations, self.dt) if models else []
+        fitted = self._fitted_on(fitted)
         near = excess(self.select_chi2) <= self.settings.adequate
         movable = {key[0] for key in self.state.keys} if near else set()
         again = [self._freed(m.name) if m.name in movable else m for m in fitted]
@@ -246,6 +247,18 @@ class Search(Ledger):
             min(m, self._given_back(m.name, m.theta), key=misfit) if tolerances.confounded(m.name, best) else m
             for m in better
         ]
+
+    def _fitted_on(self, fitted: Sequence[Model]) -> list[Model]:
+        """Return candidates, of which those that leave next to nothing are fitted on, if there are several.
+
+        They may do equally well, and one whose fit ended a little early would be called worse than the others.
+        """
+        near = [m for m in fitted if m.chi2 is not None and excess(m.chi2) <= self.settings.adequate]
+        if len(near) < 2:
+            return [*fitted]
+        ended = fit(self.state.scorer, near, self.state.table, self.settings.iterations, self.dt)
+        by_name = {m.name: m for m in (*fitted, *ended)}
+        return [by_name[m.name] for m in fitted]
 
     # ------------------------------------------------------------------ judgement
 
