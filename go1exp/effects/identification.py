@@ -73,6 +73,8 @@ class Identification:
         excitation: motion that shows it best (``go1exp list excitations``).
         confounded: effects that many recordings cannot tell from it. It is enough if one of two names the other.
         told_apart_by: what to record to tell them apart, the end of a sentence that begins with "record".
+        doubt_on_feet: what to look at before it is believed of a robot on its feet, where it was named wrongly; a
+            sentence. Empty: nothing.
     """
 
     nominal: bool = False
@@ -93,3 +95,4 @@ class Identification:
     excitation: str = "chirp"
     confounded: tuple[str, ...] = ()
     told_apart_by: str = ""
+    doubt_on_feet: str = ""

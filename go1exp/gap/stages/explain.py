@@ -25,6 +25,7 @@ from go1exp.gap.score.robust import excess
 from go1exp.gap.search import clocks
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
+from go1exp.gap.search.tolerances import identification
 from go1exp.gap.sentence import advice, sentence
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
@@ -36,12 +37,6 @@ FEWEST_SWINGS = 24
 SWING_ALONE = (
     "Only legs in the air were compared, so trunk, feet and ground were not judged; search.phase=whole compares all."
 )
-
-OFFSET_ON_FEET = (
-    "Drives that are weak at one kind of joints can look like this encoder_offset while the robot is on its feet: "
-    "look at its zeros, or record it hung, before training takes it."
-)
-"""Seen on sealed walks: hips of 85 % were named as certified offsets of the calves (docs/gap_walks.md)."""
 
 
 def explain(
@@ -116,7 +111,8 @@ def _explained(
 
 def doubts(named: Sequence[NamedEffect], on_ground: bool) -> list[str]:
     """Return what to look at before what is named is believed, where it has been wrong on sealed cases."""
-    return [OFFSET_ON_FEET] if on_ground and any(n.effect == "encoder_offset" for n in named) else []
+    doubted = (identification(n.effect).doubt_on_feet for n in named if on_ground)
+    return [line for line in doubted if line]
 
 
 def searched(comparison: Comparison, rng: np.random.Generator, warnings: list[str], on_progress: Progress) -> Search:
