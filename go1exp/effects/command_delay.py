@@ -44,7 +44,7 @@ class CommandDelay(Delayed):
         """Return the feed-forward torque of ``delay`` ago: it comes with the target."""
         if self._fed is None:
             self._fed = self._line.twin()
-        return self._fed.advance(torque, self.delay)
+        return self._fed.at(torque, self._steps)
 
     def reset(self, mask: Tensor) -> None:
         """Let the next target and torque stand for the whole past in the rows of ``mask`` (N,)."""

@@ -24,10 +24,15 @@ class Delayed(Effect):
         super().__init__(setup, **values)
         (longest,) = (p.high for p in self.params if p.name == "delay")
         self._line = DelayLine(setup.num_envs, len(setup.joints), longest, setup.physics_dt, setup.dtype, setup.device)
+        self._steps = self._line.steps(self.delay)
+
+    def prepare(self) -> None:
+        """Work out how many samples ago the delays are."""
+        self._steps.copy_(self._line.steps(self.delay))
 
     def late(self, signal: Tensor) -> Tensor:
         """Take the newest ``signal`` (N, J) and return that of ``delay`` ago; once a step."""
-        return self._line.advance(signal, self.delay)
+        return self._line.at(signal, self._steps)
 
     def reset(self, mask: Tensor) -> None:
         """Let the next signal stand for the whole past in the rows of ``mask`` (N,)."""

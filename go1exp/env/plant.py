@@ -234,9 +234,10 @@ class Plant:
         A joint that goes on to change its speed by ``turn`` (N, J), rad/s, rests after ``share`` of the step; so long
         friction has the old sign. Where it would end up sticking this changes nothing, and it turns no joint by itself.
         """
-        bound, share = self.backend.field(FRICTION)[:, self._joints], -self.qd / turn
-        turns = (share > 0.0) & (share < 1.0) & (turn.abs() > 2.0 * bound * self._ease)
-        return torch.where(turns, 2.0 * share * bound * turn.sign(), 0.0)
+        # Between -1 and 0 where the joint turns; at 0 it makes no difference.
+        minus_share, twice = self.qd / turn, 2.0 * self.backend.field(FRICTION)[:, self._joints]
+        turns = (minus_share.ceil() == 0.0) & (turn.abs() > twice * self._ease)
+        return torch.where(turns, torch.copysign(minus_share * twice, turn), 0.0)
 
     def joint_acceleration(self) -> Tensor:
         """(N, J) change of joint speed over the last step, rad/s2."""

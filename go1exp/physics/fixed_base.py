@@ -8,15 +8,12 @@ from pathlib import Path
 import mujoco
 
 from go1exp.physics.mount import add_mount
-from go1exp.physics.scene import RIGID, Sensors
+from go1exp.physics.scene import RIGID
 from go1exp.robot import MOUNT
 from go1exp.schema.registry import Expected
 
 BASE = "trunk"
 """Name that the base body gets, whatever the file calls it: effects on the attitude of a held robot look for it."""
-
-NO_SENSORS = Sensors(*[slice(0, 0)] * 7)
-"""Blocks of a model without any."""
 
 
 class FixedBaseError(Expected):
@@ -30,7 +27,6 @@ def build_fixed_base(
     effort: Sequence[float],
     physics_dt: float,
     base_quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
-    disable: int = 0,
     mounted: bool = False,
 ) -> mujoco.MjModel:
     """Compile a robot that is bolted down.
@@ -45,7 +41,6 @@ def build_fixed_base(
         effort: peak torque of each, (J,) N m.
         physics_dt: timestep, s.
         base_quat: attitude of the base, w-x-y-z, base to world; it replaces the file's.
-        disable: further disable flags of MuJoCo.
         mounted: the base has the joints of ``physics/mount.py``, before its own.
 
     Raises:
@@ -78,9 +73,9 @@ def build_fixed_base(
         motor.forcelimited, motor.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
     spec.option.timestep = physics_dt
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    flags = (mujoco.mjtDisableBit.mjDSBL_AUTORESET, mujoco.mjtDisableBit.mjDSBL_ISLAND)
-    for flag in (*map(int, flags), disable):
-        spec.option.disableflags |= flag
+    without = mujoco.mjtDisableBit
+    for flag in (without.mjDSBL_AUTORESET, without.mjDSBL_ISLAND, without.mjDSBL_CONTACT, without.mjDSBL_SENSOR):
+        spec.option.disableflags |= int(flag)
     try:
         model = spec.compile()
     except ValueError as error:

@@ -8,7 +8,6 @@ import numpy as np
 from go1exp import robot
 from go1exp.physics.scene import build_model
 from go1exp.robot import RobotConfig
-from go1exp.terrain import TerrainConfig, build_terrain
 
 
 def joint_torques(
@@ -26,8 +25,7 @@ def joint_torques(
     Returns:
         torques (T, 12), N m.
     """
-    terrain = build_terrain(TerrainConfig(kind="flat"))
-    model, _ = build_model(config, terrain, physics_dt=0.002, held=base_quat)
+    model, _ = build_model(config, None, physics_dt=0.002, held=base_quat)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # no stop and no ground is touched
     data = mujoco.MjData(model)
     torque = np.zeros_like(q)

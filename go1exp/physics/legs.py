@@ -54,8 +54,7 @@ class LegDynamics:
 
     def __init__(self, config: RobotConfig) -> None:
         """Compile the robot with its trunk free and nothing to touch."""
-        self._model, _ = build_model(config, build_terrain(TerrainConfig(kind="flat")), 0.002)
-        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self._model, _ = build_model(config, None, 0.002)
         self._data = mujoco.MjData(self._model)
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, trunk: np.ndarray) -> np.ndarray:

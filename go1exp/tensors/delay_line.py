@@ -27,10 +27,12 @@ class DelayLine(Memory):
     ) -> None:
         """Allocate for delays up to ``longest`` s of a signal sampled every ``dt`` s."""
         self._dt, self._longest = dt, longest
-        self._depth = math.ceil(longest / dt - 1e-9) + 2
-        self._past = torch.zeros(self._depth, num_envs, joints, dtype=dtype, device=device)
+        self._oldest = math.ceil(longest / dt - 1e-9)  # samples back
+        slots = 1 << (self._oldest + 1).bit_length()  # a power of two: places wrap around by a mask
+        self._wrap = slots - 1
+        self._past = torch.zeros(slots, num_envs, joints, dtype=dtype, device=device)
         self._newest = torch.zeros(1, dtype=torch.int64, device=device)
-        self._age = torch.zeros(num_envs, 1, dtype=torch.int64, device=device)
+        self._age = torch.zeros(num_envs, 1, dtype=dtype, device=device)
 
     def twin(self) -> DelayLine:
         """Return an empty line for another signal (N, J) of the same kind."""
@@ -47,17 +49,25 @@ class DelayLine(Memory):
 
     def reset(self, mask: Tensor) -> None:
         """Let the next sample stand for the whole past in the rows of ``mask`` (N,)."""
-        self._age.masked_fill_(mask.unsqueeze(1), 0)
+        rows = mask.unsqueeze(1)
+        self._age.masked_fill_(rows, 0)
+        self._past.masked_fill_(rows, 0)  # what counts nothing must be finite
+
+    def steps(self, delay: Tensor) -> Tensor:
+        """Return delays in s as numbers of samples, as :meth:`at` takes them."""
+        return (delay / self._dt).clamp_(0.0, self._oldest)
 
     def advance(self, sample: Tensor, delay: Tensor) -> Tensor:
         """Take the newest ``sample`` (N, J) and return the signal ``delay`` (N, J) or (N, 1) s ago."""
-        self._newest.add_(1).remainder_(self._depth)
+        return self.at(sample, self.steps(delay))
+
+    def at(self, sample: Tensor, steps: Tensor) -> Tensor:
+        """Take the newest ``sample`` (N, J) and return the signal ``steps`` (N, J) or (N, 1) samples ago."""
+        self._newest.add_(1).bitwise_and_(self._wrap)
         self._past.index_copy_(0, self._newest, sample.unsqueeze(0))
-        steps = torch.minimum((delay / self._dt).clamp(0.0, self._depth - 2), self._age).expand_as(sample)
+        steps = torch.minimum(steps, self._age).expand_as(sample).unsqueeze(0)
         self._age += 1
-        whole = steps.floor()
-        share = steps - whole
-        index = (self._newest - whole.long()).remainder_(self._depth).unsqueeze(0)
-        a = self._past.gather(0, index).squeeze(0)
-        b = self._past.gather(0, index.sub_(1).remainder_(self._depth)).squeeze(0)
-        return torch.where(share == 0, a, torch.lerp(a, b, share))
+        index = (self._newest - steps.long()).bitwise_and_(self._wrap)
+        after = self._past.gather(0, index)
+        before = self._past.gather(0, index.sub_(1).bitwise_and_(self._wrap))
+        return torch.lerp(after, before, steps.frac()).squeeze(0)

@@ -12,9 +12,6 @@ from go1exp.effects.tolerances import Tolerances
 from go1exp.schema.joint_values import JointValues
 from go1exp.schema.registry import Term, bind
 
-NEEDLESS = 1 << 4 | 1 << 13
-"""MuJoCo's flags (mjDSBL_CONTACT, mjDSBL_SENSOR) for what a robot in the air does not need; half of the step's time."""
-
 
 class Machine(Protocol):
     """A robot that can be replayed."""

@@ -200,16 +200,26 @@ def padded(rows: int) -> int:
 
 def _sampled(q: np.ndarray, qd: np.ndarray, torque: np.ndarray | None, at: np.ndarray, dt: float) -> np.ndarray:
     """Interpolate (K, R, J) to the times ``at`` (R, n), in steps: angles by cubics, the rest by lines."""
+    rows, joints = at.shape[0], q.shape[2]
     low = np.clip(np.floor(at + 1e-6).astype(int), 0, len(q) - 2)
     share = np.maximum(at - low, 0.0)[..., None]
-    row = np.arange(at.shape[0])[:, None]
+    before = low * rows + np.arange(rows)[:, None]
+
+    def values(signal: np.ndarray, place: np.ndarray) -> np.ndarray:
+        return np.take(signal.reshape(-1, joints), place, axis=0)
+
+    a, va = values(q, before), values(qd, before)
+    of_torque = [] if torque is None else [values(torque, before)]
     if share.max() < 1e-4:
-        parts = [q[low, row], qd[low, row], *([torque[low, row]] if torque is not None else [])]
-        return np.stack(parts, axis=2)
-    a, b, va, vb = q[low, row], q[low + 1, row], qd[low, row] * dt, qd[low + 1, row] * dt
+        return np.stack([a, va, *of_torque], axis=2)
+    b, vb = values(q, before + rows), values(qd, before + rows)
+    va *= dt
+    vb *= dt
     s2, s3 = share**2, share**3
-    angle = a + share * va + s2 * (3 * (b - a) - 2 * va - vb) + s3 * (2 * (a - b) + va + vb)
-    parts = [angle, (va + share * (vb - va)) / dt]
-    if torque is not None:
-        parts.append(torque[low, row] + share * (torque[low + 1, row] - torque[low, row]))
-    return np.stack(parts, axis=2)
+    y = np.empty((*at.shape, 2 + len(of_torque), joints))
+    y[:, :, 0] = a + share * va + s2 * (3 * (b - a) - 2 * va - vb) + s3 * (2 * (a - b) + va + vb)
+    y[:, :, 1] = (va + share * (vb - va)) / dt
+    for made in of_torque:
+        assert torque is not None
+        y[:, :, 2] = made + share * (values(torque, before + rows) - made)
+    return y

@@ -19,13 +19,14 @@ from go1exp.effects.tolerances import DECLARED, Tolerances
 from go1exp.gap.data.cutting import Place, cut
 from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import NEEDLESS, pd, voltage
+from go1exp.gap.replay.machine import pd, voltage
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.result import Clock, GapSettings, Phase
 from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, gain_warnings, wrong_speeds
 from go1exp.gap.robots.description import ModelConfig
-from go1exp.physics.fixed_base import NO_SENSORS, FixedBaseError, build_fixed_base, feel_each_other
+from go1exp.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
 from go1exp.physics.mujoco_cpu import MujocoCpu
+from go1exp.physics.scene import NO_SENSORS
 from go1exp.recording import Recording
 from go1exp.schema.registry import ConfigError, Entry, Term
 from go1exp.tensors.randomness import EnvRandom
@@ -103,7 +104,7 @@ class FixedBase:
     def model(self, physics_dt: float, base_quat: Sequence[float], mounted: bool = False) -> Any:
         """Return the compiled MuJoCo model; the base of one that is ``mounted`` can move."""
         file, base = Path(self.config.mjcf), self.config.base
-        return build_fixed_base(file, base, self.joints, self.effort, physics_dt, base_quat, NEEDLESS, mounted)
+        return build_fixed_base(file, base, self.joints, self.effort, physics_dt, base_quat, mounted)
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False

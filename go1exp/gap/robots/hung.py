@@ -17,7 +17,6 @@ from go1exp.gap.data.contact import contact_of
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import NEEDLESS
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.result import GapSettings, Phase
 from go1exp.gap.robots.go1 import Go1
@@ -31,7 +30,6 @@ from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.schema.contact import ContactConfig
 from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import TerrainConfig, build_terrain
 
 LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
 
@@ -75,9 +73,7 @@ class HungGo1(Go1):
     ) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
         w, x, y, z = base_quat
-        ground = build_terrain(TerrainConfig(kind="flat"))
-        model, blocks = build_model(self.config, ground, physics_dt, held=(w, x, y, z), mounted=mounted)
-        model.opt.disableflags |= NEEDLESS
+        model, blocks = build_model(self.config, None, physics_dt, held=(w, x, y, z), mounted=mounted)
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 

@@ -16,7 +16,6 @@ from go1exp.env.plant import drive_setup
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.swings import SwingWindows, cut_swings, for_swings
 from go1exp.gap.data.windows import Windows
-from go1exp.gap.replay.machine import NEEDLESS
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.swinging import HEAVY, SwingReplayer
 from go1exp.gap.result import GapSettings, Phase
@@ -27,7 +26,6 @@ from go1exp.physics.scene import build_model, weigh_down
 from go1exp.recording import Recording
 from go1exp.robot import RobotConfig
 from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import TerrainConfig, build_terrain
 
 IMU_PROBE = (0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.0005)
 """Errors of accelerometer, m/s2, gyro, rad/s, and delay, s, by which the influence of the IMU is measured."""
@@ -59,8 +57,7 @@ class SwingingGo1(Go1):
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
     ) -> tuple[Any, DriveSetup]:
         """Return a backend with ``num`` robots in the air on heavy trunks, and their drives."""
-        model, blocks = build_model(self.config, build_terrain(TerrainConfig(kind="flat")), physics_dt)
-        model.opt.disableflags |= NEEDLESS
+        model, blocks = build_model(self.config, None, physics_dt)
         weigh_down(model, HEAVY)
         backend = MujocoCpu(model, blocks, num, threads)
         return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))

@@ -10,9 +10,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import lsq_linear
 
 from go1exp.effects.base import Param
 from go1exp.effects.identification import Identification
@@ -27,9 +26,6 @@ PRIOR = 0.5
 
 WIDE = 20.0
 """The same for a parameter that may leave it."""
-
-ROUNDS = 40
-"""Rounds after which an active set counts as cycling."""
 
 
 def identification(effect: str) -> Identification:
@@ -233,22 +229,17 @@ def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:
     full = _definite((matrix + np.diag(limits.weight)) * scale[:, None] * scale)
     aim = (right + limits.weight * limits.centre) * scale
     low, high = limits.low / scale, limits.high / scale
-    # The primal-dual active set method (Hintermueller, Ito and Kunisch, 2002) needs a few solutions of equations where
-    # SciPy's bounded least squares needs one for each bound that it meets; where it cycles, SciPy decides.
-    x = np.clip(np.zeros_like(aim), low, high)
-    slope, before = aim - full @ x, None
-    for _ in range(ROUNDS):
-        below, above = x + slope <= low, x + slope >= high
-        if before is not None and np.array_equal(below, before[0]) and np.array_equal(above, before[1]):
-            return np.asarray(x.clip(low, high) * scale)
-        before, free = (below, above), ~(below | above)
-        x = np.where(below, low, np.where(above, high, 0.0))
-        if free.any():
-            x[free] = cho_solve(cho_factor(full[np.ix_(free, free)]), aim[free] - full[np.ix_(free, ~free)] @ x[~free])
-        slope = np.where(free, 0.0, aim - full @ x)
-    root = np.linalg.cholesky(full)
-    wide = np.where(high - low < 1e-9, low + 1e-9, high)
-    return np.asarray(lsq_linear(root.T, np.linalg.solve(root, aim), (low, wide), method="bvls").x * scale)
+    x, moves = low.copy(), low < high
+    size = int(moves.sum())
+    if not size:
+        return np.asarray(x * scale)
+    inner, slope = full[np.ix_(moves, moves)], full[np.ix_(moves, ~moves)] @ x[~moves] - aim[moves]
+    best = np.zeros(size).clip(low[moves], high[moves])
+    factor, free = np.zeros((size, size + 7)), np.zeros(size, dtype=np.int32)
+    if mujoco.mju_boxQP(best, factor, free, inner, slope, low[moves], high[moves]) < 0:
+        raise np.linalg.LinAlgError("MuJoCo found no minimum within bounds")
+    x[moves] = best
+    return np.asarray(x * scale)
 
 
 def moved(theta: Theta, layout: Layout, columns: Sequence[Probe], x: np.ndarray, machine: Machine) -> Theta:
