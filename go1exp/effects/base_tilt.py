@@ -11,7 +11,7 @@ from go1exp.drive import ModelFields
 from go1exp.effects.base import Effect, Measured, Param
 from go1exp.effects.identification import TWO_ATTITUDES, Identification
 from go1exp.schema.registry import effect
-from go1exp.tensors.rotation import quat_multiply
+from go1exp.tensors.rotation import quat_multiply, rotate, rotate_inverse
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -55,12 +55,10 @@ class BaseTilt(Effect):
         """Turn gravity about a held trunk."""
         if self.setup.floating:
             return
-        from scipy.spatial.transform import Rotation  # slow to import, and settings are checked first
-
-        quat = model.nominal("body_quat")[0, model.ids("body", ("trunk",))].cpu().numpy()
+        (trunk,) = model.ids("body", ("trunk",))
         gravity = model.field("opt.gravity")
-        held = torch.as_tensor(Rotation.from_quat(quat, scalar_first=True).as_matrix()[0]).to(gravity)
-        turned = _tilted(self.roll, self.pitch, gravity @ held) @ held.T
+        held = model.nominal("body_quat")[:, trunk].to(gravity)
+        turned = rotate(held, _tilted(self.roll, self.pitch, rotate_inverse(held, gravity)))
         gravity.copy_(torch.where((self.roll == 0.0) & (self.pitch == 0.0), gravity, turned))
 
     def on_sensor(self, measured: Measured) -> Measured:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from go1exp.actuator.setup import Actuator, HasGains
 from go1exp.drive import DriveSetup, ModelFields
 from go1exp.effects.base import Effect, Gears, Measured
 from go1exp.effects.two_mass import TwoMass
+from go1exp.physics.backend import PhysicsBackend
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term
 
@@ -24,15 +25,16 @@ HOOKS = (
 class _Fields:
     """Model fields under construction: the compiled values, changed by one effect after the other."""
 
-    def __init__(self, compiled: Callable[[str], Tensor], ids: Callable[..., Tensor], names: Sequence[str], n: int):
-        self._compiled, self.ids = compiled, ids
-        self.values = {name: compiled(name).unsqueeze(0).repeat(n, *[1] * compiled(name).dim()) for name in names}
+    def __init__(self, backend: PhysicsBackend, names: Sequence[str]) -> None:
+        self._backend, self.ids, n = backend, backend.ids, backend.num_envs
+        compiled = {name: backend.compiled(name) for name in names}
+        self.values = {name: value.unsqueeze(0).repeat(n, *[1] * value.dim()) for name, value in compiled.items()}
 
     def field(self, name: str) -> Tensor:
         return self.values[name]
 
     def nominal(self, name: str) -> Tensor:
-        return self._compiled(name).unsqueeze(0)
+        return self._backend.compiled(name).unsqueeze(0) if name in self.values else self._backend.nominal(name)
 
 
 class EffectStack:
@@ -83,9 +85,9 @@ class EffectStack:
                 drawn = (centre + widths[p.name] * unit.to(live.dtype)).clamp(p.smallest, p.high)
                 live.copy_(torch.where(named, drawn, centre))
 
-    def model_values(self, compiled: Callable[[str], Tensor], ids: Callable[..., Tensor]) -> dict[str, Tensor]:
-        """Return the model fields (N, ...) with all effects in them; ``compiled(name)`` gives a field without."""
-        fields: ModelFields = _Fields(compiled, ids, self.fields, self._setup.num_envs)
+    def model_values(self, backend: PhysicsBackend) -> dict[str, Tensor]:
+        """Return the fields (N, ...) of the backend's model with all effects in them, from those without any."""
+        fields: ModelFields = _Fields(backend, self.fields)
         for effect in self._acting["edit_model"]:
             effect.edit_model(fields)
         return fields.values  # type: ignore[attr-defined]

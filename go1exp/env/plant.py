@@ -116,7 +116,7 @@ class Plant:
         """Put the effects' present values into force: in their laws, the model and the drives."""
         self.effects.prepare()
         if self.effects.fields:
-            self.backend.rebase(self.effects.model_values(self.backend.compiled, self.backend.ids))
+            self.backend.rebase(self.effects.model_values(self.backend))
             self.backend.derive_constants(torch.ones(len(self.q), dtype=torch.bool, device=self.q.device))
         if self._gains:
             self.effects.set_gains(self.actuator, *self._gains)

@@ -17,10 +17,10 @@ from go1exp.env.plant import FRICTION, Plant
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Rows, bolted, mounted
+from go1exp.physics.backend import PhysicsBackend
 from go1exp.schema.registry import bind
 
-Base = tuple[tuple[float, ...], bool]
-"""Attitude of a base, and whether it can move on a mount."""
+LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass
@@ -41,7 +41,7 @@ class Replayer:
     max_rows: int
     threads: int
     made: int = 0
-    _backends: dict[Any, tuple[Any, DriveSetup, set[str]]] = field(default_factory=dict)
+    _backends: dict[tuple[int, float, bool], tuple[Any, DriveSetup, set[str]]] = field(default_factory=dict)
     _inputs: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     def run(self, rows: Rows, dt: float) -> np.ndarray:
@@ -49,29 +49,28 @@ class Replayer:
         w = self.windows
         y = np.empty((len(rows.window), w.t.shape[1], len(w.quantities), len(w.joints)))
         soft = mounted(rows)
-        kinds, which = np.unique(np.c_[self.quats[rows.window].round(6), soft], axis=0, return_inverse=True)
-        for k, (*quat, softly) in enumerate(kinds):
-            members = np.flatnonzero(which.ravel() == k)
+        for softly in np.unique(soft):
+            members = np.flatnonzero(soft == softly)
             part = rows if softly else bolted(rows)
             pieces = int(np.ceil(len(members) / self.max_rows))
             for piece in np.array_split(members, pieces):
                 size = min(padded(len(piece)), self.max_rows)
                 full = np.concatenate([piece, np.repeat(piece[-1:], size - len(piece))])
-                base = tuple(float(v) for v in quat), bool(softly)
-                y[piece] = self._batch(part.part(full), dt, base)[: len(piece)]
+                y[piece] = self._batch(part.part(full), dt, bool(softly))[: len(piece)]
         return y
 
-    def _plant(self, rows: Rows, dt: float, base: Base) -> Plant:
+    def _plant(self, rows: Rows, dt: float, softly: bool) -> Plant:
         """Return a plant whose effects are exactly those of ``rows``, on a backend that may be an old one."""
-        key = (len(rows.window), dt, base)
+        key = len(rows.window), dt, softly
         if key not in self._backends:
-            quat, softly = base
-            self._backends[key] = (*self.machine.build(len(rows.window), dt, quat, self.threads, softly), set())
+            self._backends[key] = (*self.machine.build(len(rows.window), dt, LEVEL, self.threads, softly), set())
         backend, setup, touched = self._backends[key]
         for name in touched:
             backend.field(name).copy_(backend.compiled(name))
         if touched:
             backend.derive_constants(torch.ones(len(rows.window), dtype=torch.bool))
+        if not setup.floating:
+            hold(backend, self.quats[rows.window])
         names = list(dict.fromkeys(effect for effect, _ in rows.values))
         terms = [bind("effect", name, {}, name)[0] for name in names]
         plant = Plant(backend, setup, self.machine.drive(), [term for term in terms if term is not None])
@@ -153,10 +152,10 @@ class Replayer:
             self._inputs[dt] = torch.as_tensor(targets), torch.as_tensor(enabled)
         return self._inputs[dt]
 
-    def _batch(self, rows: Rows, dt: float, base: Base) -> np.ndarray:
+    def _batch(self, rows: Rows, dt: float, softly: bool) -> np.ndarray:
         """Run a batch, all windows at once."""
         w = self.windows
-        plant = self._plant(rows, dt, base)
+        plant = self._plant(rows, dt, softly)
         index = torch.as_tensor(rows.window)
         targets, enabled = self._signals(dt)
         targets, enabled = targets[:, index], enabled[:, index]
@@ -190,6 +189,14 @@ class Replayer:
         at = w.t[rows.window] / dt - first
         y = _sampled(q, qd, torque, at, dt)
         return y if recorder is None else recorder.joined(y, at, plant, dt)
+
+
+def hold(backend: PhysicsBackend, quats: np.ndarray) -> None:
+    """Hold the trunks of robots that are not free at attitudes of their own (R, 4), w-x-y-z, base to world."""
+    attitude = backend.compiled("body_quat").repeat(len(quats), 1, 1)
+    (trunk,) = backend.ids("body", ("trunk",))
+    attitude[:, trunk] = torch.as_tensor(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    backend.rebase({"body_quat": attitude})
 
 
 def padded(rows: int) -> int:
