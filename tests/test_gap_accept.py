@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from go1exp.compose import compose
 from go1exp.gap.answer import decide
 from go1exp.gap.files import _errors
 from go1exp.gap.report import words
-from go1exp.gap.result import AngleErrors, GapResult, GapSettings
+from go1exp.gap.result import AngleErrors, GapResult, GapSettings, NamedEffect
 from go1exp.gap.score import angle_errors
 from go1exp.schema.registry import ConfigError
 from go1exp.schema.settings import parse
@@ -41,18 +41,27 @@ def test_another_angle_is_refused_in_one_line(given: str) -> None:
 
 def search(**changes: Any) -> Any:
     signal = dict.fromkeys(("coulomb", "viscous"), 100.0)
-    usual = {"settings": GapSettings(), "signal": signal, "state": SimpleNamespace(terms=("coulomb",))}
-    return SimpleNamespace(**{**usual, **changes})
+    return SimpleNamespace(**{"settings": GapSettings(), "signal": signal, "first": 80.0, **changes})
+
+
+def term(status: Literal["certified", "compensating"]) -> NamedEffect:
+    return NamedEffect("coulomb", ("knee",), {}, {}, ("coulomb",), status)
 
 
 def test_what_remains_is_right_if_it_is_accepted_and_the_names_stay() -> None:
-    nothing = search(state=SimpleNamespace(terms=()))
-    assert decide(search(), 80.0, 40.0, False) == "partly explained"
-    assert decide(search(), 80.0, 40.0, True) == "explained"
-    assert decide(nothing, 80.0, 80.0, False) == "unexplained"
-    assert decide(nothing, 80.0, 80.0, True) == "no gap"
-    still = search(state=SimpleNamespace(terms=()), signal={"coulomb": 0.0})
-    assert decide(still, 80.0, 80.0, True) == "not excited"
+    sure = (term("certified"),)
+    assert decide(search(), sure, 40.0, False) == "partly explained"
+    assert decide(search(), sure, 40.0, True) == "explained"
+    assert decide(search(), (), 80.0, False) == "unexplained"
+    assert decide(search(), (), 80.0, True) == "no gap"
+    assert decide(search(signal={"coulomb": 0.0}), (), 80.0, True) == "not excited"
+
+
+def test_names_none_of_which_is_certain_explain_nothing_however_near_they_come() -> None:
+    sure, unsure = term("certified"), term("compensating")
+    assert decide(search(), (unsure, unsure), 0.1, False) == "partly explained"
+    assert decide(search(), (unsure,), 0.1, True) == "explained"
+    assert decide(search(), (unsure, sure), 0.1, False) == "explained"
 
 
 def test_every_joint_of_a_window_must_be_within_beside_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -303,7 +303,7 @@ def test_a_replay_begins_where_the_mount_bears_the_legs_or_so_far_from_it_as_is_
     values = {("soft_mount", name): np.array([value]) for name, value in SOFT.items()}
     soft_rows = variants(replayer().machine, values, np.arange(4), [])
     load = np.tile([1.0, 2.0, 3.0, 0.1, 0.2, 5.0, 0.0, 0.0, 0.0, 0.5], (4, 1))
-    plant = replayer()._plant(soft_rows, 0.001, (LEVEL, True))
+    plant = replayer()._plant(soft_rows, 0.001, True)
     w, backend = replayer().windows, plant.backend
     assert isinstance(backend, MujocoCpu)
     q, qd = torch.as_tensor(w.q[:4]), torch.as_tensor(w.qd[:4])

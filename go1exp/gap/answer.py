@@ -97,7 +97,7 @@ def concluded(search: Search, warnings: list[str]) -> Answer:
         search.withdraw(f"the tolerances suffice, and {why}")
         final, theta, named = search.first, search.state.theta, ()
     within = share_accepted(search)
-    verdict = decide(search, first, final, within >= MOST_WINDOWS)
+    verdict = decide(search, named, final, within >= MOST_WINDOWS)
     reached = {"null": plain, "box": first, "final": final}
     if len(search.splits.confirm):
         confirmed = reached["confirm"] = excess(search.state.held_out(windows=search.splits.confirm))
@@ -265,15 +265,23 @@ def _intervals(
     return {name: (float(min(low[k], values[k])), float(max(high[k], values[k]))) for k, name in kept.items()}
 
 
-def decide(search: Search, first: float, final: float, accepted: bool) -> Verdict:
-    """Return the verdict from the held-out excesses within the tolerances, and with the terms.
+def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted: bool) -> Verdict:
+    """Return the verdict.
 
-    ``accepted``: what remains is within what the user does not care about.
+    Terms none of which is certain explain nothing, however near they bring the model to these logs: so near come some
+    to a robot that has none of them.
+
+    Args:
+        search: that is done.
+        named: its terms.
+        final: held-out excess with them.
+        accepted: whether what remains is within what the user does not care about.
     """
-    settings = search.settings
+    settings, first = search.settings, search.first
     loud = [effect for effect, s in search.signal.items() if s >= SILENT]
-    if search.state.terms:
-        return "explained" if accepted or final <= settings.adequate else "partly explained"
+    if named:
+        sure = final <= settings.adequate and any(n.status == "certified" for n in named)
+        return "explained" if accepted or sure else "partly explained"
     if first > settings.adequate and not accepted:
         return "unexplained"
     return "not excited" if len(loud) < 0.5 * len(search.signal) else "no gap"

@@ -76,7 +76,7 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggesti
         accepted = 1e3 * search.settings.accept
         parts.append(f"{answer.within:.0%} of the held-out windows are within the {accepted:.3g} mrad accepted.")
     if answer.verdict == "partly explained":
-        parts.append("The rest is explained by nothing in the library, so what is named may stand for something else.")
+        parts.append(_partly(answer, search.settings.adequate))
     named = {effect.effect for effect in answer.named}  # a simpler one may have taken the place of what was accepted
     first_tried = [c for c in search.candidates if c.stage == 1 and c.effect not in named]
     rejected = [c.effect for c in first_tried if c.status == "rejected"][:2]
@@ -88,6 +88,13 @@ def sentence(answer: Answer, search: Search, silent: Mapping[str, str], suggesti
     if quiet:
         parts.append(f"These logs cannot show {', '.join(quiet)}.")
     return " ".join([*filter(None, parts), *suggestions])
+
+
+def _partly(answer: Answer, adequate: float) -> str:
+    """Return why an answer that names something is not a full one."""
+    if answer.excess["final"] <= adequate and not any(effect.status == "certified" for effect in answer.named):
+        return "That is near the floor, but nothing of what is named is certain, so it may stand for something else."
+    return "The rest is explained by nothing in the library, so what is named may stand for something else."
 
 
 def _opening(verdict: Verdict, first: float, search: Search) -> str:
