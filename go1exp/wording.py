@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+NOT_FOR_TRAINING = "Not for training."
+"""How a file of effects says on its first line that training should not take it."""
+
 
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun: ``1 row``, ``2 rows``."""

@@ -25,6 +25,7 @@ from go1exp.gap.result import GapSettings
 from go1exp.recording import Meta, Recording, RecordingError
 from go1exp.robot import JOINTS
 from go1exp.schema.registry import ConfigError
+from go1exp.wording import NOT_FOR_TRAINING
 
 Run = Callable[..., tuple[int, str]]
 
@@ -167,6 +168,14 @@ def test_every_wrong_file_is_named_at_once(run: Run) -> None:
 def test_a_file_that_says_none_is_none(tmp_path: Path, run: Run) -> None:
     (tmp_path / "mine.yaml").write_text((config_folder() / "effect/none.yaml").read_text())
     assert compose("train", choices_from_files(["effect=mine.yaml"], "train"))["effect"] == {}
+
+
+def test_training_warns_of_a_file_that_is_not_for_it(tmp_path: Path, run: Run) -> None:
+    (tmp_path / "compensating.yaml").write_text(f"# Makes up. {NOT_FOR_TRAINING}\ncoulomb:\n  bound: 0.1\n")
+    with pytest.warns(UserWarning, match=r"effect=compensating\.yaml: not for training"):
+        composed = compose("train", choices_from_files(["effect=compensating.yaml"], "train"))
+    assert composed["effect"] == {"coulomb": {"bound": 0.1}}
+    choices_from_files(["effect=compensating.yaml"], "record")  # may have it
 
 
 def test_a_file_is_taken_though_a_shipped_choice_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

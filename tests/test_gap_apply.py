@@ -210,7 +210,8 @@ def test_training_reads_what_was_named(tmp_path: Path) -> None:
     assert terms["kd_scale"].slots["spread"] == {"scale": 0.2}  # it may be viscous: twice as wide
     assert "cannot tell it from viscous" in written[0].read_text()
     assert "viscous" not in OmegaConf.load(written[0])
-    (only,) = task(written[2]).effect
+    with pytest.warns(UserWarning, match="not for training"):
+        (only,) = task(written[2]).effect
     assert (only.key, only.parameters["damping"]) == ("viscous", {"FR_hip": 0.3})
     (nominal,) = task(written[1]).effect
     assert (nominal.key, nominal.parameters["added"]) == ("armature", dict.fromkeys(JOINTS, 5e-4))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from go1exp.choices import choice_files, config_folder, groups_in, groups_of
 from go1exp.schema.registry import ConfigError
 from go1exp.schema.yaml_file import UNREADABLE, why_unreadable
+from go1exp.wording import NOT_FOR_TRAINING
 
 PATHS = {"model": "mjcf"}
 """Group -> key of its files that names another file, from where the file itself lies."""
@@ -47,7 +49,7 @@ def choices_from_files(arguments: Sequence[str], verb: str) -> list[str]:
             if not re.search(r"\.ya?ml$", file):
                 return item[0]
             try:
-                return _choice(group, file)
+                return _choice(group, file, verb)
             except ConfigError as error:
                 problems.extend(error.problems)
                 return ""
@@ -64,8 +66,8 @@ def _unquoted(item: str) -> str:
     return re.sub(r"\\(.)", r"\1", item[1:-1]) if item[:1] in ("'", '"') else item
 
 
-def _choice(group: str, file: str) -> str:
-    """Make a file a choice of ``group`` and return its name there."""
+def _choice(group: str, file: str, verb: str) -> str:
+    """Make a file a choice of ``group`` and return its name there; warn if ``verb`` is what the file is not for."""
     path, key = Path(file).expanduser(), f"{group}={file}"
     none = "none" in choice_files(group, [config_folder()])
     content = _mapping(
@@ -74,6 +76,8 @@ def _choice(group: str, file: str) -> str:
         f"without any, use {group}=none" if none else "it must describe one",
         f"as the files of conf/{group} are",
     )
+    if verb == "train" and NOT_FOR_TRAINING in path.read_text(encoding="utf-8").partition("\n")[0]:
+        warnings.warn(f"{key}: not for training, as its first line says; effect.yaml beside it is", stacklevel=2)
     named = content.get(PATHS.get(group, ""))
     if isinstance(named, str):
         content[PATHS[group]] = str((path.parent / named).resolve())

@@ -32,6 +32,7 @@ from go1exp.schema.contact import contact_text
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term, members
 from go1exp.tensors.threads import one_thread
+from go1exp.wording import NOT_FOR_TRAINING
 
 ROBOT = "robot"
 """Key of a value that belongs to no joint."""
@@ -83,7 +84,7 @@ def write(result: GapResult, folder: Path) -> tuple[Path, ...]:
             "The model's own parameters, within their tolerances.",
             _box_lines(result.box, tolerances_of(result)),
         ),
-        (COMPENSATING, "Makes up for something that no effect describes. Not for training.", _named_lines(rest)),
+        (COMPENSATING, f"Makes up for something that no effect describes. {NOT_FOR_TRAINING}", _named_lines(rest)),
     ):
         path = folder / name
         path.unlink(missing_ok=True)
