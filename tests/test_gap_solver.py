@@ -301,6 +301,42 @@ def test_candidates_that_leave_next_to_nothing_are_fitted_to_their_end(
     assert [m.name for m in candidates if m.theta] == expected
 
 
+@pytest.mark.parametrize(
+    ("left", "asked"),
+    [
+        (0.05, [("leaning", True)]),  # no gap: only what strains a tolerance
+        (0.2, [("screened", False), ("leaning", True)]),
+        (0.7, [("screened", False)]),  # the model is wrong: tolerances do not make up for it
+    ],
+)
+def test_where_little_is_left_and_nothing_alone_removes_it_what_strains_a_tolerance_is_asked(
+    left: float, asked: list[tuple[str, bool]]
+) -> None:
+    judged, model = [], Model("base_tilt", {}, Freedom(DECLARED, frozenset()), ())
+
+    def judge(fitted: list[str], state: Any, train: Any, select: Any, small: bool) -> tuple[Model | None, None]:
+        judged.append((*fitted, small))
+        return (model if fitted == ["leaning"] else None), None
+
+    search: Any = SimpleNamespace(
+        settings=GapSettings(),
+        state=SimpleNamespace(terms=(), loosened=(), train_chi2=None),
+        select_chi2=np.full((8, 4), 1.0 + left),
+        strained=False,
+        progress=lambda what, share: None,
+        _looks_at_all=lambda term, share, small: not small,
+        _screened=lambda: [],
+        _note_signals=lambda screened: None,
+        _fitted=lambda screened: ["screened"],
+        _leaning=lambda screened: ["leaning"],
+        _judged=judge,
+        _accept=lambda accepted: accepted is model,
+    )
+    accepted = stepwise.Search._advance(search)
+    assert judged == asked
+    assert (accepted, search.strained) == (asked[-1][1], asked[-1][1])  # a strained term must be clear of doubt
+
+
 @pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
 def test_hidden_friction_is_named_where_it_is() -> None:
     rig, recordings = robot("effect=coulomb", "effect.coulomb.bound=[0.0,0.0,0.3]")

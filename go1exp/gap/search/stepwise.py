@@ -88,8 +88,16 @@ class Search(Ledger):
         term = len(self.state.terms) + 1
         share = 0.15 + 0.7 * (term - 1) / self.settings.max_terms
         small = excess(self.select_chi2) < self.settings.material
-        fitted = self._proposals(term, share, small)
+        screened = self._screened() if self._looks_at_all(term, share, small) else []
+        self._note_signals(screened)
+        self.progress(f"fitting candidates for term {term}", share + 0.06)
+        fitted = self._leaning(screened) if small else self._fitted(screened)
         accepted, inside = self._judged(fitted, self.state, self.state.train_chi2, self.select_chi2, small)
+        if accepted is None and inside is None and not small and excess(self.select_chi2) <= self.settings.adequate:
+            # Little is left, and nothing alone removes it: several tolerances may make up for what is missing.
+            small = True
+            fitted = self._leaning(screened)
+            accepted, inside = self._judged(fitted, self.state, self.state.train_chi2, self.select_chi2, small)
         if accepted is not None:
             self.progress(f"fitting the model with {accepted.name}", share + 0.12)
             self.strained |= small and not self.state.terms
@@ -100,16 +108,19 @@ class Search(Ledger):
         self._loosen(inside)
         return True
 
-    def _proposals(self, term: int, share: float, small: bool) -> list[Model]:
-        """Return fitted candidates for a term; none where the tolerances close the gap and nothing strains them."""
-        screened: list[Screened] = []
-        if not small or not self.signal:
-            self.progress(f"screening for term {term}", share)
-            screened = self._screened()
-            self._note_signals(screened)
-        if not small:
-            self.progress(f"fitting candidates for term {term}", share + 0.06)
-            return self._fitted(screened)
+    def _looks_at_all(self, term: int, share: float, small: bool) -> bool:
+        """Return whether all effects are screened: not where no gap is left, once their signals are known."""
+        if small and self.signal:
+            return False
+        self.progress(f"screening for term {term}", share)
+        return True
+
+    def _leaning(self, screened: Sequence[Screened]) -> list[Model]:
+        """Return fitted candidates where the tolerances close the gap: none unless something strains them.
+
+        Args:
+            screened: what screening says of every effect; it is asked if that is nothing, and needed.
+        """
         within = tolerances.nominal(self.state.machine)
         relief = strain.relief(self.state.scorer, self.state.table, self.state.may)
         values = strain.values(self.state.scorer, self.state.table)
@@ -118,7 +129,6 @@ class Search(Ledger):
         if not straining and not missing:
             self._note_absorbed(relief)
             return []
-        self.progress(f"fitting candidates for term {term}", share + 0.06)
         if not straining:
             return self._fitted(missing)
         given_back = [self._given_back(effect, self.state.theta) for effect in straining]
