@@ -47,6 +47,15 @@ class DelayLine(Memory):
         twin.load_state_dict(state)
         return twin
 
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Write the state back; that of an older version has as many places as the longest delay needs."""
+        past, newest = state["_past"], state["_newest"]
+        if len(past) < len(self._past):
+            oldest_first = past.roll(-int(newest) - 1, 0)
+            past, newest = torch.zeros_like(self._past), torch.full_like(newest, len(past) - 1)
+            past[: len(oldest_first)] = oldest_first
+        super().load_state_dict({**state, "_past": past, "_newest": newest})
+
     def reset(self, mask: Tensor) -> None:
         """Let the next sample stand for the whole past in the rows of ``mask`` (N,)."""
         rows = mask.unsqueeze(1)
