@@ -25,6 +25,19 @@ def test_it_is_bounded_least_squares() -> None:
         np.testing.assert_allclose(x, slow, atol=1e-6)
 
 
+def test_what_may_not_move_stays_and_the_rest_makes_up_for_it() -> None:
+    rng = np.random.default_rng(1)
+    columns, wanted, fixed = rng.standard_normal((40, 6)), rng.standard_normal(40), np.array([0.0, 0.07])
+    some = limits(-0.1, 0.15, 0.0, 6)
+    some.low[:2] = some.high[:2] = fixed
+    x = tolerances.solve(columns.T @ columns, columns.T @ wanted, some)
+    np.testing.assert_array_equal(x[:2], fixed)
+    slow = lsq_linear(columns[:, 2:], wanted - columns[:, :2] @ fixed, (-0.1, 0.15), tol=1e-12).x
+    np.testing.assert_allclose(x[2:], slow, atol=1e-6)
+    some.low[:] = some.high[:] = 0.02
+    np.testing.assert_allclose(tolerances.solve(columns.T @ columns, columns.T @ wanted, some), 0.02)
+
+
 def test_columns_that_say_the_same_but_for_rounding_are_no_crash() -> None:
     """Their products, summed in float32, can be indefinite by more than the prior holds."""
     matrix = 1e8 * np.array([[1.0, 1.0 + 5e-8, 0.0], [1.0 + 5e-8, 1.0, 0.0], [0.0, 0.0, 1.0]])
