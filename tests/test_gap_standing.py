@@ -27,7 +27,7 @@ from go1exp.gap.score.initial_state import settled
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.localise import ON_FEET, REGIMES, localise
 from go1exp.gap.score.robust import excess
-from go1exp.gap.search import profile_likelihood, single_cause
+from go1exp.gap.search import places, profile_likelihood, single_cause
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.state import State
 from go1exp.gap.search.stepwise import Search
@@ -35,7 +35,7 @@ from go1exp.gap.stages.explain import explain
 from go1exp.physics.legs import Legs
 from go1exp.physics.scene import build_model
 from go1exp.recording import VECTORS, Recording
-from go1exp.robot import RobotConfig
+from go1exp.robot import JOINTS, RobotConfig
 from go1exp.terrain import TerrainConfig, build_terrain
 from tests import laboratory
 
@@ -292,6 +292,31 @@ def test_offsets_that_are_alike_are_one_cause_where_their_tolerance_does_not_rea
     if best is not None:
         assert best.name == "encoder_offset"
         assert best.theta[key] == pytest.approx(np.full(12, offset), abs=1e-3)
+
+
+@pytest.mark.parametrize(("hips", "others"), [(0.855, 1.0), (1.0, 1.0), (0.96, 0.96)])
+def test_the_drives_of_one_part_may_be_off_together_within_their_tolerances(
+    monkeypatch: pytest.MonkeyPatch, hips: float, others: float
+) -> None:
+    """Hips of 0.855 are 0.95 of strength and 0.9 of the gain, as far as this robot tells."""
+    score, _ = scored()
+    keys = [("strength", "scale"), ("kp_scale", "scale")]
+    truth = np.where(np.arange(12) % 3 == 0, hips, others)
+
+    def made_up(score: Scorer, theta: Theta, windows: np.ndarray, dt: float) -> np.ndarray:
+        made = np.prod([np.broadcast_to(theta.get(key, np.ones(1)), (12,)) for key in keys], axis=0)
+        return np.full((len(windows), 1), 1.0 + 1e4 * np.mean((made - truth) ** 2))
+
+    monkeypatch.setattr(profile_likelihood, "chi2", made_up)
+    begin: Theta = {keys[0]: np.full(12, others)}
+    theta = profile_likelihood.at_one_part(score, begin, keys, places.parts(JOINTS), np.arange(2), 0.002)
+    if hips == others:
+        assert theta == begin  # nothing fits better, so nothing changes
+        return
+    made = theta[keys[0]] * theta[keys[1]]
+    np.testing.assert_allclose(made, truth, atol=1e-3)
+    for key in keys:
+        assert (abs(theta[key] - 1.0) <= declared(key).tolerance + 1e-9).all()
 
 
 def test_the_fit_within_tolerances_begins_at_what_is_off_alike_where_nothing_alone_explains_it(

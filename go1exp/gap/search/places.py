@@ -26,6 +26,12 @@ DOUBTFUL = 0.05
 """p-value on held-out windows from which a joint that brings less is left out."""
 
 
+def parts(joints: Sequence[str]) -> list[frozenset[int]]:
+    """Return the joints of each part, by their names: all hips (``FR_hip``), all thighs, all calves."""
+    kinds = [name.split("_", 1)[-1] for name in joints]
+    return [frozenset(k for k, kind in enumerate(kinds) if kind == part) for part in dict.fromkeys(kinds)]
+
+
 def pieces(joints: Sequence[str]) -> list[frozenset[int]]:
     """Return sets of joints that an effect may be at, by their names (``FR_hip``): each one, part, leg, side, and all.
 

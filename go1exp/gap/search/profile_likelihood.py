@@ -9,7 +9,8 @@ Where feet stick, derivatives say little. So values on a ladder are tried, and t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -140,10 +141,7 @@ def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows:
         windows: (V,) to fit.
         dt: physics step, s.
     """
-    limits = {}
-    for key in keys:
-        p = score.replayer.machine.tolerances.param(key)
-        limits[key] = max(p.low, p.null - p.tolerance), min(p.high, p.null + p.tolerance)
+    limits = {key: _limits(score, key) for key in keys}
     theta = {key: value.clip(*limits[key]) for key, value in begin.items() if key in limits}
     least = cost(score, theta, windows, dt)
     for key in [*(k for k in keys if k not in theta), *theta]:
@@ -153,6 +151,56 @@ def within_tolerances(score: Scorer, begin: Theta, keys: Sequence[Key], windows:
         if nearest.fun < least:
             theta, least = {**theta, key: _everywhere(score, key, nearest.x)}, float(nearest.fun)
     return theta
+
+
+def at_one_part(
+    score: Scorer, begin: Theta, keys: Sequence[Key], parts: Iterable[frozenset[int]], windows: np.ndarray, dt: float
+) -> Theta:
+    """Return values within their tolerances of which those of one part's joints are off together, if that fits better.
+
+    All of them at one end of their tolerances come first, since several that are off a little together are what none
+    of them shows by itself; of the best part and end each is then fitted.
+
+    Args:
+        score: what :func:`begun` returns.
+        begin: values within their tolerances.
+        keys: parameters of the joints.
+        parts: the joints of each.
+        windows: (V,) to fit.
+        dt: physics step, s.
+    """
+    theta, least, better = begin, cost(score, begin, windows, dt), frozenset[int]()
+    for part in parts:
+        for end in (0, 1):
+            tried = begin
+            for key in keys:
+                tried = _with_part(score, tried, key, part, _limits(score, key)[end])
+            if (now := cost(score, tried, windows, dt)) < least:
+                theta, least, better = tried, now, part
+    for key in keys if better else ():
+        along = partial(_with_part, score, theta, key, better)
+        nearest = minimize_scalar(
+            lambda value, along=along: cost(score, along(value), windows, dt),
+            bounds=_limits(score, key),
+            options={"maxiter": CLOSER},
+        )
+        if nearest.fun < least:
+            theta, least = along(nearest.x), float(nearest.fun)
+    return theta
+
+
+def _limits(score: Scorer, key: Key) -> tuple[float, float]:
+    """Return the ends of a parameter's tolerance."""
+    p = score.replayer.machine.tolerances.param(key)
+    return max(p.low, p.null - p.tolerance), min(p.high, p.null + p.tolerance)
+
+
+def _with_part(score: Scorer, theta: Theta, key: Key, part: frozenset[int], value: float) -> Theta:
+    """Return the values with those of one parameter at the joints of a part replaced."""
+    p = score.replayer.machine.tolerances.param(key)
+    values = np.broadcast_to(theta.get(key, np.array([p.null])), (len(score.windows.joints),)).copy()
+    values[[*part]] = value
+    return {**theta, key: values}
 
 
 def ladder(p: Param) -> list[float]:

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from go1exp.effects.tolerances import sizes
+from go1exp.effects.tolerances import effect_class, sizes
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import table
 from go1exp.gap.score.robust import excess, log_chi2, removed
-from go1exp.gap.search import alike, profile_likelihood, significance, tolerances
+from go1exp.gap.search import alike, places, profile_likelihood, significance, tolerances
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.state import State
 from go1exp.schema.registry import members
@@ -73,8 +73,8 @@ class Sought:
 
     Attributes:
         best: the clearest cause, or None.
-        within: values within tolerances, alike at all joints, that do most of what the best cause does; empty where
-            nothing had to be asked of them.
+        within: values within tolerances that do most of what the best cause does, alike at all joints but for the
+            drives of one part; empty where nothing had to be asked of them.
     """
 
     best: Model | None
@@ -118,7 +118,11 @@ def clearest(begun: Scorer, state: State) -> Sought:
 
 
 def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Theta:
-    """Return what does most of what ``best`` does within tolerances: it, drives and legs, all off alike."""
+    """Return what does most of what ``best`` does within tolerances: it, drives and legs, off alike.
+
+    Alike at all joints, and then the drives of one part: hips of 85 %, whose 0.95 of strength and 0.9 of both gains are
+    within their tolerances, were named as offsets of the calves' encoders.
+    """
     known = members("effect")
     effects = [
         name
@@ -126,7 +130,10 @@ def _off_alike(begun: Scorer, best: Theta, windows: np.ndarray, dt: float) -> Th
         if tolerances.identification(name).weighs_on_legs or known[name].traits.get("gains")
     ]
     keys = list(dict.fromkeys([*(key for name in effects for key in sizes(name)), *best]))
-    return profile_likelihood.within_tolerances(begun, best, keys, windows, dt)
+    everywhere = profile_likelihood.within_tolerances(begun, best, keys, windows, dt)
+    of_drives = [key for name in effects if not effect_class(name).fields for key in sizes(name)]
+    joints = begun.windows.joints
+    return profile_likelihood.at_one_part(begun, everywhere, of_drives, places.parts(joints), windows, dt)
 
 
 Judge = Callable[[Sequence[Model], State, np.ndarray, np.ndarray], tuple[Model | None, Model | None]]
