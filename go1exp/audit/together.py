@@ -90,6 +90,6 @@ def naming_flaws(reports: Sequence[AuditReport]) -> dict[str, str]:
     often = max(shown, key=lambda key: len(shown[key]), default=None)
     if often is None or len(shown[often]) < 2:
         return {}
-    seen = {episode for episodes in shown.values() for episode in episodes}
+    showing = {episode for episodes in shown.values() for episode in episodes}
     why = f"{often[1]}: as in {shown[often][0]}: {message[often]}"
-    return {report.episode: why for report in reports if report.episode not in seen}
+    return {report.episode: why for report in reports if report.episode not in showing}

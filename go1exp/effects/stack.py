@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from go1exp.actuator.setup import Actuator, HasGains
-from go1exp.drive import DriveSetup, ModelFields
+from go1exp.drive import CompiledModel, DriveSetup, ModelFields
 from go1exp.effects.base import Effect, Gears, Measured
 from go1exp.effects.two_mass import TwoMass
-from go1exp.physics.backend import PhysicsBackend
 from go1exp.schema.joint_values import spread
 from go1exp.schema.registry import Term
 
@@ -25,16 +24,16 @@ HOOKS = (
 class _Fields:
     """Model fields under construction: the compiled values, changed by one effect after the other."""
 
-    def __init__(self, backend: PhysicsBackend, names: Sequence[str]) -> None:
-        self._backend, self.ids, n = backend, backend.ids, backend.num_envs
-        compiled = {name: backend.compiled(name) for name in names}
+    def __init__(self, model: CompiledModel, names: Sequence[str]) -> None:
+        self._model, self.ids, n = model, model.ids, model.num_envs
+        compiled = {name: model.compiled(name) for name in names}
         self.values = {name: value.unsqueeze(0).repeat(n, *[1] * value.dim()) for name, value in compiled.items()}
 
     def field(self, name: str) -> Tensor:
         return self.values[name]
 
     def nominal(self, name: str) -> Tensor:
-        return self._backend.compiled(name).unsqueeze(0) if name in self.values else self._backend.nominal(name)
+        return self._model.compiled(name).unsqueeze(0) if name in self.values else self._model.nominal(name)
 
 
 class EffectStack:
@@ -85,9 +84,9 @@ class EffectStack:
                 drawn = (centre + widths[p.name] * unit.to(live.dtype)).clamp(p.smallest, p.high)
                 live.copy_(torch.where(named, drawn, centre))
 
-    def model_values(self, backend: PhysicsBackend) -> dict[str, Tensor]:
-        """Return the fields (N, ...) of the backend's model with all effects in them, from those without any."""
-        fields: ModelFields = _Fields(backend, self.fields)
+    def model_values(self, model: CompiledModel) -> dict[str, Tensor]:
+        """Return the fields (N, ...) of a model with all effects in them, from those without any."""
+        fields: ModelFields = _Fields(model, self.fields)
         for effect in self._acting["edit_model"]:
             effect.edit_model(fields)
         return fields.values  # type: ignore[attr-defined]

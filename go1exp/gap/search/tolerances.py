@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 
 from go1exp.effects.base import Param
@@ -19,6 +18,7 @@ from go1exp.effects.tolerances import Tolerances, effect_class, sizes
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.linear import Layout
+from go1exp.physics import box
 from go1exp.schema.registry import members
 
 PRIOR = 0.5
@@ -230,15 +230,8 @@ def solve(matrix: np.ndarray, right: np.ndarray, limits: Bounds) -> np.ndarray:
     aim = (right + limits.weight * limits.centre) * scale
     low, high = limits.low / scale, limits.high / scale
     x, moves = low.copy(), low < high
-    size = int(moves.sum())
-    if not size:
-        return np.asarray(x * scale)
-    inner, slope = full[np.ix_(moves, moves)], full[np.ix_(moves, ~moves)] @ x[~moves] - aim[moves]
-    best = np.zeros(size).clip(low[moves], high[moves])
-    factor, free = np.zeros((size, size + 7)), np.zeros(size, dtype=np.int32)
-    if mujoco.mju_boxQP(best, factor, free, inner, slope, low[moves], high[moves]) < 0:
-        raise np.linalg.LinAlgError("MuJoCo found no minimum within bounds")
-    x[moves] = best
+    slope = full[np.ix_(moves, ~moves)] @ x[~moves] - aim[moves]
+    x[moves] = box.minimum(full[np.ix_(moves, moves)], slope, low[moves], high[moves])
     return np.asarray(x * scale)
 
 
