@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from go1exp import data_root, excitations
-from go1exp.audit import AuditReport, audit, audit_file, clock_flaws, naming_flaws, signals
+from go1exp.audit import AuditReport, audit, audit_file, clock_flaws, signals
 from go1exp.cli import record_audit
 from go1exp.recording import Meta, Recording, RecordingError, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
@@ -838,26 +838,3 @@ def test_the_servos_encoders_are_recognised() -> None:
 def test_a_real_go1_snippet_is_sound() -> None:
     (recording,) = real("go1_walk_snippet")
     assert audit(recording).flaws == []
-
-
-def crossed(name: str, episode: str) -> AuditReport:
-    """Report of a recording in which the two front thighs have each other's names."""
-    sound = made(name)
-    other = {"FR_thigh": "FL_thigh", "FL_thigh": "FR_thigh"}
-    channels = {f"q_{joint}": sound.channels[f"q_{other[joint]}"] for joint in other} | {
-        f"qd_{joint}": sound.channels[f"qd_{other[joint]}"] for joint in other
-    }
-    return audit(replace_episode(with_(sound, **channels), episode))
-
-
-def test_what_two_recordings_of_a_set_show_of_its_names_is_in_those_too_that_do_not_show_it() -> None:
-    still = audit(replace_episode(made("drop"), "e2"))
-    shows = [crossed("multisine", "e0"), crossed("multisine", "e1")]
-    assert all(report.by_check("order") for report in shows)
-    assert not still.by_check("order")
-    flaws = naming_flaws([*shows, still])
-    assert list(flaws) == ["e2"]
-    assert re.match(r"q_target_F[RL]_thigh: as in e0: moves with .* are swapped$", flaws["e2"])
-    assert naming_flaws([shows[0], still]) == {}  # one recording may be mixed up by itself
-    assert naming_flaws(shifted(0, 0, 0)) == {}
-    assert naming_flaws([]) == {}

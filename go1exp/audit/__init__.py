@@ -2,6 +2,6 @@
 
 from go1exp.audit.checks import audit, audit_file
 from go1exp.audit.report import AuditReport, Channel, Finding, Verdict
-from go1exp.audit.together import clock_flaws, naming_flaws
+from go1exp.audit.together import clock_flaws
 
-__all__ = ["AuditReport", "Channel", "Finding", "Verdict", "audit", "audit_file", "clock_flaws", "naming_flaws"]
+__all__ = ["AuditReport", "Channel", "Finding", "Verdict", "audit", "audit_file", "clock_flaws"]

@@ -69,27 +69,3 @@ def clock_flaws(reports: Sequence[AuditReport]) -> dict[str, str]:
     ordered = sorted(known, key=lambda one: one.time)
     ends = " to ".join(str(one) for one in dict.fromkeys((ordered[0], ordered[-1])))
     return {report.episode: f"joints answer their commands after {ends}: {why}" for report in reports}
-
-
-NAMING = ("order", "sign", "units")
-"""Checks of what the joints of a set are called, which way they turn, and in which unit they are written."""
-
-
-def naming_flaws(reports: Sequence[AuditReport]) -> dict[str, str]:
-    """Return what is wrong with how a set names its joints, for the recordings that do not show it, by episode.
-
-    One program wrote them all. So what two recordings or more show is in those too in which both joints move alike.
-    """
-    shown: dict[tuple[str, str], list[str]] = {}
-    message: dict[tuple[str, str], str] = {}
-    for report in reports:
-        for f in report.findings:
-            if f.check in NAMING and f.verdict == "bad":
-                shown.setdefault((f.check, f.channel), []).append(report.episode)
-                message.setdefault((f.check, f.channel), f.message)
-    often = max(shown, key=lambda key: len(shown[key]), default=None)
-    if often is None or len(shown[often]) < 2:
-        return {}
-    showing = {episode for episodes in shown.values() for episode in episodes}
-    why = f"{often[1]}: as in {shown[often][0]}: {message[often]}"
-    return {report.episode: why for report in reports if report.episode not in showing}

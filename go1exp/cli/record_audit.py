@@ -19,7 +19,7 @@ def _task(container: dict[str, Any]) -> int:
 
     settings = parse(AuditSettings, container)
 
-    from go1exp.audit import AuditReport, audit_file, clock_flaws, naming_flaws
+    from go1exp.audit import AuditReport, audit_file, clock_flaws
 
     reports: dict[str, Any] = {}
     folders: dict[Path, dict[Path, AuditReport]] = {}
@@ -37,13 +37,12 @@ def _task(container: dict[str, Any]) -> int:
         folders.setdefault(file.parent, {})[file] = report
         status = max(status, STATUS[report.verdict])
     for together in folders.values():
-        of_set = list(together.values())
-        for what, flaws in (("clocks", clock_flaws(of_set)), ("naming", naming_flaws(of_set))):
-            for file, report in together.items():
-                if report.episode in flaws:
-                    print(f"{file}: bad: {flaws[report.episode]}")
-                    reports[str(file)] |= {"verdict": "bad", what: flaws[report.episode]}
-                    status = max(status, STATUS["bad"])
+        flaws = clock_flaws(list(together.values()))
+        for file, report in together.items():
+            if report.episode in flaws:
+                print(f"{file}: bad: {flaws[report.episode]}")
+                reports[str(file)] |= {"verdict": "bad", "clocks": flaws[report.episode]}
+                status = max(status, STATUS["bad"])
     if settings.out:
         out = Path(settings.out)
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 
-from go1exp.audit import audit, clock_flaws, naming_flaws
+from go1exp.audit import audit, clock_flaws
 from go1exp.errors import Expected
 from go1exp.gap.data.clocks import rows_of, same_rows
 from go1exp.gap.data.contact import too_coarse
@@ -120,10 +120,9 @@ def prepare(recordings: Sequence[Recording], robot: Robot, settings: GapSettings
     """
     robot = robot.suited(recordings, settings.phase)
     reports = [audit(r) for r in recordings]
-    together = (clock_flaws(reports), naming_flaws(reports))
+    clocks = clock_flaws(reports)
     flaws = [
-        robot.flaws(r, report)
-        + [f"{report.episode}: {of_set[report.episode]}" for of_set in together if report.episode in of_set]
+        robot.flaws(r, report) + ([f"{report.episode}: {clocks[report.episode]}"] if report.episode in clocks else [])
         for r, report in zip(recordings, reports, strict=True)
     ]
     good = [k for k, lines in enumerate(flaws) if not lines]
