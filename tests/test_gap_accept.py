@@ -62,6 +62,8 @@ def test_names_none_of_which_is_certain_explain_nothing_however_near_they_come()
     assert decide(search(), (unsure, unsure), 0.1, False) == "partly explained"
     assert decide(search(), (unsure,), 0.1, True) == "explained"
     assert decide(search(), (unsure, sure), 0.1, False) == "explained"
+    quick = search(settings=GapSettings(bootstraps=0))  # how certain they are was not asked
+    assert decide(quick, (unsure,), 0.1, False) == "explained"
 
 
 def test_every_joint_of_a_window_must_be_within_beside_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:

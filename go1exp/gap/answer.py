@@ -269,7 +269,7 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
     """Return the verdict.
 
     Terms none of which is certain explain nothing, however near they bring the model to these logs: so near come some
-    to a robot that has none of them.
+    to a robot that has none of them. Without resamples (``search.bootstraps=0``) nobody has asked how certain they are.
 
     Args:
         search: that is done.
@@ -280,8 +280,8 @@ def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted:
     settings, first = search.settings, search.first
     loud = [effect for effect, s in search.signal.items() if s >= SILENT]
     if named:
-        sure = final <= settings.adequate and any(n.status == "certified" for n in named)
-        return "explained" if accepted or sure else "partly explained"
+        certain = not settings.bootstraps or any(n.status == "certified" for n in named)
+        return "explained" if accepted or (certain and final <= settings.adequate) else "partly explained"
     if first > settings.adequate and not accepted:
         return "unexplained"
     return "not excited" if len(loud) < 0.5 * len(search.signal) else "no gap"
