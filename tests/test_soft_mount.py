@@ -24,9 +24,8 @@ from go1exp.effects.rules import on_mount
 from go1exp.effects.soft_mount import SoftMount
 from go1exp.effects.tolerances import DECLARED
 from go1exp.env.plant import Plant, drive_setup
-from go1exp.gap.comparison import LEVEL
 from go1exp.gap.data.prepare import Ready
-from go1exp.gap.replay.replayer import Replayer
+from go1exp.gap.replay.replayer import LEVEL, Replayer
 from go1exp.gap.replay.rows import Rows, Theta, bolted, mounted, variants
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model

@@ -16,6 +16,7 @@ from go1exp.gap.data.cutting import Place
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.splits import Splits, splits, stretches
 from go1exp.gap.data.windows import Windows
+from go1exp.gap.replay.replayer import LEVEL
 from go1exp.gap.result import DEFAULT_CLOCK, Clock, ClockChoice, Floors, GapSettings
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.hung import hung
@@ -34,8 +35,6 @@ FEWEST_WINDOWS = 8
 
 FEWEST_RECORDINGS = 3
 """Recordings that must remain if others are left out."""
-
-LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 FEWEST_STRETCHES = 8
 """Stretches of held-out windows below which no sign-flip test of two clocks comes to p < 0.01: 2 / 2^8."""

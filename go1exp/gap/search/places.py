@@ -39,10 +39,8 @@ def pieces(joints: Sequence[str]) -> list[frozenset[int]]:
     """
     names = [name.split("_", 1) if "_" in name else [name, ""] for name in joints]
     legs = list(dict.fromkeys(leg for leg, _ in names))
-    sets = [frozenset([k]) for k in range(len(joints))]
-    for place in (1, 0):
-        values = dict.fromkeys(name[place] for name in names)
-        sets += [frozenset(k for k, name in enumerate(names) if name[place] == value) for value in values]
+    sets = [*(frozenset([k]) for k in range(len(joints))), *parts(joints)]
+    sets += [frozenset(k for k, name in enumerate(names) if name[0] == leg) for leg in legs]
     if len(legs) == 4 and all(len(leg) == 2 for leg in legs):
         for letter in (0, 1):
             values = dict.fromkeys(leg[letter] for leg in legs)
