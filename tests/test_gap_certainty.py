@@ -12,7 +12,7 @@ import pytest
 
 from go1exp.effects.tolerances import DECLARED, declared
 from go1exp.gap.answer import Answer, bounded_joints, weak_joints
-from go1exp.gap.certainty import doubt
+from go1exp.gap.certainty import beside_a_gap, doubt, widened
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.ledger import LastCheck, Ledger
 from go1exp.gap.search.trial import Trial
@@ -98,6 +98,33 @@ def test_beside_a_large_effect_a_small_one_is_judged_by_what_is_left_without_it(
     monkeypatch.setattr("go1exp.gap.search.ledger.excess", lambda chi2: chi2)
     search: Any = SimpleNamespace(first=100.0, select_chi2=left, share_of=lambda term: returned)
     assert Ledger.removes(search, "torque_delay") == pytest.approx(share, nan_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("goes", "half"),
+    [(1.0, 0.0), (0.75, 1.96 * 0.2), (0.0, 1.96 * 0.4), (-0.4, 1.96 * 0.4), (math.nan, 1.96 * 0.4 * math.sqrt(0.16))],
+    ids=["all", "three quarters", "nothing", "less than nothing", "nobody looked: what all terms take"],
+)
+def test_beside_a_gap_a_value_is_as_unsure_as_what_remains_is_large(
+    goes: float, half: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("go1exp.gap.certainty.excess", lambda chi2: 16.0)  # of 100 within the tolerances
+    search: Any = Stub(own=goes)
+    search.select_chi2 = np.empty(0)
+    assert beside_a_gap(search, "coulomb") == pytest.approx(half, rel=1e-3, abs=1e-12)
+
+
+def test_an_interval_is_widened_as_independent_errors_add() -> None:
+    value = np.array([1.3, 1.0, 0.4])
+    low, high = widened(value, value - 0.04, value + 0.03, null=1.0, share=0.1)
+    drawn = np.random.default_rng(0).standard_normal((2, 400_000))
+    for k, v in enumerate(value):
+        off = 0.04 / 1.96 * drawn[0] + 0.1 / 1.96 * abs(v - 1.0) * drawn[1]
+        assert low[k] == pytest.approx(v + np.quantile(off, 0.025), abs=5e-4)
+    assert high - value == pytest.approx(np.hypot(0.03, 0.1 * np.abs(value - 1.0)))
+    same = widened(value, value - 0.04, value + 0.03, null=1.0, share=0.0)
+    assert same[0] == pytest.approx(value - 0.04)
+    assert same[1] == pytest.approx(value + 0.03)
 
 
 def test_a_value_on_its_bound_is_no_certain_one() -> None:

@@ -9,8 +9,9 @@ from typing import Literal
 
 import numpy as np
 
+from go1exp.effects.base import Param
 from go1exp.effects.tolerances import Tolerances, declared, sizes
-from go1exp.gap.certainty import HALF, doubt
+from go1exp.gap.certainty import HALF, beside_a_gap, doubt, widened
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
 from go1exp.gap.robots.fixed_base import FixedBase
@@ -157,6 +158,7 @@ def name_terms(
         per_joint = [key for key in sizes(effect) if known.param(key).per == "joint"]
         at = _joints_beyond(per_joint, theta, drawn, joints, known)
         reason = doubt(search, effect, theta, at, adequate, check)
+        unsure = 0.0 if adequate else beside_a_gap(search, effect)
         if per_joint and not at:
             at = (_strongest(per_joint, theta, joints, known),)
         params: dict[str, dict[str, float]] = {}
@@ -164,7 +166,7 @@ def name_terms(
         for key in (key for key in theta if key[0] == effect):
             params[key[1]] = _by_joint(key, theta[key], joints, at)
             if key in drawn:
-                interval[key[1]] = _intervals(key, theta[key], drawn[key], joints, at)
+                interval[key[1]] = _intervals(known.param(key), theta[key], drawn[key], joints, at, unsure)
         status: Literal["certified", "compensating"] = "compensating" if reason else "certified"
         share = search.share_of(effect)
         named.append(NamedEffect(effect, at, params, interval, search.aliases[effect], status, reason, share))
@@ -241,28 +243,30 @@ def _strongest(keys: Sequence[Key], theta: Theta, joints: Sequence[str], known: 
     return joints[int(np.max(away, axis=0).argmax())]
 
 
-def _named_places(key: Key, joints: Sequence[str], at: Sequence[str]) -> tuple[int, dict[int, str]]:
+def _named_places(per: str, joints: Sequence[str], at: Sequence[str]) -> tuple[int, dict[int, str]]:
     """Return how many values a parameter has, and under which name each that counts is written down, by number."""
-    if declared(key).per != "joint":
+    if per != "joint":
         return 1, {0: "robot"}
     return len(joints), {k: name for k, name in enumerate(joints) if name in at}
 
 
 def _by_joint(key: Key, value: np.ndarray, joints: Sequence[str], at: Sequence[str]) -> dict[str, float]:
     """Return the values of a parameter by joint (those of ``at``), or by ``robot``."""
-    count, kept = _named_places(key, joints, at)
+    count, kept = _named_places(declared(key).per, joints, at)
     values = np.broadcast_to(np.ravel(value), count)
     return {name: float(values[k]) for k, name in kept.items()}
 
 
 def _intervals(
-    key: Key, value: np.ndarray, samples: np.ndarray, joints: Sequence[str], at: Sequence[str]
+    param: Param, value: np.ndarray, samples: np.ndarray, joints: Sequence[str], at: Sequence[str], unsure: float
 ) -> dict[str, tuple[float, float]]:
     """Return the 95 % intervals of a parameter by joint (those of ``at``), or by ``robot``; each holds the value."""
-    count, kept = _named_places(key, joints, at)
+    count, kept = _named_places(param.per, joints, at)
     values = np.broadcast_to(np.ravel(value), count)
     low, high = (np.broadcast_to(v, count) for v in np.quantile(samples, QUANTILES, axis=0))
-    return {name: (float(min(low[k], values[k])), float(max(high[k], values[k]))) for k, name in kept.items()}
+    low, high = widened(values, np.minimum(low, values), np.maximum(high, values), param.null, unsure)
+    low, high = np.maximum(low, param.low), np.minimum(high, param.high)
+    return {name: (float(low[k]), float(high[k])) for k, name in kept.items()}
 
 
 def decide(search: Search, named: Sequence[NamedEffect], final: float, accepted: bool) -> Verdict:

@@ -6,9 +6,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import norm
 
 from go1exp.effects.tolerances import sizes
 from go1exp.gap.replay.rows import Theta
+from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search.evidence import at_bound
 from go1exp.gap.search.ledger import LastCheck, Ledger
 
@@ -18,6 +20,16 @@ MOST = 0.75
 HALF = 0.5
 """Share of the excess that is most of it: what removes more is not withdrawn, and must remove as much on the last check
 to be certified."""
+
+ASTRAY = 0.4
+"""Relative standard deviation of a term's values beside a gap that remains, for each unit of the error's amplitude that
+the term leaves of what there is without it: what makes the rest may act as the term does. Chosen on sealed effects
+that were named beside a gap (84 values of seven cases): where 15, 25 and 75 % of the amplitude remained, errors were 7,
+10 and 44 %, of which resamples explain 5. Without it 73 % of the truths lay in the intervals of certified terms, and
+31 % in those of others."""
+
+HALF_WIDTH = float(norm.ppf(0.975))
+"""Of a 95 % interval, in standard deviations."""
 
 
 def on_bound(search: Ledger, effect: str, theta: Theta, joints: Sequence[str]) -> str:
@@ -73,3 +85,32 @@ def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adeq
         share = "less" if math.isnan(alone) else f"{max(alone, 0.0):.0%}"
         return f"a gap remains, and of what there is without it, it removes only {share}"
     return f"a gap remains, and {' and '.join(rivals)} would do as well" if rivals else ""
+
+
+def beside_a_gap(search: Ledger, effect: str) -> float:
+    """Return the relative half width that what remains adds to the 95 % intervals of a term's values.
+
+    Args:
+        search: that accepted the term, and whose model leaves a gap.
+        effect: the term.
+    """
+    goes = search.removes(effect)
+    if math.isnan(goes):
+        goes = removed(search.first, excess(search.select_chi2))
+    return HALF_WIDTH * ASTRAY * math.sqrt(min(max(1.0 - goes, 0.0), 1.0))
+
+
+def widened(
+    value: np.ndarray, low: np.ndarray, high: np.ndarray, null: float, share: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return intervals (low, high) of values, wider by a share of what each is off null; independent errors add up.
+
+    Args:
+        value: fitted.
+        low: ends of their intervals, of the same shape.
+        high: the same.
+        null: of the parameter.
+        share: half width, relative.
+    """
+    astray = share * np.abs(value - null)
+    return value - np.hypot(value - low, astray), value + np.hypot(high - value, astray)
