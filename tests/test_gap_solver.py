@@ -350,6 +350,7 @@ def test_hidden_friction_is_named_where_it_is() -> None:
     np.testing.assert_allclose(list(found.params["bound"].values()), 0.3, rtol=0.1)
     assert result.excess["box"] > 1.0
     assert result.excess["final"] < 0.2
+    assert dict(result.waterfall)["within tolerances"] == result.excess["box"]  # all of a report by the same floors
     assert result.closed > 0.95
     assert "coulomb" in result.sentence
     (row,) = [c for c in result.candidates if c.status == "accepted"]

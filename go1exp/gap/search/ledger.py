@@ -51,6 +51,7 @@ class Ledger:
         candidates: the evidence.
         signal: effect -> chi2 that it would add at twice its tolerance.
         steps: (what, held-out excess) after every accepted term.
+        base: which of the steps is the model within its tolerances, without a term.
         single: the term that explains nearly everything alone, if there is one (``gap/search/single_cause.py``).
         within: values within tolerances, alike at all joints, at which the fit of the tolerances begins; on the ground.
         strained: whether the first term was accepted although the tolerances explain the data nearly as well.
@@ -73,6 +74,7 @@ class Ledger:
     candidates: list[Candidate] = field(default_factory=list)
     signal: dict[str, float] = field(default_factory=dict)
     steps: list[tuple[str, float]] = field(default_factory=list)
+    base: int = 0
     single: str = ""
     within: Theta = field(default_factory=dict)
     strained: bool = False
@@ -108,6 +110,11 @@ class Ledger:
         back = self.share_of(term) * self.first
         without = back + max(excess(self.select_chi2), 0.0)
         return back / without if without > 0.0 else math.nan
+
+    def measured_again(self, first: float) -> None:
+        """Take this as the held-out excess within the tolerances: terms bring their initial states and floors."""
+        self.first = first
+        self.steps[self.base] = (self.steps[self.base][0], first)
 
     def withdraw(self, why: str) -> None:
         """Take back all terms."""

@@ -143,8 +143,8 @@ class Search(Ledger):
         if excess(chi2) <= excess(state.held_out(self.state.theta)) + significance.SAME:  # by the same floors
             self.state, self.select_chi2 = state, chi2
             return True
-        self.first = first
         self.steps.pop()
+        self.measured_again(first)
         self.reject([model.name], "with all else fitted again the held-out error grows")
         return False
 
@@ -167,7 +167,7 @@ class Search(Ledger):
         # With little data, what was fitted from scratch can be a poorer optimum.
         if excess(plain) < excess(chi2) - significance.SAME:
             state, chi2 = state.at(model.theta), plain
-        self.first = excess(state.held_out(self.nominal))  # by the same floors
+        self.measured_again(excess(state.held_out(self.nominal)))  # by the same floors
         self.steps.append((model.name, excess(chi2)))
         return state, chi2
 
@@ -177,7 +177,7 @@ class Search(Ledger):
         self.state = replace(self.state, loosened=loosened, theta=model.theta).settled(2)
         self.select_chi2 = self.state.held_out()
         if not self.state.terms:
-            self.nominal, self.first = self.state.theta, excess(self.select_chi2)
+            self.nominal, self.first, self.base = self.state.theta, excess(self.select_chi2), len(self.steps)
         self.steps.append((f"{model.name} within its tolerance", excess(self.select_chi2)))
 
     # ------------------------------------------------------------------ candidates
