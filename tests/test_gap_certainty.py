@@ -49,6 +49,8 @@ class Stub:
     signal: dict[str, float] = field(default_factory=dict)
     own: float = 0.9
     first: float = 100.0
+    strained: bool = False
+    select_chi2: float = 2.0
     settings: GapSettings = field(default_factory=GapSettings)
     state: Any = field(
         default_factory=lambda: SimpleNamespace(
@@ -110,7 +112,6 @@ def test_beside_a_gap_a_value_is_as_unsure_as_what_remains_is_large(
 ) -> None:
     monkeypatch.setattr("go1exp.gap.certainty.excess", lambda chi2: 16.0)  # of 100 within the tolerances
     search: Any = Stub(own=goes)
-    search.select_chi2 = np.empty(0)
     assert beside_a_gap(search, "coulomb") == pytest.approx(half, rel=1e-3, abs=1e-12)
 
 
@@ -125,6 +126,20 @@ def test_an_interval_is_widened_as_independent_errors_add() -> None:
     same = widened(value, value - 0.04, value + 0.03, null=1.0, share=0.0)
     assert same[0] == pytest.approx(value - 0.04)
     assert same[1] == pytest.approx(value + 0.03)
+
+
+@pytest.mark.parametrize(
+    ("joints", "strained", "left", "sure"),
+    [(1, True, -0.05, False), (1, True, -0.15, True), (1, False, -0.05, True), (2, True, -0.05, True)],
+    ids=["doubted", "it gains a tenth of the floor", "the tolerances do not suffice", "two joints"],
+)
+def test_one_joint_alone_is_doubted_where_the_tolerances_do_nearly_as_well(
+    joints: int, strained: bool, left: float, sure: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("go1exp.gap.certainty.excess", lambda chi2: chi2)
+    search: Any = Stub(first=0.0, strained=strained, select_chi2=left)
+    theta = {("coulomb", "bound"): np.full(4, 0.3)}
+    assert (doubt(search, "coulomb", theta, JOINTS[:joints], True, BORNE_OUT) == "") is sure
 
 
 def test_a_value_on_its_bound_is_no_certain_one() -> None:

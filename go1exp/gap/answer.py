@@ -120,7 +120,7 @@ def why_withdrawn(search: Search, named: Sequence[NamedEffect], first: float) ->
     if search.strained and not any(beyond_doubt(n, search.state.tolerances) for n in named):
         return "no interval lies beyond its tolerance"
     if first <= search.settings.adequate and not any(n.status == "certified" for n in named):
-        return "resamples of the logs do not agree on it"
+        return " and ".join(dict.fromkeys(n.reason for n in named))
     return ""
 
 

@@ -79,6 +79,8 @@ def doubt(search: Ledger, effect: str, theta: Theta, joints: Sequence[str], adeq
         return "it leaves its tolerance at no joint beyond doubt"
     if bound := on_bound(search, effect, theta, joints):
         return bound
+    if len(joints) == 1 and search.strained and search.first - excess(search.select_chi2) < search.settings.material:
+        return "the tolerances do nearly as well, and at one joint many effects act alike"
     if adequate:
         return ""
     if not alone > MOST:  # NaN too
