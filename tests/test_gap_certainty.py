@@ -129,6 +129,19 @@ def test_an_interval_is_widened_as_independent_errors_add() -> None:
 
 
 @pytest.mark.parametrize(
+    ("share", "first", "adequate", "sure"),
+    [(0.6, 100.0, True, True), (0.45, 100.0, True, False), (0.6, 100.0, False, False), (0.6, 0.3, True, False)],
+    ids=["closes the gap", "too rarely", "a gap remains", "the tolerances suffice"],
+)
+def test_half_of_the_resamples_are_enough_where_the_gap_is_closed(
+    share: float, first: float, adequate: bool, sure: bool
+) -> None:
+    reason = why(Stub(shares={"coulomb": share}, first=first), adequate=adequate)
+    assert (reason == "") is sure
+    assert sure or f"named again in {share:.0%} of the resamples only" in reason
+
+
+@pytest.mark.parametrize(
     ("joints", "strained", "left", "sure"),
     [(1, True, -0.05, False), (1, True, -0.15, True), (1, False, -0.05, True), (2, True, -0.05, True)],
     ids=["doubted", "it gains a tenth of the floor", "the tolerances do not suffice", "two joints"],

@@ -100,7 +100,7 @@ class GapSettings:
             further off in nine of ten held-out windows; 0 for none.
         confirm_fraction: share of the episodes that is kept for the last check.
         bootstraps: resamples of the episodes.
-        certified: share of the bootstraps in which a term must be named again.
+        certified: share of the bootstraps that must name a term again; half if it closes what the tolerances leave.
         overlays: windows whose curves are kept for pictures.
         max_rows: simulations side by side.
         threads: threads of the physics engine; 0 takes all cores.
