@@ -32,9 +32,17 @@ BORNE_OUT = LastCheck(True, 0.9)
 )
 def test_why_what_removes_half_of_a_gap_is_rejected(gain: tuple[float, ...], p: float, why: str) -> None:
     one: dict[str, Any] = {"after": [0.33], "gain": np.array([gain]), "p": np.array([p]), "share": np.array([0.52])}
-    no = np.array([False])
+    no, shown = np.array([False]), np.array([p < 0.01])
     trial = Trial(
-        ["viscous"], **one, sizes=np.array([2.7]), needed=0.1, alpha=0.01, helps=no, alias=no, aside=no, chosen=None
+        ["viscous"],
+        **one,
+        sizes=np.array([2.7]),
+        needed=0.1,
+        shown=shown,
+        helps=no,
+        alias=no,
+        aside=no,
+        chosen=None,
     )
     assert trial.reason(0) == ("rejected", why)
 

@@ -25,7 +25,7 @@ from go1exp.gap.result import EXIT_CODES, GapResult, GapSettings
 from go1exp.gap.robots.hung import HungGo1, hung
 from go1exp.gap.score.likelihood import gram
 from go1exp.gap.score.linear import Layout, predicted
-from go1exp.gap.search import stepwise, strain
+from go1exp.gap.search import significance, stepwise, strain
 from go1exp.gap.search.fit import Model, scores
 from go1exp.gap.search.significance import max_t
 from go1exp.gap.search.tolerances import Bounds, Freedom, solve
@@ -266,6 +266,17 @@ def test_a_clock_need_not_start_at_zero(plain: tuple[simulate.Rig, list[Recordin
         chi2.append(scores(comparison.scorer, [weaker], np.arange(len(windows)), 0.001)[0])
     assert chi2[0].mean() > 2.0
     np.testing.assert_allclose(chi2[1], chi2[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("p", "share", "before", "shown"),
+    [(0.005, 0.2, 2.0, True), (0.05, 0.8, 2.0, True), (0.05, 0.7, 2.0, False), (0.05, 0.8, 0.05, False)],
+    ids=["significant", "few windows, most of the gap", "not most of it", "no gap"],
+)
+def test_few_windows_are_enough_for_what_removes_most_of_a_gap(
+    p: float, share: float, before: float, shown: bool
+) -> None:
+    assert significance.shown(np.array([p, 0.2]), np.array([share, 1.0]), before, QUICK).tolist() == [shown, False]
 
 
 def test_what_strains_most_is_tried_with_its_rivals() -> None:

@@ -26,10 +26,11 @@ def eliminate(search: Ledger) -> None:
         rest = search.state.without(name).settled(1)
         without = rest.held_out()
         gain = significance.gains(without, search.select_chi2[None])
-        needed = removed(excess(without), excess(search.select_chi2)) > search.settings.min_share
+        share = removed(excess(without), excess(search.select_chi2))
         search.returned[name] = removed(search.first, search.first + excess(search.select_chi2) - excess(without))
-        p = significance.max_t(gain, search.rng, len(search.state.machine.groups))[0]
-        if not needed or p >= search.settings.alpha:
+        p = significance.max_t(gain, search.rng, len(search.state.machine.groups))
+        shown = significance.shown(p, np.array([share]), excess(without), search.settings)
+        if not share > search.settings.min_share or not shown[0]:
             search.state, search.select_chi2 = rest, without
             search.steps.append((f"without {name}", excess(without)))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from go1exp.gap.result import GapSettings
 from go1exp.gap.score.robust import log_chi2
 
 FLIPS = 4000
@@ -17,6 +18,14 @@ WORSE = 0.05
 
 LEAST = 0.7
 """A model with less than this share of the best one's gain is no equal, however uncertain."""
+
+FEW_WINDOWS = 0.1
+"""p-value that is enough for what removes ``LARGE`` of a gap: a stop or a limit of the torque shows in few windows, and
+flipped signs cannot call three of them significant. Of sealed effects that removed so much with 0.01 to 0.1, and did
+not come second to another one, all three were right; what removed half to ``LARGE``, one of three."""
+
+LARGE = 0.75
+"""Share of the excess that only the right effect removes, or one that acts alike."""
 
 
 def gains(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -54,6 +63,19 @@ def max_t(gain: np.ndarray, rng: np.random.Generator, groups: int = 1, flips: in
         observed.append(gains_there.mean(axis=1) / scale)
     of_all = np.max(largest, axis=0)
     return np.asarray([(1 + np.sum(of_all >= s - 1e-12)) / (flips + 1) for s in np.max(observed, axis=0)])
+
+
+def shown(p: np.ndarray, share: np.ndarray, before: float, settings: GapSettings) -> np.ndarray:
+    """Return which models (M,) held-out windows show to be better.
+
+    Args:
+        p: p-value (M,) of each model's gain.
+        share: of the excess that is gone (M,).
+        before: excess of the model with which they are compared.
+        settings: significance, and the excess that is a gap.
+    """
+    large = (share >= LARGE) & (before > settings.material)
+    return np.asarray((p < settings.alpha) | (large & (p < FEW_WINDOWS)))
 
 
 def same(gain: float) -> float:

@@ -38,8 +38,8 @@ class Trial:
         share: (M,) of the excess that is gone.
         sizes: (M,) in tolerances.
         needed: share that one must remove.
-        alpha: significance that one must have.
-        helps: (M,) which are significant and remove enough.
+        shown: (M,) which are significant.
+        helps: (M,) which are, and remove enough.
         alias: (M,) which do as well as the best of those that also leave their tolerances.
         aside: (M,) which do as well too, with more numbers.
         chosen: the one of these to accept; None if there is none, or if one within its tolerance does as well.
@@ -52,7 +52,7 @@ class Trial:
     share: np.ndarray
     sizes: np.ndarray
     needed: float
-    alpha: float
+    shown: np.ndarray
     helps: np.ndarray
     alias: np.ndarray
     aside: np.ndarray
@@ -76,11 +76,11 @@ class Trial:
             return "rejected", f"leaves its tolerance by too little ({self.sizes[k]:.2g} of it) to be called missing"
         if self.sizes[k] <= 1.0:
             return "rejected", f"fits within its tolerance ({self.sizes[k]:.2g} of it)"
-        if p >= self.alpha and share > FEW and self.mean[k] > 0:
+        if not self.shown[k] and share > FEW and self.mean[k] > 0:
             return "rejected", f"removes {share:.1%} of the excess, but too few windows show it (p = {p:.2g})"
-        if p < self.alpha and share > self.needed and self.mean[k] <= 0:
+        if self.shown[k] and share > self.needed and self.mean[k] <= 0:
             return "rejected", f"removes {share:.1%} of the excess, but other windows lose as much in log chi2"
-        if p >= self.alpha or self.mean[k] <= 0:
+        if not self.shown[k] or self.mean[k] <= 0:
             return "rejected", f"no significant gain on held-out windows (p = {p:.2g})"
         if chosen is None and self.helps[k]:
             return "rejected", "another effect does as well within its tolerance"
@@ -127,7 +127,8 @@ def tried(
     needed = settings.min_share if before > settings.adequate else max(MOSTLY, settings.min_share)
     needed = -math.inf if small else needed
     sizes = np.array([evidence.size(m.name, m.theta, m.may.tolerances) for m in fitted])
-    helps = (p < settings.alpha) & (share > needed) & (gain.mean(axis=1) > 0)
+    shown = significance.shown(p, share, 0.0 if small else before, settings)
+    helps = shown & (share > needed) & (gain.mean(axis=1) > 0)
     outside = helps & (sizes > (CLEAR if small else 1.0))
     machine = scorer.replayer.machine
     numbers = np.array(
@@ -136,7 +137,7 @@ def tried(
     names, within = [m.name for m in fitted], tolerances.nominal(machine)
     unclear = [small and a not in within and any(tolerances.confounded(a, b) for b in names) for a in names]
     chosen, alias, aside = _choice(gain, outside, helps & (sizes <= 1.0), numbers, np.array(unclear), rng)
-    return Trial(names, after, gain, p, share, sizes, needed, settings.alpha, helps, alias, aside, chosen)
+    return Trial(names, after, gain, p, share, sizes, needed, shown, helps, alias, aside, chosen)
 
 
 def _choice(
