@@ -113,7 +113,7 @@ def _named_lines(named: Sequence[NamedEffect]) -> list[str]:
             if halves:  # an alias may be the truth: twice as wide
                 widths[name] = float(f"{max(halves) * (2.0 if others else 1.0):.3g}")
         if widths:
-            lines.append(f"  spread: {json.dumps(widths)}  # each robot's own, from the bootstrap")
+            lines.append(f"  spread: {json.dumps(widths)}  # each robot's own, from the intervals")
     return lines
 
 
