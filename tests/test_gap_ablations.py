@@ -80,7 +80,7 @@ def test_every_method_is_told_of_the_same_cases(tmp_path: Path, monkeypatch: pyt
     whole, no_box = asked
     assert f"cases={tmp_path / 'cases'}" in whole
     assert whole[0] == no_box[0]
-    assert {*no_box} - {*whole} == {f"out={tmp_path / 'no_box'}", "calibrate=false"}
+    assert {*no_box} - {*whole} == {f"out={tmp_path / 'no_box'}", "calibrate=false", "max_terms=1"}
 
 
 def test_a_missing_extra_is_told_before_anything_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
