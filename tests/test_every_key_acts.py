@@ -285,7 +285,7 @@ OTHER: dict[str, Callable[[Walk], list[Any]]] = {
     "play:checkpoint": lambda walk: [str(walk.trained("run") / "checkpoints/000003.pt")],
     "gap:logs": lambda walk: [str(walk.recorded("stiff", {**HELD, "effect": {"viscous": {"damping": 0.6}}}))],
     "gap:stage": lambda walk: ["localise"],
-    "gap:search.alpha": lambda walk: [1e-4],  # no p-value is that small
+    "gap:search.alpha": lambda walk: [1e-5],  # no p-value is a tenfold of that
     "gap:search.min_share": lambda walk: [1.0],
     "gap:search.adequate": lambda walk: [1e6],
     "gap:search.material": lambda walk: [1e6],

@@ -277,6 +277,8 @@ def test_few_windows_are_enough_for_what_removes_most_of_a_gap(
     p: float, share: float, before: float, shown: bool
 ) -> None:
     assert significance.shown(np.array([p, 0.2]), np.array([share, 1.0]), before, QUICK).tolist() == [shown, False]
+    strict = replace(QUICK, alpha=1e-4)
+    assert not significance.shown(np.array([p, 0.2]), np.array([share, 1.0]), before, strict).any()
 
 
 def test_what_strains_most_is_tried_with_its_rivals() -> None:

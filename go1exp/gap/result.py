@@ -88,7 +88,7 @@ class GapSettings:
             are taken for effects (for comparison).
         judge: by what candidates are judged: ``max_t`` on held-out windows; for comparison ``gain``, any gain there, or
             ``bic``, Schwarz's criterion on the windows of the fit.
-        alpha: significance that a term needs.
+        alpha: significance that a term needs; ten times that if it removes three quarters of a gap.
         min_share: share of the remaining excess that a term must remove.
         max_terms: most terms that are named.
         effects: names of the effects to consider; all that the recordings could show if empty.

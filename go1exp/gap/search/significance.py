@@ -19,10 +19,11 @@ WORSE = 0.05
 LEAST = 0.7
 """A model with less than this share of the best one's gain is no equal, however uncertain."""
 
-FEW_WINDOWS = 0.1
-"""p-value that is enough for what removes ``LARGE`` of a gap: a stop or a limit of the torque shows in few windows, and
-flipped signs cannot call three of them significant. Of sealed effects that removed so much with 0.01 to 0.1, and did
-not come second to another one, all three were right; what removed half to ``LARGE``, one of three."""
+FEW_WINDOWS = 10.0
+"""Times ``alpha`` of the settings that are enough for what removes ``LARGE`` of a gap: a stop or a limit of the torque
+shows in few windows, and flipped signs cannot call three of them significant. Of sealed effects that removed so much
+with p of 0.01 to 0.1, and did not come second to another one, all three were right; what removed half to ``LARGE``, one
+of three."""
 
 LARGE = 0.75
 """Share of the excess that only the right effect removes, or one that acts alike."""
@@ -75,7 +76,7 @@ def shown(p: np.ndarray, share: np.ndarray, before: float, settings: GapSettings
         settings: significance, and the excess that is a gap.
     """
     large = (share >= LARGE) & (before > settings.material)
-    return np.asarray((p < settings.alpha) | (large & (p < FEW_WINDOWS)))
+    return np.asarray((p < settings.alpha) | (large & (p < FEW_WINDOWS * settings.alpha)))
 
 
 def same(gain: float) -> float:
