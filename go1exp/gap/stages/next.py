@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from go1exp.effects.tolerances import sizes
+from go1exp.gap.certainty import HALF_WIDTH
 from go1exp.gap.comparison import Comparison, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
 from go1exp.gap.design.choice import COARSE, ENOUGH, Choice, choose
@@ -29,9 +30,6 @@ from go1exp.record.simulate import held_quat
 from go1exp.recording import Recording
 from go1exp.robot import JOINTS, RobotConfig
 from go1exp.tensors.threads import one_thread
-
-INTERVAL_SD = 2.0 * 1.96
-"""Width of a 95 % interval in standard deviations."""
 
 WIDEST = 0.5
 """Largest relative standard deviation of a size that is believed; an interval across null would have any."""
@@ -167,7 +165,7 @@ def _spread(named: NamedEffect, robot: Robot) -> float:
         for place, (low, high) in places.items():
             size = abs(named.params[name][place] - null)
             if size > 0.0 and math.isfinite(high - low):
-                shares.append((high - low) / INTERVAL_SD / size)
+                shares.append((high - low) / (2.0 * HALF_WIDTH) / size)
     return min(float(np.median(shares)), WIDEST) if shares else 0.0
 
 
