@@ -21,7 +21,7 @@ help: ## list the verbs
 
 setup: $(OK) ## make .venv with the locked packages and go1exp in it (redone when pyproject.toml, the lock or C++ changes)
 
-$(OK): pyproject.toml requirements/lock.txt hatch_build.py $(wildcard go1exp/estimation/cpp/*)
+$(OK): pyproject.toml requirements/lock.txt hatch_build.py $(wildcard go1exp/deploy/estimation/cpp/*)
 	@$(PY) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "go1exp needs Python 3.11 or newer with venv, but '$(PY)' is missing, older or has no venv."; \
 	  echo "Install python3.11 or name one: make setup PY=/path/to/python3.11"; exit 1; } >&2
@@ -34,7 +34,7 @@ $(OK): pyproject.toml requirements/lock.txt hatch_build.py $(wildcard go1exp/est
 	@$(PIP) install -qq --require-hashes --no-deps -r requirements/lock.txt
 	@echo "setup 4/5: go1exp itself, editable"
 	@$(PIP) install -qq --no-build-isolation --no-deps -e .
-	@$(BIN)/python -c 'from go1exp.estimation import compiled; compiled()' 2>&1 | tail -n 1
+	@$(BIN)/python -c 'from go1exp.deploy.estimation import compiled; compiled()' 2>&1 | tail -n 1
 	@echo "setup 5/5: check that the packages fit together"
 	@$(PIP) check
 	@touch $@
@@ -151,5 +151,5 @@ lock: ## resolve requirements/base.in into requirements/lock.txt, keeping the pi
 
 clean: ## remove .venv, build products and caches; keeps runs/ and outputs/
 	@echo "clean: $(VENV), build products and caches"
-	@rm -rf $(VENV) build dist *.egg-info go1exp/estimation/_kalman.*.so .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) build dist *.egg-info go1exp/deploy/estimation/_kalman.*.so .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find go1exp tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,4 +1,4 @@
-"""Builds the Kalman filter (go1exp/estimation/cpp) when go1exp is installed.
+"""Builds the Kalman filter (go1exp/deploy/estimation/cpp) when go1exp is installed.
 
 An editable install leaves the extension beside its source; a wheel gets a copy of it. Without a C++ compiler, Python's
 headers, pybind11 or Eigen, go1exp is installed without the filter, which then says at its first use what is missing.
@@ -21,7 +21,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 ROOT = Path(__file__).resolve().parent
-PACKAGE = ROOT / "go1exp" / "estimation"
+PACKAGE = ROOT / "go1exp" / "deploy" / "estimation"
 NAME = "_kalman" + str(sysconfig.get_config_var("EXT_SUFFIX"))
 
 # No fused multiply-add: every machine rounds alike.
@@ -94,7 +94,7 @@ class KalmanBuildHook(BuildHookInterface):
         build_data["pure_python"] = False
         build_data["infer_tag"] = True
         if version != "editable":
-            build_data["force_include"][str(extension)] = f"go1exp/estimation/{NAME}"
+            build_data["force_include"][str(extension)] = f"go1exp/deploy/estimation/{NAME}"
 
 
 if __name__ == "__main__":

@@ -26,12 +26,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from go1exp import data_root
-from go1exp.fit import FitResult, FitSettings, fit
-from go1exp.fit.dataset import windows
-from go1exp.fit.report import rmse
-from go1exp.importers import import_recordings
-from go1exp.recording import Recording
+from go1exp.base.paths import data_root
+from go1exp.gap.actuator_net import FitResult, FitSettings, fit
+from go1exp.gap.actuator_net.dataset import windows
+from go1exp.gap.actuator_net.report import rmse
+from go1exp.logs.importers import import_recordings
+from go1exp.logs.recording import Recording
 
 SETTINGS = FitSettings(inputs=("tau_cmd", "velocity"), history=20, period=0.002, epochs=20, patience=20)
 

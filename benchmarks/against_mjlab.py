@@ -63,10 +63,10 @@ Loop = Callable[[int], None]
 
 def go1exp_loop(num_envs: int, device: str) -> tuple[Loop, int, dict[str, str]]:
     """Return go1exp's training, its steps an iteration, and its settings."""
-    from go1exp.compose import compose
-    from go1exp.config import parse_train
-    from go1exp.env.sb3_env import Go1VecEnv
-    from go1exp.physics.scene import build_model
+    from go1exp.config.compose import compose
+    from go1exp.sim.env.sb3_env import Go1VecEnv
+    from go1exp.sim.physics.scene import build_model
+    from go1exp.sim.task import parse_train
     from go1exp.train import trainer
 
     graph = device != "cpu"

@@ -34,10 +34,10 @@ from benchmarks.closed_loop_sizes import SIZES, Size
 from benchmarks.gap import hidden, logger
 from benchmarks.gap.walking import Policy
 from benchmarks.results import write_results
-from go1exp.config import parse_train
-from go1exp.evaluate.policy import load_network
-from go1exp.export.graph import DeployedPolicy
+from go1exp.deploy.export.graph import DeployedPolicy
+from go1exp.sim.task import parse_train
 from go1exp.train import run_folder
+from go1exp.train.policy import load_network
 
 DONE = "done.json"
 """In the folder of a step that is finished."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.gap import hidden
-from go1exp.statistics.intervals import Interval, bootstrap_interval, mean_interval, share_interval
+from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval, mean_interval, share_interval
 
 POLICIES = ("before", "plain", "net", "effects")
 """As trained; fine-tuned on the plain model, with the actuator net, and with the named effects."""

@@ -16,12 +16,12 @@ import torch
 
 from go1exp import robot
 from go1exp.cli.runs import shipped_policies
-from go1exp.config import TaskConfig
-from go1exp.env.core import Go1Core
-from go1exp.evaluate.policy import Policy, load_run
+from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.registry import bind_list
 from go1exp.evaluate.rollout import EvalConfig, evaluate
-from go1exp.schema.contact import ContactConfig
-from go1exp.schema.registry import bind_list
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig
+from go1exp.train.policy import Policy, load_run
 
 COMMANDS = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 

@@ -25,17 +25,17 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from go1exp import data_root
-from go1exp.compose import compose
-from go1exp.config import parse_task
-from go1exp.estimation import Status, go1, make_filter, readings, scaler
-from go1exp.estimation.mocap import Judgement, judge
-from go1exp.estimation.replay import samples
-from go1exp.importers.source import files
-from go1exp.record.sensors import Channel, SensorConfig
-from go1exp.record.simulate import Rig, Walk, play, play_policy
-from go1exp.recording import VECTORS, Recording, RecordingError
-from go1exp.schema.registry import bind
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind
+from go1exp.deploy.estimation import Status, go1, make_filter, readings, scaler
+from go1exp.deploy.estimation.mocap import Judgement, judge
+from go1exp.deploy.estimation.replay import samples
+from go1exp.logs.importers.source import files
+from go1exp.logs.record.sensors import Channel, SensorConfig
+from go1exp.logs.record.simulate import Rig, Walk, play, play_policy
+from go1exp.logs.recording import VECTORS, Recording, RecordingError
+from go1exp.sim.task import parse_task
 
 COMMANDS: dict[str, object] = {
     "lin_vel_x": [-0.5, 1.5],
@@ -164,7 +164,7 @@ def simulated(run: Path | None, seconds: float, robots: int, every: int, lost: f
         task = parse_task(compose("train", [f"terrain={ground}", "backend.threads=1"]))
         rig = Rig(task.robot, task.actuator, (), task.terrain, task.backend, 0.002)
         if run is None:
-            from go1exp.record.plan import Episode, make_motion
+            from go1exp.logs.record.plan import Episode, make_motion
 
             squat, _ = bind("excitation", "squat", {}, "squat")
             assert squat is not None
@@ -172,7 +172,7 @@ def simulated(run: Path | None, seconds: float, robots: int, every: int, lost: f
             episode = Episode(f"squat_{ground}", "squat", motion, 35.0, 1.2, None, None, 0)
             score(play(rig, [episode], SENSORS, 0, lambda *_: None), ground, every, lost)
             continue
-        from go1exp.evaluate.policy import load_run
+        from go1exp.train.policy import load_run
 
         trained, policy, _ = load_run(run)
         count, length = (1, seconds) if ground == "flat" else (robots, seconds / robots)

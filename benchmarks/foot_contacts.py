@@ -21,17 +21,17 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.estimation import COMMANDS, SENSORS
-from go1exp import data_root
-from go1exp.compose import compose
-from go1exp.config import parse_task
-from go1exp.deploy.estimate import BOTH, TORQUE
-from go1exp.estimation import go1, make_filter, readings
-from go1exp.estimation.feet import FootCalibration, LoadByBoth, forces_by_torque, kinematics
-from go1exp.estimation.legs import foot
-from go1exp.estimation.replay import samples
-from go1exp.record.simulate import Rig, Walk, play_policy
-from go1exp.recording import VECTORS, Recording
-from go1exp.schema.registry import bind
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind
+from go1exp.deploy.estimation import go1, make_filter, readings
+from go1exp.deploy.estimation.feet import FootCalibration, LoadByBoth, forces_by_torque, kinematics
+from go1exp.deploy.estimation.legs import foot
+from go1exp.deploy.estimation.replay import samples
+from go1exp.deploy.runtime.estimate import BOTH, TORQUE
+from go1exp.logs.record.simulate import Rig, Walk, play_policy
+from go1exp.logs.recording import VECTORS, Recording
+from go1exp.sim.task import parse_task
 
 CONFIG = go1()
 BOXES = ("boxes_proportion=1.0", "bumps_proportion=0.0", "ramps_proportion=0.0", "flat_proportion=0.0")
@@ -39,7 +39,7 @@ BOXES = ("boxes_proportion=1.0", "bumps_proportion=0.0", "ramps_proportion=0.0",
 
 def walks(run: Path, seconds: float, robots: int, seed: int = 0) -> Iterator[tuple[str, list[Recording]]]:
     """Yield ground and walks on it."""
-    from go1exp.evaluate.policy import load_run
+    from go1exp.train.policy import load_run
 
     trained, policy, _ = load_run(run)
     command, problems = bind("command", "uniform_velocity", COMMANDS, "command")

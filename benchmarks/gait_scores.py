@@ -19,17 +19,17 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from go1exp import data_root
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.env.core import Go1Core
-from go1exp.evaluate.policy import load_run
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import members
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS
 from go1exp.mdp.foot_timers import FootTimers
+from go1exp.mdp.measures import gait
 from go1exp.mdp.types import TermSetup
-from go1exp.measures import gait
-from go1exp.schema.registry import members
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import parse_train
+from go1exp.train.policy import load_run
 
 PHYSICS_DT, SUBSTEPS = 0.002, 10
 

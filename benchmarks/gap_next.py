@@ -26,10 +26,13 @@ from typing import Any
 
 import numpy as np
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from benchmarks.results import write_results
-from go1exp.compose import compose
-from go1exp.config import parse_parts
+from go1exp.base.tensors.threads import one_thread
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind
+from go1exp.config.schema.settings import parse
+from go1exp.evaluate.statistics.intervals import bootstrap_interval
 from go1exp.gap.comparison import Comparison, compare
 from go1exp.gap.design.choice import COARSE, ENOUGH, choose
 from go1exp.gap.design.limits import Limits, limits_of
@@ -42,14 +45,11 @@ from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.stages.explain import explain
-from go1exp.record.plan import Episode, make_motion
-from go1exp.record.sensors import SensorConfig
-from go1exp.record.simulate import Rig, held_quat, play
-from go1exp.recording import Recording
-from go1exp.schema.registry import bind
-from go1exp.schema.settings import parse
-from go1exp.statistics.intervals import bootstrap_interval
-from go1exp.tensors.threads import one_thread
+from go1exp.logs.record.plan import Episode, make_motion
+from go1exp.logs.record.sensors import SensorConfig
+from go1exp.logs.record.simulate import Rig, held_quat, play
+from go1exp.logs.recording import Recording
+from go1exp.sim.task import parse_parts
 
 FIRST_SECONDS = 3.0
 GAINS = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))

@@ -29,12 +29,12 @@ def solve(case: Path, out: Path, settings: dict[str, Any]) -> str:
     """Solve one case and return a line about it."""
     import torch
 
-    from go1exp.compose import compose
-    from go1exp.config import parse_parts
+    from go1exp.config.compose import compose
     from go1exp.gap import files
     from go1exp.gap.result import GapResult, GapSettings
     from go1exp.gap.stages.explain import explain
-    from go1exp.recording import RecordingError, read_folder
+    from go1exp.logs.recording import RecordingError, read_folder
+    from go1exp.sim.task import parse_parts
 
     torch.set_num_threads(1)
     start = time.perf_counter()

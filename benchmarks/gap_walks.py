@@ -82,7 +82,7 @@ class Case:
 def cases(seed: int, scale: int, kinds: Sequence[str], effects: Sequence[str], size: float, phase: str) -> list[Case]:
     """Draw the cases; ``size`` in tolerances."""
     from go1exp import robot
-    from go1exp.effects.tolerances import declared
+    from go1exp.sim.effects.tolerances import declared
 
     rng, drawn = np.random.default_rng(seed), []
     for turn in range(scale):
@@ -107,12 +107,12 @@ def solved(case: Case, policy: str, episodes: int, seconds: float, phase: str) -
     from go1exp.cli.record import RIG
     from go1exp.cli.runs import trained
     from go1exp.cli.settings import RecordSettings, parse
-    from go1exp.compose import compose
-    from go1exp.config import parse_parts
-    from go1exp.evaluate.policy import load_run
+    from go1exp.config.compose import compose
     from go1exp.gap.result import GapSettings
     from go1exp.gap.stages.explain import explain
-    from go1exp.record import simulate
+    from go1exp.logs.record import simulate
+    from go1exp.sim.task import parse_parts
+    from go1exp.train.policy import load_run
 
     config, acts, _ = load_run(trained(None, policy, "", None)[0])
     gains = [f"actuator.{g}={simulate.configured(config.task.actuator, g)[0]}" for g in ("kp", "kd")]  # type: ignore[index]
@@ -135,7 +135,7 @@ def solved(case: Case, policy: str, episodes: int, seconds: float, phase: str) -
 
 def figures(counts: Mapping[str, Sequence[bool]]) -> dict[str, float | int | str | None]:
     """Return shares, and the number of cases with a wrong name, as a file of results has them."""
-    from go1exp.statistics.intervals import share_interval
+    from go1exp.evaluate.statistics.intervals import share_interval
 
     flat: dict[str, float | int | str | None] = {}
     for name, each in counts.items():

@@ -20,14 +20,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from benchmarks.foot_contacts import walks
-from go1exp import data_root
-from go1exp.deploy.estimate import KalmanEstimator
-from go1exp.deploy.go1_fields import PERIOD
-from go1exp.deploy.messages import OVERTAKEN_S, LowState
-from go1exp.deploy.packet_delay import PacketDelay
-from go1exp.estimation import go1, make_filter, readings, sample
-from go1exp.estimation.replay import samples
-from go1exp.recording import VECTORS
+from go1exp.base.paths import data_root
+from go1exp.deploy.estimation import go1, make_filter, readings, sample
+from go1exp.deploy.estimation.replay import samples
+from go1exp.deploy.runtime.estimate import KalmanEstimator
+from go1exp.deploy.runtime.packet_delay import PacketDelay
+from go1exp.logs.recording import VECTORS
+from go1exp.robot.go1_fields import PERIOD
+from go1exp.robot.messages import OVERTAKEN_S, LowState
 
 NETWORKS = ((0.0, 0.0), (0.0, 0.01), (0.002, 0.0), (0.005, 0.01), (0.01, 0.01), (0.02, 0.02))
 """Jitter, s, and share of the packets that are lost."""

@@ -16,11 +16,11 @@ import numpy as np
 
 from benchmarks import commands
 from go1exp.cli.record import RIG
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.record import plan, simulate
-from go1exp.record.sensors import Channel, SensorConfig
-from go1exp.schema.registry import Term, members
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import Term, members
+from go1exp.logs.record import plan, simulate
+from go1exp.logs.record.sensors import Channel, SensorConfig
+from go1exp.sim.task import parse_parts
 
 HIDDEN = [
     "effect=[lag,coulomb,torque_speed_limit]",
@@ -81,6 +81,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    import go1exp.excitations  # noqa: F401  (registers every excitation)
+    import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 
     main()

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.ship_policy import GRID
-from go1exp import data_root
-from go1exp.evaluate.policy import load_run
+from go1exp.base.paths import data_root
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
+from go1exp.train.policy import load_run
 
 PHYSICS_DT = {50: 0.002, 100: 0.002, 200: 0.00125, 400: 0.00125}
 """Rate of the policy, Hz -> step of the physics, s: the longest up to 2 ms that fits."""

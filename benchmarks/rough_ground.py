@@ -17,11 +17,11 @@ from typing import Any
 
 import torch
 
-from go1exp.env.core import Go1Core
-from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
+from go1exp.evaluate.statistics.intervals import share_interval
 from go1exp.mdp.commands import FixedVelocity
-from go1exp.statistics.intervals import share_interval
+from go1exp.sim.env.core import Go1Core
+from go1exp.train.policy import load_run
 
 USAGE = (
     "usage: python -m benchmarks.rough_ground run=FOLDER [ground=FOLDER] [speed=1.0] [robots=200] [seconds=12] [seed=1]"

@@ -21,17 +21,17 @@ from typing import Any
 
 import torch
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from go1exp.cli import other_robot
-from go1exp.compose import compose
-from go1exp.config import TaskConfig
+from go1exp.config.compose import compose
 from go1exp.evaluate import table
 from go1exp.evaluate.bars import ROBOT
 from go1exp.evaluate.delay_margin import delay_margin
-from go1exp.evaluate.policy import Policy, load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
-from go1exp.measures import every_measure
+from go1exp.mdp.measures import every_measure
+from go1exp.sim.task import TaskConfig
 from go1exp.train import checkpoint, start
+from go1exp.train.policy import Policy, load_run
 
 GRID = {
     "x": (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0),

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from go1exp.config import parse_train
-from go1exp.env.core import Go1Core
+from go1exp.base.tensors.threads import one_thread
+from go1exp.config.schema.backends import CpuBackend
 from go1exp.evaluate.estimated import EstimatedVelocity
-from go1exp.evaluate.policy import load_policy
-from go1exp.schema.backends import CpuBackend
-from go1exp.tensors.threads import one_thread
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import parse_train
 from go1exp.train import run_folder
+from go1exp.train.policy import load_policy
 
 SETTLED_S = 2.0
 

@@ -47,11 +47,11 @@ if found != wanted:
 
 import go1exp
 
-runtime = Path(go1exp.__path__[0], "deploy").glob("[!_]*.py")
-for name in ("pyarrow.parquet", "go1exp.recording", *(f"go1exp.deploy.{file.stem}" for file in runtime)):
+runtime = Path(go1exp.__path__[0], "deploy", "runtime").glob("[!_]*.py")
+for name in ("pyarrow.parquet", "go1exp.logs.recording", *(f"go1exp.deploy.runtime.{file.stem}" for file in runtime)):
     importlib.import_module(name)
 
-from go1exp.estimation import compiled, go1, make_filter
+from go1exp.deploy.estimation import compiled, go1, make_filter
 
 compiled()
 make_filter(go1())
@@ -71,8 +71,8 @@ largest = sorted(parts, key=parts.get, reverse=True)[:4]
 print(f"size: {size(folder):.0f} MB; " + ", ".join(f"{name} {parts[name]:.0f}" for name in largest))
 
 if bundle:
-    from go1exp.deploy.bundle import load
-    from go1exp.errors import Expected
+    from go1exp.deploy.runtime.bundle import load
+    from go1exp.base.errors import Expected
 
     try:
         loaded = load(bundle[0])

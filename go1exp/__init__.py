@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from go1exp.env.core import Go1Core
+    from go1exp.sim.env.core import Go1Core
 
 # Torch's idle OpenMP threads would spin on the cores that MuJoCo's threads need between two policy steps: on two cores
 # that costs a third of the environment's speed. Read by OpenMP when torch is first imported; a user's choice stands.
@@ -16,24 +15,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
 
-_PACKAGE = Path(__file__).resolve().parent
-
-
-def data_root() -> Path:
-    """Folder that holds ``conf/`` and ``assets/``: the package itself in a wheel, the repository root in a checkout.
-
-    The repository root counts only with its ``pyproject.toml``, so a stranger's ``conf/`` in site-packages never does.
-    """
-    if (_PACKAGE / "conf").is_dir():
-        return _PACKAGE
-    root = _PACKAGE.parent
-    if (root / "conf").is_dir() and (root / "pyproject.toml").is_file():
-        return root
-    raise FileNotFoundError(f"go1exp: no conf/ in {_PACKAGE} and no checkout around it")
-
 
 def make(overrides: Sequence[str] = (), num_envs: int = 1024, seed: int = 0, **options: Any) -> Go1Core:
-    """Return N robots that step together on torch tensors: see ``go1exp.env.batch.make``."""
-    from go1exp.env.batch import make as batched
+    """Return N robots that step together on torch tensors: see ``go1exp.sim.env.batch.make``."""
+    from go1exp.sim.env.batch import make as batched
 
     return batched(overrides, num_envs, seed, **options)

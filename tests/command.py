@@ -18,7 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from go1exp.cli import ONE_BLAS_THREAD
 
 COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
@@ -35,7 +35,7 @@ finally:
 """The command line, and afterwards the names of all loaded modules in the file ``$MODULES``."""
 
 COMPOSED = """
-from go1exp.compose import compose
+from go1exp.config.compose import compose
 compose("train", ["seed=1", "ppo.hidden=[8]"])  # Hydra has looked for its plugins, and its parsers know their grammars
 """
 
@@ -46,15 +46,16 @@ import importlib
 defer("torch")
 for verb in [*VERBS, *(f"{{verb}}_{{word}}" for verb, words in SUBVERBS.items() for word in words)]:
     importlib.import_module(f"go1exp.cli.{{MODULES.get(verb, verb)}}")
-import go1exp.config, go1exp.cli.settings, go1exp.excitations, go1exp.importers
+import go1exp.sim.task, go1exp.cli.settings, go1exp.logs.excitations, go1exp.logs.importers
 """
 """What a refusal needs: neither torch nor an engine. A refusal that loads them is seen, as they are not there yet."""
 
 WARM = f"""{COMPOSED}
 import torch, mujoco, stable_baselines3
 import torch._dynamo  # an optimiser imports it: 1.5 s
-import go1exp.train.trainer, go1exp.evaluate, go1exp.record.simulate, go1exp.excitations, go1exp.importers
-import go1exp.audit, go1exp.audit.checks, go1exp.fit.fitting, go1exp.cli.app
+import go1exp.train.trainer, go1exp.evaluate, go1exp.logs.record.simulate, go1exp.logs.excitations
+import go1exp.logs.importers
+import go1exp.logs.audit, go1exp.logs.audit.checks, go1exp.gap.actuator_net.fitting, go1exp.cli.app
 """
 """What work needs."""
 

@@ -23,12 +23,12 @@ import pytest
 import torch
 
 from go1exp import robot
-from go1exp.compose import compose
-from go1exp.config import TaskConfig, parse_task
-from go1exp.drive import DriveSetup
-from go1exp.env.core import Go1Core
-from go1exp.fit.net import ActuatorNet, NetInfo, Provenance, group_names
-from go1exp.tensors.randomness import EnvRandom
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.compose import compose
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, group_names
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig, parse_task
 from tests.selection import changed_since, chosen
 
 torch.set_num_threads(1)

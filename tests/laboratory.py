@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import rig_groups
 from go1exp.cli.settings import RecordSettings, parse
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.record import plan, simulate
-from go1exp.recording import Recording
-from go1exp.schema.registry import bind
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind
+from go1exp.logs.record import plan, simulate
+from go1exp.logs.recording import Recording
+from go1exp.sim.task import parse_parts
 
 
 def recorded(

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from go1exp.deploy import job, udp, walk
-from go1exp.deploy.loop import Deadlines
-from go1exp.deploy.messages import LowCmd, LowState
-from go1exp.sim_robot.__main__ import bundle_task, sim_config
-from go1exp.sim_robot.machine import TICK, Robot
-from go1exp.sim_robot.server import TRUTH, Server
+from go1exp.deploy.runtime import job, udp, walk
+from go1exp.deploy.runtime.loop import Deadlines
+from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
+from go1exp.deploy.sim_robot.machine import TICK, Robot
+from go1exp.deploy.sim_robot.server import TRUTH, Server
+from go1exp.robot.messages import LowCmd, LowState
 
 BEGIN = 100.0
 """The runtime's clock at the start, s."""
@@ -126,7 +126,7 @@ class InProcess:
 def lockstep(
     spoil: Spoil = lambda state: state, on_server: Callable[[World], None] = lambda world: None
 ) -> Iterator[World]:
-    """Let ``go1exp.deploy.job.run_job`` run in simulated time.
+    """Let ``go1exp.deploy.runtime.job.run_job`` run in simulated time.
 
     ``spoil`` changes what sensors say, None is silence; ``on_server`` is called when the robot is there.
     """

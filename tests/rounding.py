@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from go1exp.actuator.grouped_mlp import LANES
-from go1exp.fit.net import load
+from go1exp.sim.actuator.actuator_net import load
+from go1exp.sim.actuator.grouped_mlp import LANES
 
 UNIT = 2.0**-24
 """Largest relative error of one float32 operation."""

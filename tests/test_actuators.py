@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.actuator.delay import Delay
-from go1exp.actuator.grouped_mlp import FEWEST, LANES, GroupedMLP, padded_rows
-from go1exp.actuator.net import Net
-from go1exp.config import TaskConfig
-from go1exp.drive import DriveSetup
-from go1exp.effects.stack import EffectStack
-from go1exp.env.core import Go1Core
-from go1exp.fit.net import ActuatorNet, NetFileError, load
-from go1exp.schema.registry import ConfigError, Term, members
-from go1exp.tensors.randomness import EnvRandom
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.registry import ConfigError, Term, members
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.actuator.actuator_net import ActuatorNet, NetFileError, load
+from go1exp.sim.actuator.delay import Delay
+from go1exp.sim.actuator.grouped_mlp import FEWEST, LANES, GroupedMLP, padded_rows
+from go1exp.sim.actuator.net import Net
+from go1exp.sim.effects.stack import EffectStack
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig
 from tests.rounding import alone_and_in_a_batch
 
 Drives = Callable[..., DriveSetup]

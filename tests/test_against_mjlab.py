@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import against_mjlab
 from benchmarks.against_mjlab import NEEDS, Side, compare, lacking, main, report
-from go1exp import data_root
+from go1exp.base.paths import data_root
 
 WORKER = """
 import sys, time

@@ -18,12 +18,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp import data_root, excitations
-from go1exp.audit import AuditReport, audit, audit_file, clock_flaws, signals
+from go1exp.base.paths import data_root
 from go1exp.cli import record_audit
-from go1exp.recording import Meta, Recording, RecordingError, joint_channels, write
+from go1exp.config.schema import registry
+from go1exp.logs import excitations
+from go1exp.logs.audit import AuditReport, audit, audit_file, clock_flaws, signals
+from go1exp.logs.recording import Meta, Recording, RecordingError, joint_channels, write
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE, per_joint, soft_limits
-from go1exp.schema import registry
 
 RATE = 500.0
 SECONDS = 6
@@ -780,7 +781,7 @@ Importer = Callable[..., list[Recording]]
 
 
 def real(importer: str, *path: str) -> list[Recording]:
-    from go1exp.importers import import_recordings
+    from go1exp.logs.importers import import_recordings
 
     folder = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
     if not folder.is_dir():

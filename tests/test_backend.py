@@ -15,12 +15,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
-from go1exp.config import TaskConfig
-from go1exp.env.core import Go1Core
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import Sensors, build_model
-from go1exp.schema.registry import members
-from go1exp.terrain import build_terrain
+from go1exp.config.schema.registry import members
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import Sensors, build_model
+from go1exp.sim.task import TaskConfig
+from go1exp.sim.terrain import build_terrain
 
 FEET = [f"{leg}_foot" for leg in robot.LEGS]
 Build = Callable[..., MujocoCpu]

@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from go1exp import recording
-from go1exp.choices import config_folder
+from go1exp.base.wording import NOT_FOR_TRAINING
 from go1exp.cli import main
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.logs import remove_empty
 from go1exp.cli.quoting import command, protected
-from go1exp.compose import compose, compose_checked
+from go1exp.config.choices import config_folder
+from go1exp.config.compose import compose, compose_checked
+from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.result import GapSettings
-from go1exp.recording import Meta, Recording, RecordingError
+from go1exp.logs import recording
+from go1exp.logs.recording import Meta, Recording, RecordingError
 from go1exp.robot import JOINTS
-from go1exp.schema.registry import ConfigError
-from go1exp.wording import NOT_FOR_TRAINING
 
 Run = Callable[..., tuple[int, str]]
 
@@ -271,7 +271,7 @@ def test_of_several_sets_of_gains_a_fit_takes_the_one_that_is_chosen(run: Run, t
     small = ("hidden=[4]", "epochs=1", "half_net=false", "plots=false", "share=all")
     status, text = run("fit-actuator", "recordings=logs", "gains=[35,0.5]", "out=nets/mine", *small)
     assert status == 0, text
-    from go1exp.fit import load
+    from go1exp.gap.actuator_net import load
 
     assert load(tmp_path / "nets/mine/net.npz").info.kp == (35.0,) * len(JOINTS)
 
@@ -373,7 +373,7 @@ def test_an_effect_file_may_be_called_anything(given: str, tmp_path: Path) -> No
     ],
 )
 def test_the_environment_refuses_overrides_in_the_words_of_the_command_line(override: str, said: str) -> None:
-    import go1exp.gym  # noqa: F401  (registers the environment)
+    import go1exp.sim.gym  # noqa: F401  (registers the environment)
 
     with pytest.raises(ConfigError, match=re.escape(said)):
         gymnasium.make("Go1-v0", overrides=[override])

@@ -15,11 +15,11 @@ import pytest
 import torch
 
 from go1exp.cli.train import _refuse_other
-from go1exp.compose import compose
-from go1exp.config import parse_train
+from go1exp.config.compose import compose
+from go1exp.config.schema.beside import ROWS, StopRule
+from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.beside import answered, score
-from go1exp.schema.beside import ROWS, StopRule
-from go1exp.schema.registry import ConfigError
+from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, early_stop, run_folder, trainer
 from go1exp.train.beside import Beside
 from go1exp.train.early_stop import EarlyStop
@@ -78,7 +78,7 @@ def test_policies_are_evaluated_beside_and_the_best_is_kept(tmp_path: Path) -> N
     for name, value in plain.policy.state_dict().items():  # training knows nothing of it
         assert torch.equal(value, beside.policy.state_dict()[name])
     assert (tmp_path / "plain/metrics.csv").read_text() == (tmp_path / "run/metrics.csv").read_text()
-    from go1exp.evaluate.policy import load_run
+    from go1exp.train.policy import load_run
 
     assert load_run(tmp_path / "run", tmp_path / "run/best.pt")[2]["iteration"] == best["iteration"]
 

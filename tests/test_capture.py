@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from go1exp.env.core import Go1Core
+from go1exp.sim.env.core import Go1Core
 
 UNFIT = {
     "aten.lift_fresh.default": "a tensor made of numbers of the host, such as an index that is a list",

@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from go1exp import cli, data_root, recording
-from go1exp.compose import compose
-from go1exp.config import parse_parts
+from go1exp import cli
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.stages.replay import Part, replay
-from go1exp.recording import Recording, joint_channels
+from go1exp.logs import recording
+from go1exp.logs.recording import Recording, joint_channels
+from go1exp.sim.task import parse_parts
 from tests.small_run import SMALL
 
 STEP = 0.002

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from go1exp import robot
-from go1exp.compose import compose
-from go1exp.config import parse_task
-from go1exp.env.core import Go1Core
+from go1exp.config.compose import compose
 from go1exp.mdp.clearance import foot_positions
-from go1exp.physics.model import load_robot
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.physics.model import load_robot
+from go1exp.sim.task import parse_task
 
 
 def test_the_closed_form_of_the_feet_is_the_models() -> None:

@@ -16,16 +16,16 @@ import pytest
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from go1exp.cli import ONE_BLAS_THREAD, SUBVERBS, VERBS, _by_name, main
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.settings import DeploySettings, parse
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.evaluate.camera import RenderingUnavailable, choose_gl
-from go1exp.schema import registry
-from go1exp.schema.registry import ConfigError
+from go1exp.config.compose import compose
+from go1exp.config.schema import registry
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.env.camera import RenderingUnavailable, choose_gl
+from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
 from tests.command import LIGHT, WITH_MODULES, run_alone
 from tests.command import run as cli
@@ -575,7 +575,7 @@ def test_eval_prints_a_table_and_writes_the_same_as_json(run: Path, tmp_path: Pa
 
 def test_a_measure_of_a_users_own_is_printed(run: Path, tmp_path: Path) -> None:
     text = (
-        "import numpy as np\nfrom go1exp.terms import Trace, measure\n\n"
+        "import numpy as np\nfrom go1exp.extend import Trace, measure\n\n"
         "@measure('three', unit='rad')\ndef three(trace: Trace):\n"
         "    '''Three.'''\n    return np.full(trace.counts.shape[1], 3.0)\n"
     )

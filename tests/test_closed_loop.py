@@ -23,8 +23,8 @@ from benchmarks.gap.motions import RATE
 from benchmarks.gap.truth import Truth
 from benchmarks.gap.walking import LOAD_AT, PERIOD, Ground, build, follow, squat, walk
 from go1exp import robot
-from go1exp.compose import compose
-from go1exp.config import TrainConfig, parse_train
+from go1exp.config.compose import compose
+from go1exp.sim.task import TrainConfig, parse_train
 
 NONE = np.zeros(robot.NUM_JOINTS, dtype=bool)
 

@@ -37,7 +37,9 @@ MORE = {
 }
 """For ``make test-all``: forks of a light process refuse the same in tests/test_cli.py, and show what was imported."""
 
-slow = pytest.mark.slow("go1exp/cli/", "go1exp/__init__.py", "go1exp/config.py", "go1exp/schema/", "tests/command.py")
+slow = pytest.mark.slow(
+    "go1exp/cli/", "go1exp/__init__.py", "go1exp/sim/task.py", "go1exp/config/schema/", "tests/command.py"
+)
 
 
 @pytest.mark.parametrize("words", [*SMOKE, *(pytest.param(words, marks=slow) for words in MORE)])

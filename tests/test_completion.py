@@ -10,16 +10,16 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-import go1exp.excitations
-import go1exp.importers
-import go1exp.record.policy  # noqa: F401  (registers every importer and excitation)
-from go1exp import data_root
-from go1exp.choices import config_folder, groups_in
+import go1exp.logs.excitations
+import go1exp.logs.importers
+import go1exp.logs.record.policy  # noqa: F401  (registers every importer and excitation)
+from go1exp.base.paths import data_root
 from go1exp.cli import SUBVERBS, VERBS
 from go1exp.cli.completion import STAGES, WORDS, _importers, _listed, completions
 from go1exp.cli.settings import SETTINGS, GapVerb
-from go1exp.config import PPOConfig
-from go1exp.schema import registry
+from go1exp.config.choices import config_folder, groups_in
+from go1exp.config.schema import registry
+from go1exp.sim.task import PPOConfig
 
 PROGRAM = "import sys; from go1exp.cli import main; sys.exit(main())"
 

@@ -13,11 +13,11 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from yaml import YAMLError
 
-from go1exp.choices import config_folder
 from go1exp.cli.app import App
 from go1exp.cli.files import choices_from_files
-from go1exp.compose import as_container, as_hydra_takes_them, compose, compose_unresolved, hydra_for
-from go1exp.config_source import VerbSource
+from go1exp.config.choices import config_folder
+from go1exp.config.compose import as_container, as_hydra_takes_them, compose, compose_unresolved, hydra_for
+from go1exp.config.source import VerbSource
 
 WAYS = [
     [],

@@ -17,10 +17,11 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-import go1exp.importers
-import go1exp.protocol.kinds
-import go1exp.record.policy  # noqa: F401  (registers every importer and excitation)
-from go1exp import cli, data_root
+import go1exp.evaluate.protocol.kinds
+import go1exp.logs.importers
+import go1exp.logs.record.policy  # noqa: F401  (registers every importer and excitation)
+from go1exp import cli
+from go1exp.base.paths import data_root
 from go1exp.cli import listing, settings
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.gap import with_logs
@@ -28,13 +29,13 @@ from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.plugins import begin
 from go1exp.cli.record import RIG
 from go1exp.cli.record import _motions as motions
-from go1exp.compose import compose, hydra_for
-from go1exp.config import TrainConfig, parse_parts, parse_train
-from go1exp.env.core import Go1Core
+from go1exp.config.compose import compose, hydra_for
+from go1exp.config.schema import plugins, registry
+from go1exp.config.schema.registry import Term
+from go1exp.evaluate.protocol.base import chosen
 from go1exp.gap.robots.description import parse_model
-from go1exp.protocol.base import chosen
-from go1exp.schema import plugins, registry
-from go1exp.schema.registry import Term
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TrainConfig, parse_parts, parse_train
 from tests.test_extending import files as files_of_extending
 from tests.test_own_robot import files as files_of_own_robot
 
@@ -130,7 +131,7 @@ def ablated(name: str, base: Mapping[str, Any]) -> dict[str, Any]:
     return {**base, **{f"reward.{term}.weight": 0.0 for term in terms}}
 
 
-@pytest.mark.slow("conf/", "go1exp/config.py", "go1exp/schema/", "go1exp/compose.py")
+@pytest.mark.slow("conf/", "go1exp/sim/task.py", "go1exp/config/schema/", "go1exp/config/compose.py")
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_an_ablation_changes_what_it_says_and_nothing_else(name: str) -> None:
     container = compose("train", [f"experiment=ablation/{name}"])
@@ -488,7 +489,15 @@ def test_the_pages_show_every_verb() -> None:
     assert missing == []
 
 
-COMPOSED = ("README.md", "docs/", "conf/", "go1exp/cli/", "go1exp/compose.py", "go1exp/config.py", "go1exp/schema/")
+COMPOSED = (
+    "README.md",
+    "docs/",
+    "conf/",
+    "go1exp/cli/",
+    "go1exp/config/compose.py",
+    "go1exp/sim/task.py",
+    "go1exp/config/schema/",
+)
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from go1exp import robot
-from go1exp.compose import compose
-from go1exp.config import TaskConfig, parse_task, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.schema.contact import MUJOCO_CONTACT
-from go1exp.schema.registry import ConfigError
+from go1exp.config.compose import compose
+from go1exp.config.schema.contact import MUJOCO_CONTACT
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.task import TaskConfig, parse_task, parse_train
 
 STILL = ("rand=none", "event=none", "termination=none", "command=forward")
 

@@ -20,10 +20,11 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from deploy.lock import FOLDER, PARTS, blocks, part
-from go1exp import data_root, recording
-from go1exp.deploy.launch import SimulatedRobot
-from go1exp.deploy.walk import STATUS
-from go1exp.export.build import build
+from go1exp.base.paths import data_root
+from go1exp.deploy.export.build import build
+from go1exp.deploy.runtime.launch import SimulatedRobot
+from go1exp.deploy.runtime.walk import STATUS
+from go1exp.logs import recording
 
 ROOT = data_root()
 SCRIPTS = {"build.sh", "check.sh", "install.sh"}
@@ -160,7 +161,7 @@ def replay(root: Path) -> str:
     return said
 
 
-@pytest.mark.slow("deploy/", "go1exp/deploy/", "go1exp/estimation/", "hatch_build.py", ".dockerignore")
+@pytest.mark.slow("deploy/", "go1exp/deploy/", "go1exp/deploy/estimation/", "hatch_build.py", ".dockerignore")
 def test_the_lines_of_the_dockerfile_make_a_runtime_that_walks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = tmp_path / "image"
     root.mkdir()

@@ -16,23 +16,24 @@ import yaml
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from go1exp import data_root, robot
-from go1exp.config import TaskConfig
-from go1exp.controller import forces, ground, swing
-from go1exp.controller.as_targets import AsTargets
-from go1exp.controller.batch import Driven
-from go1exp.controller.feet import Feet
-from go1exp.controller.forces import Body, ForcePlan, Problem
-from go1exp.controller.gait import Clock
-from go1exp.controller.mpc import Mpc
-from go1exp.controller.settings import MpcSettings, parse_controller
-from go1exp.controller.types import Drive, Sensed
-from go1exp.env.core import Go1Core
+from go1exp import robot
+from go1exp.base.paths import data_root
+from go1exp.config.schema.registry import ConfigError
+from go1exp.evaluate.controller import forces, ground, swing
+from go1exp.evaluate.controller.as_targets import AsTargets
+from go1exp.evaluate.controller.batch import Driven
+from go1exp.evaluate.controller.feet import Feet
+from go1exp.evaluate.controller.forces import Body, ForcePlan, Problem
+from go1exp.evaluate.controller.gait import Clock
+from go1exp.evaluate.controller.mpc import Mpc
+from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
+from go1exp.evaluate.controller.types import Drive, Sensed
 from go1exp.evaluate.rollout import EvalConfig, evaluate
-from go1exp.physics.kinematics import Kinematics
-from go1exp.physics.model import load_robot
 from go1exp.robot import GRAVITY
-from go1exp.schema.registry import ConfigError
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.physics.kinematics import Kinematics
+from go1exp.sim.physics.model import load_robot
+from go1exp.sim.task import TaskConfig
 
 FILE = data_root() / "conf/controller/mpc.yaml"
 
@@ -445,7 +446,7 @@ def test_it_walks_by_noisy_sensors_the_estimator_and_late_commands(make_task: Ca
     assert row["mean"]["x"] == pytest.approx(0.5, abs=0.05)
 
 
-@pytest.mark.slow("go1exp/controller/", "go1exp/estimation/", "conf/controller/")
+@pytest.mark.slow("go1exp/evaluate/controller/", "go1exp/deploy/estimation/", "conf/controller/")
 @pytest.mark.parametrize(
     "command", [(0.5, 0.0, 0.0), (1.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0)]
 )

@@ -16,13 +16,13 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from go1exp import robot
-from go1exp.config import TaskConfig
-from go1exp.drive import DriveSetup
-from go1exp.env.core import Go1Core
-from go1exp.env.faults import NumericalFault
+from go1exp.config.schema.registry import Entry, Term
 from go1exp.mdp.types import StepResult
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.schema.registry import Entry, Term
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.faults import NumericalFault
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.task import TaskConfig
 
 Make = Callable[..., Go1Core]
 

@@ -10,17 +10,17 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from go1exp.compose import compose
-from go1exp.config import TrainConfig, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.evaluate.policy import load_network
-from go1exp.export.build import build
+from go1exp.config.compose import compose
+from go1exp.config.schema import plugins
+from go1exp.config.schema.registry import ConfigError, members
+from go1exp.deploy.export.build import build
 from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS, GroundHeight, HeightScan
-from go1exp.schema import plugins
-from go1exp.schema.registry import ConfigError, members
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import checkpoint, run_folder, start, trainer
 from go1exp.train.device import DevicePPO
+from go1exp.train.policy import load_network
 from go1exp.train.ppo import AdaptivePPO
 from tests.small_run import SMALL
 
@@ -216,7 +216,7 @@ def test_the_ground_is_scanned_only_for_whom_reads_it_and_is_that_of_the_terrain
 
 
 MEMORY = '''
-from go1exp.terms import Memory, Snapshot, TermSetup, observation
+from go1exp.extend import Memory, Snapshot, TermSetup, observation
 
 
 @observation("last_command", size=3)

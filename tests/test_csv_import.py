@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from go1exp import recording
-from go1exp.deploy.go1_fields import TORQUE_NOTE
-from go1exp.deploy.job import ON_WIRE
-from go1exp.importers import import_recordings
-from go1exp.importers.csv import UNITS
-from go1exp.recording import JOINT_QUANTITIES, VECTORS, Recording, RecordingError
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.runtime.job import ON_WIRE
+from go1exp.logs import recording
+from go1exp.logs.importers import import_recordings
+from go1exp.logs.importers.csv import UNITS
+from go1exp.logs.recording import JOINT_QUANTITIES, VECTORS, Recording, RecordingError
+from go1exp.robot.go1_fields import TORQUE_NOTE
 from tests.command import LIGHT, run
 
 ROWS = 40

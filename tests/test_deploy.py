@@ -20,16 +20,17 @@ from typing import IO, Any, cast
 import numpy as np
 import pytest
 
-from go1exp import cli, data_root, recording, robot
-from go1exp.audit import audit
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.controller.deployed import Deployed
-from go1exp.controller.mpc import Mpc
-from go1exp.controller.settings import MpcSettings, parse_controller
-from go1exp.deploy import go1_sdk, walk, wire
-from go1exp.deploy.bundle import load
-from go1exp.deploy.commands import (
+from go1exp import cli, robot
+from go1exp.base.errors import Expected
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
+from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.config.schema.registry import ConfigError, Term, members
+from go1exp.deploy.estimation import from_json, go1, make_filter, sample, to_json
+from go1exp.deploy.export.build import build
+from go1exp.deploy.runtime import go1_sdk, walk, wire
+from go1exp.deploy.runtime.bundle import load
+from go1exp.deploy.runtime.commands import (
     CommandError,
     Keyboard,
     Sinusoid,
@@ -41,29 +42,30 @@ from go1exp.deploy.commands import (
     split_keys,
     stretched,
 )
-from go1exp.deploy.controller import LYING, PHASES, Cycle
-from go1exp.deploy.estimate import BLIND_S, KalmanEstimator, settings
-from go1exp.deploy.go1_fields import JOINTS, MOTOR_NAMES
-from go1exp.deploy.go1_wire import Health
-from go1exp.deploy.job import Job, run_job
-from go1exp.deploy.launch import RefusedError, RobotError
-from go1exp.deploy.log import About, Log, Ring
-from go1exp.deploy.messages import Link, LowCmd, LowState
-from go1exp.deploy.safety import RULES
-from go1exp.deploy.udp import UdpLink
-from go1exp.deploy.walk import FAULTS, STATUS, Plan
-from go1exp.errors import Expected
-from go1exp.estimation import from_json, go1, make_filter, sample, to_json
-from go1exp.export.build import build
+from go1exp.deploy.runtime.controller import LYING, PHASES, Cycle
+from go1exp.deploy.runtime.estimate import BLIND_S, KalmanEstimator, settings
+from go1exp.deploy.runtime.go1_wire import Health
+from go1exp.deploy.runtime.job import Job, run_job
+from go1exp.deploy.runtime.launch import RefusedError, RobotError
+from go1exp.deploy.runtime.log import About, Log, Ring
+from go1exp.deploy.runtime.safety import RULES
+from go1exp.deploy.runtime.udp import UdpLink
+from go1exp.deploy.runtime.walk import FAULTS, STATUS, Plan
+from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
+from go1exp.deploy.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
+from go1exp.deploy.sim_robot.server import TRUTH, Network, Server, Truth
+from go1exp.evaluate.controller.deployed import Deployed
+from go1exp.evaluate.controller.mpc import Mpc
+from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.gap.robots.hung import hung
-from go1exp.record.plan import make_motion
-from go1exp.record.played import played
-from go1exp.recording import VECTORS
-from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
-from go1exp.schema.registry import ConfigError, Term, members
-from go1exp.sim_robot.__main__ import bundle_task, sim_config
-from go1exp.sim_robot.machine import NOISE, SILENCE, TICK, Robot, turned
-from go1exp.sim_robot.server import TRUTH, Network, Server, Truth
+from go1exp.logs import recording
+from go1exp.logs.audit import audit
+from go1exp.logs.record.plan import make_motion
+from go1exp.logs.record.played import played
+from go1exp.logs.recording import VECTORS
+from go1exp.robot.go1_fields import JOINTS, MOTOR_NAMES
+from go1exp.robot.messages import Link, LowCmd, LowState
+from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
 from tests.lockstep import BEGIN, Spoil, lockstep
 from tests.small_run import SMALL
@@ -345,7 +347,7 @@ def test_a_bundle_that_is_not_for_a_go1_never_reaches_its_motors(
 ) -> None:
     whole = load(file)
     other = dataclasses.replace(whole, metadata=dataclasses.replace(whole.metadata, **change))
-    monkeypatch.setattr("go1exp.deploy.bundle.load", lambda path: other)
+    monkeypatch.setattr("go1exp.deploy.runtime.bundle.load", lambda path: other)
     said: list[str] = []
     with pytest.raises((Expected, ConfigError), match=message):
         run_job(Job(file, "sim", Plan(), str(tmp_path / "out")), said.append)
@@ -1057,7 +1059,7 @@ def test_without_the_sdk_the_robot_is_refused(file: str, tmp_path: Path) -> None
 # ---------------------------------------------------------------------- processes
 
 
-@pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/", "go1exp/cli/", "go1exp/export/")
+@pytest.mark.slow("go1exp/deploy/", "go1exp/deploy/sim_robot/", "go1exp/cli/", "go1exp/deploy/export/")
 def test_the_verb_walks_against_another_process_in_real_time(
     file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -1092,7 +1094,7 @@ def begun(folder: Path, *arguments: str) -> tuple[subprocess.Popen[str], IO[str]
     return process, process.stdout
 
 
-@pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/", "go1exp/cli/", "go1exp/export/")
+@pytest.mark.slow("go1exp/deploy/", "go1exp/deploy/sim_robot/", "go1exp/cli/", "go1exp/deploy/export/")
 def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_path: Path) -> None:
     code = (
         "import sys, json\nfrom go1exp.deploy.__main__ import main\nstatus = main(sys.argv[1:])\n"
@@ -1186,9 +1188,9 @@ def test_what_is_wrong_is_said_in_a_line(file: str, tmp_path: Path, capfd: pytes
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/", "go1exp/cli/", "go1exp/export/")
+@pytest.mark.slow("go1exp/deploy/", "go1exp/deploy/sim_robot/", "go1exp/cli/", "go1exp/deploy/export/")
 def test_the_bench_measures_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
-    from go1exp.bench import deploy
+    from go1exp.evaluate.bench import deploy
 
     monkeypatch.setattr(deploy, "RATE", 100.0)
     monkeypatch.setenv("PYTHONPATH", str(data_root()))

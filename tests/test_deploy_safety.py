@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from go1exp import robot
-from go1exp.deploy import loop as loop_module
-from go1exp.deploy.bundle import Bundle
-from go1exp.deploy.controller import Controller, Cycle, Stages
-from go1exp.deploy.loop import Deadlines, MonotonicClock, Timing, run
-from go1exp.deploy.messages import LowCmd, LowState
-from go1exp.deploy.metadata import Port
-from go1exp.deploy.safety import RULES, Safety, SafetyConfig, lean, sdk_range
+from go1exp.deploy.runtime import loop as loop_module
+from go1exp.deploy.runtime.bundle import Bundle
+from go1exp.deploy.runtime.controller import Controller, Cycle, Stages
+from go1exp.deploy.runtime.loop import Deadlines, MonotonicClock, Timing, run
+from go1exp.deploy.runtime.metadata import Port
+from go1exp.deploy.runtime.safety import RULES, Safety, SafetyConfig, lean, sdk_range
+from go1exp.robot.messages import LowCmd, LowState
 
 NOMINAL = robot.NOMINAL_STANCE
 LIMIT = robot.per_joint(robot.EFFORT_LIMIT)

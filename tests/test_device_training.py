@@ -12,11 +12,11 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from go1exp.compose import compose
-from go1exp.config import TrainConfig, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.env.faults import NumericalFault
-from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.config.compose import compose
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.faults import NumericalFault
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import checkpoint
 from go1exp.train.device import DevicePPO
 from go1exp.train.device_update import DeviceUpdate

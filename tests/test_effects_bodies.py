@@ -16,17 +16,17 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.compose import compose
-from go1exp.config import TaskConfig, parse_task
-from go1exp.drive import DriveSetup
-from go1exp.effects.base import Gears, Measured
-from go1exp.effects.two_mass import TwoMass, resonance
-from go1exp.env.plant import Plant, drive_setup
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model
-from go1exp.schema.registry import bind
-from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import build_terrain
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.effects.base import Gears, Measured
+from go1exp.sim.effects.two_mass import TwoMass, resonance
+from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig, parse_task
+from go1exp.sim.terrain import build_terrain
 
 G = 9.81
 CALVES = slice(2, None, 3)
@@ -178,7 +178,7 @@ def test_inertia_and_weight_are_those_of_the_links_written_down_anew(name: str) 
 
 def with_bodies(loads: Mapping[str, tuple[float, tuple[float, float, float]]]) -> mujoco.MjModel:
     """Compile a robot that carries real bodies: name of the link -> mass, kg, and place in its frame, m."""
-    from go1exp.physics.model import load_robot
+    from go1exp.sim.physics.model import load_robot
 
     spec = load_robot(task().robot.inertia)
     for link, (mass, at) in loads.items():
@@ -220,7 +220,7 @@ def test_a_point_load_is_a_body_on_the_link(part: str, at: tuple[float, float, f
     assert np.allclose(a.qfrc_bias, b.qfrc_bias, atol=1e-7)
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_payload_taken_away_undoes_one_and_leaves_an_inertia() -> None:
     both = {
         "first": {"term": "payload", "mass": 0.8, "z": 0.05},
@@ -292,7 +292,7 @@ def test_a_wrench_accelerates_the_whole_robot_by_force_over_mass() -> None:
 # ---------------------------------------------------------------------- contact
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 @pytest.mark.parametrize("scale", [0.3, 0.5])
 def test_feet_slip_beyond_friction_times_weight(scale: float) -> None:
     """Pushed beyond it a robot gains speed by (force - friction) / mass; below, its feet only creep (soft contact)."""
@@ -439,7 +439,7 @@ def frequency(signal: np.ndarray, dt: float) -> float:
     return float((len(crossings) - 1) / (2.0 * dt * (crossings[-1] - crossings[0])))
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 @pytest.mark.parametrize("compliance", [1 / 60, 1 / 150, 1 / 400])
 @pytest.mark.parametrize(("dt", "tolerance"), [(0.00025, 0.003), (0.002, 0.08)])
 def test_rotor_and_calf_swing_at_the_two_mass_frequency(compliance: float, dt: float, tolerance: float) -> None:
@@ -477,7 +477,7 @@ def test_a_spring_twists_by_compliance_times_torque_and_the_drive_reads_the_roto
     assert plant.torque.abs().max() > 0.5
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_free_play_between_upright_and_upside_down_is_the_gap() -> None:
     gap, upside_down = 0.02, (0.0, 1.0, 0.0, 0.0)
     q = {
@@ -517,7 +517,7 @@ def test_within_the_gap_no_torque_passes_and_the_joint_has_lost_its_rotor(drives
     assert torch.allclose(rotors.rate, 0.002 * torque / rotor)
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_the_stiffer_a_spring_the_more_it_is_a_rigid_gear() -> None:
     target = robot.NOMINAL_STANCE + 0.2
     rigid = settle(rig({}), target, 0.1)
@@ -544,7 +544,7 @@ def kinetic(plant: Plant) -> Tensor:
     return torch.tensor(found) + (0.5 * rotor * speed**2).sum(1)
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 @pytest.mark.parametrize("kinds", [("flexibility",), ("backlash",), ("flexibility", "backlash")])
 def test_gears_make_no_energy(kinds: tuple[str, ...]) -> None:
     """Drives off, weightless, legs thrown about, all values within the bounds: links and rotors only lose speed."""

@@ -20,19 +20,19 @@ from scipy.signal import lsim
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.actuator.envelope import envelope
-from go1exp.compose import compose
-from go1exp.config import MANY_TERMS, TaskConfig, parse_task
-from go1exp.deploy import go1_wire
-from go1exp.deploy.messages import LowCmd
-from go1exp.drive import DriveSetup
-from go1exp.effects.base import Effect
-from go1exp.env.plant import Plant, drive_setup
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model
-from go1exp.schema.registry import Term, bind
-from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import build_terrain
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import Term, bind
+from go1exp.deploy.runtime import go1_wire
+from go1exp.robot.drive import DriveSetup
+from go1exp.robot.messages import LowCmd
+from go1exp.sim.actuator.envelope import envelope
+from go1exp.sim.effects.base import Effect
+from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
+from go1exp.sim.terrain import build_terrain
 
 DT = 0.002
 CALF = robot.JOINTS.index("FR_calf")

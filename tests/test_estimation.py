@@ -19,10 +19,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp import data_root, robot
-from go1exp.compose import compose
-from go1exp.config import parse_task
-from go1exp.estimation import (
+from go1exp import robot
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError, bind
+from go1exp.deploy.estimation import (
     WIDTH,
     EstimatorError,
     FilterConfig,
@@ -36,14 +37,14 @@ from go1exp.estimation import (
     scaler,
     to_json,
 )
-from go1exp.estimation.kalman import NumpyFilter
-from go1exp.estimation.legs import foot
-from go1exp.estimation.replay import estimate
-from go1exp.record.plan import Episode, make_motion
-from go1exp.record.sensors import Channel, SensorConfig
-from go1exp.record.simulate import Rig, play
-from go1exp.recording import VECTORS
-from go1exp.schema.registry import ConfigError, bind
+from go1exp.deploy.estimation.kalman import NumpyFilter
+from go1exp.deploy.estimation.legs import foot
+from go1exp.deploy.estimation.replay import estimate
+from go1exp.logs.record.plan import Episode, make_motion
+from go1exp.logs.record.sensors import Channel, SensorConfig
+from go1exp.logs.record.simulate import Rig, play
+from go1exp.logs.recording import VECTORS
+from go1exp.sim.task import parse_task
 
 GRAVITY = np.array([0.0, 0.0, 9.81])
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -233,7 +234,7 @@ def test_many_samples_at_once_are_the_same_as_one_by_one() -> None:
 # ---------------------------------------------------------------------- what it must find
 
 
-@pytest.mark.slow("go1exp/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
 def test_a_swaying_robot_is_followed_exactly() -> None:
     rows, truth = stroll(exact(), seconds=4.0)
     states = make_filter(exact()).run(rows)
@@ -265,7 +266,7 @@ def test_an_offset_of_the_accelerometer_is_learnt_while_standing() -> None:
     np.testing.assert_allclose(states[-1, 3:6], 0.0, atol=2e-3)
 
 
-@pytest.mark.slow("go1exp/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
 def test_one_slipping_foot_moves_the_estimate_little() -> None:
     config = exact()
     rows, truth = (values.copy() for values in stroll(config, 4.0))
@@ -313,7 +314,7 @@ def sinking_steps(config: FilterConfig, slope: float) -> np.ndarray:
     return np.array(rows)
 
 
-@pytest.mark.slow("go1exp/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
 @pytest.mark.parametrize("slope", [0.0, 0.3])
 def test_ground_that_gives_way_does_not_make_the_trunk_sink(slope: float) -> None:
     config = go1(foot_radius=0.0)
@@ -430,7 +431,7 @@ def test_rolling_feet_need_chains() -> None:
 
 
 def test_a_missing_extension_says_how_to_build_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "go1exp.estimation._kalman", None)
+    monkeypatch.setitem(sys.modules, "go1exp.deploy.estimation._kalman", None)
     with pytest.raises(EstimatorError, match=r"C\+\+17 compiler.*make setup"):
         make_filter(go1())
 
@@ -455,7 +456,7 @@ def test_building_without_a_compiler_says_so_and_leaves_nothing(
 def test_the_filter_needs_nothing_heavy() -> None:
     heavy = "('torch', 'mujoco', 'stable_baselines3', 'hydra', 'omegaconf', 'scipy', 'pyarrow')"
     code = (
-        "import sys; from go1exp.estimation import *; make_filter(go1()); "
+        "import sys; from go1exp.deploy.estimation import *; make_filter(go1()); "
         f"print([m for m in {heavy} if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=data_root(), capture_output=True, text=True, timeout=60)
@@ -487,7 +488,7 @@ def test_a_simulated_go1_that_squats_is_followed(source: Literal["force", "torqu
 
 
 def test_on_the_real_scaler_it_beats_leg_odometry_by_far() -> None:
-    from go1exp.estimation.mocap import judge
+    from go1exp.deploy.estimation.mocap import judge
 
     root = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
     if not (root / "scaler_walk_mocap").is_dir():
@@ -503,12 +504,12 @@ def _main(folder: Path, motions: Callable[[], None]) -> None:
     import importlib.util
 
     (file,) = folder.glob("_kalman.*.so")
-    spec = importlib.util.spec_from_file_location("go1exp.estimation._kalman", file)
+    spec = importlib.util.spec_from_file_location("go1exp.deploy.estimation._kalman", file)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    sys.modules["go1exp.estimation._kalman"] = module
+    sys.modules["go1exp.deploy.estimation._kalman"] = module
     motions()
 
 

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp import data_root
-from go1exp.estimation import go1, make_filter, readings, scaler
-from go1exp.estimation.attitude import vertical
-from go1exp.estimation.kalman import NumpyFilter
-from go1exp.estimation.mocap import judge
-from go1exp.importers import import_recordings
-from go1exp.importers.scaler_walk_mocap import motion_capture
-from go1exp.importers.source import load_npz
-from go1exp.recording import VECTORS, RecordingError
+from go1exp.base.paths import data_root
+from go1exp.deploy.estimation import go1, make_filter, readings, scaler
+from go1exp.deploy.estimation.kalman import NumpyFilter
+from go1exp.deploy.estimation.mocap import judge
+from go1exp.logs.importers import import_recordings
+from go1exp.logs.importers.scaler_walk_mocap import motion_capture
+from go1exp.logs.importers.source import load_npz
+from go1exp.logs.recording import VECTORS, RecordingError
 from go1exp.robot import NOMINAL_STANCE
+from go1exp.robot.attitude import vertical
 
 DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data")) / "scaler_walk_mocap"
 
@@ -80,7 +80,7 @@ def test_it_is_what_the_feet_carry() -> None:
         assert np.corrcoef(carried, felt)[0, 1] > 0.75
 
 
-@pytest.mark.slow("go1exp/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
 @pytest.mark.parametrize("number", [14, 15])
 def test_motion_capture_a_stride_off_is_moved_back(number: int, tmp_path: Path) -> None:
     """Run 14 came so; run 15 is made so."""
@@ -103,7 +103,7 @@ def test_motion_capture_a_stride_off_is_moved_back(number: int, tmp_path: Path) 
 # ---------------------------------------------------------------------- runs with faults
 
 
-@pytest.mark.slow("go1exp/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
 def test_broken_rows_and_missing_sensors_do_not_stop_a_run(tmp_path: Path) -> None:
     whole = judge(DATA / "run_19.npz", scaler()) if run(19) else None
     arrays = run(19)
@@ -217,7 +217,7 @@ MEASURE = """
 import ctypes, sys
 import numpy as np
 sys.path.insert(0, {tests!r})
-from go1exp.estimation import go1, make_filter
+from go1exp.deploy.estimation import go1, make_filter
 from test_estimation import random_motion
 counter = ctypes.CDLL({library!r}).allocations
 rows = random_motion(go1(), 5000, seed=7)
@@ -231,7 +231,7 @@ print(*found, *sorted(set(outcome[:, -1].astype(int))))
 """
 
 
-@pytest.mark.slow("go1exp/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/estimated.py", "assets/estimation/", "hatch_build.py")
 def test_an_update_allocates_nothing(tmp_path: Path) -> None:
     """Every allocation of the process is counted, C++'s ``new`` too: 5000 updates of every outcome need as many
     as 5 do.

@@ -14,16 +14,16 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from go1exp.compose import compose
-from go1exp.config import TaskConfig, TrainConfig, parse_train
-from go1exp.env.core import Go1Core
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate import table
 from go1exp.evaluate.observed import columns
-from go1exp.evaluate.policy import Policy, load_policy
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
-from go1exp.measures import every_measure
-from go1exp.schema.registry import ConfigError
+from go1exp.mdp.measures import every_measure
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig, TrainConfig, parse_train
 from go1exp.train import checkpoint, run_folder, trainer
+from go1exp.train.policy import Policy, load_policy
 
 MakeTask = Callable[..., TaskConfig]
 

@@ -12,15 +12,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from go1exp.config import TaskConfig
-from go1exp.env.core import Go1Core
 from go1exp.evaluate import delay_margin as margins
 from go1exp.evaluate import table
 from go1exp.evaluate.delay_margin import delay_margin, delayed
 from go1exp.evaluate.recorder import Recorder
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task
-from go1exp.measures import every_measure
+from go1exp.mdp.measures import every_measure
 from go1exp.robot import GRAVITY
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig
 
 MakeTask = Callable[..., TaskConfig]
 

@@ -32,28 +32,28 @@ import torch
 from mujoco.batch import Batch
 from omegaconf import OmegaConf
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from go1exp.cli import settings
 from go1exp.cli.app import App
 from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.record import RIG
 from go1exp.cli.simulate import BODY
-from go1exp.compose import compose_unresolved
-from go1exp.config import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
-from go1exp.deploy import go1_wire
-from go1exp.deploy.bundle import loads
-from go1exp.deploy.messages import LowCmd
-from go1exp.deploy.walk import STATUS
-from go1exp.env.core import Go1Core
-from go1exp.export import graph
-from go1exp.export.build import build
-from go1exp.export.graph import DeployedPolicy
+from go1exp.config.compose import compose_unresolved
+from go1exp.config.schema import registry
+from go1exp.config.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
+from go1exp.config.schema.registry import ConfigError, Expected, Range
+from go1exp.deploy.export import graph
+from go1exp.deploy.export.build import build
+from go1exp.deploy.export.graph import DeployedPolicy
+from go1exp.deploy.runtime import go1_wire
+from go1exp.deploy.runtime.bundle import loads
+from go1exp.deploy.runtime.walk import STATUS
+from go1exp.deploy.sim_robot.settings import SimSettings
 from go1exp.mdp.types import Snapshot
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.schema import registry
-from go1exp.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
-from go1exp.schema.registry import ConfigError, Expected, Range
-from go1exp.sim_robot.settings import SimSettings
+from go1exp.robot.messages import LowCmd
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.task import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
 from go1exp.train import run_folder, start, trainer, wandb_writer
 from tests.lockstep import lockstep
 
@@ -965,7 +965,7 @@ def play_trace(container: dict[str, Any], walk: Walk) -> Trace:
 def record_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """Where the recordings lie and what their channels hold; their names and metadata repeat the settings."""
     from go1exp.cli.record import APP
-    from go1exp.record import simulate
+    from go1exp.logs.record import simulate
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "SETTLE_S", 0.02)
@@ -997,9 +997,9 @@ def import_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def fit_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """Errors in the report, the net's numbers, and for how long it was trained; not what the net says of itself."""
-    from go1exp import fit
     from go1exp.cli import fit_actuator
-    from go1exp.fit.net import load
+    from go1exp.gap import actuator_net as fit
+    from go1exp.sim.actuator.actuator_net import load
 
     def plot(result: fit.FitResult, folder: Path) -> list[Path]:
         (folder / "picture.png").touch()
@@ -1105,7 +1105,7 @@ def deploy_trace(container: dict[str, Any], walk: Walk) -> Trace:
 def sim_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What a client that moves a leg hears, and where the robot truly is, tick by tick."""
     from go1exp.cli.simulate import APP
-    from go1exp.sim_robot import alone
+    from go1exp.deploy.sim_robot import alone
 
     seen: list[Any] = []
 
@@ -1136,9 +1136,9 @@ def list_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def bench_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is built and for how long it runs, by a clock of its own and without other processes."""
-    from go1exp.bench import env, measure
     from go1exp.cli.bench import APP
-    from go1exp.physics import mujoco_cpu
+    from go1exp.evaluate.bench import env, measure
+    from go1exp.sim.physics import mujoco_cpu
 
     built: list[Any] = []
     ticks = itertools.count()
@@ -1200,27 +1200,27 @@ def walk(tmp_path_factory: pytest.TempPathFactory, make_net: Callable[..., Path]
         return kept[identity]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("go1exp.export.build.to_onnx", to_onnx)
+        patch.setattr("go1exp.deploy.export.build.to_onnx", to_onnx)
         yield Walk(tmp_path_factory.mktemp("keys"), make_net)
 
 
-VERB = ("go1exp/cli/", "go1exp/config.py", "go1exp/schema/")
+VERB = ("go1exp/cli/", "go1exp/sim/task.py", "go1exp/config/schema/")
 RUN = (*VERB, "go1exp/train/")
 SLOW = {
-    "gap": ("conf/gap.yaml", "go1exp/gap/", "go1exp/effects/", *VERB),
-    "record_audit": ("conf/record_audit.yaml", "go1exp/audit/", *VERB),
-    "export": ("conf/export.yaml", "go1exp/export/", *VERB),
-    "export_check": ("conf/export_check.yaml", "go1exp/export/", *VERB),
-    "deploy": ("conf/deploy.yaml", "go1exp/deploy/", "go1exp/sim_robot/", *VERB),
-    "sim": ("conf/sim.yaml", "go1exp/sim_robot/", *VERB),
-    "fit-actuator": ("conf/fit-actuator.yaml", "go1exp/fit/", *VERB),
+    "gap": ("conf/gap.yaml", "go1exp/gap/", "go1exp/sim/effects/", *VERB),
+    "record_audit": ("conf/record_audit.yaml", "go1exp/logs/audit/", *VERB),
+    "export": ("conf/export.yaml", "go1exp/deploy/export/", *VERB),
+    "export_check": ("conf/export_check.yaml", "go1exp/deploy/export/", *VERB),
+    "deploy": ("conf/deploy.yaml", "go1exp/deploy/", "go1exp/deploy/sim_robot/", *VERB),
+    "sim": ("conf/sim.yaml", "go1exp/deploy/sim_robot/", *VERB),
+    "fit-actuator": ("conf/fit-actuator.yaml", "go1exp/gap/actuator_net/", *VERB),
     "eval": ("conf/eval.yaml", "go1exp/evaluate/", *VERB),
     "play": ("conf/play.yaml", "go1exp/evaluate/", *VERB),
-    "bench": ("conf/bench.yaml", "go1exp/bench/", *VERB),
+    "bench": ("conf/bench.yaml", "go1exp/evaluate/bench/", *VERB),
     "ppo": ("conf/ppo/", *RUN),
     "logger": ("conf/logger/", *RUN),
     "experiment": ("conf/experiment/", *RUN),
-    "effect": ("conf/effect/", "go1exp/effects/", "go1exp/env/plant.py"),
+    "effect": ("conf/effect/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py"),
 }
 """Programs, and groups of train, of which a trace takes long, and what they are made of. ``make test`` asks of their
 keys only that each is read, in one trace for all of a program; ``make test-all`` that each acts. The terms of the MDP,
@@ -1341,7 +1341,7 @@ def test_a_trace_repeats(program: str, walk: Walk) -> None:
     assert difference(walk.base(program, container, ""), walk.trace(program, container, "")) is None
 
 
-@pytest.mark.slow("go1exp/schema/", "go1exp/config.py")
+@pytest.mark.slow("go1exp/config/schema/", "go1exp/sim/task.py")
 def test_dead_keys_are_found(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
     def ghost(s: Snapshot, *, used: float = 1.0, unused: float = 1.0, half: Range = (0.0, 1.0)) -> torch.Tensor:
         return used * half[1] * s.joint_vel.square().sum(-1)

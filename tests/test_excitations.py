@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from go1exp import excitations, robot
-from go1exp.excitations import ExcitationError, Motion
-from go1exp.schema import registry
+from go1exp import robot
+from go1exp.config.schema import registry
+from go1exp.logs import excitations
+from go1exp.logs.excitations import ExcitationError, Motion
 
 RATE = 500.0
 MEMBERS = registry.members("excitation")

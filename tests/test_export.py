@@ -23,27 +23,28 @@ from onnx import numpy_helper
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from go1exp import cli, data_root, robot
-from go1exp.compose import compose
-from go1exp.config import ActionConfig, TaskConfig, parse_task, parse_train
-from go1exp.deploy import bundle
-from go1exp.deploy.archive import BundleError, as_json, pack, seal, stored
-from go1exp.deploy.bundle import MEMBERS, Bundle, loads
-from go1exp.deploy.controller import Controller, Stages
-from go1exp.deploy.messages import Link, LowCmd, LowState
-from go1exp.deploy.metadata import Metadata
-from go1exp.deploy.policy import OnnxPolicy
-from go1exp.deploy.safety import Safety
-from go1exp.env.core import Go1Core
-from go1exp.evaluate.policy import load_policy
-from go1exp.export import graph
-from go1exp.export.build import build, command_ranges, gains
-from go1exp.export.graph import DeployedPolicy, ExportError, required_inputs, to_onnx
-from go1exp.export.trace import readings
+from go1exp import cli, robot
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
+from go1exp.config.schema.history import history_columns, width
+from go1exp.config.schema.registry import Entry, Term
+from go1exp.deploy.export import graph
+from go1exp.deploy.export.build import build, command_ranges, gains
+from go1exp.deploy.export.graph import DeployedPolicy, ExportError, required_inputs, to_onnx
+from go1exp.deploy.export.trace import readings
+from go1exp.deploy.runtime import bundle
+from go1exp.deploy.runtime.archive import BundleError, as_json, pack, seal, stored
+from go1exp.deploy.runtime.bundle import MEMBERS, Bundle, loads
+from go1exp.deploy.runtime.controller import Controller, Stages
+from go1exp.deploy.runtime.metadata import Metadata
+from go1exp.deploy.runtime.policy import OnnxPolicy
+from go1exp.deploy.runtime.safety import Safety
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.history import history_columns, width
-from go1exp.schema.registry import Entry, Term
+from go1exp.robot.messages import Link, LowCmd, LowState
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import ActionConfig, TaskConfig, parse_task, parse_train
 from go1exp.train import run_folder, trainer
+from go1exp.train.policy import load_policy
 from go1exp.train.ppo import GaussianPolicy
 from tests.small_run import SMALL
 
@@ -214,7 +215,7 @@ def test_the_same_run_gives_the_same_bytes(run: Path, data: bytes) -> None:
 def test_another_seed_gives_another_trace_of_the_same_policy(
     run: Path, members: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("go1exp.export.build.to_onnx", lambda module: members["policy.onnx"])
+    monkeypatch.setattr("go1exp.deploy.export.build.to_onnx", lambda module: members["policy.onnx"])
     built = build(run, seconds=0.5, seed=1)
     other = loads(built, "other.zip")
     with zipfile.ZipFile(io.BytesIO(built)) as archive:
@@ -572,8 +573,8 @@ def test_the_runtime_does_on_the_traces_readings_what_the_environment_did(good: 
 def test_loading_a_bundle_loads_neither_torch_nor_an_engine_nor_hydra(data: bytes, tmp_path: Path) -> None:
     (tmp_path / "b.zip").write_bytes(data)
     code = (
-        "import sys, json, go1exp.deploy.controller, go1exp.deploy.loop, go1exp.deploy.safety; "
-        "from go1exp.deploy.bundle import load; found = load('b.zip'); "
+        "import sys, json, go1exp.deploy.runtime.controller, go1exp.deploy.runtime.loop, go1exp.deploy.runtime.safety; "
+        "from go1exp.deploy.runtime.bundle import load; found = load('b.zip'); "
         "print(json.dumps([found.seal, sorted({name.split('.')[0] for name in sys.modules})]))"
     )
     done = subprocess.run(
@@ -608,7 +609,9 @@ def test_export_writes_a_bundle_and_check_says_what_is_in_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("go1exp.export.build.to_onnx", lambda module: members["policy.onnx"])  # of this run: 3 s less
+    monkeypatch.setattr(
+        "go1exp.deploy.export.build.to_onnx", lambda module: members["policy.onnx"]
+    )  # of this run: 3 s less
     assert verb(monkeypatch, "export", f"run={run}", "seconds=0.5", "out=there/walk.zip", "checkpoint=000002.pt") == 0
     message = capsys.readouterr().out
     assert [p.name for p in (tmp_path / "there").iterdir()] == ["walk.zip"]
@@ -636,7 +639,7 @@ def test_export_writes_a_bundle_and_check_says_what_is_in_it(
 def test_a_bundle_lies_in_its_run_folder_unless_told_otherwise(
     run: Path, data: bytes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("go1exp.export.build.build", lambda *_, **__: data)
+    monkeypatch.setattr("go1exp.deploy.export.build.build", lambda *_, **__: data)
     assert verb(monkeypatch, "export", f"run={run}") == 0
     assert (run / "bundle.zip").read_bytes() == data
     (run / "bundle.zip").unlink()
@@ -663,6 +666,6 @@ def test_another_network_than_its_environments_is_refused(run: Path, monkeypatch
         finally:
             bias -= 0.01
 
-    monkeypatch.setattr("go1exp.export.build.to_onnx", off)
+    monkeypatch.setattr("go1exp.deploy.export.build.to_onnx", off)
     with pytest.raises(BundleError, match=r"trace\.npz: joint_target\["):
         build(run, seconds=0.2)

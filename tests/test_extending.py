@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from go1exp.cli import main
-from go1exp.schema import plugins
-from go1exp.schema.registry import groups
+from go1exp.config.schema import plugins
+from go1exp.config.schema.registry import groups
 from tests.small_run import SMALL
 
 PAGE = data_root() / "docs/extending.md"
@@ -67,7 +67,13 @@ def test_the_page_has_an_example_of_each_kind_of_term() -> None:
     assert [entry.name for entry in plugin.entries if entry.name not in text] == []
 
 
-@pytest.mark.slow("docs/extending.md", "go1exp/schema/", "go1exp/terms.py", "go1exp/testing/", "go1exp/cli/plugins.py")
+@pytest.mark.slow(
+    "docs/extending.md",
+    "go1exp/config/schema/",
+    "go1exp/extend/__init__.py",
+    "go1exp/extend/testing/",
+    "go1exp/cli/plugins.py",
+)
 @pytest.mark.parametrize("words", [words for words in commands() if words[0] == "go1exp"], ids=" ".join)
 def test_a_command_of_the_page_works(
     words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -77,7 +83,13 @@ def test_a_command_of_the_page_works(
     assert main() == 0, capsys.readouterr().err
 
 
-@pytest.mark.slow("docs/extending.md", "go1exp/schema/", "go1exp/terms.py", "go1exp/testing/", "go1exp/cli/plugins.py")
+@pytest.mark.slow(
+    "docs/extending.md",
+    "go1exp/config/schema/",
+    "go1exp/extend/__init__.py",
+    "go1exp/extend/testing/",
+    "go1exp/cli/plugins.py",
+)
 def test_the_page_s_test_passes() -> None:
     (command,) = [words for words in commands() if words[0] == "pytest"]
     done = subprocess.run(

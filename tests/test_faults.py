@@ -17,14 +17,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from go1exp import files
-from go1exp.compose import compose
-from go1exp.config import TrainConfig, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.env.faults import NumericalFault
+from go1exp.base import files
+from go1exp.config.compose import compose
+from go1exp.config.schema import registry
+from go1exp.config.schema.registry import Expected
 from go1exp.mdp.types import Snapshot, StepResult
-from go1exp.schema import registry
-from go1exp.schema.registry import Expected
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.faults import NumericalFault
+from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import checkpoint, run_folder, trainer
 from go1exp.train.group import Group
 from go1exp.train.metrics import CsvWriter
@@ -203,7 +203,7 @@ def test_on_the_command_line_a_fault_is_a_message_and_a_status(run: Path) -> Non
     code = """
 import sys
 from go1exp.cli import main
-from go1exp.env.core import Go1Core
+from go1exp.sim.env.core import Go1Core
 snapshot = Go1Core.snapshot
 def broken(self):
     s = snapshot(self)

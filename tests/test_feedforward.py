@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.env.core import Go1Core
-from go1exp.env.plant import Plant
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.plant import Plant
 
 Make = Callable[..., Go1Core]
 

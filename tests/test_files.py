@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from go1exp import files
+from go1exp.base import files
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="a device without space is a thing of Linux")

@@ -13,11 +13,21 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from go1exp import data_root
-from go1exp.fit import FitError, FitResult, FitSettings, NetFileError, fit, load, plot, smooth_motion, text
-from go1exp.fit.dataset import fingerprint, split, windows
-from go1exp.fit.net import ActuatorNet, InputName
-from go1exp.recording import Meta, Recording, RecordingError, problems
+from go1exp.base.paths import data_root
+from go1exp.gap.actuator_net import (
+    FitError,
+    FitResult,
+    FitSettings,
+    NetFileError,
+    fit,
+    load,
+    plot,
+    smooth_motion,
+    text,
+)
+from go1exp.gap.actuator_net.dataset import fingerprint, split, windows
+from go1exp.logs.recording import Meta, Recording, RecordingError, problems
+from go1exp.sim.actuator.actuator_net import ActuatorNet, InputName
 
 JOINTS = ("FR_hip", "FR_calf")
 KP, KD = 20.0, 0.5
@@ -523,7 +533,7 @@ def measured(folder: str) -> Path:
 
 def test_the_net_beats_the_linear_map_on_a_measured_drive() -> None:
     """Elbow and shoulder of the AK80 double pendulum: episode 02 held out, as its command's repetition 13 is."""
-    from go1exp.importers import import_recordings
+    from go1exp.logs.importers import import_recordings
 
     folder = measured("ak80_double_pendulum") / "design_A_0"
     names = [folder / f"trajectory_{n}.npz" for n in ("00", "01", "02", "03", "04")]

@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from go1exp import robot
-from go1exp.config import TaskConfig
-from go1exp.env.core import Go1Core
+from go1exp.extend.testing.snapshots import random_snapshot
 from go1exp.mdp.derived import slip_speed
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.rewards import foot_force, foot_peak_force
-from go1exp.physics.scene import build_model
-from go1exp.terrain import build_terrain
-from go1exp.testing.snapshots import random_snapshot
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig
+from go1exp.sim.terrain import build_terrain
 
 QUIET = ("rand=none", "event=none", "termination=none", "command=forward")
 

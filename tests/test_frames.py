@@ -11,17 +11,17 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from go1exp.config import TaskConfig
-from go1exp.deploy.metadata import Block, Metadata, Port
-from go1exp.deploy.past import PolicyMemory
-from go1exp.env.core import Go1Core
-from go1exp.env.frames import Frames
+from go1exp.config.schema.history import columns_of, history_columns
+from go1exp.deploy.export.build import metadata
+from go1exp.deploy.export.graph import DeployedPolicy
+from go1exp.deploy.export.trace import readings
+from go1exp.deploy.runtime.metadata import Block, Metadata, Port
+from go1exp.deploy.runtime.past import PolicyMemory
 from go1exp.evaluate.drivers import PolicyDriver
-from go1exp.export.build import metadata
-from go1exp.export.graph import DeployedPolicy
-from go1exp.export.trace import readings
 from go1exp.mdp.types import TermSetup
-from go1exp.schema.history import columns_of, history_columns
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.frames import Frames
+from go1exp.sim.task import TaskConfig
 from go1exp.train.ppo import GaussianPolicy
 
 MakeTask = Callable[..., TaskConfig]

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 import torch
 
-from go1exp.env.core import Go1Core
-from go1exp.env.gait_log import GaitLog
+from go1exp.extend.testing.snapshots import random_snapshot
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.types import Snapshot
-from go1exp.testing.snapshots import random_snapshot
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.gait_log import GaitLog
 from go1exp.train import checkpoint
 from go1exp.train.checkpoint import DamagedCheckpoint
 from go1exp.train.group import Group

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from go1exp.cli.settings import GapVerb
-from go1exp.compose import compose
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.settings import parse
 from go1exp.gap.answer import decide
 from go1exp.gap.files import _errors
 from go1exp.gap.report import words
 from go1exp.gap.result import AngleErrors, GapResult, GapSettings, NamedEffect
 from go1exp.gap.score import angle_errors
-from go1exp.schema.registry import ConfigError
-from go1exp.schema.settings import parse
 
 
 def settings(accept: str) -> GapVerb:

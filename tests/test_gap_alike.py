@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from go1exp.effects.tolerances import declared
+from go1exp.config.schema.registry import members
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.alike import LEVEL, differ
-from go1exp.schema.registry import members
+from go1exp.sim.effects.tolerances import declared
 
 TOLERANCE = declared(("encoder_offset", "offset")).tolerance
 WALK = 0.001 * np.array([9.5, 8.3, 9.6, 9.6, 9.6, 9.6, 11.4, 9.6, 6.9, 9.6, 9.7, 9.5])

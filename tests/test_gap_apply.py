@@ -14,22 +14,22 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.audit import audit
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.files import choices_from_files
-from go1exp.compose import compose
-from go1exp.config import parse_parts, parse_task
-from go1exp.env.core import Go1Core
+from go1exp.config.compose import compose
+from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
 from go1exp.gap.result import AngleErrors, Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.stages.apply import CALIBRATION, COMPENSATING, EFFECT, composed, prove, terms_of, theta_of, write
 from go1exp.gap.stages.explain import explain
-from go1exp.record import simulate
-from go1exp.recording import Recording
+from go1exp.logs.audit import audit
+from go1exp.logs.record import simulate
+from go1exp.logs.recording import Recording
 from go1exp.robot import JOINTS
-from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import parse_parts, parse_task
 from tests.laboratory import recorded
 
 NAN = math.nan
@@ -370,7 +370,7 @@ def test_a_calibration_counts_with_the_effect_and_not_alone(tmp_path: Path) -> N
     assert seen.after < 0.3
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_what_is_not_for_training_is_not_asked_of_the_proof(tmp_path: Path) -> None:
     lean = named("viscous", "compensating", damping=dict.fromkeys(JOINTS, 0.3))
     before = proof(tmp_path, result(excess={"box": 1e6, "final": 0.0})).before

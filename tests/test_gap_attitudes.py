@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from go1exp import robot
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.env.plant import Plant
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind
 from go1exp.gap.replay.replayer import LEVEL, hold
 from go1exp.gap.robots.hung import hung
-from go1exp.schema.registry import bind
+from go1exp.sim.env.plant import Plant
+from go1exp.sim.task import parse_parts
 
 HANGS = np.array([LEVEL, (0.98, 0.0, 0.199, 0.0), (0.9, 0.3, -0.1, 0.3)])  # not all of unit length, as logs have them
 DT, STEPS = 0.001, 300

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.gap import cases, generate, score
 from benchmarks.gap_solve import solve
-from go1exp import data_root
-from go1exp.recording import read_folder
+from go1exp.base.paths import data_root
+from go1exp.logs.recording import read_folder
 
 SEED = 20261121
 
@@ -19,7 +19,7 @@ SLICE = (("null", 1), ("single", 2 * len(cases.HUNG) + cases.HUNG.index("lag")),
 
 
 FAST = ("damaged",)
-ABOUT = ("benchmarks/gap/", "benchmarks/gap_solve.py", "go1exp/gap/", "go1exp/effects/", "go1exp/physics/")
+ABOUT = ("benchmarks/gap/", "benchmarks/gap_solve.py", "go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/physics/")
 
 
 @pytest.mark.parametrize(

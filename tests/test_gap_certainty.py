@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from go1exp.effects.tolerances import DECLARED, declared
 from go1exp.gap.answer import Answer, bounded_joints, weak_joints
 from go1exp.gap.certainty import beside_a_gap, doubt, widened
 from go1exp.gap.result import Candidate, GapSettings, NamedEffect
 from go1exp.gap.search.ledger import LastCheck, Ledger
 from go1exp.gap.search.trial import Trial
 from go1exp.gap.sentence import sentence
+from go1exp.sim.effects.tolerances import DECLARED, declared
 
 JOINTS = ("a_hip", "a_thigh", "b_hip", "b_thigh")
 BORNE_OUT = LastCheck(True, 0.9)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from go1exp.config.schema.registry import ConfigError
 from go1exp.gap import files
 from go1exp.gap.comparison import _last_check, clock_taken, compare, prepare
 from go1exp.gap.data.clocks import beginnings, rows_of, same_rows
@@ -23,8 +24,7 @@ from go1exp.gap.score.likelihood import Scorer, grouped
 from go1exp.gap.search import clocks, tolerances
 from go1exp.gap.stages.apply import read_as
 from go1exp.gap.stages.explain import explain
-from go1exp.recording import Recording
-from go1exp.schema.registry import ConfigError
+from go1exp.logs.recording import Recording
 from tests.test_gap_machines import machine, played, recording
 
 QUICK = GapSettings(

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from go1exp.compose import compose
-from go1exp.config import parse_parts
+from go1exp.config.compose import compose
 from go1exp.gap.comparison import compare, robot_from
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.result import GapSettings
@@ -18,6 +17,7 @@ from go1exp.gap.search import state as search_state
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import descend, fit
 from go1exp.gap.search.state import State
+from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
 
 FRICTION = ("coulomb", "bound")

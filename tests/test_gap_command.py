@@ -13,7 +13,7 @@ from go1exp.cli.gap import APP, DOES_NOT_HOLD
 from go1exp.cli.logs import long_enough, read_all
 from go1exp.gap import files
 from go1exp.gap.result import EXIT_CODES, GapResult, NamedEffect
-from go1exp.recording import Recording, RecordingError, write
+from go1exp.logs.recording import Recording, RecordingError, write
 from tests.test_gap_report import answer
 
 DEMO = sorted(Path("assets/demo/hung_go1").glob("*.parquet"))

@@ -11,13 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp import robot
 from go1exp.cli.gap import APP
-from go1exp.compose import compose
-from go1exp.config import parse_parts, parse_task
-from go1exp.effects.rules import drive_problems
-from go1exp.effects.tolerances import DECLARED, Tolerances
+from go1exp.config.compose import compose
+from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig, contact_text
+from go1exp.config.schema.registry import ConfigError, bind
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
 from go1exp.gap.data.contact import contact_of, contact_warnings, tolerances_of, too_coarse
@@ -36,11 +35,12 @@ from go1exp.gap.search.screen import Motion, library
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.stages import apply
 from go1exp.gap.stages.explain import explain
-from go1exp.record.simulate import policy_task
-from go1exp.recording import Recording, write
-from go1exp.robot import RobotConfig
-from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig, contact_text
-from go1exp.schema.registry import ConfigError, bind
+from go1exp.logs.record.simulate import policy_task
+from go1exp.logs.recording import Recording, write
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.rules import drive_problems
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances
+from go1exp.sim.task import parse_parts, parse_task
 from tests import laboratory
 
 STIFF = ContactConfig(time_constant=0.005, cone="pyramidal", impratio=1.0)
@@ -250,7 +250,7 @@ def test_a_hard_floor_is_the_models_own_where_recordings_name_it_and_else_off() 
     assert own.candidates == []
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_payload_on_a_hard_floor_is_named_by_the_models_own_contact_alone() -> None:
     config, recordings = recorded("excitation=[squat,drop]", "contact=stiff", "seeds=[0,1]", "+effect.payload.mass=1.0")
     cause = search_in(recordings, config, None).single_cause()

@@ -10,20 +10,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-import go1exp.excitations
-import go1exp.record.policy  # noqa: F401  (registers every excitation)
+import go1exp.logs.excitations
+import go1exp.logs.record.policy  # noqa: F401  (registers every excitation)
 from benchmarks.gap import cases
 from benchmarks.gap.motions import MOTIONS, RATE
 from benchmarks.gap.simulate import Episode, simulate
 from benchmarks.gap.truth import Truth, apply
 from go1exp.cli.record import RIG
 from go1exp.cli.settings import RecordSettings, parse
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.excitations import Motion
-from go1exp.record import plan
-from go1exp.record.simulate import Rig, play
-from go1exp.schema.registry import bind
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind
+from go1exp.logs.excitations import Motion
+from go1exp.logs.record import plan
+from go1exp.logs.record.simulate import Rig, play
+from go1exp.sim.task import parse_parts
 
 QUIET = [f"sensors.{name}={{noise: 0.0, step: 0.0}}" for name in ("q", "qd", "tau_est", "gyro", "acc", "attitude")]
 SIGNED = ("base_tilt", "encoder_offset", "link_com", "cogging", "parallel_stiffness")
@@ -60,7 +60,7 @@ def library(names: tuple[str, ...], values: dict[str, cases.Values], episode: Ep
     return recording.joint("q")
 
 
-@pytest.mark.slow("benchmarks/", "go1exp/effects/", "go1exp/excitations/", "go1exp/record/")
+@pytest.mark.slow("benchmarks/", "go1exp/sim/effects/", "go1exp/logs/excitations/", "go1exp/logs/record/")
 def test_both_sides_move_alike_under_the_same_effects() -> None:
     """Each group at 5 tolerances, all of it at once: what the effects change differs by some per cent between both."""
     rng, joints = np.random.default_rng(3), np.arange(12)

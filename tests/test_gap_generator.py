@@ -19,10 +19,10 @@ from benchmarks.gap.motions import HIGH, LOW, MOTIONS, RATE
 from benchmarks.gap.simulate import Episode, Samples, build, simulate
 from benchmarks.gap.truth import Truth, apply
 from go1exp import robot
-from go1exp.recording import RecordingError, read_folder
+from go1exp.logs.recording import RecordingError, read_folder
 
 HERE = Path(cases.__file__).parent
-ALLOWED = {"go1exp", "go1exp.recording", "go1exp.robot"}
+ALLOWED = {"go1exp", "go1exp.logs.recording", "go1exp.robot"}
 EVERY = np.arange(12)
 NONE = np.zeros(12, dtype=bool)
 
@@ -55,10 +55,10 @@ def test_the_tolerances_are_those_of_the_library() -> None:
     """Copied, not imported: this is the one place where both are seen."""
     import math
 
-    import go1exp.config  # noqa: F401  (registers every effect)
-    from go1exp.effects.tolerances import Tolerances
-    from go1exp.schema.contact import MUJOCO_CONTACT
-    from go1exp.schema.registry import members
+    import go1exp.sim.task  # noqa: F401  (registers every effect)
+    from go1exp.config.schema.contact import MUJOCO_CONTACT
+    from go1exp.config.schema.registry import members
+    from go1exp.sim.effects.tolerances import Tolerances
 
     library: dict[str, dict[str, float]] = {}
     nulls: dict[tuple[str, str], float] = {}
@@ -231,7 +231,7 @@ def test_a_command_delay_shifts_the_answer_in_time() -> None:
     assert np.abs(a[105:] - b[105:]).max() > 5e-3
 
 
-@pytest.mark.slow("benchmarks/", "go1exp/effects/")
+@pytest.mark.slow("benchmarks/", "go1exp/sim/effects/")
 @pytest.mark.parametrize("effect", cases.HUNG)
 @pytest.mark.usefixtures("brief")
 def test_every_effect_moves_the_robot(effect: str) -> None:
@@ -245,7 +245,7 @@ def test_every_effect_moves_the_robot(effect: str) -> None:
     assert np.abs(a - b).max() > (1e-4 if effect in ("base_tilt", "encoder_offset", "joint_stop") else 2e-3)
 
 
-@pytest.mark.slow("benchmarks/", "go1exp/effects/")
+@pytest.mark.slow("benchmarks/", "go1exp/sim/effects/")
 @pytest.mark.parametrize("effect", outside.EFFECTS)
 @pytest.mark.usefixtures("brief")
 def test_every_effect_beyond_the_library_moves_the_robot(effect: str) -> None:

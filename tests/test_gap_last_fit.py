@@ -9,9 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.effects.tolerances import DECLARED
+from go1exp.config.compose import compose
 from go1exp.gap.comparison import compare, robot_from
 from go1exp.gap.replay.rows import Probe, Theta
 from go1exp.gap.result import GapSettings
@@ -21,6 +19,8 @@ from go1exp.gap.search import state
 from go1exp.gap.search.last_fit import opposite, resampled_values, semidefinite
 from go1exp.gap.search.state import State
 from go1exp.gap.search.stepwise import Search
+from go1exp.sim.effects.tolerances import DECLARED
+from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
 
 HIDDEN_S = 0.005
@@ -119,7 +119,7 @@ def test_the_other_change_is_the_other_way_where_there_is_room_and_shapes_keep_t
     np.testing.assert_allclose(phase.delta, given[1].delta)
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_what_the_step_errs_by_is_taken_for_no_delay(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps of 1 ms make commands that jump act late, so a fit at them takes a delay for shorter than it is."""
     fine, drawn = delays(monkeypatch, 4)

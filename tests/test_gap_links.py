@@ -11,16 +11,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from go1exp.effects.base import Measured
-from go1exp.env.plant import Plant
+from go1exp.config.schema.registry import bind
 from go1exp.gap.comparison import compare
 from go1exp.gap.result import GapResult, GapSettings
 from go1exp.gap.robots.description import ModelConfig, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.search.fit import scores
 from go1exp.gap.stages.explain import explain
-from go1exp.recording import Meta, Recording, joint_channel
-from go1exp.schema.registry import bind
+from go1exp.logs.recording import Meta, Recording, joint_channel
+from go1exp.sim.effects.base import Measured
+from go1exp.sim.env.plant import Plant
 
 LEG = """
 <mujoco>
@@ -104,7 +104,7 @@ def test_a_leg_without_a_secret_has_no_gap(tmp_path: Path) -> None:
     assert result.named == ()
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_shift_across_the_leg_is_named_as_one_and_not_as_an_offset_of_the_encoder(tmp_path: Path) -> None:
     """Across the thigh: it turns the hip, whose encoder would have to be off by an angle that depends on the pose."""
     result = answer(tmp_path, {"link_com": {"left": {"thigh": 0.012}}})
@@ -117,7 +117,7 @@ def test_a_shift_across_the_leg_is_named_as_one_and_not_as_an_offset_of_the_enco
     assert "encoder_offset" not in found.alias_set
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_load_is_judged_by_the_answer_of_the_loaded_leg_to_its_initial_state(tmp_path: Path) -> None:
     robot = leg(tmp_path)
     load = {"mass": {"calf": 0.12}, "x": 0.02, "z": -0.213}
@@ -132,7 +132,7 @@ def test_a_load_is_judged_by_the_answer_of_the_loaded_leg_to_its_initial_state(t
     assert plain > 1.5
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 @pytest.mark.parametrize("z", [-0.213, -0.06])
 def test_a_load_on_the_calf_is_named_with_its_mass_and_its_place(tmp_path: Path, z: float) -> None:
     """At the foot, and on the shank: neither is a heavier link, nor a shift of its mass."""
@@ -145,7 +145,7 @@ def test_a_load_on_the_calf_is_named_with_its_mass_and_its_place(tmp_path: Path,
     assert found.params["z"]["calf"] == pytest.approx(z, abs=0.02)
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_denser_calf_is_not_called_a_load(tmp_path: Path) -> None:
     result = answer(tmp_path, {"link_mass": {"scale": {"calf": 1.5}}})
     assert [(n.effect, n.joints) for n in result.named] == [("link_mass", ("calf",))], result.sentence

@@ -18,8 +18,8 @@ from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.result import GapResult, GapSettings, NamedEffect
 from go1exp.gap.stages import loop as stage_loop
 from go1exp.gap.stages.next import NextResult, Verdict
-from go1exp.record.simulate import held_quat
-from go1exp.recording import read
+from go1exp.logs.record.simulate import held_quat
+from go1exp.logs.recording import read
 from go1exp.robot import JOINTS
 from tests.laboratory import recorded
 
@@ -28,7 +28,7 @@ LITTLE, MUCH = Worth(1.0, 1.0, 0.0, 0.1), Worth(1e4, 0.5, 1.0, 1.0)
 
 
 def rehearsal() -> Rehearsal:
-    from go1exp.excitations.motion import always_on
+    from go1exp.logs.excitations.motion import always_on
     from go1exp.robot import NOMINAL_STANCE
 
     attitude = Attitude(0.0, 0.26, held_quat((0.0, 0.26)))

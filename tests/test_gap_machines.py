@@ -15,11 +15,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from go1exp.cli.files import choices_from_files
-from go1exp.compose import compose
-from go1exp.effects.tolerances import declared
-from go1exp.env.plant import Plant
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError, bind
 from go1exp.gap.answer import name_terms
 from go1exp.gap.comparison import NotComparable, compare, prepare
 from go1exp.gap.data.prepare import MOST_WINDOWS, clock_of_speeds, noise_in_time, slope
@@ -35,9 +34,10 @@ from go1exp.gap.search.last_fit import resampled_values
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.stages.explain import explain
-from go1exp.importers import import_recordings
-from go1exp.recording import Meta, Recording, joint_channel
-from go1exp.schema.registry import ConfigError, bind
+from go1exp.logs.importers import import_recordings
+from go1exp.logs.recording import Meta, Recording, joint_channel
+from go1exp.sim.effects.tolerances import declared
+from go1exp.sim.env.plant import Plant
 
 MODELS = sorted(f.stem for f in (data_root() / "conf/model").glob("*.yaml") if f.stem != "go1")
 DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
@@ -365,7 +365,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/", "conf/model/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/", "conf/model/")
 def test_friction_hidden_in_a_servo_is_named() -> None:
     robot = machine("xl330_pendulum", tolerances={})
     steps, logs = np.arange(0.0, 6.0, 0.0005), []
@@ -383,7 +383,7 @@ def test_friction_hidden_in_a_servo_is_named() -> None:
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/", "conf/model/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/", "conf/model/")
 @pytest.mark.parametrize("external", [0.0, 1.0])
 def test_friction_of_loaded_gears_is_told_from_dry_friction_and_by_its_law(external: float) -> None:
     """A weight that is swung up to the level loads the gears by up to 0.5 N m, hanging down by nothing."""

@@ -10,25 +10,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from go1exp import data_root
-from go1exp.config import RobotConfig
+from go1exp.base.paths import data_root
+from go1exp.config.schema import registry
+from go1exp.config.schema.registry import members
 from go1exp.gap import answer, sentence
 from go1exp.gap.robots.hung import HungGo1
 from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
 from go1exp.gap.search.screen import Motion, free_shapes, library
-from go1exp.schema import registry
-from go1exp.schema.registry import members
+from go1exp.robot.config import RobotConfig
 
 FILE = '''
 """``effect=creep``: a friction that nobody has thought of."""
 
 import math
 
-from go1exp.effects.base import Effect, Param
-from go1exp.effects.identification import Identification
-from go1exp.schema.registry import effect
+from go1exp.sim.effects.base import Effect, Param
+from go1exp.sim.effects.identification import Identification
+from go1exp.config.schema.registry import effect
 
 
 @effect("creep")
@@ -116,7 +116,7 @@ def test_a_new_effect_that_needs_ground_is_left_out_where_the_trunk_is_held() ->
 
 
 def test_the_workflow_knows_no_effect_by_its_name() -> None:
-    """What it must know of one is in the effect's own file (``go1exp/effects/identification.py``)."""
+    """What it must know of one is in the effect's own file (``go1exp/sim/effects/identification.py``)."""
     package = data_root() / "go1exp"
     sources = [*sorted((package / "gap").rglob("*.py")), package / "cli/gap.py"]
     assert len(sources) > 20

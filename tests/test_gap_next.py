@@ -14,11 +14,9 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
-from go1exp import recording
 from go1exp.cli import main
 from go1exp.cli.gap_next import text
-from go1exp.env.plant import Plant
-from go1exp.excitations import ExcitationError
+from go1exp.config.schema.registry import bind
 from go1exp.gap import files as gap_files
 from go1exp.gap.comparison import Comparison, compare
 from go1exp.gap.design.choice import ENOUGH, choose
@@ -37,11 +35,13 @@ from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import tolerances
 from go1exp.gap.stages import next as stage_next
 from go1exp.gap.stages.next import NextResult
-from go1exp.record.playback import playback
-from go1exp.record.simulate import held_quat
-from go1exp.recording import Meta, Recording, joint_channels
+from go1exp.logs import recording
+from go1exp.logs.excitations import ExcitationError
+from go1exp.logs.record.playback import playback
+from go1exp.logs.record.simulate import held_quat
+from go1exp.logs.recording import Meta, Recording, joint_channels
 from go1exp.robot import JOINTS, NOMINAL_STANCE, soft_limits
-from go1exp.schema.registry import bind
+from go1exp.sim.env.plant import Plant
 from tests.laboratory import recorded
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="stand" pos="0 0 1">
@@ -420,9 +420,9 @@ def test_the_file_plays_back_through_record(tmp_path: Path) -> None:
 def playback_recorded(file: Path, overrides: Sequence[str]) -> Recording:
     from go1exp.cli.record import RIG, _motions
     from go1exp.cli.settings import RecordSettings, parse
-    from go1exp.compose import compose
-    from go1exp.config import parse_parts
-    from go1exp.record import plan, simulate
+    from go1exp.config.compose import compose
+    from go1exp.logs.record import plan, simulate
+    from go1exp.sim.task import parse_parts
 
     container = compose("record", ["backend.threads=1", f"excitation=[{{playback: {{file: {file}}}}}]", *overrides])
     parts, _ = parse_parts(container, RIG)

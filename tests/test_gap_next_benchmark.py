@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.gap_next import CASES, TOLD_APART, Row, figures, line_of, main, ratios
+from go1exp.config.schema.registry import members
 from go1exp.gap.search.tolerances import confounded
-from go1exp.schema.registry import members
 
 MOST = 4
 

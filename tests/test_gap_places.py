@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from go1exp.effects.tolerances import DECLARED
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.linear import Layout
 from go1exp.gap.search import evidence, places, reduction, tolerances
@@ -17,6 +16,7 @@ from go1exp.gap.search.screen import SHARES, Motion, Screened, Variant, library,
 from go1exp.gap.search.tolerances import Freedom
 from go1exp.gap.search.trial import _choice
 from go1exp.robot import JOINTS
+from go1exp.sim.effects.tolerances import DECLARED
 
 LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(4))
 MACHINE: Any = SimpleNamespace(

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from go1exp.effects.tolerances import DECLARED
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.search import reduction, tolerances
 from go1exp.robot import JOINTS
+from go1exp.sim.effects.tolerances import DECLARED
 
 NONE: Theta = {}
 

@@ -19,16 +19,16 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp import robot
 from go1exp.cli.settings import RecordSettings, parse
-from go1exp.compose import compose
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind, members
 from go1exp.gap.report import localisation_text, text, words, write_report
 from go1exp.gap.report.figures import rows_of, shown_joints, split_channel
 from go1exp.gap.report.html import page
 from go1exp.gap.report.tables import Cell, heat_maps, short
 from go1exp.gap.result import Candidate, ClockChoice, Floors, GapResult, Localisation, NamedEffect, Overlay, Verdict
-from go1exp.schema.registry import bind, members
 
 CALVES = tuple(j for j in robot.JOINTS if j.endswith("calf"))
 REGIMES = ("stick", "reversal", "slow", "fast", "high torque", "after an edge", "drives off", "small angle")

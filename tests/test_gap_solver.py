@@ -10,11 +10,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.record import RIG
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.effects.tolerances import DECLARED
+from go1exp.config.compose import compose
 from go1exp.gap.comparison import compare
 from go1exp.gap.data.cutting import even_clock, noise
 from go1exp.gap.data.splits import splits
@@ -30,8 +28,10 @@ from go1exp.gap.search.fit import Model, scores
 from go1exp.gap.search.significance import max_t
 from go1exp.gap.search.tolerances import Bounds, Freedom, solve
 from go1exp.gap.stages.explain import explain
-from go1exp.record import simulate
-from go1exp.recording import Meta, Recording
+from go1exp.logs.record import simulate
+from go1exp.logs.recording import Meta, Recording
+from go1exp.sim.effects.tolerances import DECLARED
+from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
 
 QUICK = GapSettings(
@@ -350,7 +350,7 @@ def test_where_little_is_left_and_nothing_alone_removes_it_what_strains_a_tolera
     assert (accepted, search.strained) == (asked[-1][1], asked[-1][1])  # a strained term must be clear of doubt
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_hidden_friction_is_named_where_it_is() -> None:
     rig, recordings = robot("effect=coulomb", "effect.coulomb.bound=[0.0,0.0,0.3]")
     plain, _ = parse_parts(compose("record", []), RIG)

@@ -11,8 +11,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.effects.tolerances import declared, sizes
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.gap.comparison import prepare
 from go1exp.gap.data.splits import splits
 from go1exp.gap.data.standing import StandingWindows
@@ -32,11 +31,13 @@ from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.state import State
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.stages.explain import explain
-from go1exp.physics.legs import Legs
-from go1exp.physics.scene import build_model
-from go1exp.recording import VECTORS, Recording
-from go1exp.robot import JOINTS, RobotConfig
-from go1exp.terrain import TerrainConfig, build_terrain
+from go1exp.logs.recording import VECTORS, Recording
+from go1exp.robot import JOINTS
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.tolerances import declared, sizes
+from go1exp.sim.physics.legs import Legs
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.terrain import TerrainConfig, build_terrain
 from tests import laboratory
 
 QUICK = GapSettings(window_s=0.1, stride_s=0.25, physics_dt=0.002, bootstraps=20, overlays=0)
@@ -199,7 +200,7 @@ def search_in(*overrides: str) -> Search:
     return Search(score, parts, QUICK, dt, rng, lambda what, share: None)
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it() -> None:
     search = search_in("+effect.payload.mass=1.0")
     plain = excess(search.state.held_out({}))
@@ -212,7 +213,7 @@ def test_a_payload_is_named_although_the_tolerances_of_the_joints_could_carry_it
     assert search.candidates[0].excess_after < 0.1 * plain
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_payload_on_a_walking_robot_fits_best_by_first_states_of_its_own() -> None:
     config, recordings = recorded("excitation=[gait]", "seeds=[0,1]", "+effect.payload.mass=2.0")
     replayer, dt = ready(config, recordings)
@@ -235,7 +236,7 @@ def test_rungs_of_a_ladder_are_on_both_sides_of_null_and_no_farther_than_a_param
     assert rungs == pytest.approx([-0.8, -0.4, 0.0, 0.4, 0.8, 1.6, 3.2, 6.4])
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
     search = search_in()
     assert search.single_cause() is None
@@ -243,7 +244,7 @@ def test_nothing_alone_is_named_in_a_robot_like_the_model() -> None:
     assert excess(search.state.held_out({})) < search.settings.material
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 @pytest.mark.parametrize(
     "hidden",
     [("+effect.strength.scale=0.93",), ("+effect.strength.scale=0.96", "+effect.kp_scale.scale=0.92")],
@@ -262,7 +263,7 @@ def test_drives_that_are_all_a_little_weak_are_no_payload_and_within_tolerances(
     assert excess(begun.held_out()) < 0.2 * plain
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_drives_that_are_all_weaker_than_tolerances_allow_are_one_cause() -> None:
     cause = search_in("+effect.strength.scale=0.8").single_cause()
     assert cause is not None

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from go1exp.effects.tolerances import sizes
 from go1exp.gap.comparison import Comparison, NotComparable, compare
 from go1exp.gap.data.cutting import Place
 from go1exp.gap.data.swings import SwingWindows, TrunkMotion, foot_forces, places, swings
@@ -29,9 +28,11 @@ from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.stages import explain as stages_explain
 from go1exp.gap.stages.explain import explain
-from go1exp.physics.legs import Legs
-from go1exp.recording import Recording
-from go1exp.robot import LEGS, RobotConfig
+from go1exp.logs.recording import Recording
+from go1exp.robot import LEGS
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.tolerances import sizes
+from go1exp.sim.physics.legs import Legs
 from tests import laboratory
 
 EXACT = tuple(
@@ -221,7 +222,7 @@ def test_a_robot_that_never_lifts_a_foot_is_told_so() -> None:
         compare(recordings, HungGo1(config), SWING)
 
 
-SEARCH = ("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+SEARCH = ("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 LONG = ("seeds=[0,1,2,3]", "seconds=4.0")
 
 

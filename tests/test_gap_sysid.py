@@ -13,7 +13,7 @@ from benchmarks.gap import cases, generate, known, logger, score
 from benchmarks.gap.simulate import simulate
 from benchmarks.gap.truth import Truth, apply
 from go1exp import robot
-from go1exp.recording import Recording
+from go1exp.logs.recording import Recording
 
 pytestmark = pytest.mark.skipif(
     not hasattr(gap_sysid.sysid, "optimize"), reason='mujoco.sysid lacks its own dependencies: "mujoco[sysid]"'

@@ -15,9 +15,8 @@ import pytest
 from go1exp.cli.app import App
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.gap import APP
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.effects.tolerances import DECLARED, Tolerances, declared, sizes
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import members
 from go1exp.gap import files
 from go1exp.gap.answer import why_withdrawn
 from go1exp.gap.report import tables, text, write_report
@@ -28,9 +27,10 @@ from go1exp.gap.robots.hung import hung
 from go1exp.gap.search import evidence, tolerances
 from go1exp.gap.stages.apply import prove, write
 from go1exp.gap.stages.explain import explain
-from go1exp.recording import Recording
+from go1exp.logs.recording import Recording
 from go1exp.robot import JOINTS
-from go1exp.schema.registry import members
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances, declared, sizes
+from go1exp.sim.task import parse_parts
 from tests.laboratory import recorded
 
 ADDED = ("armature", "added")

@@ -17,24 +17,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from go1exp import recording, robot
+from go1exp import robot
 from go1exp.cli.runs import shipped_policies
-from go1exp.deploy import go1_sdk, job
-from go1exp.deploy import go1_wire as wire
-from go1exp.deploy.commands import Wish
-from go1exp.deploy.go1_check import Bounds, check
-from go1exp.deploy.job import Job, run_job
-from go1exp.deploy.launch import RobotError, SimulatedRobot
-from go1exp.deploy.messages import LowCmd, LowState
-from go1exp.deploy.walk import Plan
-from go1exp.export.build import build
+from go1exp.deploy.export.build import build
+from go1exp.deploy.runtime import go1_sdk, job
+from go1exp.deploy.runtime import go1_wire as wire
+from go1exp.deploy.runtime.commands import Wish
+from go1exp.deploy.runtime.go1_check import Bounds, check
+from go1exp.deploy.runtime.job import Job, run_job
+from go1exp.deploy.runtime.launch import RobotError, SimulatedRobot
+from go1exp.deploy.runtime.walk import Plan
+from go1exp.logs import recording
+from go1exp.robot.messages import LowCmd, LowState
 
 try:
     SDK: Any = go1_sdk._module()
 except RobotError:
     SDK = None
 
-pytestmark = pytest.mark.slow("go1exp/deploy/", "go1exp/sim_robot/")
+pytestmark = pytest.mark.slow("go1exp/deploy/", "go1exp/deploy/sim_robot/")
 LOCAL = 8080
 
 
@@ -179,7 +180,7 @@ def test_it_too_refuses_a_wrong_checksum(client: SimpleNamespace) -> None:
 
 
 def test_its_position_limit_is_the_range_to_which_our_targets_are_limited(client: SimpleNamespace) -> None:
-    from go1exp.deploy.safety import sdk_range
+    from go1exp.deploy.runtime.safety import sdk_range
 
     guard = SDK.Safety(SDK.LeggedType.Go1)
     for far, side in ((-9.0, 0), (9.0, 1)):

@@ -18,29 +18,30 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp import recording, robot
+from go1exp import robot
 from go1exp.cli.runs import shipped_policies
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.deploy import go1_check, job
-from go1exp.deploy import go1_wire as wire
-from go1exp.deploy.bundle import load
-from go1exp.deploy.commands import Wish
-from go1exp.deploy.estimate import BOTH, TORQUE, KalmanEstimator, settings
-from go1exp.deploy.go1_check import Bounds, Heard, judged, listen
-from go1exp.deploy.job import CheckJob, Job, run_check, run_job
-from go1exp.deploy.launch import RobotError
-from go1exp.deploy.messages import LowState
-from go1exp.deploy.udp import Go1Link
-from go1exp.deploy.walk import Plan
-from go1exp.estimation import go1
-from go1exp.estimation.feet import CalibrationError, FootCalibration, calibrated, forces_by_torque, kinematics
-from go1exp.export.build import build
-from go1exp.sim_robot.__main__ import bundle_task, sim_config
-from go1exp.sim_robot.alone import Account
-from go1exp.sim_robot.machine import SILENCE, TICK, Robot
-from go1exp.sim_robot.protocols import FootSensors
-from go1exp.sim_robot.server import GONE_S, STRANGER, TRUTH, Network, Server
+from go1exp.config.compose import compose
+from go1exp.deploy.estimation import go1
+from go1exp.deploy.estimation.feet import CalibrationError, FootCalibration, calibrated, forces_by_torque, kinematics
+from go1exp.deploy.export.build import build
+from go1exp.deploy.runtime import go1_check, job
+from go1exp.deploy.runtime import go1_wire as wire
+from go1exp.deploy.runtime.bundle import load
+from go1exp.deploy.runtime.commands import Wish
+from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, settings
+from go1exp.deploy.runtime.go1_check import Bounds, Heard, judged, listen
+from go1exp.deploy.runtime.job import CheckJob, Job, run_check, run_job
+from go1exp.deploy.runtime.launch import RobotError
+from go1exp.deploy.runtime.udp import Go1Link
+from go1exp.deploy.runtime.walk import Plan
+from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
+from go1exp.deploy.sim_robot.alone import Account
+from go1exp.deploy.sim_robot.machine import SILENCE, TICK, Robot
+from go1exp.deploy.sim_robot.protocols import FootSensors
+from go1exp.deploy.sim_robot.server import GONE_S, STRANGER, TRUTH, Network, Server
+from go1exp.logs import recording
+from go1exp.robot.messages import LowState
+from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
 from tests.lockstep import World, lockstep
 from tests.small_run import SMALL
@@ -279,7 +280,7 @@ def speakers(count: int) -> Iterator[list[socket.socket]]:
 
 
 def stance_command(**changes: Any) -> bytes:
-    from go1exp.deploy.messages import LowCmd
+    from go1exp.robot.messages import LowCmd
 
     usual = {"joint_target": robot.NOMINAL_STANCE.copy(), "kp": np.full(12, 20.0), "kd": np.full(12, 0.5)}
     return wire.pack_command(LowCmd(**{**usual, **changes}))
@@ -469,7 +470,7 @@ def test_nobody_there_is_said_in_a_line(tmp_path: Path, monkeypatch: pytest.Monk
 
 def heard_of(**changes: Any) -> Heard:
     """What a good robot says for a second, with changes."""
-    from go1exp.deploy.messages import LowState
+    from go1exp.robot.messages import LowState
 
     usual: dict[str, Any] = {
         "joint_pos": robot.NOMINAL_STANCE,

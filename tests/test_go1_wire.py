@@ -15,13 +15,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from go1exp.deploy import go1_wire as wire
-from go1exp.deploy.messages import LowCmd, LowState
-from go1exp.deploy.udp import Go1Link
-from go1exp.sim_robot.machine import Robot
-from go1exp.sim_robot.protocols import Go1, roll_pitch_yaw
-from go1exp.sim_robot.server import Server
-from go1exp.sim_robot.settings import SimConfig
+from go1exp.deploy.runtime import go1_wire as wire
+from go1exp.deploy.runtime.udp import Go1Link
+from go1exp.deploy.sim_robot.machine import Robot
+from go1exp.deploy.sim_robot.protocols import Go1, roll_pitch_yaw
+from go1exp.deploy.sim_robot.server import Server
+from go1exp.deploy.sim_robot.settings import SimConfig
+from go1exp.robot.messages import LowCmd, LowState
 
 # Bytes of unitree-legged-sdk 3.8.20231105, received on a socket: InitCmdData, then twelve motors set to
 # q = linspace(-1, 1, 12), dq = 0, tau = 0.37 k - 2, Kp = 20 + 0.37 k, Kd = 0.5 + 0.07 k.
@@ -416,14 +416,16 @@ MANY = settings(max_examples=10_000, deadline=None, suppress_health_check=[Healt
 FEW = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-@pytest.mark.slow("go1exp/deploy/go1_wire.py", "go1exp/sim_robot/protocols.py", "go1exp/sim_robot/server.py")
+@pytest.mark.slow(
+    "go1exp/deploy/runtime/go1_wire.py", "go1exp/deploy/sim_robot/protocols.py", "go1exp/deploy/sim_robot/server.py"
+)
 @MANY
 @given(mutated(VENDOR_COMMAND))
 def test_of_ten_thousand_mutated_commands_none_is_obeyed(listening: End, packet: tuple[bytes, bool]) -> None:
     meet_command(listening, *packet)
 
 
-@pytest.mark.slow("go1exp/deploy/go1_wire.py", "go1exp/deploy/udp.py")
+@pytest.mark.slow("go1exp/deploy/runtime/go1_wire.py", "go1exp/deploy/runtime/udp.py")
 @MANY
 @given(mutated(GOOD))
 def test_of_ten_thousand_mutated_states_none_is_believed(looking: End, packet: tuple[bytes, bool]) -> None:

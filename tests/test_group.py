@@ -13,11 +13,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from go1exp.compose import compose
-from go1exp.config import TrainConfig, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.schema.registry import ConfigError
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import checkpoint, preflight, run_folder, trainer
 from go1exp.train.device import DevicePPO
 from go1exp.train.group import Group, joined

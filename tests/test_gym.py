@@ -15,14 +15,14 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import go1exp
-from go1exp import data_root
-from go1exp.config import TaskConfig
-from go1exp.env import register
-from go1exp.env.core import Go1Core
-from go1exp.env.faults import NumericalFault
-from go1exp.env.gym_env import Go1Env
-from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.schema.registry import ConfigError
+from go1exp.base.paths import data_root
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.env import register
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.faults import NumericalFault
+from go1exp.sim.env.gym_env import Go1Env
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import TaskConfig
 from tests.command import run, run_alone
 
 Make = Callable[..., Go1Core]
@@ -56,7 +56,7 @@ def actions(n: int, steps: int, scale: float = 1.0, seed: int = 0) -> np.ndarray
 # Gymnasium
 
 
-alone = pytest.mark.slow("README.md", "go1exp/__init__.py", "go1exp/env/", "go1exp/compose.py", "conf/")
+alone = pytest.mark.slow("README.md", "go1exp/__init__.py", "go1exp/sim/env/", "go1exp/config/compose.py", "conf/")
 
 
 @pytest.mark.parametrize("start", [run, pytest.param(run_alone, marks=alone)], ids=["forked", "alone"])

@@ -15,12 +15,12 @@ from unittest import mock
 
 import pytest
 
-from go1exp.choices import config_folder, groups_in, groups_of
 from go1exp.cli import SUBVERBS, VERBS, main
 from go1exp.cli.helptext import texts_of
 from go1exp.cli.settings import SETTINGS
-from go1exp.compose import compose
-from go1exp.schema.settings import attributes
+from go1exp.config.choices import config_folder, groups_in, groups_of
+from go1exp.config.compose import compose
+from go1exp.config.schema.settings import attributes
 
 EVERY = [*VERBS, *(f"{verb} {word}" for verb, words in SUBVERBS.items() for word in words)]
 

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from go1exp import data_root, recording
-from go1exp.importers import import_recordings
-from go1exp.recording import Recording, RecordingError
+from go1exp.base.paths import data_root
+from go1exp.config.schema.registry import ConfigError, members
+from go1exp.logs import recording
+from go1exp.logs.importers import import_recordings
+from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot import JOINT_POS_LIMITS, JOINTS, NOMINAL_STANCE
-from go1exp.schema.registry import ConfigError, members
 
 DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data"))
 

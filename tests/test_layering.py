@@ -13,164 +13,62 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from go1exp import data_root
+import pytest
+
+from go1exp.base.paths import data_root
 from go1exp.cli import MODULES, SUBVERBS, VERBS
-from go1exp.schema import registry
+from go1exp.config.schema import registry
 
 PACKAGE = data_root() / "go1exp"
 FILES = sorted(PACKAGE.rglob("*.py"))
 RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
 
-FOREIGN = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra")
-OWN = (
-    "physics",
-    "env",
-    "train",
-    "evaluate",
-    "record",
-    "fit",
-    "gap",
-    "export",
-    "sim_robot",
-    "bench",
-    "protocol",
-    "report",
-    "viewer",
-    "cli",
-)
+ORDER = {
+    "": ("base", "config", "robot", "mdp", "sim", "train", "logs", "gap", "deploy", "evaluate", "extend", "cli"),
+    "sim": ("terrain.py", "physics", "actuator", "effects", "task.py", "env", "gym.py"),
+    "gap": (
+        *("actuator_net", "result.py", "files.py", "data", "replay", "robots", "score", "search", "comparison.py"),
+        *("design", "certainty.py", "answer.py", "sentence.py", "report", "stages"),
+    ),
+    "deploy": ("estimation", "runtime", "__main__.py", "export", "sim_robot"),
+}
+"""Rooms of the package, and within three of them, from the ground up: a room imports itself and those below it."""
 
-
-def up(*but: str) -> tuple[str, ...]:
-    """The upper packages, but those."""
-    return tuple(f"go1exp.{m}" for m in OWN if m not in but)
-
-
-UP = up()
+ENGINES = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra", "omegaconf")
 
 FORBIDDEN: dict[str, tuple[str, ...]] = {
-    # plain descriptions
-    "__init__.py": (*FOREIGN, "torch", "numpy", "go1exp.cli", "go1exp.train"),  # `make` is a door to env/
-    "__main__.py": (*FOREIGN, "torch", "numpy", "pydantic", *up("cli")),
-    "errors.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
-    "files.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
-    "wording.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
-    "memory.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
-    "signals.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
-    "robot.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
-    "schema/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    "schema/registry.py": (*FOREIGN, "torch", "go1exp"),
-    "schema/joint_values.py": (*FOREIGN, "torch", "go1exp"),
-    "terms.py": (*FOREIGN, "omegaconf", "go1exp.config", *up("record")),  # what a user's file imports
-    "testing/": ("mujoco", "gymnasium", "stable_baselines3", "hydra", "omegaconf", *up("env", "physics")),
-    "tensors/": (*FOREIGN, "go1exp.schema", "go1exp.robot", "go1exp.mdp", *UP),
-    "terrain.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
-    "config.py": (*FOREIGN, "omegaconf", "go1exp.compose", *UP),
-    "gym.py": ("stable_baselines3", "hydra", "omegaconf", "mujoco", *up("env")),
-    "drive.py": (*FOREIGN, "go1exp.schema.registry", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
-    # recordings, which need no robot and no engine
-    "recording.py": (*FOREIGN, "torch", "go1exp.mdp", *UP),
-    "importers/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    "audit/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    "svg.py": (*FOREIGN, "torch", "numpy", "pydantic", "go1exp"),
-    "statistics/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", "go1exp.schema", "go1exp.measures", *UP),
-    "measures/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    "excitations/": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    # what the robot's computer runs
-    "estimation/": (*FOREIGN, "torch", "omegaconf", "go1exp.config", "go1exp.mdp", *UP),
-    "choices.py": (*FOREIGN, "torch", "numpy", "pydantic", "omegaconf", "go1exp.schema", "go1exp.config", *UP),
-    "config_source.py": ("mujoco", "gymnasium", "stable_baselines3", "torch", "go1exp.config", *UP),
-    "compose.py": ("mujoco", "gymnasium", "stable_baselines3", "torch", "go1exp.config", *UP),
-    # the MDP knows no engine, the engine no MDP
-    "mdp/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.actuator", *UP),
-    "mdp/types.py": (*FOREIGN, "go1exp"),
-    # an actuator may load a net: the file's format, not the way it is fitted
-    "actuator/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *up("fit")),
-    "effects/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *UP),
-    "physics/": (
-        *("gymnasium", "stable_baselines3", "hydra", "omegaconf", "go1exp.mdp", "go1exp.actuator", "go1exp.config"),
-        *("go1exp.effects", *up("physics")),
-    ),
-    # what moves a robot other than a policy: plain numbers, but for what drives an environment
-    "controller/": (
-        *("mujoco", "gymnasium", "stable_baselines3", "hydra", "omegaconf", "go1exp.compose"),
-        *("go1exp.config", "go1exp.actuator", "go1exp.effects", *up("physics", "env", "record", "sim_robot")),
-    ),
-    "controller/settings.py": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    "controller/types.py": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    "controller/forces.py": (*FOREIGN, "torch", "go1exp.config", "go1exp.mdp", *UP),
-    # the environment joins them
-    "env/": ("mujoco", "hydra", "omegaconf", "go1exp.train", "go1exp.bench", "go1exp.cli"),
-    "env/core.py": ("gymnasium", "stable_baselines3", "go1exp.compose", "go1exp.evaluate"),
-    "env/faults.py": (*FOREIGN, "torch"),
-    "env/gym_env.py": ("stable_baselines3",),
-    "env/sb3_env.py": ("go1exp.compose", "go1exp.evaluate"),
-    # users of the environment
-    "record/": (
-        "mujoco",
-        "gymnasium",
-        "stable_baselines3",
-        "hydra",
-        "omegaconf",
-        "go1exp.compose",
-        *up("physics", "env", "record"),
-    ),
-    "fit/": (*FOREIGN, "omegaconf", "go1exp.config", "go1exp.mdp", *up("fit")),
-    "gap/": ("mujoco", "hydra", "omegaconf", "go1exp.compose", "go1exp.train", "go1exp.bench", "go1exp.cli"),
-    # launchers know run folders, and nothing of robots
-    "sweep/": (*FOREIGN, "torch", "omegaconf", "go1exp.config", "go1exp.mdp", "go1exp.robot", *up("train")),
-    "train/": ("mujoco", "hydra", "go1exp.compose", "go1exp.physics", "go1exp.evaluate", "go1exp.bench", "go1exp.cli"),
-    "export/": ("mujoco", "gymnasium", "hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
-    # the robot's computer: nothing of the above, nor what describes it
-    "deploy/": (
-        *(
-            *FOREIGN,
-            "torch",
-            "onnx",
-            "omegaconf",
-            "pydantic",
-            "scipy",
-            "rich",
-            "go1exp.schema.registry",
-            "go1exp.config",
-        ),
-        *("go1exp.robot", "go1exp.compose", "go1exp.mdp", "go1exp.actuator", "go1exp.effects", *UP),
-    ),
-    # the simulated robot: the runtime's messages on one side, the plant on the other
-    "sim_robot/": (
-        *("mujoco", "gymnasium", "stable_baselines3", "hydra", "omegaconf", "go1exp.compose"),
-        *up("physics", "env", "record", "sim_robot"),
-    ),
-    "sim_robot/settings.py": (*FOREIGN, "torch", "go1exp.config", *up("sim_robot")),
-    "evaluate/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
-    "bench/": ("hydra", "omegaconf", "go1exp.evaluate", "go1exp.cli"),
-    "report/": (*FOREIGN, "torch", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
-    "protocol/": ("mujoco", "hydra", "omegaconf", "go1exp.compose", "go1exp.bench", "go1exp.cli"),
-    # what is seen and asked for in a browser; the sessions behind it know none
-    "viewer/": ("hydra", "omegaconf", "go1exp.compose", "go1exp.train", "go1exp.bench", "go1exp.cli"),
-    "viewer/session.py": ("mujoco", "hydra", "omegaconf", "go1exp.cli"),
-    "viewer/sim_probe.py": ("mujoco", "hydra", "omegaconf", "go1exp.cli"),
-    "viewer/sim_process.py": ("mujoco", "hydra", "omegaconf", "go1exp.cli"),
-    "viewer/replay.py": ("mujoco", "torch", "hydra", "omegaconf", "go1exp.cli"),
-    "viewer/requests.py": (*FOREIGN, "torch", "numpy", "go1exp"),
-    "viewer/history.py": (*FOREIGN, "torch", "go1exp"),
-    "viewer/gate.py": (*FOREIGN, "torch", "numpy", "go1exp"),
-    "viewer/gamepad.py": (*FOREIGN, "torch", "numpy", "go1exp"),
+    "__init__.py": (*ENGINES, "torch", "numpy"),
+    "base/errors.py": (*ENGINES, "torch", "numpy", "pydantic"),
+    "base/files.py": (*ENGINES, "torch", "numpy", "pydantic"),
+    "base/tensors/": ENGINES,
+    "config/schema/": (*ENGINES, "torch"),
+    "config/choices.py": (*ENGINES, "torch", "numpy", "pydantic"),
+    "robot/__init__.py": (*ENGINES, "torch", "pydantic"),
+    "robot/messages.py": (*ENGINES, "torch", "pydantic"),
+    "mdp/": ENGINES,
+    "sim/physics/": ("gymnasium", "stable_baselines3", "hydra", "omegaconf"),
+    "sim/actuator/": ENGINES,
+    "sim/effects/": ENGINES,
+    "sim/env/core.py": ENGINES,
+    "logs/": ENGINES,
+    "logs/recording.py": (*ENGINES, "torch"),
+    "logs/importers/": (*ENGINES, "torch"),
+    "logs/audit/": (*ENGINES, "torch"),
+    # The robot's computer has none of these; pydantic is loaded with the estimator alone.
+    "deploy/estimation/": (*ENGINES, "torch"),
+    "deploy/runtime/": (*ENGINES, "torch", "onnx", "scipy", "rich", "pydantic"),
+    "evaluate/report/": (*ENGINES, "torch"),
+    "evaluate/statistics/": (*ENGINES, "torch"),
+    "evaluate/viewer/session.py": ENGINES,
+    "extend/__init__.py": ENGINES,
 }
-"""File or folder (ending in /) -> what it may not import; a module stands for what is in it too."""
+"""File or folder (ending in /) -> packages of others that it may not import."""
 
-FREE = ("go1exp.__version__", "go1exp.errors", "go1exp.files", "go1exp.signals")
-"""What every file of the package may import."""
-
-SETTLED = {
-    "compose.py",
-    "config_source.py",
-    "cli/app.py",
-    "cli/files.py",
-    "cli/sweep.py",
-    "cli/train.py",
+HYDRA = {
+    *("config/compose.py", "config/source.py", "cli/app.py", "cli/files.py", "cli/sweep.py", "cli/train.py"),
     "cli/tune.py",
 }
-"""The only files that may import hydra."""
+"""The only files that may import Hydra."""
 
 
 @cache
@@ -228,43 +126,37 @@ def test_the_rules_are_about_files_that_exist() -> None:
     assert [place for place in FORBIDDEN if not files_of(place)] == []
 
 
-def test_a_layer_imports_nothing_from_above_it() -> None:
+def test_a_file_imports_no_package_that_it_must_do_without() -> None:
     broken = {
         f"{name} imports {imported}"
         for place, forbidden in FORBIDDEN.items()
         for name in files_of(place)
         for imported in imports(RELATIVE[name])
         for module in forbidden
-        if within(imported, module) and not (module == "go1exp" and any(within(imported, f) for f in FREE))
+        if within(imported, module)
     }
     assert broken == set()
 
 
-GAP_ROOMS = (
-    *("result.py", "files.py", "data/", "replay/", "robots/", "score/", "search/", "comparison.py", "design/"),
-    *("certainty.py", "answer.py", "sentence.py", "report/", "stages/"),
-)
-"""Rooms of the gap workflow from the ground up: each may import itself and those below it."""
+@pytest.mark.parametrize("house", ORDER)
+def test_a_room_imports_only_itself_and_rooms_below_it(house: str) -> None:
+    prefix = f"{house}/" if house else ""
 
-
-def test_each_room_of_gap_imports_only_itself_and_rooms_below_it() -> None:
     def floor(name: str) -> int:
-        return next(k for k, room in enumerate(GAP_ROOMS) if name.startswith(f"gap/{room}"))
+        return ORDER[house].index(name.removeprefix(prefix).split("/")[0])
 
-    mine = [name for name in RELATIVE if name.startswith("gap/") and name != "gap/__init__.py"]
+    def inside(name: str) -> bool:
+        return name.startswith(prefix) and name != f"{prefix}__init__.py"
+
+    mine = [name for name in RELATIVE if inside(name)]
     upwards = {
         f"{name} imports {other}"
         for name in mine
         for other in own_imports(RELATIVE[name])
-        if other.startswith("gap/") and floor(other) > floor(name)
+        if inside(other) and floor(other) > floor(name)
     }
     assert upwards == set()
-    assert {floor(name) for name in mine} == set(range(len(GAP_ROOMS)))
-
-
-def test_every_file_belongs_to_a_layer() -> None:
-    placed = [n for n in RELATIVE if n in FORBIDDEN or any(n.startswith(p) for p in FORBIDDEN if p.endswith("/"))]
-    assert set(RELATIVE) - set(placed) == {n for n in RELATIVE if n.startswith("cli/")}
+    assert {floor(name) for name in mine} == set(range(len(ORDER[house])))
 
 
 def importers(module: str) -> set[str]:
@@ -272,12 +164,12 @@ def importers(module: str) -> set[str]:
 
 
 def test_hydra_stays_in_compose_and_on_the_command_line() -> None:
-    assert importers("hydra") <= SETTLED
-    assert importers("omegaconf") <= SETTLED | {"cli/gap.py", "train/run_folder.py"}
+    assert importers("hydra") <= HYDRA
+    assert importers("omegaconf") <= HYDRA | {"cli/gap.py", "train/run_folder.py"}
 
 
 def test_sb3_stays_at_its_border_and_in_the_learner() -> None:
-    allowed = {"env/sb3_env.py", "bench/env.py"}
+    allowed = {"sim/env/sb3_env.py", "evaluate/bench/env.py"}
     assert {n for n in importers("stable_baselines3") if not n.startswith("train/")} <= allowed
 
 
@@ -292,13 +184,13 @@ STUDIO = (
     "sim_window",
     "panels",
 )
-BROWSER = {f"viewer/{name}.py" for name in STUDIO}
+BROWSER = {f"evaluate/viewer/{name}.py" for name in STUDIO}
 """Files that build on MuJoCo Studio, or draw shapes of MuJoCo in its window."""
 
 
 def test_mujoco_stays_in_the_physics_and_where_pictures_are_made() -> None:
-    outside = {name for name in importers("mujoco") if not name.startswith("physics/")}
-    assert outside <= {"evaluate/camera.py", "evaluate/video.py", "evaluate/stick.py", "bench/env.py", *BROWSER}
+    outside = {name for name in importers("mujoco") if not name.startswith("sim/physics/")}
+    assert outside <= {"sim/env/camera.py", "evaluate/video.py", "evaluate/stick.py", "evaluate/bench/env.py", *BROWSER}
 
 
 def test_wandb_and_tensorboard_stay_in_the_metrics() -> None:
@@ -327,7 +219,7 @@ def test_no_module_imports_itself_in_a_circle() -> None:
 
 def test_importing_the_configuration_loads_no_engine_and_no_learner() -> None:
     code = (
-        "import sys; sys.modules['torch'] = type(sys)('torch'); import go1exp.config; "
+        "import sys; sys.modules['torch'] = type(sys)('torch'); import go1exp.sim.task; "
         "print([m for m in ('mujoco', 'gymnasium', 'stable_baselines3', 'hydra', 'torch.nn') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=data_root(), capture_output=True, text=True, timeout=60)
@@ -367,12 +259,10 @@ def decorated(file: Path) -> Iterator[tuple[str, str]]:
 
 
 def test_terms_are_registered_in_the_order_of_the_source() -> None:
-    import go1exp.config
-    import go1exp.excitations
-    import go1exp.importers
-    import go1exp.measures
-    import go1exp.protocol.kinds
-    import go1exp.record.policy  # noqa: F401  (registers every member)
+    import go1exp.evaluate.protocol.kinds
+    import go1exp.logs.excitations
+    import go1exp.logs.importers
+    import go1exp.logs.record.policy  # noqa: F401  (registers every member)
 
     groups = registry.groups()
     expected = {"reward", "observation", "rand", "command", "event", "termination", "curriculum", "actuator"}
@@ -444,7 +334,7 @@ def test_every_module_says_what_it_is_for() -> None:
 
 
 def test_only_what_talks_to_people_prints() -> None:
-    talkers = ("cli/", "train/", "sweep/", "evaluate/", "deploy/__main__.py", "signals.py")
+    talkers = ("cli/", "train/", "evaluate/", "deploy/__main__.py", "base/signals.py")
     printing = {
         f"{name}:{node.lineno}"
         for name, file in RELATIVE.items()

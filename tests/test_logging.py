@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 from stable_baselines3.common import logger as sb3_logger
 
-from go1exp.compose import compose
-from go1exp.config import LoggerConfig, WandbConfig, parse_train
-from go1exp.schema.registry import Expected
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import Expected
+from go1exp.sim.task import LoggerConfig, WandbConfig, parse_train
 from go1exp.train import metrics, run_folder, trainer, wandb_writer
 from go1exp.train.metrics import CsvWriter, make_logger
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from go1exp import robot
-from go1exp.measures import every_measure, measured
-from go1exp.measures.recorded import hysteresis, trace_of
-from go1exp.measures.runs import find_runs, largest_within, settled
-from go1exp.measures.trace import NotMeasured, Trace
-from go1exp.recording import Meta, Recording, RecordingError
-from go1exp.schema.registry import members
-from go1exp.statistics.intervals import mean_interval, phase_interval, share_interval
-from go1exp.testing.traces import random_trace, without
+from go1exp.config.schema.registry import members
+from go1exp.evaluate.statistics.intervals import mean_interval, phase_interval, share_interval
+from go1exp.extend.testing.traces import random_trace, without
+from go1exp.logs.recorded import hysteresis, trace_of
+from go1exp.logs.recording import Meta, Recording, RecordingError
+from go1exp.mdp.measures import every_measure, measured
+from go1exp.mdp.measures.runs import find_runs, largest_within, settled
+from go1exp.mdp.measures.trace import NotMeasured, Trace
 
 DT, SAMPLES = 0.002, 10
 WALK, STAND = (1.0, 0.0, 0.0), (0.0, 0.0, 0.0)

@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 import torch
 
-import go1exp.protocol.kinds  # noqa: F401  (registers them)
-from go1exp import memory
+import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
+from go1exp.base import memory
 from go1exp.cli.play import APP as PLAY
 from go1exp.cli.plugins import begin
 from go1exp.cli.record import APP as RECORD
-from go1exp.compose import compose
-from go1exp.config import TaskConfig, parse_train
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError, TooLongError, members
 from go1exp.evaluate import video
 from go1exp.evaluate.drivers import PolicyDriver
-from go1exp.protocol.base import Chosen, chosen
-from go1exp.protocol.plan import STEP_BYTES, Plan
-from go1exp.protocol.refusing import refuse
-from go1exp.protocol.stage import Setting, Stage
-from go1exp.record.plan import ROW_BYTES
-from go1exp.report import evaluating
-from go1exp.schema.registry import ConfigError, TooLongError, members
+from go1exp.evaluate.protocol.base import Chosen, chosen
+from go1exp.evaluate.protocol.plan import STEP_BYTES, Plan
+from go1exp.evaluate.protocol.refusing import refuse
+from go1exp.evaluate.protocol.stage import Setting, Stage
+from go1exp.evaluate.report import evaluating
+from go1exp.logs.record.plan import ROW_BYTES
+from go1exp.sim.task import TaskConfig, parse_train
 
 # ---------------------------------------------------------------------- go1exp play
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 
 PACKAGE = data_root() / "go1exp"
 

@@ -16,16 +16,17 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from go1exp import data_root, robot
-from go1exp.compose import compose
-from go1exp.config import MANY_TERMS, TaskConfig, parse_task
-from go1exp.effects.rules import on_mount
-from go1exp.env.plant import Plant, drive_setup
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import Sensors, build_model
-from go1exp.schema.registry import bind, members
-from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import build_terrain
+from go1exp import robot
+from go1exp.base.paths import data_root
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import bind, members
+from go1exp.sim.effects.rules import on_mount
+from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import Sensors, build_model
+from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
+from go1exp.sim.terrain import build_terrain
 
 GAINS = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))
 FINE, COARSE = 0.00025, 0.002
@@ -140,7 +141,7 @@ def worst(a: Tensor, b: Tensor) -> list[float]:
     return [1e3 * x for x in (a - b).abs().amax((0, 2)).tolist()]
 
 
-@pytest.mark.slow("go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/", "go1exp/actuator/")
+@pytest.mark.slow("go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/", "go1exp/sim/actuator/")
 def test_an_effect_moves_the_same_at_a_coarse_and_a_fine_step(effect: str) -> None:
     bars, _ = BARS.get(effect, ((BAR,) * len(GAINS), ""))
     found = worst(ours(COARSE, choice(effect)), ours(FINE, choice(effect)))

@@ -14,18 +14,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from go1exp import data_root
-from go1exp.audit import audit as audited
+from go1exp.base.paths import data_root
 from go1exp.cli import main
 from go1exp.cli.files import choices_from_files
-from go1exp.compose import compose
+from go1exp.config.compose import compose
+from go1exp.config.schema.settings import attributes
 from go1exp.gap.result import EXIT_CODES, GapSettings
 from go1exp.gap.robots.description import Firmware, ModelConfig, SearchDefaults, parse_model
 from go1exp.gap.robots.fixed_base import FixedBase
-from go1exp.importers.csv import UNITS
-from go1exp.physics.scene import RIGID
-from go1exp.recording import read
-from go1exp.schema.settings import attributes
+from go1exp.logs.audit import audit as audited
+from go1exp.logs.importers.csv import UNITS
+from go1exp.logs.recording import read
+from go1exp.sim.physics.scene import RIGID
 
 PAGE = data_root() / "docs/own_robot.md"
 TEXT = PAGE.read_text()
@@ -113,7 +113,9 @@ def test_the_page_is_followed_up_to_the_audit(
     assert FixedBase.from_config(model).flaws(first, audited(first)) == []
 
 
-@pytest.mark.slow("docs/own_robot.md", "go1exp/gap/", "go1exp/importers/", "go1exp/effects/", "go1exp/env/plant.py")
+@pytest.mark.slow(
+    "docs/own_robot.md", "go1exp/gap/", "go1exp/logs/importers/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py"
+)
 def test_the_page_is_followed_to_the_hidden_friction(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

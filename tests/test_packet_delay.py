@@ -10,12 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
-from go1exp.deploy.estimate import LONGEST_AHEAD, KalmanEstimator, acceleration
-from go1exp.deploy.go1_fields import PERIOD
-from go1exp.deploy.job import summary_lines
-from go1exp.deploy.messages import OVERTAKEN_S, LowState
-from go1exp.deploy.packet_delay import MOST_SLIP, WINDOW_S, PacketDelay, delays, slip, spread
-from go1exp.estimation import Status, go1, make_filter, sample
+from go1exp.deploy.estimation import Status, go1, make_filter, sample
+from go1exp.deploy.runtime.estimate import LONGEST_AHEAD, KalmanEstimator, acceleration
+from go1exp.deploy.runtime.job import summary_lines
+from go1exp.deploy.runtime.packet_delay import MOST_SLIP, WINDOW_S, PacketDelay, delays, slip, spread
+from go1exp.robot.go1_fields import PERIOD
+from go1exp.robot.messages import OVERTAKEN_S, LowState
 
 
 def test_delays_are_those_beyond_the_fastest_of_the_last_second() -> None:

@@ -21,19 +21,19 @@ from go1exp import robot
 from go1exp.cli import engine as engine_choice
 from go1exp.cli import other_robot
 from go1exp.cli.runs import shipped_policies
-from go1exp.compose import compose
-from go1exp.config import TaskConfig, parse_parts
-from go1exp.env.core import Go1Core
-from go1exp.env.engine import make_backend
+from go1exp.config.compose import compose
+from go1exp.config.schema.backends import CpuBackend
+from go1exp.config.schema.registry import ConfigError, Expected
 from go1exp.evaluate import engine as evaluate_engine
-from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate
-from go1exp.physics import agreement
-from go1exp.physics.scene import build_model
-from go1exp.schema.backends import CpuBackend
-from go1exp.schema.registry import ConfigError, Expected
-from go1exp.terrain import Terrain, build_terrain
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.engine import make_backend
+from go1exp.sim.physics import agreement
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig, parse_parts
+from go1exp.sim.terrain import Terrain, build_terrain
 from go1exp.train import preflight
+from go1exp.train.policy import load_run
 
 INSTALLED = importlib.util.find_spec("sapien") is not None
 needs_physx = pytest.mark.skipif(not INSTALLED, reason="sapien is not installed: pip install 'go1exp[physx]'")
@@ -437,13 +437,13 @@ def test_without_its_package_the_engine_says_what_to_install(build: Build, monke
     for name in ("sapien", "sapien.physx"):
         monkeypatch.setitem(sys.modules, name, None)
     for name in ("physx", "physx_robot", "physx_contacts"):
-        monkeypatch.delitem(sys.modules, f"go1exp.physics.{name}", raising=False)
+        monkeypatch.delitem(sys.modules, f"go1exp.sim.physics.{name}", raising=False)
     with pytest.raises(Expected, match=r"pip install 'go1exp\[physx\]'"):
         build(1)
 
 
 def test_it_trains_nothing(make_task: Callable[..., TaskConfig]) -> None:
-    from go1exp.config import parse_train
+    from go1exp.sim.task import parse_train
 
     config = parse_train(compose("train"))
     config = dataclasses.replace(config, task=dataclasses.replace(config.task, backend=PHYSX))

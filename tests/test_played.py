@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from go1exp import robot
-from go1exp.deploy.log import _attitude
-from go1exp.deploy.messages import LowState
-from go1exp.excitations import ExcitationError
-from go1exp.record.played import BLEND_S, GAINS, RATE_HZ, played
-from go1exp.recording import joint_channels
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.runtime.log import _attitude
+from go1exp.logs.excitations import ExcitationError
+from go1exp.logs.record.played import BLEND_S, GAINS, RATE_HZ, played
+from go1exp.logs.recording import joint_channels
+from go1exp.robot.messages import LowState
 
 STANCE = robot.NOMINAL_STANCE
 

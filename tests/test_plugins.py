@@ -17,19 +17,19 @@ import torch
 from omegaconf import OmegaConf
 
 from go1exp.cli import main
-from go1exp.compose import compose
-from go1exp.config import parse_task, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.evaluate.policy import load_run
-from go1exp.export.graph import ExportError, required_inputs
-from go1exp.schema import plugins, registry
-from go1exp.schema.registry import ConfigError
-from go1exp.sim_robot.__main__ import bundle_task
+from go1exp.config.compose import compose
+from go1exp.config.schema import plugins, registry
+from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.export.graph import ExportError, required_inputs
+from go1exp.deploy.sim_robot.__main__ import bundle_task
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import parse_task, parse_train
 from go1exp.train import checkpoint, kept_plugins, run_folder, start, trainer
+from go1exp.train.policy import load_run
 from tests.small_run import SMALL
 
 LAZY = '''
-from go1exp.terms import Positive, Snapshot, reward
+from go1exp.extend import Positive, Snapshot, reward
 
 @reward("lazy")
 def lazy(s: Snapshot, *, scale: Positive = 2.0):
@@ -38,7 +38,7 @@ def lazy(s: Snapshot, *, scale: Positive = 2.0):
 '''
 
 REMEMBERING = '''
-from go1exp.terms import Memory, Positive, Snapshot, TermSetup, observation, reward, termination
+from go1exp.extend import Memory, Positive, Snapshot, TermSetup, observation, reward, termination
 
 class Average(Memory):
     memory = ("mean", "calls")
@@ -219,7 +219,7 @@ def test_an_installed_package_is_searched_when_a_term_is_wanted_that_nobody_has(
 def test_gymnasium_takes_plugins_among_its_overrides() -> None:
     write("my_terms.py", LAZY)
     overrides = ["plugins=[my_terms.py]", "+reward.lazy.weight=-1", "backend.threads=1"]
-    env = gymnasium.make("go1exp.gym:Go1-v0", overrides=overrides)
+    env = gymnasium.make("go1exp.sim.gym:Go1-v0", overrides=overrides)
     env.reset(seed=0)
     *_, info = env.step(env.action_space.sample() * 0.01)
     assert info["reward_terms"]["lazy"] < 0.0
@@ -271,7 +271,7 @@ def test_two_configurations_of_one_process_may_have_different_terms_of_one_name(
     ("text", "line", "what"),
     [
         ("\n\nx = 1 / 0\n", 3, "ZeroDivisionError: division by zero"),
-        ("\nfrom go1exp.terms import reward\n\nreward('a'\n", 4, "SyntaxError: '(' was never closed"),
+        ("\nfrom go1exp.extend import reward\n\nreward('a'\n", 4, "SyntaxError: '(' was never closed"),
         ("import no_such_thing\n", 1, "ModuleNotFoundError: No module named 'no_such_thing'"),
         ("def f():\n    raise ValueError('one\\ntwo')\nf()\n", 2, "ValueError: one"),
         ("raise SystemExit\n", 1, "SystemExit: without a message"),

@@ -19,12 +19,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal, kl_divergence
 
-from go1exp.compose import compose
-from go1exp.config import PPOConfig, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
 from go1exp.mdp.types import StepResult
-from go1exp.schema.registry import ConfigError
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import PPOConfig, parse_train
 from go1exp.train import trainer
 from go1exp.train.loss import ppo_loss
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, linear_rate, policy_settings

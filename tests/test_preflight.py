@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from go1exp import memory
-from go1exp.compose import compose
-from go1exp.config import LoggerConfig, TrainConfig, WandbConfig, parse_train
-from go1exp.schema.registry import ConfigError
+from go1exp.base import memory
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.task import LoggerConfig, TrainConfig, WandbConfig, parse_train
 from go1exp.train import memory_need, metrics, preflight
 from tests.command import run as cli
 

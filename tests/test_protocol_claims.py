@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from go1exp.protocol.claims import Claim, judged, verdict
-from go1exp.protocol.comparing import word
-from go1exp.protocol.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
-from go1exp.statistics.intervals import (
+from go1exp.evaluate.protocol.claims import Claim, judged, verdict
+from go1exp.evaluate.protocol.comparing import word
+from go1exp.evaluate.protocol.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
+from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,
     logistic_fit,

@@ -12,17 +12,17 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-import go1exp.protocol.kinds  # noqa: F401  (registers them)
+import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.cli import compare, evaluate, subjects
 from go1exp.cli.helptext import show
 from go1exp.cli.plugins import begin
 from go1exp.cli.protocols import chosen as protocols_chosen
 from go1exp.cli.protocols import playable
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.deploy.archive import BundleError
-from go1exp.export.build import build
-from go1exp.schema.registry import ConfigError
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.export.build import build
+from go1exp.deploy.runtime.archive import BundleError
+from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
 from tests.small_run import SMALL
 from tests.test_cli import assert_refused

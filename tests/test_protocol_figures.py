@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-import go1exp.protocol.kinds  # noqa: F401  (registers them)
+import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp import robot
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.measures.trace import Trace
-from go1exp.protocol.base import chosen
-from go1exp.protocol.kinds import gait, hardware, push_map, rate, terrain
-from go1exp.protocol.kinds.energy import effort
-from go1exp.protocol.plan import Motion
-from go1exp.protocol.stage import delay_of_effects
+from go1exp.config.compose import compose
+from go1exp.evaluate.protocol.base import chosen
+from go1exp.evaluate.protocol.kinds import gait, hardware, push_map, rate, terrain
+from go1exp.evaluate.protocol.kinds.energy import effort
+from go1exp.evaluate.protocol.plan import Motion
+from go1exp.evaluate.protocol.stage import delay_of_effects
+from go1exp.mdp.measures.trace import Trace
+from go1exp.sim.task import parse_train
 
 STEPS, DT = 100, 0.02
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from go1exp.protocol.ground import COURSE, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes, goal
-from go1exp.terrain import build_terrain
+from go1exp.evaluate.protocol.ground import COURSE, RESOLUTION, RUN_UP, SHAPES, TREAD, UNITS, Lanes, goal
+from go1exp.sim.terrain import build_terrain
 
 
 def profile(lanes: Lanes, lane: int) -> tuple[np.ndarray, np.ndarray]:

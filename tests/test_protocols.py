@@ -17,23 +17,23 @@ import pytest
 import torch
 from torch import Tensor
 
-import go1exp.protocol.kinds  # noqa: F401  (registers them)
-from go1exp.compose import compose
-from go1exp.config import TaskConfig
+import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError, members
 from go1exp.evaluate.drivers import ControllerDriver, Driver, PolicyDriver
-from go1exp.protocol import comparing
-from go1exp.protocol.base import Chosen, chosen
-from go1exp.protocol.disturbances import Impulses
-from go1exp.protocol.kinds.corners import step_answer
-from go1exp.protocol.kinds.push_map import largest_survived
-from go1exp.protocol.plan import Plan
-from go1exp.protocol.playing import Rates, play
-from go1exp.protocol.quantities import FINGERPRINT, ROBOT
-from go1exp.protocol.report.compare import page as comparison
-from go1exp.protocol.report.writing import write
-from go1exp.protocol.result import Result
-from go1exp.protocol.stage import Setting, Stage, fitting_step
-from go1exp.schema.registry import ConfigError, members
+from go1exp.evaluate.protocol import comparing
+from go1exp.evaluate.protocol.base import Chosen, chosen
+from go1exp.evaluate.protocol.disturbances import Impulses
+from go1exp.evaluate.protocol.kinds.corners import step_answer
+from go1exp.evaluate.protocol.kinds.push_map import largest_survived
+from go1exp.evaluate.protocol.plan import Plan
+from go1exp.evaluate.protocol.playing import Rates, play
+from go1exp.evaluate.protocol.quantities import FINGERPRINT, ROBOT
+from go1exp.evaluate.protocol.report.compare import page as comparison
+from go1exp.evaluate.protocol.report.writing import write
+from go1exp.evaluate.protocol.result import Result
+from go1exp.evaluate.protocol.stage import Setting, Stage, fitting_step
+from go1exp.sim.task import TaskConfig
 from tests.test_every_key_acts import unread
 
 SMALL = {
@@ -392,9 +392,9 @@ def test_the_mpc_is_put_back_to_an_instant(make_task: Callable[..., TaskConfig])
     pytest.importorskip("daqp")
     import yaml
 
-    from go1exp import data_root
-    from go1exp.controller.mpc import Mpc
-    from go1exp.controller.settings import MpcSettings, parse_controller
+    from go1exp.base.paths import data_root
+    from go1exp.evaluate.controller.mpc import Mpc
+    from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 
     file = data_root() / "conf/controller/mpc.yaml"
     settings = parse_controller(yaml.safe_load(file.read_text()) | {"stand": 0.0})

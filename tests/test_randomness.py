@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
-from go1exp.tensors.randomness import EnvRandom
+from go1exp.base.tensors.randomness import EnvRandom
 
 
 def test_an_environment_draws_the_same_in_any_batch_bit_for_bit() -> None:

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import pytest
 
-from go1exp.sweep.index import read
+from go1exp.train.sweep.index import read
 from tests import ray_cluster
 from tests.command import environment, run_alone
 from tests.small_run import SMALL
 
-pytestmark = pytest.mark.slow("go1exp/sweep/", "go1exp/cli/", "conf/launcher/", "tests/ray_cluster.py")
+pytestmark = pytest.mark.slow("go1exp/train/sweep/", "go1exp/cli/", "conf/launcher/", "tests/ray_cluster.py")
 
 LONGER = (*SMALL, "ppo.iterations=150", "checkpoint.every=5")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from go1exp.cli import SUBVERBS
 from tests.command import run
 

@@ -13,19 +13,19 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-import go1exp.excitations
-import go1exp.record.policy  # noqa: F401  (registers every excitation)
+import go1exp.logs.excitations
+import go1exp.logs.record.policy  # noqa: F401  (registers every excitation)
 from go1exp import robot
-from go1exp.audit import audit
 from go1exp.cli import main
 from go1exp.cli.record import RIG
 from go1exp.cli.settings import RecordSettings, parse
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.record import plan, simulate
-from go1exp.record.sensors import Channel, SensorConfig
-from go1exp.recording import Recording, read_folder
-from go1exp.schema.registry import ConfigError, bind
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError, bind
+from go1exp.logs.audit import audit
+from go1exp.logs.record import plan, simulate
+from go1exp.logs.record.sensors import Channel, SensorConfig
+from go1exp.logs.recording import Recording, read_folder
+from go1exp.sim.task import parse_parts
 
 Make = Callable[..., list[Recording]]
 NOISELESS = [f"sensors.{name}={{noise: 0.0, step: 0.0}}" for name in ("q", "qd", "tau_est", "gyro", "acc", "attitude")]
@@ -326,7 +326,7 @@ def test_a_recording_can_be_audited_and_a_damaged_one_is_named(
 
 
 def test_channels_without_noise_or_steps_are_left_as_they_are() -> None:
-    from go1exp.record.sensors import log
+    from go1exp.logs.record.sensors import log
 
     rng = np.random.default_rng(0)
     perfect = Channel(0.0, 0.0)

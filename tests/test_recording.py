@@ -19,10 +19,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from go1exp import recording as rec
-from go1exp.recording import Meta, Recording, RecordingError
+from go1exp.config.schema.contact import ContactConfig
+from go1exp.logs import recording as rec
+from go1exp.logs.recording import Meta, Recording, RecordingError
 from go1exp.robot import JOINTS, LEGS
-from go1exp.schema.contact import ContactConfig
 
 META = Meta(
     robot="arm",
@@ -478,7 +478,7 @@ def test_importing_the_format_loads_no_engine() -> None:
     import sys
 
     code = (
-        "import sys, go1exp.recording; "
+        "import sys, go1exp.logs.recording; "
         "print([m for m in ('torch', 'mujoco', 'hydra', 'gymnasium', 'pyarrow', 'scipy') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

@@ -19,20 +19,20 @@ import pytest
 import yaml
 from scipy import stats
 
-import go1exp.protocol.kinds  # noqa: F401  (registers them)
+import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.cli.report import _task
-from go1exp.compose import compose
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.settings import parse
 from go1exp.evaluate.files import write as write_evaluation
+from go1exp.evaluate.report import curves
+from go1exp.evaluate.report.groups import baseline, groups
+from go1exp.evaluate.report.made import Report, report
+from go1exp.evaluate.report.runs import study
+from go1exp.evaluate.report.settings import ReportSettings
+from go1exp.evaluate.report.tables import plain_rows, tables
+from go1exp.evaluate.report.writing import page, write
 from go1exp.evaluate.rows import rows_of
-from go1exp.report import curves
-from go1exp.report.groups import baseline, groups
-from go1exp.report.made import Report, report
-from go1exp.report.runs import study
-from go1exp.report.settings import ReportSettings
-from go1exp.report.tables import plain_rows, tables
-from go1exp.report.writing import page, write
-from go1exp.schema.registry import ConfigError
-from go1exp.schema.settings import parse
 
 CONFIG: dict[str, Any] = {
     "seed": 0,
@@ -323,7 +323,7 @@ def test_without_anything_random_there_are_no_robots_to_pair(tmp_path: Path) -> 
 
 def kicked(folder: Path, evaluated: bool = False) -> None:
     """Write two groups of six runs that were kicked; with a larger weight they recover sooner."""
-    from go1exp.protocol.result import write_rows
+    from go1exp.evaluate.protocol.result import write_rows
 
     protocol = compose("eval", ["protocol=kicks"])["protocol"]["kicks"]
     for seed in range(6):
@@ -484,7 +484,7 @@ def test_figures_are_refused_before_anything_is_evaluated(tmp_path: Path, monkey
         made_of.append(wanted)
         return []
 
-    monkeypatch.setattr("go1exp.report.evaluating.evaluate_missing", noted)
+    monkeypatch.setattr("go1exp.evaluate.report.evaluating.evaluate_missing", noted)
     line = [f"folders=[{tmp_path}]", f"folder={tmp_path}/out", "eval=true", "protocol=[grid,kicks]"]
     with pytest.raises(ConfigError, match=r"figures: unknown figure 'nosuch'; known: .*error_xy.*recovery_s"):
         _task(compose("report", [*line, "figures=[nosuch,error_xy]"]))
@@ -548,7 +548,7 @@ def test_the_page_needs_nothing_beside_it(two_groups: Path) -> None:
 
 
 def test_eval_true_evaluates_what_is_missing_with_the_runs_own_policy(tmp_path: Path) -> None:
-    from go1exp.config import parse_train
+    from go1exp.sim.task import parse_train
     from go1exp.train import run_folder, run_state, trainer
     from tests.small_run import SMALL
 

@@ -20,9 +20,9 @@ from typing import Any
 import pytest
 import torch
 
-from go1exp import data_root
-from go1exp.compose import compose
-from go1exp.config import parse_train
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
+from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, metrics, run_folder, trainer
 from tests.command import COMMAND_LINE, run_alone
 from tests.command import run as cli
@@ -225,7 +225,12 @@ def test_a_run_killed_between_checkpoints_goes_on_when_the_same_command_is_given
 
 
 @pytest.mark.slow(
-    "go1exp/train/", "go1exp/signals.py", "go1exp/cli/", "go1exp/tensors/", "go1exp/terrain.py", "go1exp/env/"
+    "go1exp/train/",
+    "go1exp/base/signals.py",
+    "go1exp/cli/",
+    "go1exp/base/tensors/",
+    "go1exp/sim/terrain.py",
+    "go1exp/sim/env/",
 )
 def test_a_run_on_rough_ground_stopped_by_sigterm_goes_on_with_resume(
     folder: Path, monkeypatch: pytest.MonkeyPatch, usual_handler: Callable[[int, FrameType | None], None]
@@ -283,7 +288,7 @@ def test_a_signal_in_the_last_iteration_leaves_a_finished_run(
     assert caught.value.finished
 
 
-@pytest.mark.slow("go1exp/train/", "go1exp/signals.py", "go1exp/cli/", "go1exp/tensors/")
+@pytest.mark.slow("go1exp/train/", "go1exp/base/signals.py", "go1exp/cli/", "go1exp/base/tensors/")
 def test_the_end_of_the_terminal_costs_no_checkpoint(tmp_path: Path) -> None:
     """The kernel sends SIGHUP, and what is printed from then on fails."""
     master, slave = pty.openpty()

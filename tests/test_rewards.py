@@ -26,9 +26,9 @@ from benchmarks.gait_scores import (
     walking,
 )
 from go1exp import robot
-from go1exp.config import TaskConfig
+from go1exp.config.schema.registry import members
 from go1exp.mdp.types import Snapshot, TermSetup
-from go1exp.schema.registry import members
+from go1exp.sim.task import TaskConfig
 
 WALK = [0.5, 0.0, 0.0]
 """A command, so that the robot counts as moving."""

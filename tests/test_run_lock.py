@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from go1exp import data_root
-from go1exp.compose import compose
+from go1exp.base.paths import data_root
+from go1exp.config.compose import compose
 from go1exp.train import run_folder, run_lock, run_state
 from tests.small_run import SMALL
 

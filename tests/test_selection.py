@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from tests.selection import changed_since, chosen, touched
 
 

@@ -10,13 +10,13 @@ import torch
 
 from go1exp.cli import other_robot
 from go1exp.cli.runs import shipped_policies, trained
-from go1exp.compose import compose
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.bars import ROBOT, judged
-from go1exp.evaluate.policy import load_run
 from go1exp.evaluate.rollout import EvalConfig, evaluate
-from go1exp.measures import every_measure
-from go1exp.schema.registry import ConfigError
+from go1exp.mdp.measures import every_measure
 from go1exp.train import checkpoint
+from go1exp.train.policy import load_run
 
 NAMES = sorted(shipped_policies())
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 
 WHILE_LOADING = """
 import os, signal, sys
@@ -22,7 +22,7 @@ sys.meta_path.insert(0, Interrupt())
 {program}
 """
 PROGRAM = "from go1exp.cli import main; sys.exit(main())"
-WORKING = pytest.mark.slow("go1exp/cli/", "go1exp/signals.py", "go1exp/evaluate/", "go1exp/record/")
+WORKING = pytest.mark.slow("go1exp/cli/", "go1exp/base/signals.py", "go1exp/evaluate/", "go1exp/logs/record/")
 RUNTIME = "from go1exp.deploy.__main__ import main; sys.exit(main(sys.argv[1:]))"
 
 

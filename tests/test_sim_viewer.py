@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 
 from go1exp import robot
+from go1exp.base.errors import Expected
 from go1exp.cli.play_web import printed
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.deploy import go1_wire
-from go1exp.deploy.messages import LowCmd
-from go1exp.errors import Expected
-from go1exp.sim_robot.machine import TICK, Body, Robot
-from go1exp.sim_robot.server import STRANGER, Server
-from go1exp.sim_robot.settings import SimConfig
-from go1exp.viewer import requests as ask
-from go1exp.viewer import sim_probe
-from go1exp.viewer.history import SPAN
-from go1exp.viewer.sim_probe import EVERY, HANGS, Frame, Probe
-from go1exp.viewer.sim_process import Answering, RobotProcess
-from go1exp.viewer.sim_show import SimShow, SimView, longest
+from go1exp.config.compose import compose
+from go1exp.deploy.runtime import go1_wire
+from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
+from go1exp.deploy.sim_robot.server import STRANGER, Server
+from go1exp.deploy.sim_robot.settings import SimConfig
+from go1exp.evaluate.viewer import requests as ask
+from go1exp.evaluate.viewer import sim_probe
+from go1exp.evaluate.viewer.history import SPAN
+from go1exp.evaluate.viewer.sim_probe import EVERY, HANGS, Frame, Probe
+from go1exp.evaluate.viewer.sim_process import Answering, RobotProcess
+from go1exp.evaluate.viewer.sim_show import SimShow, SimView, longest
+from go1exp.robot.messages import LowCmd
+from go1exp.sim.task import parse_parts
 
 GROUPS = ("robot", "actuator", "effect", "contact", "terrain")
 CONTAINER = compose("sim", ["effect=payload"])
@@ -264,7 +264,7 @@ def test_of_each_group_the_longest_interval_is_drawn() -> None:
     np.testing.assert_array_equal(longest(t, values, 2500)[0], t)
 
 
-@pytest.mark.slow("go1exp/viewer/", "go1exp/sim_robot/", "go1exp/cli/simulate.py")
+@pytest.mark.slow("go1exp/evaluate/viewer/", "go1exp/deploy/sim_robot/", "go1exp/cli/simulate.py")
 def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(capfd: pytest.CaptureFixture[str]) -> None:
     groups = {name: CONTAINER[name] for name in GROUPS}
     process = RobotProcess(groups, (0, 0), SimConfig(), ("127.0.0.1", 0), None, printed)

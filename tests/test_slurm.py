@@ -21,7 +21,7 @@ from tests import slurm_cluster
 from tests.command import environment, run_alone
 from tests.small_run import SMALL
 
-pytestmark = pytest.mark.slow("go1exp/sweep/", "go1exp/cli/", "conf/launcher/", "tests/slurm_cluster.py")
+pytestmark = pytest.mark.slow("go1exp/train/sweep/", "go1exp/cli/", "conf/launcher/", "tests/slurm_cluster.py")
 
 LONGER = (*SMALL, "ppo.iterations=150", "checkpoint.every=5")
 JOBS = ("seed=1,2", "reward=paper,paper_literal")

@@ -17,13 +17,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from go1exp import data_root, robot
-from go1exp.compose import compose
-from go1exp.config import TaskConfig, parse_task
-from go1exp.effects.rules import on_mount
-from go1exp.effects.soft_mount import SoftMount
-from go1exp.effects.tolerances import DECLARED
-from go1exp.env.plant import Plant, drive_setup
+from go1exp import robot
+from go1exp.base.paths import data_root
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import Term, bind
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.replay.replayer import LEVEL, Replayer
 from go1exp.gap.replay.rows import Rows, Theta, bolted, mounted, variants
@@ -35,12 +33,15 @@ from go1exp.gap.score.angle_errors import unexplained
 from go1exp.gap.score.likelihood import state_probes
 from go1exp.gap.search.fit import stacked
 from go1exp.gap.stages.explain import explain
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model
-from go1exp.recording import read_folder
-from go1exp.schema.registry import Term, bind
-from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import build_terrain
+from go1exp.logs.recording import read_folder
+from go1exp.sim.effects.rules import on_mount
+from go1exp.sim.effects.soft_mount import SoftMount
+from go1exp.sim.effects.tolerances import DECLARED
+from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig, parse_task
+from go1exp.sim.terrain import build_terrain
 from tests.laboratory import recorded
 
 MASS, INERTIA, G = 12.0, (0.1, 0.2, 0.3), 9.81
@@ -350,7 +351,7 @@ def test_what_all_legs_feel_explains_their_errors_by_one_number() -> None:
 # ---------------------------------------------------------------------- found in recordings
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/effects/", "go1exp/env/plant.py", "go1exp/physics/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/sim/effects/", "go1exp/sim/env/plant.py", "go1exp/sim/physics/")
 def test_a_hidden_mount_is_named_with_its_values_and_not_taken_for_a_tilt_or_inertia() -> None:
     hidden = {"roll": 0.012, "pitch": 0.008, "damping": 0.15}
     made = ["physics_dt=0.0005", "seconds=3", "excitation=[chirp,steps]", "gains=[[20,0.5],[35,1.2]]"]

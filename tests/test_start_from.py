@@ -13,11 +13,11 @@ import torch
 
 from go1exp.cli.runs import shipped_policies
 from go1exp.cli.train import APP
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.evaluate.policy import load_run
-from go1exp.schema.registry import ConfigError
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, run_folder, start, trainer
+from go1exp.train.policy import load_run
 
 SMALL = (
     *("ppo.num_envs=4", "ppo.steps=4", "ppo.minibatches=2", "ppo.epochs=1", "ppo.iterations=1", "ppo.hidden=[16]"),

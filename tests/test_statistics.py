@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from go1exp import data_root
-from go1exp.statistics import association, compare
-from go1exp.statistics.intervals import (
+from go1exp.base.paths import data_root
+from go1exp.evaluate.statistics import association, compare
+from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,
     mean_interval,
     share_interval,
     stratified_mean_interval,
 )
-from go1exp.statistics.runs import (
+from go1exp.evaluate.statistics.runs import (
     clustered_share,
     iqm,
     iqm_band,

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from go1exp.sweep import index
+from go1exp.train.sweep import index
 from tests import slurm_cluster
 from tests.command import environment, run_alone
 
 pytestmark = pytest.mark.slow(
-    "go1exp/sweep/", "go1exp/report/", "conf/study/", "conf/launcher/", "tests/slurm_cluster.py"
+    "go1exp/train/sweep/", "go1exp/evaluate/report/", "conf/study/", "conf/launcher/", "tests/slurm_cluster.py"
 )
 
 LAUNCHERS = {

@@ -18,17 +18,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from go1exp.cli.tune import _ranges
-from go1exp.schema.registry import ConfigError
-from go1exp.sweep import index
-from go1exp.sweep.command import Command, Running, run
-from go1exp.sweep.launchers import LAUNCHERS, chosen
-from go1exp.sweep.local import shares
-from go1exp.sweep.slurm import Slurm
-from go1exp.sweep.task import Task
-from go1exp.sweep.tune import Range, _rows
+from go1exp.config.schema.registry import ConfigError
 from go1exp.train import run_lock, run_state
+from go1exp.train.sweep import index
+from go1exp.train.sweep.command import Command, Running, run
+from go1exp.train.sweep.launchers import LAUNCHERS, chosen
+from go1exp.train.sweep.local import shares
+from go1exp.train.sweep.slurm import Slurm
+from go1exp.train.sweep.task import Task
+from go1exp.train.sweep.tune import Range, _rows
 
 CONF = data_root() / "conf"
 

@@ -39,7 +39,7 @@ def table(text: str) -> dict[int, str]:
     return {int(n): state.strip() for n, state in re.findall(r"^ +(\d+)  (.{8})  seed=", text, re.MULTILINE)}
 
 
-@pytest.mark.slow("go1exp/cli/", "go1exp/train/", "go1exp/signals.py")
+@pytest.mark.slow("go1exp/cli/", "go1exp/train/", "go1exp/base/signals.py")
 def test_a_sweep_outlives_a_failure_stops_at_ctrl_c_and_goes_on_with_the_line_that_it_prints(tmp_path: Path) -> None:
     done = cli(tmp_path, "train", "-m", "seed=1,2,3,4", *SMALL, code=BAD_DAY)
     assert done.returncode == 130, done.stderr

@@ -14,15 +14,15 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.compose import compose
-from go1exp.config import TrainConfig, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.config.compose import compose
+from go1exp.config.schema import plugins
+from go1exp.config.schema.registry import ConfigError, Entry, foreign, members
+from go1exp.extend.testing import check_term
 from go1exp.mdp import mirror
 from go1exp.mdp.mirror import Mirror
-from go1exp.schema import plugins
-from go1exp.schema.registry import ConfigError, Entry, foreign, members
-from go1exp.testing import check_term
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import memory_need
 from go1exp.train.loss import ppo_loss
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy
@@ -310,7 +310,7 @@ def test_the_images_count_in_the_memory_that_a_training_needs() -> None:
 
 
 PLUGIN = '''
-from go1exp.terms import Snapshot, mirror, observation
+from go1exp.extend import Snapshot, mirror, observation
 
 
 @observation("loads", size=4{})

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from go1exp.compose import compose
-from go1exp.config import parse_task
-from go1exp.env.core import Go1Core
-from go1exp.env.terms import Call
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.registry import ConfigError
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.terms import Call
+from go1exp.sim.task import parse_task
 
 
 def one_number(s: Snapshot) -> Tensor:

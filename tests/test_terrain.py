@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from go1exp.config import parse_parts
 from go1exp.mdp.curricula import terrain_levels_after
 from go1exp.mdp.ground import GroundHeight
-from go1exp.physics.terrain_geom import add_to_spec
-from go1exp.terrain import TILE_TYPES, Terrain, TerrainConfig, build_terrain, column_types
+from go1exp.sim.physics.terrain_geom import add_to_spec
+from go1exp.sim.task import parse_parts
+from go1exp.sim.terrain import TILE_TYPES, Terrain, TerrainConfig, build_terrain, column_types
 
 CONFIG = TerrainConfig(kind="tiles", rows=4, cols=10, border=2.0, seed=3)
 EVEN: dict[str, Any] = {

@@ -18,22 +18,22 @@ from typing import Any
 import pytest
 import yaml
 
-from go1exp import data_root
+from go1exp.base.errors import Expected
+from go1exp.base.paths import data_root
 from go1exp.cli.tune import _ranges
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.errors import Expected
-from go1exp.schema.registry import ConfigError
-from go1exp.sweep import trials
-from go1exp.sweep.command import Ended
-from go1exp.sweep.settings import TuneSettings
-from go1exp.sweep.tune import Range, Search
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.task import parse_train
 from go1exp.train import run_lock, wandb_writer
+from go1exp.train.sweep import trials
+from go1exp.train.sweep.command import Ended
+from go1exp.train.sweep.settings import TuneSettings
+from go1exp.train.sweep.tune import Range, Search
 from tests.command import environment
 from tests.command import run as cli
 from tests.small_run import SMALL
 
-ABOUT = ("go1exp/sweep/", "go1exp/cli/tune.py", "conf/tune.yaml")
+ABOUT = ("go1exp/train/sweep/", "go1exp/cli/tune.py", "conf/tune.yaml")
 NEEDS_OPTUNA = pytest.mark.skipif(
     importlib.util.find_spec("optuna") is None and not os.environ.get("GO1EXP_TEST_TUNE"),
     reason="no optuna: pip install 'go1exp[tune]'",

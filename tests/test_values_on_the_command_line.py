@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from go1exp.cli.app import App
-from go1exp.compose import compose
-from go1exp.config import parse_task
+from go1exp.config.compose import compose
+from go1exp.config.schema.joint_values import spread
 from go1exp.robot import JOINTS
-from go1exp.schema.joint_values import spread
+from go1exp.sim.task import parse_task
 
 
 def composed_by_app(tmp_path: Path, *arguments: str) -> dict[str, Any]:

@@ -15,11 +15,11 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from go1exp.env.core import Go1Core
-from go1exp.env.gym_env import Go1Env
-from go1exp.evaluate import camera as camera_module
-from go1exp.evaluate.camera import GROUND_RANGE, Camera, Picture, RenderingUnavailable, Stage, choose_gl
 from go1exp.evaluate.video import keeping, live, record, steer, write_gif, write_mp4, write_strip
+from go1exp.sim.env import camera as camera_module
+from go1exp.sim.env.camera import GROUND_RANGE, Camera, Picture, RenderingUnavailable, Stage, choose_gl
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.gym_env import Go1Env
 
 PLAIN = ("rand=none", "command=forward")
 MakeCore = Callable[..., Go1Core]

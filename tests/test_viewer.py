@@ -11,24 +11,35 @@ import numpy as np
 import pytest
 
 from go1exp import robot
+from go1exp.base.errors import Expected
 from go1exp.cli.play_web import _drivers, _grounds
 from go1exp.cli.subjects import driver, named
-from go1exp.compose import compose
-from go1exp.config import parse_parts
-from go1exp.errors import Expected
+from go1exp.config.compose import compose
+from go1exp.config.schema.contact import MUJOCO_CONTACT
+from go1exp.config.schema.registry import ConfigError
+from go1exp.evaluate.viewer import requests as wish
+from go1exp.evaluate.viewer.conditions import Setup
+from go1exp.evaluate.viewer.effects import catalogue, resized
+from go1exp.evaluate.viewer.gate import Gate, listening, words
+from go1exp.evaluate.viewer.history import SPAN, History
+from go1exp.evaluate.viewer.replay import (
+    Choose,
+    Magnify,
+    Motion,
+    Piece,
+    Play,
+    Player,
+    Seek,
+    Story,
+    of_recording,
+    of_result,
+)
+from go1exp.evaluate.viewer.replay_show import ReplayShow
+from go1exp.evaluate.viewer.session import Robots, Session
+from go1exp.evaluate.viewer.walk import WalkShow
 from go1exp.gap.result import GapResult, Overlay
-from go1exp.recording import Meta, Recording, RecordingError, joint_channels
-from go1exp.schema.contact import MUJOCO_CONTACT
-from go1exp.schema.registry import ConfigError
-from go1exp.viewer import requests as wish
-from go1exp.viewer.conditions import Setup
-from go1exp.viewer.effects import catalogue, resized
-from go1exp.viewer.gate import Gate, listening, words
-from go1exp.viewer.history import SPAN, History
-from go1exp.viewer.replay import Choose, Magnify, Motion, Piece, Play, Player, Seek, Story, of_recording, of_result
-from go1exp.viewer.replay_show import ReplayShow
-from go1exp.viewer.session import Robots, Session
-from go1exp.viewer.walk import WalkShow
+from go1exp.logs.recording import Meta, Recording, RecordingError, joint_channels
+from go1exp.sim.task import parse_parts
 
 GO1 = parse_parts(compose("train", []), ("robot",))[0]["robot"]
 
@@ -426,7 +437,7 @@ def test_setup_that_does_not_fit_is_a_refusal(robots: Robots) -> None:
 
 
 def test_the_page_of_the_documentation_names_the_keys_of_the_window() -> None:
-    from go1exp import data_root
+    from go1exp.base.paths import data_root
 
     text = (data_root() / "docs/viewer.md").read_text()
     for key in ("arrow", "space", "Backspace", "P"):

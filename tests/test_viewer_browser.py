@@ -20,14 +20,14 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from go1exp import data_root
+from go1exp.base.paths import data_root
 from tests.browser import CHROMIUM, Browser, wait_until
 
 PATIENCE = 120.0
 """How long something may take that draws without a graphics card beside other tests, s."""
 
 PARTS = (
-    "go1exp/viewer/",
+    "go1exp/evaluate/viewer/",
     "go1exp/cli/play_web.py",
     "go1exp/cli/play.py",
     "tests/browser.py",

@@ -14,18 +14,18 @@ import pytest
 pytest.importorskip("mujoco.studio")
 
 from go1exp.cli import gap, play, simulate
-from go1exp.compose import compose
-from go1exp.config import parse_train
-from go1exp.export.build import build
+from go1exp.config.compose import compose
+from go1exp.deploy.export.build import build
+from go1exp.evaluate.viewer import requests as ask
+from go1exp.evaluate.viewer import sim_process, web
+from go1exp.evaluate.viewer.gate import FIRST_PORT, listening
+from go1exp.evaluate.viewer.replay_show import ReplayShow
+from go1exp.evaluate.viewer.sim_show import SimShow
+from go1exp.evaluate.viewer.walk import WalkShow
 from go1exp.gap import files
-from go1exp.recording import write
+from go1exp.logs.recording import write
+from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
-from go1exp.viewer import requests as ask
-from go1exp.viewer import sim_process, web
-from go1exp.viewer.gate import FIRST_PORT, listening
-from go1exp.viewer.replay_show import ReplayShow
-from go1exp.viewer.sim_show import SimShow
-from go1exp.viewer.walk import WalkShow
 from tests.small_run import SMALL
 from tests.test_viewer import answer, recording
 

@@ -13,9 +13,9 @@ pytest.importorskip("mujoco.studio")
 
 from mujoco.studio import messages
 
-from go1exp.errors import Expected
-from go1exp.viewer.page_process import Mailbox, launch
-from go1exp.viewer.web import Ask, Shown
+from go1exp.base.errors import Expected
+from go1exp.evaluate.viewer.page_process import Mailbox, launch
+from go1exp.evaluate.viewer.web import Ask, Shown
 
 
 @pytest.fixture

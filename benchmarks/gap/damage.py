@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from go1exp.recording import Recording, joint_channel
+from go1exp.logs.recording import Recording, joint_channel
 
 
 def damage(recordings: list[Recording], kind: str, rng: np.random.Generator) -> list[Recording]:

@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.gap import cases, known, logger
 from benchmarks.gap.damage import damage, truncate
 from benchmarks.gap.simulate import simulate
-from go1exp.recording import Recording
+from go1exp.logs.recording import Recording
 
 
 def recordings(case: cases.Case) -> list[Recording]:

@@ -18,7 +18,7 @@ from benchmarks.gap.simulate import Episode, simulate
 from benchmarks.gap.truth import Truth, apply
 from benchmarks.gap.walking import KD, KP, PERIOD, Ground, Policy, follow, recorded, squat, walk
 from go1exp import robot
-from go1exp.recording import Recording
+from go1exp.logs.recording import Recording
 
 HUNG_DT, WALK_DT = 2.5e-4, 5e-4
 """Steps of the physics of hung and of walking robots, s; an error at half of the latter is the same within 1 %."""

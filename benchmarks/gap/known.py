@@ -1,6 +1,6 @@
 """What the solver may know beside the logs: the nominal robot, the tolerances, and the names that it may give.
 
-The numbers are copied from the effects' declared tolerances (``go1exp/effects``) on purpose and not imported: the
+The numbers are copied from the effects' declared tolerances (``go1exp/sim/effects``) on purpose and not imported: the
 benchmark must not change when the library does.
 """
 

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.gap.motions import RATE
 from benchmarks.gap.simulate import Episode, Samples, attitude
 from go1exp import robot
-from go1exp.recording import Meta, Recording, joint_channels, write
+from go1exp.logs.recording import Meta, Recording, joint_channels, write
 
 
 @dataclass(frozen=True)

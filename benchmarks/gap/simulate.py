@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.gap import laws, outside
 from benchmarks.gap.motions import RATE
 from benchmarks.gap.truth import Truth
-from go1exp import data_root, robot
+from go1exp import robot
+from go1exp.base.paths import data_root
 
 SETTLE = 0.8
 """Time for which the first target is held before the log begins, s."""

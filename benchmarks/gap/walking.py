@@ -17,8 +17,9 @@ from benchmarks.gap.logger import Logger, log
 from benchmarks.gap.motions import RATE
 from benchmarks.gap.simulate import Drive, Samples, compiled
 from benchmarks.gap.truth import Truth
-from go1exp import data_root, robot
-from go1exp.recording import VECTORS, Meta, Recording
+from go1exp import robot
+from go1exp.base.paths import data_root
+from go1exp.logs.recording import VECTORS, Meta, Recording
 
 PERIOD = 0.02
 """Period of a policy, s."""

@@ -11,7 +11,7 @@ import signal
 import sys
 from types import FrameType
 
-from go1exp import signals
+from go1exp.base import signals
 from go1exp.cli.verbs import LISTS as LISTS
 from go1exp.cli.verbs import MODULES as MODULES
 from go1exp.cli.verbs import ONE_BLAS_THREAD as ONE_BLAS_THREAD

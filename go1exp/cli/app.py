@@ -24,18 +24,18 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from go1exp.choices import CONFIG_DIR, given_folders
 from go1exp.cli import plugins
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.quoting import protected
 from go1exp.cli.verbs import FLAGS, VALUED
-from go1exp.compose import as_container, as_hydra_takes_them, composition_problem
-from go1exp.config_source import seen_by
-from go1exp.schema.registry import ConfigError, Expected
+from go1exp.config.choices import CONFIG_DIR, given_folders
+from go1exp.config.compose import as_container, as_hydra_takes_them, composition_problem
+from go1exp.config.schema.registry import ConfigError, Expected
+from go1exp.config.source import seen_by
 
 BAD_CONFIG, FAILED = 2, 1
 """Exit statuses: configuration refused before anything was built; the work failed. What a signal ended has
-``go1exp.signals.STOPPED``."""
+``go1exp.base.signals.STOPPED``."""
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from go1exp.base.files import write_json
 from go1exp.cli.app import App, spinner
-from go1exp.files import write_json
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
-    from go1exp.config import TaskConfig, TrainConfig
+    from go1exp.sim.task import TaskConfig, TrainConfig
 
 BARS = {
     "env_over_bare": (0.75, "environment over bare mujoco.batch of the same model"),
@@ -48,16 +48,16 @@ def _task(container: dict[str, Any]) -> None:
 
     settings = parse(BenchSettings, container)
 
-    from go1exp.compose import compose
-    from go1exp.config import parse_train
+    from go1exp.config.compose import compose
+    from go1exp.sim.task import parse_train
 
     on_gpu = settings.suite == "gpu"
     overrides = ["backend=warp" if on_gpu else f"backend.threads={settings.threads}", *settings.overrides]
     container = compose("train", overrides)
     config = parse_train(container)
 
-    from go1exp.bench import env, train
-    from go1exp.bench.measure import machine
+    from go1exp.evaluate.bench import env, train
+    from go1exp.evaluate.bench.measure import machine
 
     show = spinner(settings.rounds, f"measuring {settings.suite}")
     timing = (settings.num_envs, settings.rounds, settings.seconds, show)
@@ -66,11 +66,11 @@ def _task(container: dict[str, Any]) -> None:
     elif settings.suite == "train":
         figures = train.run(config, *timing)
     elif settings.suite == "deploy":
-        from go1exp.bench import deploy
+        from go1exp.evaluate.bench import deploy
 
         figures = deploy.run(container, *timing)
     elif settings.suite == "report":
-        from go1exp.bench import report
+        from go1exp.evaluate.bench import report
 
         figures = report.run(container, spinner(1, "measuring report"))
     elif settings.suite == "mpc":
@@ -94,10 +94,10 @@ def _task(container: dict[str, Any]) -> None:
 
 def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
     """Run the suite that also records and fits."""
-    import go1exp.excitations  # noqa: F401  (registers every excitation)
-    from go1exp.bench import actuator
+    import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
     from go1exp.cli.settings import RecordSettings, parse
-    from go1exp.compose import compose
+    from go1exp.config.compose import compose
+    from go1exp.evaluate.bench import actuator
 
     record = compose("record")
     wanted = {f.name for f in fields(RecordSettings)}
@@ -107,9 +107,9 @@ def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
 
 def _mpc(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
     """Run the suite of the model predictive controller, with its own settings."""
-    from go1exp.bench import mpc
     from go1exp.cli import controllers
-    from go1exp.compose import compose
+    from go1exp.config.compose import compose
+    from go1exp.evaluate.bench import mpc
 
     settings = controllers.chosen(compose("record")["controller"])
     assert settings is not None
@@ -122,7 +122,7 @@ def _gpu(config: TrainConfig, overrides: list[str], timing: tuple[Any, ...]) -> 
 
     if not torch.cuda.is_available():
         raise ConfigError(["suite=gpu: torch finds no CUDA device"])
-    from go1exp.bench import gpu
+    from go1exp.evaluate.bench import gpu
 
     print(gpu.gpu())
     return gpu.run(config, overrides, *timing)

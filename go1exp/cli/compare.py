@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 from go1exp.cli import other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.cli.protocols import RATES
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.subjects import Named, Variation
-    from go1exp.protocol.base import Chosen
-    from go1exp.protocol.result import Result
+    from go1exp.evaluate.protocol.base import Chosen
+    from go1exp.evaluate.protocol.result import Result
 
 
 def _task(container: dict[str, Any]) -> None:
-    import go1exp.protocol.kinds  # noqa: F401  (registers them)
+    import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
     from go1exp.cli.settings import CompareSettings, parse
     from go1exp.cli.subjects import driver, varied
-    from go1exp.protocol.base import chosen
+    from go1exp.evaluate.protocol.base import chosen
 
     other, container = other_robot.split(container)
     protocols, grid = chosen(container.pop("protocol"))
@@ -39,7 +39,7 @@ def _task(container: dict[str, Any]) -> None:
 
     from go1exp.cli.logs import writable
     from go1exp.cli.protocols import note_replaced, refuse
-    from go1exp.protocol.playing import Rates, play, refuse_lengths
+    from go1exp.evaluate.protocol.playing import Rates, play, refuse_lengths
 
     first = driver(subjects[0][0], other)
     robot_of = first.task if settings.same_robot else None
@@ -82,10 +82,10 @@ def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:
 
 def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any]) -> None:
     """Write page, JSON and rows, and print the verdicts."""
-    from go1exp.files import write_json, write_text
-    from go1exp.protocol import comparing
-    from go1exp.protocol.report.compare import page
-    from go1exp.protocol.result import as_json, finite, write_rows
+    from go1exp.base.files import write_json, write_text
+    from go1exp.evaluate.protocol import comparing
+    from go1exp.evaluate.protocol.report.compare import page
+    from go1exp.evaluate.protocol.result import as_json, finite, write_rows
 
     differences = {
         key: [d for r in results[1:] for d in comparing.compared(results[0], r)] for key, results in plays.items()
@@ -107,7 +107,7 @@ def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any])
 
 def lines(differences: dict[str, Any]) -> list[str]:
     """Return what a terminal shows: what is told apart, and how many figures are not."""
-    from go1exp.protocol.report.words import condition_text, interval_text
+    from go1exp.evaluate.protocol.report.words import condition_text, interval_text
 
     text_lines = []
     for key, those in differences.items():

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from go1exp import data_root
-from go1exp.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in, groups_of, load
+from go1exp.base.paths import data_root
 from go1exp.cli.verbs import POSITIONAL, SUBVERBS, VALUED, VERBS
+from go1exp.config.choices import CONFIG_DIR, choice_files, config_folder, given_folders, groups_in, groups_of, load
 
 OPTIONS = ("--help", "--cfg", "--multirun", "--config-dir", "--resolve", "--package", "--info")
 STAGES = ("check", "localise", "replay", "explain", "apply", "report", "view")
@@ -197,7 +197,7 @@ def _listed(folders: Sequence[Path]) -> list[str]:
 
 def _importers() -> list[str]:
     """Return the names of the importers, which are those of their files, but for the two that all of them share."""
-    files = (data_root() / "go1exp/importers").glob("[a-z]*.py")
+    files = (data_root() / "go1exp/logs/importers").glob("[a-z]*.py")
     return [file.stem for file in files if file.stem not in ("source", "table")]
 
 

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp.controller.settings import MpcSettings, parse_controller
+from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 
 if TYPE_CHECKING:
-    from go1exp.config import TaskConfig
-    from go1exp.controller.types import Controller
+    from go1exp.evaluate.controller.types import Controller
+    from go1exp.sim.task import TaskConfig
 
 CONDITIONS = "hop"
 """Shipped policy whose robot, ground and noise another controller walks under where no run is named."""
@@ -21,12 +21,12 @@ def chosen(given: Any) -> MpcSettings | None:
 
     Raises:
         ConfigError: with every problem of the settings.
-        go1exp.controller.forces.SolverError: if the controller's solver is not installed.
+        go1exp.evaluate.controller.forces.SolverError: if the controller's solver is not installed.
     """
     settings = parse_controller({"name": "policy"} if given is None else given)
     if not isinstance(settings, MpcSettings):
         return None
-    from go1exp.controller.forces import solver
+    from go1exp.evaluate.controller.forces import solver
 
     solver()  # before anything is built
     return settings
@@ -69,6 +69,6 @@ def task_of(run: Path) -> TaskConfig:
 
 def maker(settings: MpcSettings, task: TaskConfig) -> Callable[[], Controller]:
     """Return what makes one robot's controller."""
-    from go1exp.controller.mpc import Mpc
+    from go1exp.evaluate.controller.mpc import Mpc
 
     return lambda: Mpc(settings, task.robot.inertia)

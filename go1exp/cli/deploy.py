@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 from go1exp.cli import controllers
 from go1exp.cli.app import App
 from go1exp.cli.other_robot import CHOICES
-from go1exp.controller.settings import MpcSettings
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
+from go1exp.evaluate.controller.settings import MpcSettings
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import DeploySettings
-    from go1exp.deploy.controller import Mover
-    from go1exp.record.played import PlayedMotion
+    from go1exp.deploy.runtime.controller import Mover
+    from go1exp.logs.record.played import PlayedMotion
 
 
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.settings import DeploySettings, parse
-    from go1exp.schema.settings import subset
+    from go1exp.config.schema.settings import subset
 
     other = {name: container[name] for name in CHOICES if container.get(name) is not None}
     settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in CHOICES})
@@ -36,10 +36,10 @@ def _task(container: dict[str, Any]) -> int:
         rate, seconds = motion.rate, motion.seconds
 
     from go1exp.cli.logs import remove_empty, writable
-    from go1exp.deploy.commands import Wish
-    from go1exp.deploy.job import Job, run_job
-    from go1exp.deploy.launch import RefusedError
-    from go1exp.deploy.walk import Plan
+    from go1exp.deploy.runtime.commands import Wish
+    from go1exp.deploy.runtime.job import Job, run_job
+    from go1exp.deploy.runtime.launch import RefusedError
+    from go1exp.deploy.runtime.walk import Plan
 
     existed = Path(settings.out).exists()
     writable(settings.out)
@@ -89,7 +89,7 @@ def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled:
 def _check(settings: DeploySettings) -> int:
     """Look at the robot."""
     from go1exp import robot
-    from go1exp.deploy.job import CheckJob, run_check
+    from go1exp.deploy.runtime.job import CheckJob, run_check
 
     if settings.robot != "go1":
         raise ConfigError([f"check = true: is for robot=go1, not robot={settings.robot}"])
@@ -112,8 +112,8 @@ def _mover(controller: MpcSettings | None) -> Mover | None:
     """Return what walks in place of the bundle's policy, if anything does."""
     if controller is None:
         return None
-    from go1exp.controller.deployed import Deployed
-    from go1exp.controller.mpc import Mpc
+    from go1exp.evaluate.controller.deployed import Deployed
+    from go1exp.evaluate.controller.mpc import Mpc
 
     return Deployed(Mpc(controller))
 
@@ -128,7 +128,7 @@ def _motion(settings: DeploySettings, controlled: bool) -> PlayedMotion | None:
         raise ConfigError(["controller=mpc: walks; motion moves a robot that hangs. Leave out one of them"])
     if settings.robot == "sim" and settings.sim.start != "hung":
         raise ConfigError([f"motion = {settings.motion!r}: is for a robot that hangs; add sim.start=hung"])
-    from go1exp.record.played import played
+    from go1exp.logs.record.played import played
 
     return played(settings.motion, settings.seconds, settings.rate, settings.gains, settings.sim.seed)
 

@@ -6,7 +6,7 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from go1exp.schema.backends import BackendConfig
+    from go1exp.config.schema.backends import BackendConfig
 
 GROUP = "engine"
 
@@ -17,9 +17,9 @@ def split(container: dict[str, Any]) -> tuple[BackendConfig, dict[str, Any]]:
     Raises:
         ConfigError: with every problem of its settings, or if it is not installed.
     """
-    from go1exp.config import parse_parts
-    from go1exp.schema.backends import PhysxBackend
-    from go1exp.schema.registry import ConfigError
+    from go1exp.config.schema.backends import PhysxBackend
+    from go1exp.config.schema.registry import ConfigError
+    from go1exp.sim.task import parse_parts
 
     parts, problems = parse_parts(container, (GROUP,))
     if isinstance(parts.get(GROUP), PhysxBackend) and importlib.util.find_spec("sapien") is None:

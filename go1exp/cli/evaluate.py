@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
-from go1exp.schema.registry import ConfigError, Term, bind_list
+from go1exp.config.schema.registry import ConfigError, Term, bind_list
 
 if TYPE_CHECKING:
-    from go1exp.controller.settings import MpcSettings
-    from go1exp.schema.backends import BackendConfig
+    from go1exp.config.schema.backends import BackendConfig
+    from go1exp.evaluate.controller.settings import MpcSettings
 
 
 def _measures(given: Any) -> list[Term]:
     """Resolve the measures, all of them for None; raise ConfigError with every problem of them."""
-    from go1exp.measures import every_measure
+    from go1exp.mdp.measures import every_measure
 
     if given is None:
         return every_measure()
@@ -49,17 +49,17 @@ def _protocols(settings: Any, protocols: list[Any], judged: _Judged) -> None:
     folder = Path(settings.folder or subject.folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {str(folder)!r}: is a file"])
-    from go1exp.protocol.playing import Rates
+    from go1exp.evaluate.protocol.playing import Rates
 
     rates = Rates(settings.seed, settings.policy_dt, settings.physics_dt, judged.engine)
     play(protocols, subject, folder, judged.other, rates)
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.choices import config_folder, load
     from go1exp.cli.protocols import chosen as protocols_chosen
     from go1exp.cli.protocols import writable_file
     from go1exp.cli.settings import EvalSettings, parse
+    from go1exp.config.choices import config_folder, load
 
     judge, container = engine.split(container)
     other, container = other_robot.split(container)
@@ -106,8 +106,8 @@ def _grid(settings: Any, measures: list[Term], judged: _Judged, subject: tuple[P
     """Play the grid of constant commands."""
     from go1exp.evaluate import bars, files, table
     from go1exp.evaluate.delay_margin import delay_margin
-    from go1exp.evaluate.policy import load_run
     from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
+    from go1exp.train.policy import load_run
 
     run, checkpoint, out = subject
     policy, make = None, None

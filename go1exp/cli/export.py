@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from go1exp.base.files import write_bytes
 from go1exp.cli.app import App, spinner
 from go1exp.cli.quoting import command
-from go1exp.files import write_bytes
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -18,10 +18,10 @@ def _task(container: dict[str, Any]) -> None:
     checkpoint = checkpoint_file(run, settings.checkpoint)
 
     from go1exp.cli.logs import writable
-    from go1exp.config import parse_parts
-    from go1exp.deploy.bundle import loads
-    from go1exp.effects.rules import has_gains
-    from go1exp.export.build import build
+    from go1exp.deploy.export.build import build
+    from go1exp.deploy.runtime.bundle import loads
+    from go1exp.sim.effects.rules import has_gains
+    from go1exp.sim.task import parse_parts
     from go1exp.train import run_folder
 
     writable(str(out.parent))

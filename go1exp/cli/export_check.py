@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from go1exp.cli.app import App
 
 if TYPE_CHECKING:
-    from go1exp.deploy.bundle import Bundle
+    from go1exp.deploy.runtime.bundle import Bundle
 
 WIDTH = 120
 """Of the table where there is no terminal, characters."""
@@ -21,8 +21,8 @@ def _task(container: dict[str, Any]) -> None:
 
     from rich.console import Console
 
-    from go1exp.deploy.bundle import load
-    from go1exp.deploy.job import refuse_unfit
+    from go1exp.deploy.runtime.bundle import load
+    from go1exp.deploy.runtime.job import refuse_unfit
 
     bundle = load(Path(settings.file))
     refuse_unfit(bundle)

@@ -12,10 +12,10 @@ import yaml
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from go1exp.choices import choice_files, config_folder, groups_in, groups_of
-from go1exp.schema.registry import ConfigError
-from go1exp.schema.yaml_file import UNREADABLE, why_unreadable
-from go1exp.wording import NOT_FOR_TRAINING
+from go1exp.base.wording import NOT_FOR_TRAINING
+from go1exp.config.choices import choice_files, config_folder, groups_in, groups_of
+from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.yaml_file import UNREADABLE, why_unreadable
 
 PATHS = {"model": "mjcf"}
 """Group -> key of its files that names another file, from where the file itself lies."""

@@ -6,25 +6,25 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from go1exp.base.files import write_json
 from go1exp.cli.app import App, spinner
 from go1exp.cli.quoting import command
-from go1exp.files import write_json
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from go1exp.recording import Recording
-    from go1exp.robot import RobotConfig
+    from go1exp.logs.recording import Recording
+    from go1exp.robot.config import RobotConfig
 
 GO1 = "go1"
 
 
 def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[[Recording], np.ndarray]:
     """Return the function from a recording of a hung Go1 to the torques (T, 12) at its joints, N m."""
-    from go1exp.fit import FitError, smooth_motion
-    from go1exp.fit.smoothing import WINDOW
-    from go1exp.physics.inverse import joint_torques
+    from go1exp.gap.actuator_net import FitError, smooth_motion
+    from go1exp.gap.actuator_net.smoothing import WINDOW
+    from go1exp.sim.physics.inverse import joint_torques
 
     def joint_torque(recording: Recording) -> np.ndarray:
         base = recording.meta.base_quat
@@ -56,12 +56,12 @@ def _with_gains(recordings: list[Recording], gains: tuple[float, float] | None) 
 def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.settings import FitActuatorSettings
-    from go1exp.schema.settings import subset
+    from go1exp.config.schema.settings import subset
 
     settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
-    from go1exp import fit
     from go1exp.cli.logs import read_all, remove_empty, writable
+    from go1exp.gap import actuator_net as fit
 
     recordings = _with_gains(read_all(settings.recordings), settings.gains)
     existed = Path(settings.out).exists()

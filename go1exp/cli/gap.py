@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
+from go1exp.base.files import opened, write_json
 from go1exp.cli.app import App, spinner
 from go1exp.cli.play_web import address
 from go1exp.cli.quoting import command
-from go1exp.files import opened, write_json
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb
+    from go1exp.config.schema.contact import ContactConfig
     from go1exp.gap.result import GapResult
     from go1exp.gap.robots.protocol import Robot
-    from go1exp.recording import Recording
-    from go1exp.schema.contact import ContactConfig
+    from go1exp.logs.recording import Recording
 
 DOES_NOT_HOLD = 15
 """Exit status if what was found is not as good at the step of training."""
@@ -35,8 +35,8 @@ def with_logs(container: dict[str, Any]) -> dict[str, Any]:
     """
     from go1exp.cli.completion import STAGES
     from go1exp.cli.verbs import SUBVERBS
-    from go1exp.schema.registry import ConfigError, nearest, unknown_name
-    from go1exp.schema.settings import MISSING
+    from go1exp.config.schema.registry import ConfigError, nearest, unknown_name
+    from go1exp.config.schema.settings import MISSING
 
     words, stage = ("all", *STAGES, *SUBVERBS["gap"]), str(container.get("stage", "all"))
     is_verb = nearest(stage, words, 1) in [[verb] for verb in SUBVERBS["gap"]]
@@ -101,8 +101,8 @@ def _task(container: dict[str, Any]) -> int:
 
 def refuse_unknown(effects: Sequence[str]) -> None:
     """Raise ConfigError if no effect has one of the names of ``search.effects``."""
-    import go1exp.effects  # noqa: F401  (registers them)
-    from go1exp.schema.registry import ConfigError, members, unknown_name
+    import go1exp.sim.effects  # noqa: F401  (registers them)
+    from go1exp.config.schema.registry import ConfigError, members, unknown_name
 
     known = members("effect")
     if wrong := [unknown_name("search.effects", name, known, "effect") for name in effects if name not in known]:
@@ -133,8 +133,8 @@ def _progress() -> Callable[[str, float], None]:
 
 def _check(recordings: list[Recording], robot: Robot, settings: GapVerb) -> int:
     """Say whether the logs are fit to be compared, their floors, and which effects they could not show."""
-    from go1exp.audit import audit
     from go1exp.gap.stages.check import check
+    from go1exp.logs.audit import audit
 
     for recording in recordings:
         report = audit(recording)
@@ -229,8 +229,8 @@ def _print_next(lacking: dict[str, Any], robot: Robot, file: Path, contact: Cont
 
 def _contact_choice(contact: ContactConfig | None) -> dict[str, str]:
     """Return the choice of ``contact`` that training needs; nothing if it is the default or not known."""
-    from go1exp.choices import choice_files, config_folder, load
-    from go1exp.schema.contact import MUJOCO_CONTACT, read_contact
+    from go1exp.config.choices import choice_files, config_folder, load
+    from go1exp.config.schema.contact import MUJOCO_CONTACT, read_contact
 
     if contact is None or contact == MUJOCO_CONTACT:
         return {}

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from go1exp.base.files import write_json
 from go1exp.cli.app import App
-from go1exp.files import write_json
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.gap.stages.loop import Turn
@@ -17,15 +17,15 @@ TABLE = "loop.json"
 
 
 def _task(container: dict[str, Any]) -> int:
-    import go1exp.excitations
-    import go1exp.record.policy  # noqa: F401  (registers every excitation)
+    import go1exp.logs.excitations
+    import go1exp.logs.record.policy  # noqa: F401  (registers every excitation)
     from go1exp import robot as go1
     from go1exp.cli.gap import _progress, refuse_unknown
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.record import RIG, _motions
     from go1exp.cli.settings import GapLoopSettings
-    from go1exp.effects.rules import drive_problems
     from go1exp.gap.robots.description import Go1Model, parse_model
+    from go1exp.sim.effects.rules import drive_problems
 
     readers: dict[str, Any] = {"excitation": _motions, "model": parse_model}
     settings, parts = parse_with_groups(GapLoopSettings, container, RIG, **readers)
@@ -43,8 +43,8 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.logs import writable
     from go1exp.gap.robots.choice import robot_of
     from go1exp.gap.stages.loop import loop, table
-    from go1exp.record import plan
-    from go1exp.record.simulate import Rig
+    from go1exp.logs.record import plan
+    from go1exp.logs.record.simulate import Rig
 
     rig = Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
     episodes = plan.episodes(parts["excitation"], settings)
@@ -67,10 +67,10 @@ def _task(container: dict[str, Any]) -> int:
 
 def _keep(turn: Turn, out: Path) -> None:
     """Write what a round leaves, and say what it found."""
-    from go1exp import recording
     from go1exp.cli.gap_next import save
     from go1exp.gap import files
     from go1exp.gap.stages.loop import table
+    from go1exp.logs import recording
 
     folder = out / f"round_{turn.row.number}"
     (out / "recordings").mkdir(parents=True, exist_ok=True)

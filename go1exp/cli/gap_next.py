@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from go1exp.base.files import write_json
 from go1exp.cli.app import App
 from go1exp.cli.quoting import command
-from go1exp.files import write_json
 
 if TYPE_CHECKING:
     from go1exp.gap.stages.next import NextResult

@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from go1exp.cli.play_settings import Port
+from go1exp.config.schema.registry import FolderName
+from go1exp.config.schema.settings import settings
 from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.result import Angle, GapSettings
-from go1exp.record.plan import Wishes
-from go1exp.schema.registry import FolderName
-from go1exp.schema.settings import settings
+from go1exp.logs.record.plan import Wishes
 
 Logs = str | tuple[str, ...]
 """A folder of recordings, or folders and files."""

@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from go1exp.choices import about, choice_files, config_folder, given_folders, groups_of, load
 from go1exp.cli.verbs import LISTS, POSITIONAL, SUBVERBS, VALUED
+from go1exp.config.choices import about, choice_files, config_folder, given_folders, groups_of, load
 
 KEY_WIDTH = 34
 """Columns of ``key=value`` before the text beside it."""
@@ -76,7 +76,7 @@ def _positions(verb: str) -> float:
 
 def _refuse(title: str, word: str, known: Sequence[str]) -> None:
     """Say that there is no help for a word, and which ones look like it; leave."""
-    from go1exp.schema.registry import nearest
+    from go1exp.config.schema.registry import nearest
 
     close = " or ".join(repr(name) for name in nearest(word, known))
     hint = f"did you mean {close}?" if close else f"{title} --help lists them"
@@ -87,7 +87,7 @@ def _refuse(title: str, word: str, known: Sequence[str]) -> None:
 def _composed(verb: str, arguments: Sequence[str], folders: Sequence[Path]) -> dict[str, Any]:
     """Compose with the overrides among the arguments, or without them where they are wrong: help is for that too."""
     from go1exp.cli.files import choices_from_files
-    from go1exp.compose import compose
+    from go1exp.config.compose import compose
 
     overrides = [word for word in arguments if "=" in word and not word.startswith("-")]
     try:
@@ -137,8 +137,8 @@ def _group_page(
 
 def _slots(group: str) -> list[str]:
     """Explain the keys that every term of a group may have beside its own parameters."""
-    from go1exp.config import MANY_TERMS
-    from go1exp.schema.settings import attributes
+    from go1exp.config.schema.settings import attributes
+    from go1exp.sim.task import MANY_TERMS
 
     slots = MANY_TERMS.get(group)
     texts = attributes(slots) if slots else {}
@@ -151,12 +151,12 @@ def texts_of(verb: str) -> dict[str, str]:
     """Return what each setting of a verb means, by key path, groups left out."""
     from go1exp.cli.plugins import MEANING
     from go1exp.cli.settings import SETTINGS
-    from go1exp.schema.plugins import KEY
-    from go1exp.schema.settings import lines
+    from go1exp.config.schema.plugins import KEY
+    from go1exp.config.schema.settings import lines
 
     if verb != "train":
         return {**lines(SETTINGS[verb]), KEY: MEANING}
-    from go1exp.config import SECTIONS, ProcessConfig
+    from go1exp.sim.task import SECTIONS, ProcessConfig
 
     sections = [name for name in SECTIONS if name not in groups_of(verb)]
     return lines(ProcessConfig) | {k: v for name in sections for k, v in lines(SECTIONS[name], f"{name}.").items()}
@@ -164,11 +164,11 @@ def texts_of(verb: str) -> dict[str, str]:
 
 def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
     """Return what the keys of a group mean: those of a section by its class, a term by its docstring."""
-    from go1exp.config import ENGINES, ONE_TERM, REGISTERED_AS, SECTIONS
-    from go1exp.controller.settings import CONTROLLERS
-    from go1exp.schema.backends import BACKENDS
-    from go1exp.schema.registry import members
-    from go1exp.schema.settings import lines
+    from go1exp.config.schema.backends import BACKENDS
+    from go1exp.config.schema.registry import members
+    from go1exp.config.schema.settings import lines
+    from go1exp.evaluate.controller.settings import CONTROLLERS
+    from go1exp.sim.task import ENGINES, ONE_TERM, REGISTERED_AS, SECTIONS
 
     by_name = {**dict.fromkeys(ENGINES, BACKENDS), "controller": CONTROLLERS}
     if group in by_name:
@@ -176,8 +176,8 @@ def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
     if group in SECTIONS:
         return lines(SECTIONS[group], f"{group}.")
     if group == "protocol":
-        import go1exp.protocol.kinds  # noqa: F401  (registers them)
-        from go1exp.protocol.base import kinds
+        import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
+        from go1exp.evaluate.protocol.base import kinds
 
         return {k: v for key, kind in kinds(settings).items() for k, v in lines(kind, f"{group}.{key}.").items()}
     terms = members(REGISTERED_AS.get(group, group))

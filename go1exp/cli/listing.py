@@ -5,20 +5,18 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
-from go1exp.choices import about, choice_files, groups_in
 from go1exp.cli.app import App
-from go1exp.config_source import shown_folders
+from go1exp.config.choices import about, choice_files, groups_in
+from go1exp.config.source import shown_folders
 
 
 def _task(container: dict[str, Any]) -> None:
-    import go1exp.config
-    import go1exp.excitations
-    import go1exp.importers
-    import go1exp.measures
-    import go1exp.protocol.kinds
-    import go1exp.record.policy  # noqa: F401  (registers every member)
+    import go1exp.evaluate.protocol.kinds
+    import go1exp.logs.excitations
+    import go1exp.logs.importers
+    import go1exp.logs.record.policy  # noqa: F401  (registers every member)
     from go1exp.cli.settings import ListSettings, parse
-    from go1exp.schema import plugins, registry
+    from go1exp.config.schema import plugins, registry
 
     plugins.installed()
     settings = parse(ListSettings, container)
@@ -35,7 +33,7 @@ def _task(container: dict[str, Any]) -> None:
 
 
 def _print_group(group: str, choices: list[tuple[str, str]], what: str) -> None:
-    from go1exp.schema import plugins, registry
+    from go1exp.config.schema import plugins, registry
 
     terms = registry.members(group)
     print(group)

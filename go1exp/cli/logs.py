@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
-    from go1exp.recording import Recording
+    from go1exp.logs.recording import Recording
 
 FEWEST_ROWS = 4
 """Rows that a window must have."""
@@ -26,9 +26,9 @@ def files_of(places: str | Sequence[str]) -> list[Path]:
     """Return the recordings' files of a folder or file, or of several.
 
     Raises:
-        go1exp.recording.RecordingError: if a folder has none.
+        go1exp.logs.recording.RecordingError: if a folder has none.
     """
-    from go1exp.recording import RecordingError
+    from go1exp.logs.recording import RecordingError
 
     files: list[Path] = []
     for path in map(Path, [places] if isinstance(places, str) else places):
@@ -67,8 +67,8 @@ def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
 
     Whether the unit of the times is wrong, the audit's law says (``wrong_steps``).
     """
-    from go1exp.audit.log import Log
-    from go1exp.audit.single import wrong_steps
+    from go1exp.logs.audit.log import Log
+    from go1exp.logs.audit.single import wrong_steps
 
     fit = []
     for recording in recordings:
@@ -91,9 +91,9 @@ def read_all(places: str | Sequence[str]) -> list[Recording]:
     Recordings of one name from several folders are named after those, too: ``day1/run_0``, ``day2/run_0``.
 
     Raises:
-        go1exp.recording.RecordingError: if one is missing, damaged or given twice, or two in a folder have one name.
+        go1exp.logs.recording.RecordingError: if one is missing, damaged or given twice, or two share a name.
     """
-    from go1exp.recording import RecordingError, read
+    from go1exp.logs.recording import RecordingError, read
 
     files = files_of(places)
     twice = [str(path) for path, times in Counter(path.resolve() for path in files).items() if times > 1]

@@ -6,7 +6,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from go1exp.config import TaskConfig
+    from go1exp.sim.task import TaskConfig
 
 CHOICES = ("actuator", "effect", "contact")
 """Groups that a run's own choice can be replaced in; null or absent keeps it."""
@@ -18,8 +18,8 @@ def split(container: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         ConfigError: with every problem of the choices.
     """
-    from go1exp.config import parse_parts
-    from go1exp.schema.registry import ConfigError
+    from go1exp.config.schema.registry import ConfigError
+    from go1exp.sim.task import parse_parts
 
     chosen = {name: container[name] for name in CHOICES if container.get(name) is not None}
     parts, problems = parse_parts(chosen, tuple(chosen))
@@ -35,8 +35,8 @@ def replaced(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
         ConfigError: if actuator and effects do not go together.
     """
     from go1exp import robot
-    from go1exp.effects.rules import drive_problems
-    from go1exp.schema.registry import ConfigError
+    from go1exp.config.schema.registry import ConfigError
+    from go1exp.sim.effects.rules import drive_problems
 
     changed = dataclasses.replace(task, **parts)
     if problems := drive_problems(changed.actuator, changed.effect, robot.JOINTS):
@@ -46,7 +46,7 @@ def replaced(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
 
 def described(parts: dict[str, Any]) -> dict[str, Any]:
     """Return the choices as plain data, for a report."""
-    from go1exp.schema.registry import Term
+    from go1exp.config.schema.registry import Term
 
     def plain(part: Any) -> Any:
         if isinstance(part, tuple):

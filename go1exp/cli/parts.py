@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 from go1exp.cli.settings import parse
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 T = TypeVar("T")
 
@@ -23,7 +23,7 @@ def parse_with_groups(
     Args:
         kind: the class of the settings.
         container: the composed configuration.
-        groups: groups of ``go1exp.config`` that the verb has.
+        groups: groups of ``go1exp.sim.task`` that the verb has.
         **others: for each further key the function that reads it.
 
     Returns:
@@ -32,7 +32,7 @@ def parse_with_groups(
     Raises:
         ConfigError: with every problem of all of them.
     """
-    from go1exp.config import parse_parts
+    from go1exp.sim.task import parse_parts
 
     parts, problems = parse_parts(container, tuple(groups))
     for key, read in others.items():

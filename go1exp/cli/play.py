@@ -7,19 +7,19 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp import memory
+from go1exp.base import memory
 from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.app import App, spinner
 from go1exp.cli.play_web import address
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import PlaySettings
     from go1exp.cli.subjects import Named
-    from go1exp.env.core import Go1Core
-    from go1exp.evaluate.camera import Picture
-    from go1exp.evaluate.policy import Policy
-    from go1exp.terrain import TerrainConfig
+    from go1exp.sim.env.camera import Picture
+    from go1exp.sim.env.core import Go1Core
+    from go1exp.sim.terrain import TerrainConfig
+    from go1exp.train.policy import Policy
 
 FORMATS = (".mp4", ".gif")
 """Endings of a clip's file; the picture beside it is a .png."""
@@ -57,9 +57,9 @@ def _task(container: dict[str, Any]) -> None:
         writable_file(out)
 
     from go1exp.cli.subjects import driver
-    from go1exp.env.core import Go1Core
     from go1exp.evaluate.engine import require_agreement
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task
+    from go1exp.sim.env.core import Go1Core
 
     drives = driver(subject, other)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
@@ -76,7 +76,7 @@ def _ground(given: Any) -> TerrainConfig | None:
     """Return the ground that the group ``terrain`` names, None without it; raise ConfigError if it is none."""
     if given is None:
         return None
-    from go1exp.config import parse_parts
+    from go1exp.sim.task import parse_parts
 
     parts, problems = parse_parts({"terrain": given}, ("terrain",))
     if problems:
@@ -113,8 +113,8 @@ def _subject(settings: PlaySettings) -> Named:
 def _show(core: Go1Core, policy: Policy, settings: PlaySettings, out: Path | None) -> None:
     """Write clip and picture, or open the live viewer if there is no file for them."""
     from go1exp.evaluate import video
-    from go1exp.evaluate.camera import RenderingUnavailable
     from go1exp.evaluate.stick import picture
+    from go1exp.sim.env.camera import RenderingUnavailable
 
     if out is None:
         video.live(core, policy)

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from go1exp.schema.registry import Duration, FolderName, Speed
-from go1exp.schema.settings import settings
+from go1exp.config.schema.registry import Duration, FolderName, Speed
+from go1exp.config.schema.settings import settings
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 

@@ -8,22 +8,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp.choices import choice_files, config_folder, load
+from go1exp.base.errors import Expected
 from go1exp.cli.runs import shipped_policies
-from go1exp.errors import Expected
-from go1exp.schema.registry import ConfigError
+from go1exp.config.choices import choice_files, config_folder, load
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb, PlaySettings
     from go1exp.cli.subjects import Named
+    from go1exp.config.schema.backends import BackendConfig
+    from go1exp.deploy.sim_robot.machine import Body
+    from go1exp.deploy.sim_robot.settings import SimConfig
     from go1exp.evaluate.drivers import Driver
+    from go1exp.evaluate.viewer.conditions import Ground
     from go1exp.gap.robots.protocol import Robot
-    from go1exp.robot import RobotConfig
-    from go1exp.schema.backends import BackendConfig
-    from go1exp.sim_robot.machine import Body
-    from go1exp.sim_robot.settings import SimConfig
-    from go1exp.terrain import TerrainConfig
-    from go1exp.viewer.conditions import Ground
+    from go1exp.robot.config import RobotConfig
+    from go1exp.sim.terrain import TerrainConfig
 
 RUNS, MOST_RUNS = Path("runs"), 12
 """Where runs are looked for, and how many of the newest are offered."""
@@ -79,17 +79,17 @@ def walk(
         where: to listen, host and port.
     """
     require_studio()
-    from go1exp.tensors.threads import one_thread
+    from go1exp.base.tensors.threads import one_thread
 
     with one_thread():
         from go1exp.cli.subjects import driver
-        from go1exp.viewer import web
-        from go1exp.viewer.conditions import Setup
-        from go1exp.viewer.drive_window import DriveWindow
-        from go1exp.viewer.effects import catalogue
-        from go1exp.viewer.gamepad import Gamepad
-        from go1exp.viewer.session import Robots, Session
-        from go1exp.viewer.walk import WalkShow
+        from go1exp.evaluate.viewer import web
+        from go1exp.evaluate.viewer.conditions import Setup
+        from go1exp.evaluate.viewer.drive_window import DriveWindow
+        from go1exp.evaluate.viewer.effects import catalogue
+        from go1exp.evaluate.viewer.gamepad import Gamepad
+        from go1exp.evaluate.viewer.session import Robots, Session
+        from go1exp.evaluate.viewer.walk import WalkShow
 
         first = driver(subject, other)
         name, grounds = _grounds(ground or (first.task.terrain if settings.train_ground else None))
@@ -129,8 +129,8 @@ def _drivers(subject: Named, first: Driver, other: dict[str, Any]) -> dict[str, 
 
 def _grounds(wanted: TerrainConfig | None) -> tuple[str, dict[str, Ground]]:
     """Return the name of the ground that is wanted, and every ground; those of one kind that differ get a name."""
-    from go1exp.config import parse_parts
-    from go1exp.viewer.conditions import FLAT, grounds
+    from go1exp.evaluate.viewer.conditions import FLAT, grounds
+    from go1exp.sim.task import parse_parts
 
     known: dict[str, TerrainConfig] = {}
     for name, file in choice_files("terrain", [config_folder()]).items():
@@ -164,14 +164,14 @@ def sim(
         where: to serve the page, host and port.
     """
     require_studio()
-    from go1exp.sim_robot.alone import greeting
-    from go1exp.tensors.threads import one_thread
+    from go1exp.base.tensors.threads import one_thread
+    from go1exp.deploy.sim_robot.alone import greeting
 
     with one_thread():
-        from go1exp.viewer import web
-        from go1exp.viewer.sim_process import RobotProcess
-        from go1exp.viewer.sim_show import SimShow
-        from go1exp.viewer.sim_window import SimWindow
+        from go1exp.evaluate.viewer import web
+        from go1exp.evaluate.viewer.sim_process import RobotProcess
+        from go1exp.evaluate.viewer.sim_show import SimShow
+        from go1exp.evaluate.viewer.sim_window import SimWindow
 
         process = RobotProcess(groups, body.tile, config, robot_at, seconds, printed)
         try:
@@ -190,14 +190,14 @@ def printed(line: str) -> None:
 def log(file: Path, where: tuple[str, int]) -> None:
     """Show a recording, until Ctrl-C."""
     require_studio()
-    from go1exp.recording import read
+    from go1exp.logs.recording import read
 
     recording = read(file)
-    from go1exp.config import parse_parts
-    from go1exp.viewer import web
-    from go1exp.viewer.replay import of_recording
-    from go1exp.viewer.replay_show import ReplayShow
-    from go1exp.viewer.replay_window import ReplayWindow
+    from go1exp.evaluate.viewer import web
+    from go1exp.evaluate.viewer.replay import of_recording
+    from go1exp.evaluate.viewer.replay_show import ReplayShow
+    from go1exp.evaluate.viewer.replay_window import ReplayWindow
+    from go1exp.sim.task import parse_parts
 
     parts, _ = parse_parts({"robot": load(config_folder() / "robot" / "go1.yaml")}, ("robot",))
     story = of_recording(recording)
@@ -220,10 +220,10 @@ def gap(settings: GapVerb, robot: Robot, config: RobotConfig, where: tuple[str, 
 
     folder = Path(settings.out)
     result = files.load(folder)
-    from go1exp.viewer import web
-    from go1exp.viewer.replay import of_result
-    from go1exp.viewer.replay_show import ReplayShow, model_of
-    from go1exp.viewer.replay_window import ReplayWindow
+    from go1exp.evaluate.viewer import web
+    from go1exp.evaluate.viewer.replay import of_result
+    from go1exp.evaluate.viewer.replay_show import ReplayShow, model_of
+    from go1exp.evaluate.viewer.replay_window import ReplayWindow
 
     story = of_result(result, str(folder / files.RESULT))
     joints = story.pieces[0].joints

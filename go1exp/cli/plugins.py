@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from go1exp.schema import plugins
+from go1exp.config.schema import plugins
 
 MEANING = "files and packages with terms of your own, such as [my_terms.py] (docs/extending.md)"
 """Of the key ``plugins``, for the help."""

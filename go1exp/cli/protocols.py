@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from go1exp.cli import other_robot
 from go1exp.cli.app import spinner
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.subjects import Named
     from go1exp.evaluate.drivers import Driver
-    from go1exp.protocol.base import Chosen
-    from go1exp.protocol.playing import Rates
-    from go1exp.protocol.result import Result
+    from go1exp.evaluate.protocol.base import Chosen
+    from go1exp.evaluate.protocol.playing import Rates
+    from go1exp.evaluate.protocol.result import Result
 
 RATES = "rate"
 """Kind of protocol that only policies can play."""
@@ -37,8 +37,8 @@ def chosen(container: dict[str, Any], plain: dict[str, Any]) -> tuple[list[Chose
     Raises:
         ConfigError: with every problem; also for keys of the grid where it is not played.
     """
-    import go1exp.protocol.kinds  # noqa: F401  (registers them)
-    from go1exp.protocol.base import chosen as checked
+    import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
+    from go1exp.evaluate.protocol.base import chosen as checked
 
     protocols, grid = checked(container.get("protocol"))
     changed = [key for key in GRID_ONLY if not grid and key in plain and container.get(key) != plain[key]]
@@ -119,9 +119,9 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
     """Play protocols one after the other, write what came of each, and print the verdicts."""
     from go1exp.cli.logs import writable
     from go1exp.cli.subjects import driver
-    from go1exp.protocol.playing import play as played
-    from go1exp.protocol.playing import refuse_lengths
-    from go1exp.protocol.report.writing import write
+    from go1exp.evaluate.protocol.playing import play as played
+    from go1exp.evaluate.protocol.playing import refuse_lengths
+    from go1exp.evaluate.protocol.report.writing import write
 
     drives = driver(subject, other)
     refuse(protocols, drives)
@@ -139,8 +139,8 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
 
 def lines(result: Result) -> list[str]:
     """Return what a terminal shows of a result."""
-    from go1exp.protocol.claims import limits
-    from go1exp.protocol.report.words import condition_text, falls, interval_text
+    from go1exp.evaluate.protocol.claims import limits
+    from go1exp.evaluate.protocol.report.words import condition_text, falls, interval_text
 
     text_lines = [f"{result.chosen.key}: {result.label}, {result.seconds:.0f} s; {falls(result)}"]
     for v in result.verdicts:

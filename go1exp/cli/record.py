@@ -9,16 +9,17 @@ import numpy as np
 
 from go1exp.cli.app import App, spinner
 from go1exp.cli.quoting import command
-from go1exp.controller.settings import MpcSettings, parse_controller
-from go1exp.schema.registry import ConfigError, Term, bind_list
+from go1exp.config.schema.registry import ConfigError, Term, bind_list
+from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from go1exp.cli.settings import RecordSettings
-    from go1exp.record.plan import Episode
-    from go1exp.record.simulate import Rig
-    from go1exp.recording import Recording
+    from go1exp.logs.record.plan import Episode
+    from go1exp.logs.record.simulate import Rig
+    from go1exp.logs.recording import Recording
+    from go1exp.sim.env.core import Go1Core
 
 RIG = ("robot", "actuator", "effect", "terrain", "backend")
 """Groups of the configuration that describe the robot to be recorded."""
@@ -57,13 +58,13 @@ def _unused(settings: RecordSettings) -> list[str]:
 
 
 def _task(container: dict[str, Any]) -> None:
-    import go1exp.excitations
-    import go1exp.record.policy  # noqa: F401  (registers every excitation)
+    import go1exp.logs.excitations
+    import go1exp.logs.record.policy  # noqa: F401  (registers every excitation)
     from go1exp import robot
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.runs import trained
     from go1exp.cli.settings import RecordSettings
-    from go1exp.effects.rules import drive_problems, has_gains
+    from go1exp.sim.effects.rules import drive_problems, has_gains
 
     readers = {"excitation": _motions, "controller": parse_controller}
     groups = rig_groups(container)
@@ -83,15 +84,15 @@ def _task(container: dict[str, Any]) -> None:
         raise ConfigError(problems)
     walk = trained(settings.run, settings.policy, "", "")[0] if settings.run or settings.policy else None
 
+    from go1exp.base.wording import counted
     from go1exp.cli.logs import writable
-    from go1exp.record import plan
-    from go1exp.wording import counted
+    from go1exp.logs.record import plan
 
     driven = [m for m in motions if m.entry.name not in (POLICY, MPC)]
     episodes = plan.episodes(driven, settings)  # refuses wrong settings before the folder is made
     if names & {POLICY, MPC}:
         plan.refuse_too_long(settings, "episodes", settings.episodes)
-    from go1exp.record.simulate import Rig
+    from go1exp.logs.record.simulate import Rig
 
     rig = Rig(**{name: parts[name] for name in groups}, physics_dt=settings.physics_dt)
     out = writable(settings.out)
@@ -108,7 +109,7 @@ def _task(container: dict[str, Any]) -> None:
 
 def _record_motions(rig: Rig, episodes: list[Episode], settings: RecordSettings) -> list[Recording]:
     """Drive simulated robots through the motions; return a recording of each episode."""
-    from go1exp.record import simulate
+    from go1exp.logs.record import simulate
 
     if not episodes:
         return []
@@ -118,8 +119,8 @@ def _record_motions(rig: Rig, episodes: list[Episode], settings: RecordSettings)
 
 def _record_policy(rig: Rig, run: Path, settings: RecordSettings) -> list[Recording]:
     """Let the policy of a run move simulated robots; return a recording of each."""
-    from go1exp.evaluate.policy import load_run
-    from go1exp.record import simulate
+    from go1exp.logs.record import simulate
+    from go1exp.train.policy import load_run
 
     config, policy, _ = load_run(run)
     names = [f"policy_{settings.seed}_{k}" for k in range(settings.episodes)]
@@ -131,7 +132,7 @@ def _record_policy(rig: Rig, run: Path, settings: RecordSettings) -> list[Record
 
 def _misfits(settings: RecordSettings, parts: dict[str, Any]) -> list[str]:
     """Return why a model predictive controller cannot walk this robot, and look for its solver."""
-    from go1exp.controller.forces import solver
+    from go1exp.evaluate.controller.forces import solver
 
     wrong = []
     if parts["controller"].name != MPC:
@@ -145,23 +146,28 @@ def _misfits(settings: RecordSettings, parts: dict[str, Any]) -> list[str]:
 def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> list[Recording]:
     """Let a model predictive controller walk simulated robots by targets alone; return a recording of each."""
     from go1exp.cli import controllers
-    from go1exp.compose import compose
-    from go1exp.config import parse_train
-    from go1exp.controller.as_targets import AsTargets
-    from go1exp.record import simulate
+    from go1exp.config.compose import compose
+    from go1exp.evaluate.controller.as_targets import AsTargets
+    from go1exp.evaluate.controller.batch import Driven
+    from go1exp.logs.record import simulate
+    from go1exp.sim.task import parse_train
 
     task = parse_train(compose("train", [f"command={COMMANDS}"])).task
     make = controllers.maker(controller, task)
     gains = [np.array(simulate.configured(rig.actuator, name)) for name in ("kp", "kd")]
     names = [f"mpc_{settings.seed}_{k}" for k in range(settings.episodes)]
-    walk = simulate.Walk(task, None, names, settings.seconds, None, lambda: AsTargets(make(), *gains), MPC)
+
+    def drive(core: Go1Core) -> Driven:
+        return Driven(core, lambda: AsTargets(make(), *gains), noise=False, seed=settings.seed)
+
+    walk = simulate.Walk(task, None, names, settings.seconds, None, drive, MPC)
     return simulate.play_policy(rig, walk, settings.sensors, settings.seed, spinner(1, "recording a controller"))
 
 
 def _write(out: Path, recordings: list[Recording]) -> None:
     """Write the recordings and print what to do with them."""
-    from go1exp import recording
-    from go1exp.wording import counted
+    from go1exp.base.wording import counted
+    from go1exp.logs import recording
 
     for r in recordings:
         recording.write(out / f"{r.meta.episode}.parquet", r)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from go1exp.base.files import write_json
 from go1exp.cli.app import App
-from go1exp.files import write_json
 
 STATUS = {"ok": 0, "suspect": 3, "bad": 4}
 """Exit status of each verdict; the worst counts."""
@@ -15,11 +15,11 @@ STATUS = {"ok": 0, "suspect": 3, "bad": 4}
 def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.logs import files_of
     from go1exp.cli.settings import AuditSettings, parse
-    from go1exp.recording import RecordingError
+    from go1exp.logs.recording import RecordingError
 
     settings = parse(AuditSettings, container)
 
-    from go1exp.audit import AuditReport, audit_file, clock_flaws
+    from go1exp.logs.audit import AuditReport, audit_file, clock_flaws
 
     reports: dict[str, Any] = {}
     folders: dict[Path, dict[Path, AuditReport]] = {}

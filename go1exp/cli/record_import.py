@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any
 from go1exp.cli.app import App
 
 if TYPE_CHECKING:
-    from go1exp.recording import Recording
+    from go1exp.logs.recording import Recording
 
 NAMED = 3
 """Most files that a note names."""
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp import recording
+    from go1exp.base.wording import counted
     from go1exp.cli.files import mapping_of
     from go1exp.cli.logs import writable
     from go1exp.cli.settings import ImportSettings, parse
-    from go1exp.importers import import_recordings
-    from go1exp.wording import counted
+    from go1exp.logs import recording
+    from go1exp.logs.importers import import_recordings
 
     settings = parse(ImportSettings, container)
     options = mapping_of(settings.options, "options")
@@ -44,7 +44,7 @@ def _task(container: dict[str, Any]) -> None:
 
 def _refuse_one_name(path: str, names: Sequence[str]) -> None:
     """Raise RecordingError if two recordings of one call have one name: the second would replace the first."""
-    from go1exp.recording import RecordingError
+    from go1exp.logs.recording import RecordingError
 
     twice = [name for name, times in Counter(names).items() if times > 1]
     if twice:
@@ -56,9 +56,9 @@ def _refuse_one_name(path: str, names: Sequence[str]) -> None:
 
 def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
     """Return what is wrong with clocks whose steps are too long or too short, one line for all of one kind."""
-    from go1exp.audit.limits import LEAST_STEP
-    from go1exp.audit.log import Log
-    from go1exp.audit.single import wrong_steps
+    from go1exp.logs.audit.limits import LEAST_STEP
+    from go1exp.logs.audit.log import Log
+    from go1exp.logs.audit.single import wrong_steps
 
     flaws: dict[str, list[str]] = {}
     for r in recordings:

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.cli.app import App, spinner
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
-    from go1exp.protocol.base import Chosen
-    from go1exp.report.made import Report
-    from go1exp.report.runs import Study
-    from go1exp.report.settings import ReportSettings
+    from go1exp.evaluate.protocol.base import Chosen
+    from go1exp.evaluate.report.made import Report
+    from go1exp.evaluate.report.runs import Study
+    from go1exp.evaluate.report.settings import ReportSettings
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -28,20 +28,20 @@ def _task(container: dict[str, Any]) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {str(folder)!r}: is a file"])
 
-    from go1exp.report.runs import study
+    from go1exp.evaluate.report.runs import study
 
     runs = study(settings.folders, settings.unfinished)
     if settings.eval:
         _evaluate(runs, settings, protocols)
-    from go1exp.report.made import report
-    from go1exp.report.writing import write
+    from go1exp.evaluate.report.made import report
+    from go1exp.evaluate.report.writing import write
 
     made = report(runs, settings, dataclasses.asdict(settings))
     files = write(made, folder)
     print("\n".join(lines(made)))
     print(f"written to {files[0]}; {files[1].name} and {len(files) - 2} CSV files beside it")
     if settings.wandb:
-        from go1exp.report.tables import plain_rows
+        from go1exp.evaluate.report.tables import plain_rows
         from go1exp.train.metrics import log_tables
 
         log_tables(plain_rows(made), files[0], settings.project, settings.wandb, folder)
@@ -49,8 +49,8 @@ def _task(container: dict[str, Any]) -> None:
 
 def _protocols(given: Any, asked: bool) -> list[Chosen | None]:
     """Return what ``eval=true`` plays, None for the grid; raise ConfigError with every problem."""
-    import go1exp.protocol.kinds  # noqa: F401  (registers them)
-    from go1exp.protocol.base import chosen
+    import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
+    from go1exp.evaluate.protocol.base import chosen
 
     protocols, grid = chosen(given)
     if protocols and not asked:
@@ -61,9 +61,9 @@ def _protocols(given: Any, asked: bool) -> list[Chosen | None]:
 
 def _evaluate(runs: Study, settings: ReportSettings, protocols: Sequence[Chosen | None]) -> None:
     """Evaluate what is missing, and say what is being done."""
-    import go1exp.measures  # noqa: F401  (registers them)
-    from go1exp.report.evaluating import evaluate_missing, missing
-    from go1exp.report.evaluations import check_figures, evaluations
+    import go1exp.mdp.measures  # noqa: F401  (registers them)
+    from go1exp.evaluate.report.evaluating import evaluate_missing, missing
+    from go1exp.evaluate.report.evaluations import check_figures, evaluations
 
     if settings.figures:  # before hours of evaluations
         check_figures(settings.figures, evaluations(dataclasses.replace(runs, notes=[])), protocols)
@@ -77,8 +77,8 @@ def _evaluate(runs: Study, settings: ReportSettings, protocols: Sequence[Chosen 
 
 def lines(made: Report) -> list[str]:
     """Return what a terminal shows: groups, what does not count, remarks, verdicts."""
-    from go1exp.protocol.report.words import interval_text, number
-    from go1exp.report.tables import counts
+    from go1exp.evaluate.protocol.report.words import interval_text, number
+    from go1exp.evaluate.report.tables import counts
 
     runs = sum(len(g.runs) for g in made.groups)
     text_lines = [f"{runs} runs in {len(made.groups)} groups; baseline: {made.baseline.name}"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from go1exp import data_root
-from go1exp.schema.registry import ConfigError, unknown_name
+from go1exp.base.paths import data_root
+from go1exp.config.schema.registry import ConfigError, unknown_name
 
 
 def run_folder(path: str, key: str = "run") -> Path:

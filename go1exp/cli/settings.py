@@ -11,16 +11,16 @@ from go1exp.cli.gap_settings import GapLoopSettings as GapLoopSettings
 from go1exp.cli.gap_settings import GapNextSettings as GapNextSettings
 from go1exp.cli.gap_settings import GapVerb as GapVerb
 from go1exp.cli.play_settings import PlaySettings as PlaySettings
-from go1exp.deploy.controller import Stages
-from go1exp.fit.settings import FitSettings
-from go1exp.protocol.settings import CompareSettings
-from go1exp.record.plan import Wishes
-from go1exp.report.settings import ReportSettings
-from go1exp.schema import settings as schema
-from go1exp.schema.registry import Duration, FolderName, NonNegative, Positive, Speed
-from go1exp.schema.settings import settings
-from go1exp.sim_robot.settings import SimConfig, SimSettings
-from go1exp.sweep.settings import TuneSettings
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import Duration, FolderName, NonNegative, Positive, Speed
+from go1exp.config.schema.settings import settings
+from go1exp.deploy.runtime.controller import Stages
+from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
+from go1exp.evaluate.protocol.settings import CompareSettings
+from go1exp.evaluate.report.settings import ReportSettings
+from go1exp.gap.actuator_net.settings import FitSettings
+from go1exp.logs.record.plan import Wishes
+from go1exp.train.sweep.settings import TuneSettings
 
 T = TypeVar("T")
 
@@ -348,7 +348,7 @@ SETTINGS: dict[str, type] = {
     "bench": BenchSettings,
     "tune": TuneSettings,
 }
-"""Verbs besides ``train``, whose sections are in ``go1exp.config``, and the class of each one's settings."""
+"""Verbs besides ``train``, whose sections are in ``go1exp.sim.task``, and the class of each one's settings."""
 
 
 def parse(kind: type[T], container: Mapping[str, Any]) -> T:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from go1exp.cli.app import App
-from go1exp.schema.registry import ConfigError
-from go1exp.schema.settings import subset
+from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.settings import subset
 
 BODY = ("robot", "actuator", "effect", "contact", "terrain")
 """Groups of the configuration that describe the robot and its ground."""
@@ -16,10 +16,10 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp import robot
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.play_web import address
-    from go1exp.deploy.address import parsed_address
-    from go1exp.effects.rules import drive_problems
-    from go1exp.sim_robot.machine import Body, Robot
-    from go1exp.sim_robot.settings import SimConfig, SimSettings
+    from go1exp.deploy.runtime.address import parsed_address
+    from go1exp.deploy.sim_robot.machine import Body, Robot
+    from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
+    from go1exp.sim.effects.rules import drive_problems
 
     settings, parts = parse_with_groups(SimSettings, container, BODY)
     if problems := drive_problems(parts["actuator"], parts["effect"], robot.JOINTS):
@@ -35,8 +35,8 @@ def _task(container: dict[str, Any]) -> int:
 
     import torch
 
-    from go1exp.sim_robot.alone import greeting, serve
-    from go1exp.sim_robot.server import Server
+    from go1exp.deploy.sim_robot.alone import greeting, serve
+    from go1exp.deploy.sim_robot.server import Server
 
     torch.set_num_threads(1)
     server = Server(Robot(body, config), config, where[1], where[0])

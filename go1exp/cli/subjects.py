@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from go1exp.choices import choice_files, config_folder, load
 from go1exp.cli import controllers, engine, other_robot
 from go1exp.cli.runs import checkpoint_file, run_folder, shipped_policies, trained
-from go1exp.schema.registry import ConfigError
+from go1exp.config.choices import choice_files, config_folder, load
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
-    from go1exp.config import TaskConfig
-    from go1exp.controller.settings import MpcSettings
+    from go1exp.config.schema.backends import BackendConfig
+    from go1exp.evaluate.controller.settings import MpcSettings
     from go1exp.evaluate.drivers import Driver
-    from go1exp.schema.backends import BackendConfig
+    from go1exp.sim.task import TaskConfig
 
 
 @dataclass(frozen=True)
@@ -150,14 +150,14 @@ def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = 
 
     Raises:
         ConfigError: if a run's configuration is not one that this version knows.
-        go1exp.deploy.archive.BundleError: if a bundle is damaged or was changed.
+        go1exp.deploy.runtime.archive.BundleError: if a bundle is damaged or was changed.
     """
     from go1exp.evaluate.drivers import PolicyDriver
-    from go1exp.protocol.bundles import BundleDriver
+    from go1exp.evaluate.protocol.bundles import BundleDriver
 
     if subject.bundle is not None:
-        from go1exp.config import parse_train
-        from go1exp.deploy.bundle import load
+        from go1exp.deploy.runtime.bundle import load
+        from go1exp.sim.task import parse_train
 
         bundle = load(subject.bundle)
         task = _robot(parse_train(bundle.config).task, other, robot_of)
@@ -166,7 +166,7 @@ def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = 
     assert subject.run is not None
     if subject.controller is not None:
         return _controlled(subject, subject.controller, other, robot_of)
-    from go1exp.evaluate.policy import load_run
+    from go1exp.train.policy import load_run
 
     of_run, policy, about = load_run(subject.run, subject.checkpoint)
     return PolicyDriver(subject.label, _robot(of_run.task, other, robot_of), policy, about)

@@ -24,16 +24,16 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from go1exp.base.signals import STOPPED
 from go1exp.cli.app import FAILED, App, Left, Refused, spinner
 from go1exp.cli.quoting import command, quoted
-from go1exp.compose import compose
-from go1exp.schema.registry import ConfigError
-from go1exp.signals import STOPPED
-from go1exp.sweep.command import CORES, PARENT, Command, Ended
+from go1exp.config.compose import compose
+from go1exp.config.schema.registry import ConfigError
+from go1exp.train.sweep.command import CORES, PARENT, Command, Ended
 
 if TYPE_CHECKING:
-    from go1exp.sweep.index import Index
-    from go1exp.sweep.task import Launcher, Task
+    from go1exp.train.sweep.index import Index
+    from go1exp.train.sweep.task import Launcher, Task
 
 LOG = "job.log"
 """In the run folder of a job that ran in a process of its own: what it printed."""
@@ -119,8 +119,8 @@ def begin(rules: Rules, folder: Path, listed: Sequence[list[str]], launcher: dic
     Raises:
         ConfigError: with every problem of every job, each with the first job that has it; then no folder is left.
     """
-    from go1exp.sweep import index, launchers
     from go1exp.train import run_lock
+    from go1exp.train.sweep import index, launchers
 
     runs = launchers.built(launchers.chosen(launcher))
     common = set.intersection(*map(set, listed)) if len(listed) > 1 else set()
@@ -158,8 +158,8 @@ def go_on(rules: Rules, folder: Path, overrides: list[str], launcher: dict[str, 
         ConfigError: if an override changes what it may not, or a job cannot run here.
         Expected: if there is no sweep in ``folder``.
     """
-    from go1exp.sweep import index, launchers
     from go1exp.train import run_lock
+    from go1exp.train.sweep import index, launchers
 
     known = index.read(folder)
     known = replace(known, launcher=launcher or known.launcher)
@@ -257,7 +257,7 @@ class _Watch:
 
     def changed(self) -> None:
         """Look at the run folders; write and tell what is new."""
-        from go1exp.sweep import index
+        from go1exp.train.sweep import index
 
         now = index.looked_at(self.index, self.folder, self.causes)
         new = [job for job, old in zip(now.jobs, self.index.jobs, strict=True) if job.state != old.state]
@@ -271,7 +271,7 @@ class _Watch:
 
     def write(self) -> None:
         """Write the index; where that fails, the run folders know the same."""
-        from go1exp.sweep import index
+        from go1exp.train.sweep import index
 
         try:
             index.write(self.folder, self.index)
@@ -283,8 +283,8 @@ class _Watch:
 
 def _launch(rules: Rules, folder: Path, known: Index, runs: Launcher, overrides: list[str]) -> int:
     """Run what is not done in a folder that is locked; tell of the sweep; return the exit status."""
-    from go1exp.sweep import index
-    from go1exp.sweep.task import Task
+    from go1exp.train.sweep import index
+    from go1exp.train.sweep.task import Task
 
     fresh = tuple(replace(job, state="waiting", cause="") for job in known.jobs)
     watch = _Watch(folder, index.looked_at(replace(known, jobs=fresh), folder))

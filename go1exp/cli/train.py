@@ -11,18 +11,18 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from go1exp.choices import config_folder, given_folders
+from go1exp.base.signals import STOPPED
 from go1exp.cli import sweep
 from go1exp.cli.app import App, discard, run_dir
 from go1exp.cli.quoting import command
 from go1exp.cli.runs import run_folder as existing
 from go1exp.cli.runs import shipped_policies
-from go1exp.compose import key_values
-from go1exp.schema.registry import ConfigError
-from go1exp.signals import STOPPED
+from go1exp.config.choices import config_folder, given_folders
+from go1exp.config.compose import key_values
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
-    from go1exp.config import TrainConfig
+    from go1exp.sim.task import TrainConfig
     from go1exp.train.start import Weights
 
 RESUMABLE = (
@@ -105,7 +105,7 @@ def resolved(container: dict[str, Any], overrides: list[str], run: Path) -> Trai
     Raises:
         ConfigError: with everything that is wrong.
     """
-    from go1exp.config import parse_train
+    from go1exp.sim.task import parse_train
 
     config = parse_train(container)
     if config.process.resume:
@@ -169,7 +169,7 @@ def _planned(run: Path, overrides: list[str]) -> TrainJob:
     Raises:
         ConfigError: if they change what they may not.
     """
-    from go1exp.config import parse_train
+    from go1exp.sim.task import parse_train
     from go1exp.train import kept_plugins, run_folder
 
     container = _resumed(run, overrides)
@@ -183,7 +183,7 @@ def _planned(run: Path, overrides: list[str]) -> TrainJob:
 
 def plan(job: TrainJob) -> None:
     """Write the run folder of a job that has not begun; one that has begun stays as it is."""
-    from go1exp.schema import plugins
+    from go1exp.config.schema import plugins
     from go1exp.train import run_folder, run_state
 
     if run_state.read(job.run).state == "not started":

@@ -14,11 +14,11 @@ from hydra.errors import HydraException
 
 from go1exp.cli.app import FAILED, App
 from go1exp.cli.quoting import command
-from go1exp.compose import compose_checked
-from go1exp.schema.registry import ConfigError
+from go1exp.config.compose import compose_checked
+from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
-    from go1exp.sweep.tune import Range
+    from go1exp.train.sweep.tune import Range
 
 FORMS = "key=interval(low,high), key=tag(log,interval(low,high)), key=range(first,end) or key=choice(a,b)"
 
@@ -56,7 +56,7 @@ def _empty(drawn: Range) -> str | None:
 
 def _drawn(override: Override) -> Range:
     """Return the range that an override in Hydra's grammar for sweeps stands for; ValueError if it is none."""
-    from go1exp.sweep.tune import Range
+    from go1exp.train.sweep.tune import Range
 
     value = override.value()
     if isinstance(value, IntervalSweep) and value.start is not None and value.end is not None:
@@ -77,7 +77,7 @@ def _task(container: dict[str, Any]) -> int | None:
         raise ConfigError(["go1exp tune needs the package optuna: pip install 'go1exp[tune]'"])
 
     from go1exp.cli import train
-    from go1exp.sweep.tune import EVALUATED, Search
+    from go1exp.train.sweep.tune import EVALUATED, Search
 
     def plan(overrides: Sequence[str], run: Path) -> None:
         job = train.resolved(compose_checked("train", overrides), list(overrides), run)

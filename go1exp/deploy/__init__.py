@@ -1,1 +1,1 @@
-"""The runtime on the robot. It imports NumPy, onnxruntime and the standard library; no torch, engine or Hydra."""
+"""From run folder to robot: export, estimation, the runtime, a simulated robot to try it on."""

@@ -6,8 +6,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from go1exp.errors import Expected
-from go1exp.signals import STOPPED, handled, interrupt, say
+from go1exp.base.errors import Expected
+from go1exp.base.signals import STOPPED, handled, interrupt, say
 
 FAILED = 1
 
@@ -27,7 +27,7 @@ def not_negative(text: str) -> float:
 
 def arguments(given: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
-    from go1exp.deploy.walk import Plan
+    from go1exp.deploy.runtime.walk import Plan
 
     parser = argparse.ArgumentParser("python -m go1exp.deploy", description="Run a bundle's policy on a robot.")
     parser.add_argument("bundle", help="file that go1exp export wrote")
@@ -86,9 +86,9 @@ def main(given: Sequence[str]) -> int:
 
 
 def _walk(options: argparse.Namespace) -> int:
-    from go1exp.deploy.commands import Wish, parsed
-    from go1exp.deploy.job import Job, run_job
-    from go1exp.deploy.walk import Plan
+    from go1exp.deploy.runtime.commands import Wish, parsed
+    from go1exp.deploy.runtime.job import Job, run_job
+    from go1exp.deploy.runtime.walk import Plan
 
     try:
         amplitude = tuple(float(part) for part in options.amplitude.split(","))
@@ -121,8 +121,8 @@ def _check(options: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from go1exp.deploy.bundle import load
-    from go1exp.deploy.job import CheckJob, run_check
+    from go1exp.deploy.runtime.bundle import load
+    from go1exp.deploy.runtime.job import CheckJob, run_check
 
     if options.robot != "go1":
         raise ValueError(f"--check with --robot {options.robot}: is for --robot go1")

@@ -17,9 +17,9 @@ from typing import Any
 
 import torch
 
-from go1exp.evaluate.policy import load_run
+from go1exp.config.schema.backends import CpuBackend
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
-from go1exp.schema.backends import CpuBackend
+from go1exp.train.policy import load_run
 
 FALLEN = 1.0
 """Error that a robot on the ground counts with, at least, m/s."""
@@ -67,8 +67,8 @@ def evaluated(run: Path, policy_file: Path, settings: dict[str, Any]) -> dict[st
 
 def film(run: Path, policy_file: Path, settings: dict[str, Any], out: Path) -> None:
     """Film a policy file of a run on the nominal robot on flat ground; write an MP4 file."""
-    from go1exp.env.core import Go1Core
     from go1exp.evaluate import video
+    from go1exp.sim.env.core import Go1Core
 
     config, policy, _ = load_run(run, policy_file)
     shown = EvalConfig(

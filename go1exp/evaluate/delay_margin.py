@@ -6,11 +6,11 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from go1exp.config import TaskConfig
-from go1exp.controller.types import Controller
-from go1exp.evaluate.policy import Policy
+from go1exp.config.schema.registry import Term, members
+from go1exp.evaluate.controller.types import Controller
 from go1exp.evaluate.rollout import EvalConfig, evaluate
-from go1exp.schema.registry import Term, members
+from go1exp.sim.task import TaskConfig
+from go1exp.train.policy import Policy
 
 DELAYS_MS = (10, 20, 30, 40)
 

@@ -1,4 +1,4 @@
-"""What drives robots that are judged: a trained policy, or another controller (a bundle: protocol/bundles.py)."""
+"""What drives robots in evaluation: a trained policy or another controller (bundles: evaluate/protocol/bundles.py)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from go1exp.config import TaskConfig
-from go1exp.controller.batch import Driven
-from go1exp.controller.types import Controller
-from go1exp.deploy.past import Past
-from go1exp.env.core import Go1Core
+from go1exp.config.schema.history import history_columns
+from go1exp.deploy.runtime.past import Past
+from go1exp.evaluate.controller.batch import Driven
+from go1exp.evaluate.controller.types import Controller
 from go1exp.evaluate.estimated import TERM, EstimatedVelocity
 from go1exp.evaluate.observed import TrunkVelocity, columns
-from go1exp.evaluate.policy import Policy
-from go1exp.schema.history import history_columns
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig
+from go1exp.train.policy import Policy
 
 
 class Pilot(Protocol):
@@ -119,7 +119,7 @@ class _PolicyPilot:
 
 @dataclass(frozen=True)
 class ControllerDriver:
-    """Controllers of their own rate, one for each robot (``go1exp/controller``)."""
+    """Controllers of their own rate, one for each robot (``go1exp/evaluate/controller``)."""
 
     label: str
     task: TaskConfig

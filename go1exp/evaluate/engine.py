@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from go1exp.config import TaskConfig
-from go1exp.env.engine import make_backend
-from go1exp.physics.agreement import Check, require, robots_needed
-from go1exp.physics.scene import build_model
-from go1exp.schema.backends import CpuBackend
-from go1exp.terrain import TerrainConfig, build_terrain
+from go1exp.config.schema.backends import CpuBackend
+from go1exp.sim.env.engine import make_backend
+from go1exp.sim.physics.agreement import Check, require, robots_needed
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig
+from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 
 def require_agreement(task: TaskConfig) -> list[Check]:
@@ -16,7 +16,7 @@ def require_agreement(task: TaskConfig) -> list[Check]:
     Takes a quarter of a second on one core for PhysX.
 
     Raises:
-        go1exp.schema.registry.Expected: if it differs by more than the tolerances, or is not installed.
+        go1exp.config.schema.registry.Expected: if it differs by more than the tolerances, or is not installed.
     """
     if isinstance(task.backend, CpuBackend):
         return []

@@ -7,12 +7,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from go1exp.env.core import Go1Core
-from go1exp.estimation.many import Filters
+from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.estimation.many import Filters
+from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.observed import columns
-from go1exp.record.tape import sample
-from go1exp.schema.registry import ConfigError
-from go1exp.sim_robot.machine import noisy
+from go1exp.logs.record.tape import sample
+from go1exp.sim.env.core import Go1Core
 
 TERM = "base_linear_velocity"
 
@@ -30,7 +30,7 @@ class EstimatedVelocity:
 
         Raises:
             ConfigError: if the policy does not observe the velocity.
-            go1exp.estimation.EstimatorError: if the filter is not built.
+            go1exp.deploy.estimation.EstimatorError: if the filter is not built.
         """
         velocity_columns = columns(core.task, TERM)
         if velocity_columns is None:

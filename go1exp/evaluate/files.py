@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from go1exp.files import write_json
-from go1exp.protocol.result import write_rows
+from go1exp.base.files import write_json
+from go1exp.evaluate.protocol.result import write_rows
 
 FILE = "eval.json"
 """In a run folder; the rows are beside it."""

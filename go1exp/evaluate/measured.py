@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.measures import measured, per_foot
-from go1exp.measures.trace import Trace
-from go1exp.schema.registry import Term
-from go1exp.statistics.intervals import Interval, mean_interval, phase_interval, share_interval
+from go1exp.config.schema.registry import Term
+from go1exp.evaluate.statistics.intervals import Interval, mean_interval, phase_interval, share_interval
+from go1exp.mdp.measures import measured, per_foot
+from go1exp.mdp.measures.trace import Trace
 
 DIGITS = 6
 """Significant digits of a figure."""

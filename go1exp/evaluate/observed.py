@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from go1exp.config import TaskConfig
-from go1exp.schema.history import frame_width, width
+from go1exp.config.schema.history import frame_width, width
+from go1exp.sim.task import TaskConfig
 
 TrunkVelocity = Literal["exact", "estimated"]
 """Velocity of the trunk that is observed: the true one, or what the filter makes of the sensors."""

@@ -9,14 +9,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from go1exp import memory, robot
-from go1exp.config import TaskConfig
-from go1exp.env.core import Go1Core
-from go1exp.errors import Expected
+from go1exp import robot
+from go1exp.base import memory
+from go1exp.base.errors import Expected
+from go1exp.base.wording import counted
 from go1exp.mdp.derived import slip_speed
+from go1exp.mdp.measures.trace import Trace
 from go1exp.mdp.types import Snapshot
-from go1exp.measures.trace import Trace
-from go1exp.wording import counted
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig
 
 SNAPSHOT_COLUMNS = ("command", "base_lin_vel_b", "projected_gravity_b", "joint_vel", "joint_torque", "joint_target")
 """Columns of a trace that are a Snapshot's fields of the same name."""

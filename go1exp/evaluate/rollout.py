@@ -10,23 +10,23 @@ from typing import Any
 
 import torch
 
-from go1exp import memory
-from go1exp.config import TaskConfig, time_rules
-from go1exp.controller.types import Controller
-from go1exp.env.core import Go1Core
+from go1exp.base import memory
+from go1exp.base.wording import counted
+from go1exp.config.schema.backends import BackendConfig
+from go1exp.config.schema.registry import ConfigError, Term, TooLongError, members
+from go1exp.evaluate.controller.types import Controller
 from go1exp.evaluate.drivers import ControllerDriver, Driver, PolicyDriver
 from go1exp.evaluate.engine import require_agreement
 from go1exp.evaluate.measured import described, interval
 from go1exp.evaluate.observed import TrunkVelocity
-from go1exp.evaluate.policy import Policy
 from go1exp.evaluate.recorder import Recorder, bytes_per_second
 from go1exp.evaluate.rows import drawn, rows_of
 from go1exp.mdp.commands import FixedVelocity
-from go1exp.measures import measured
-from go1exp.schema.backends import BackendConfig
-from go1exp.schema.registry import ConfigError, Term, TooLongError, members
-from go1exp.terrain import TerrainConfig
-from go1exp.wording import counted
+from go1exp.mdp.measures import measured
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig, time_rules
+from go1exp.sim.terrain import TerrainConfig
+from go1exp.train.policy import Policy
 
 Command = tuple[float, float, float]
 """Commanded velocity: x, y in m/s, yaw rate in rad/s, body frame."""
@@ -118,7 +118,7 @@ def evaluate(
     A robot counts until it falls. Tracking figures of a command are over all its robots and the time after
     ``settle_s``: ``mean`` velocity, ``rmse`` against the command, per axis. ``on_step`` is called with the progress.
     ``controller`` makes what moves one robot in place of the policy, by its own sensors.
-    ``measures`` (``go1exp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
+    ``measures`` (``go1exp/mdp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
     ``rows`` has one entry for each robot (``rows.py``), for a file of its own.
     ``agreement`` says how near another engine than MuJoCo came to it before anything else was done.
 

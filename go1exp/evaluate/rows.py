@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp import robot
-from go1exp.protocol.quantities import FELL, MOVING, ROBOT, Column, add_measures
+from go1exp.evaluate.protocol.quantities import FELL, MOVING, ROBOT, Column, add_measures
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from go1exp.env.core import Go1Core
+    from go1exp.sim.env.core import Go1Core
 
 DRAW = "draw."
 """First part of the name of a column with something that was drawn for the robot."""

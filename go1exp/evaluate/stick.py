@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from go1exp import robot
-from go1exp.env.core import Go1Core
-from go1exp.evaluate.policy import Policy
-from go1exp.files import replacing
+from go1exp.base.files import replacing
+from go1exp.sim.env.core import Go1Core
+from go1exp.train.policy import Policy
 
 
 def film(core: Go1Core, policy: Policy, seconds: float, count: int = 8) -> list[np.ndarray]:

@@ -19,8 +19,10 @@ import torch
 from imageio.v2 import get_writer
 from PIL import Image, ImageDraw
 
-from go1exp.env.core import Go1Core
-from go1exp.evaluate.camera import (
+from go1exp.base.files import replacing
+from go1exp.evaluate.footfalls import Footfalls, font
+from go1exp.mdp.commands import FixedVelocity
+from go1exp.sim.env.camera import (
     AZIMUTH,
     COMMAND_RGB,
     DISTANCE,
@@ -32,10 +34,8 @@ from go1exp.evaluate.camera import (
     Stage,
     draw_velocities,
 )
-from go1exp.evaluate.footfalls import Footfalls, font
-from go1exp.evaluate.policy import Policy
-from go1exp.files import replacing
-from go1exp.mdp.commands import FixedVelocity
+from go1exp.sim.env.core import Go1Core
+from go1exp.train.policy import Policy
 
 AVERAGE_TIME = 0.5
 """Time over which the velocity in the caption is averaged, s: about a gait cycle."""

@@ -9,8 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from go1exp.effects.base import Param
-from go1exp.effects.tolerances import Tolerances, declared, sizes
+from go1exp.config.schema.registry import members
 from go1exp.gap.certainty import HALF, beside_a_gap, doubt, widened
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate, NamedEffect, Verdict
@@ -24,7 +23,8 @@ from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.last_fit import resampled_values
 from go1exp.gap.search.ledger import LastCheck
 from go1exp.gap.search.stepwise import SILENT, Search
-from go1exp.schema.registry import members
+from go1exp.sim.effects.base import Param
+from go1exp.sim.effects.tolerances import Tolerances, declared, sizes
 
 QUANTILES = (0.025, 0.975)
 """Of a 95 % interval."""

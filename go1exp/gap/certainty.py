@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from go1exp.effects.tolerances import sizes
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search.evidence import at_bound
 from go1exp.gap.search.ledger import LastCheck, Ledger
+from go1exp.sim.effects.tolerances import sizes
 
 MOST = 0.75
 """Share of the excess that is there without a term, and that it must remove, to be certified although a gap remains."""

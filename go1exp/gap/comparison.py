@@ -8,8 +8,7 @@ from typing import get_args
 
 import numpy as np
 
-from go1exp.audit import audit, clock_flaws
-from go1exp.errors import Expected
+from go1exp.base.errors import Expected
 from go1exp.gap.data.clocks import rows_of, same_rows
 from go1exp.gap.data.contact import too_coarse
 from go1exp.gap.data.cutting import Place
@@ -24,8 +23,9 @@ from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.floors import measured, repeatability
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.search.clocks import OF_CLOCK, Contestant, contest, details
-from go1exp.recording import Recording, RecordingError
-from go1exp.robot import RobotConfig
+from go1exp.logs.audit import audit, clock_flaws
+from go1exp.logs.recording import Recording, RecordingError
+from go1exp.robot.config import RobotConfig
 
 Progress = Callable[[str, float], None]
 """Called with what is being done, and which share of all is finished."""

@@ -12,7 +12,9 @@ from typing import Any, get_args
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from go1exp.files import write_json
+from go1exp.base.files import write_json
+from go1exp.config.schema.contact import ContactConfig, read_contact
+from go1exp.config.schema.registry import Expected
 from go1exp.gap.result import (
     EXIT_CODES,
     AngleErrors,
@@ -26,8 +28,6 @@ from go1exp.gap.result import (
     NamedEffect,
     Overlay,
 )
-from go1exp.schema.contact import ContactConfig, read_contact
-from go1exp.schema.registry import Expected
 
 RESULT = "verdict.json"
 """Name of the file in the output folder."""

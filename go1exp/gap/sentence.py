@@ -8,7 +8,6 @@ from itertools import combinations
 
 import numpy as np
 
-from go1exp.effects.tolerances import Tolerances, declared, effect_class, sizes
 from go1exp.gap.answer import Answer
 from go1exp.gap.certainty import HALF
 from go1exp.gap.result import NamedEffect, Verdict
@@ -17,6 +16,7 @@ from go1exp.gap.search import tolerances
 from go1exp.gap.search.evidence import deviation
 from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.stepwise import Search
+from go1exp.sim.effects.tolerances import Tolerances, declared, effect_class, sizes
 
 
 def told_apart(names: Sequence[str]) -> tuple[str, ...]:

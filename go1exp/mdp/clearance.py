@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
+from go1exp.base.tensors.rotation import rotate
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.tensors.rotation import rotate
 
 if TYPE_CHECKING:
     from torch import Tensor

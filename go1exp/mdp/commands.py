@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from go1exp.schema.registry import Fraction, Positive, PositiveRange, Speed, SpeedRange, command
-from go1exp.tensors.memory import Memory
-from go1exp.tensors.randomness import Stream
+from go1exp.base.tensors.memory import Memory
+from go1exp.base.tensors.randomness import Stream
+from go1exp.config.schema.registry import Fraction, Positive, PositiveRange, Speed, SpeedRange, command
 
 if TYPE_CHECKING:
     from torch import Tensor

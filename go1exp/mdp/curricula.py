@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import torch
 from pydantic import Field
 
-from go1exp.schema.registry import curriculum
+from go1exp.config.schema.registry import curriculum
 
 if TYPE_CHECKING:
     from torch import Tensor

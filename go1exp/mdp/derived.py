@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
+from go1exp.base.tensors.constants import constant_like
+from go1exp.base.tensors.rotation import rotate
 from go1exp.mdp.types import Snapshot
-from go1exp.tensors.constants import constant_like
-from go1exp.tensors.rotation import rotate
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from go1exp.base.tensors.memory import Memory
+from go1exp.base.tensors.randomness import Stream
+from go1exp.config.schema.registry import PositiveRange, SpeedRange, event
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.schema.registry import PositiveRange, SpeedRange, event
-from go1exp.tensors.memory import Memory
-from go1exp.tensors.randomness import Stream
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.tensors.memory import Memory
+from go1exp.base.tensors.memory import Memory
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,7 +30,7 @@ class FootImpacts(Memory):
     """Peak forces and touchdown speeds, (N, 4) float32; ``foot_peak_force`` and ``foot_touchdown_speed`` of a Snapshot.
 
     The speed is the one before the impact. A sensor's velocity belongs to the start of the physics step and its force
-    acts during that step (``physics/backend.py``): in the first step with a force, the velocity has not felt it yet.
+    acts during that step (``sim/physics/backend.py``): in the first step with a force, the velocity is not yet changed.
     """
 
     memory = ("peak_force", "touchdown_speed")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.tensors.memory import Memory
+from go1exp.base.tensors.memory import Memory
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.schema.registry import Term
-from go1exp.tensors.constants import constant, constant_like
+from go1exp.base.tensors.constants import constant, constant_like
+from go1exp.config.schema.registry import Term
 
 if TYPE_CHECKING:
     from torch import Tensor

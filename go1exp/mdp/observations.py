@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from go1exp.config.schema.registry import NonNegative, Positive, observation
 from go1exp.mdp.derived import clock_angle, joint_deviation
 from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS
 from go1exp.mdp.mirror import ACTION, AXIAL, CLOCK, COMMAND, JOINTS, LEGS, POLAR, grid
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.registry import NonNegative, Positive, observation
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -13,13 +13,13 @@ import torch
 from pydantic import AfterValidator, Field
 
 from go1exp import robot
-from go1exp.drive import ModelFields
+from go1exp.base.tensors.constants import constant_like
+from go1exp.base.tensors.randomness import Stream
+from go1exp.base.tensors.restitution import damping_ratio
+from go1exp.base.tensors.rotation import quat_from_rotvec, quat_multiply
+from go1exp.config.schema.registry import PositiveRange, Range, SpeedRange, ordered, randomization
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.schema.registry import PositiveRange, Range, SpeedRange, ordered, randomization
-from go1exp.tensors.constants import constant_like
-from go1exp.tensors.randomness import Stream
-from go1exp.tensors.restitution import damping_ratio
-from go1exp.tensors.rotation import quat_from_rotvec, quat_multiply
+from go1exp.robot.drive import ModelFields
 
 if TYPE_CHECKING:
     from torch import Tensor

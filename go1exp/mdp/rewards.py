@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
+from go1exp.base.tensors.constants import constant_like
+from go1exp.config.schema.registry import Fraction, NonNegative, Positive, reward
 from go1exp.mdp.derived import (
     ASYNC_PAIRS,
     DIAGONAL_SIGNS,
@@ -29,8 +31,6 @@ from go1exp.mdp.derived import (
 )
 from go1exp.mdp.foot_impacts import LARGEST_PRICED_FORCE
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.registry import Fraction, NonNegative, Positive, reward
-from go1exp.tensors.constants import constant_like
 
 if TYPE_CHECKING:
     from torch import Tensor

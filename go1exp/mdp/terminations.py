@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import torch
 from pydantic import Field
 
+from go1exp.config.schema.registry import termination
 from go1exp.mdp.types import Snapshot
-from go1exp.schema.registry import termination
 
 if TYPE_CHECKING:
     from torch import Tensor

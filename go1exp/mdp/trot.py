@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from go1exp.base.tensors.memory import Memory
+from go1exp.config.schema.registry import NonNegative, Positive, reward
 from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS, is_moving, since_last_contact_began
 from go1exp.mdp.types import Snapshot, TermSetup
-from go1exp.schema.registry import NonNegative, Positive, reward
-from go1exp.tensors.memory import Memory
 
 if TYPE_CHECKING:
     from torch import Tensor

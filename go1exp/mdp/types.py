@@ -36,7 +36,7 @@ class Snapshot:
 
     Joints and legs in the order of ``robot.py``; ``_b`` is the trunk frame, ``_w`` the world frame. Joint and base
     state are current. Contact forces and foot kinematics are MuJoCo sensors and describe the last physics substep,
-    2 ms before the state (see ``physics/backend.py``); timers, ``*_contact`` flags, peak force and touchdown speed
+    2 ms before the state (see ``sim/physics/backend.py``); timers, ``*_contact`` flags, peak force and touchdown speed
     cover every substep of the step.
     """
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.errors import Expected
-from go1exp.files import opened
+from go1exp.base.errors import Expected
+from go1exp.base.files import opened
+from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.train.ppo import AdaptivePPO
 
 FORMAT = 1

@@ -18,11 +18,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.config import PPOConfig
-from go1exp.env.core import Go1Core
-from go1exp.env.engine import captured
-from go1exp.env.faults import NumericalFault
-from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.engine import captured
+from go1exp.sim.env.faults import NumericalFault
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import PPOConfig
 from go1exp.train.device_buffer import DeviceRolloutBuffer
 from go1exp.train.device_update import DeviceUpdate
 from go1exp.train.group import Group, SharedNoise

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from go1exp.files import write_json
-from go1exp.schema.beside import EVALUATED, ROWS, StopRule
-from go1exp.schema.registry import unknown_name
+from go1exp.base.files import write_json
+from go1exp.config.schema.beside import EVALUATED, ROWS, StopRule
+from go1exp.config.schema.registry import unknown_name
 
 FILE = "stopped_early.json"
 """In the run folder: the rule that ended it, at which iteration and why."""

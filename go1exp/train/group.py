@@ -1,7 +1,7 @@
 """Several GPUs of one host that share a training: each has a share of the robots and of every minibatch.
 
-What is random belongs to a robot (``tensors/randomness.py``), or is drawn by all alike for all robots, of which each
-keeps its own part. The rollouts are joined after they are collected, so that a minibatch is drawn from all of them, and
+What is random belongs to a robot (``base/tensors/randomness.py``), or is drawn alike by all, each of which keeps its
+own part. The rollouts are joined after they are collected, so that a minibatch is drawn from all of them, and
 gradients are averaged before they are clipped. So a training is that of one GPU with all robots, up to the order of
 sums, and its checkpoints are too.
 """

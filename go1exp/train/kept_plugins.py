@@ -16,10 +16,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from go1exp.config import MANY_TERMS, ONE_TERM, REGISTERED_AS
-from go1exp.schema import plugins
-from go1exp.schema.plugins import Plugin
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema import plugins
+from go1exp.config.schema.plugins import Plugin
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.task import MANY_TERMS, ONE_TERM, REGISTERED_AS
 
 FOLDER = "plugins"
 """In the run folder."""

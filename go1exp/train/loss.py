@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from go1exp.config import PPOConfig
+from go1exp.sim.task import PPOConfig
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import ActorCriticPolicy

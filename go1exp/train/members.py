@@ -15,7 +15,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from go1exp.errors import Expected
+from go1exp.base.errors import Expected
 from go1exp.train import group, run_state
 from go1exp.train.group import Group
 

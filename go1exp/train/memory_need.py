@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from go1exp import memory, robot
-from go1exp.config import TrainConfig
-from go1exp.schema.backends import WarpBackend
-from go1exp.schema.registry import ConfigError
+from go1exp import robot
+from go1exp.base import memory
+from go1exp.config.schema.backends import WarpBackend
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.task import TrainConfig
 
 CPU_ROBOT_BYTES = 6000
 """One more robot on the CPU: physics state, own model fields, the MDP's tensors (measured: 6.2 kB at 4096)."""

@@ -10,9 +10,9 @@ from typing import Any
 
 from stable_baselines3.common.logger import HParam, KVWriter, Logger, TensorBoardOutputFormat
 
-from go1exp.config import LoggerConfig
-from go1exp.files import write_text
-from go1exp.schema.beside import EVALUATED
+from go1exp.base.files import write_text
+from go1exp.config.schema.beside import EVALUATED
+from go1exp.sim.task import LoggerConfig
 from go1exp.train.wandb_writer import WandbWriter
 from go1exp.train.wandb_writer import check_account as check_account
 from go1exp.train.wandb_writer import log_tables as log_tables

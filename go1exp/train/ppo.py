@@ -25,9 +25,9 @@ from stable_baselines3.common.utils import explained_variance, safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
-from go1exp.config import PPOConfig
-from go1exp.env.faults import NumericalFault
-from go1exp.env.sb3_env import Go1VecEnv
+from go1exp.sim.env.faults import NumericalFault
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import PPOConfig
 from go1exp.train import symmetry
 from go1exp.train.group import Group
 from go1exp.train.loss import ppo_loss, write_advantages

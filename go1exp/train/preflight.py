@@ -6,11 +6,11 @@ import importlib.util
 
 import torch
 
-from go1exp.config import TrainConfig
-from go1exp.effects.rules import drives
-from go1exp.env.core import Go1Core
-from go1exp.schema.backends import PhysxBackend, WarpBackend
-from go1exp.schema.registry import ConfigError
+from go1exp.config.schema.backends import PhysxBackend, WarpBackend
+from go1exp.config.schema.registry import ConfigError
+from go1exp.sim.effects.rules import drives
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TrainConfig
 from go1exp.train import memory_need, metrics
 
 LEAST_ROBOTS = 64
@@ -23,7 +23,7 @@ def check(config: TrainConfig) -> None:
     Raises:
         ConfigError: if a device, a package or an account is not there, if it does not fit into memory, or if an
             actuator net does not fit the robot or the physics step.
-        go1exp.errors.Expected: if a net's file is damaged.
+        go1exp.base.errors.Expected: if a net's file is damaged.
         FileNotFoundError: if it is not there.
     """
     check_devices(config)

@@ -19,12 +19,13 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from go1exp import __version__, data_root
-from go1exp.actuator.net import find
-from go1exp.config import TrainConfig, parse_train
-from go1exp.files import write_bytes, write_json, write_text
-from go1exp.schema.registry import ConfigError
-from go1exp.schema.yaml_file import UNREADABLE, why_unreadable
+from go1exp import __version__
+from go1exp.base.files import write_bytes, write_json, write_text
+from go1exp.base.paths import data_root
+from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.yaml_file import UNREADABLE, why_unreadable
+from go1exp.sim.actuator.net import find
+from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import kept_plugins
 
 NET = "actuator.npz"
@@ -71,7 +72,7 @@ def read_config(run: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: if ``run`` is not a run folder.
-        go1exp.schema.registry.ConfigError: if a plugin that it was trained with is missing.
+        go1exp.config.schema.registry.ConfigError: if a plugin that it was trained with is missing.
     """
     container = kept_plugins.with_copies(run, read_as_written(run))
     for settings in _with_files(container.get("actuator")):
@@ -85,7 +86,7 @@ def read_parsed(run: Path) -> TrainConfig:
 
     Raises:
         FileNotFoundError: if ``run`` is not a run folder.
-        go1exp.schema.registry.ConfigError: if its configuration is not one that this version knows; names the file.
+        go1exp.config.schema.registry.ConfigError: if this version does not know its configuration; names the file.
     """
     container = read_config(run)
     try:
@@ -99,7 +100,7 @@ def read_as_written(run: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: if ``run`` is not a run folder.
-        go1exp.schema.registry.ConfigError: if its config.yaml is damaged.
+        go1exp.config.schema.registry.ConfigError: if its config.yaml is damaged.
     """
     path = run / "config.yaml"
     if not path.is_file():

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from filelock import BaseFileLock, FileLock, SoftFileLease, Timeout
 
-from go1exp.errors import Expected
-from go1exp.files import remove_partial
+from go1exp.base.errors import Expected
+from go1exp.base.files import remove_partial
 
 LOCK, LEASE, HOLDER = ".lock", ".lease", ".holder.json"
 """Files of a run folder: what the operating system locks, what stands in for it where it cannot, and who holds it."""

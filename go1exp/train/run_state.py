@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from go1exp.files import write_json
+from go1exp.base.files import write_json
 from go1exp.train import run_lock
 
 FILE = "state.json"

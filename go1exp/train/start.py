@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from go1exp.config import TrainConfig
-from go1exp.files import write_json
-from go1exp.schema import plugins
-from go1exp.schema.history import frame_width, frames_of
-from go1exp.schema.registry import ConfigError, Term
+from go1exp.base.files import write_json
+from go1exp.config.schema import plugins
+from go1exp.config.schema.history import frame_width, frames_of
+from go1exp.config.schema.registry import ConfigError, Term
+from go1exp.sim.task import TrainConfig
 from go1exp.train import checkpoint, run_folder
 from go1exp.train.ppo import AdaptivePPO
 

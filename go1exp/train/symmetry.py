@@ -14,9 +14,9 @@ from typing import NamedTuple
 import torch
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
+from go1exp.config.schema.history import frames_of
+from go1exp.config.schema.registry import Term
 from go1exp.mdp.mirror import ACTION, Mirror, side_by_side
-from go1exp.schema.history import frames_of
-from go1exp.schema.registry import Term
 
 
 class SampleMirror(NamedTuple):

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from stable_baselines3.common.logger import Logger
 
-from go1exp import signals
-from go1exp.config import TrainConfig, parse_train
-from go1exp.env.core import Go1Core
-from go1exp.env.faults import NumericalFault
-from go1exp.env.sb3_env import Go1VecEnv
-from go1exp.files import opened, write_json
-from go1exp.schema.registry import Expected
+from go1exp.base import signals
+from go1exp.base.files import opened, write_json
+from go1exp.config.schema.registry import Expected
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.faults import NumericalFault
+from go1exp.sim.env.sb3_env import Go1VecEnv
+from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import checkpoint, kept_plugins, members, metrics, preflight, start
 from go1exp.train.beside import Beside
 from go1exp.train.device import DevicePPO

@@ -17,10 +17,10 @@ from typing import Any
 
 from stable_baselines3.common.logger import KVWriter
 
-from go1exp.config import LoggerConfig, WandbConfig
-from go1exp.files import write_text
-from go1exp.schema.beside import ROWS
-from go1exp.schema.registry import ConfigError, Expected
+from go1exp.base.files import write_text
+from go1exp.config.schema.beside import ROWS
+from go1exp.config.schema.registry import ConfigError, Expected
+from go1exp.sim.task import LoggerConfig, WandbConfig
 from go1exp.train.beside import BEST
 
 IDENTITY = "wandb_id"

@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-import go1exp.config  # noqa: F401  (registers every member)
+import go1exp.sim.task  # noqa: F401  (registers every member)
 from go1exp import robot
-from go1exp.actuator.setup import Actuator
-from go1exp.drive import DriveSetup
-from go1exp.schema.registry import members
-from go1exp.tensors.randomness import EnvRandom
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.registry import members
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.actuator.setup import Actuator
 from tests.rounding import alone_and_in_a_batch
 
 NEEDS: dict[str, Callable[[Path], dict[str, Any]]] = {

@@ -19,16 +19,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
+from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.cli.engine import split as engine_of
-from go1exp.compose import compose
-from go1exp.config import TaskConfig
-from go1exp.env.core import Go1Core
-from go1exp.env.engine import make_backend
-from go1exp.physics import agreement
-from go1exp.physics.backend import PhysicsBackend
-from go1exp.physics.scene import build_model
-from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import build_terrain
+from go1exp.config.compose import compose
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.engine import make_backend
+from go1exp.sim.physics import agreement
+from go1exp.sim.physics.backend import PhysicsBackend
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig
+from go1exp.sim.terrain import build_terrain
 
 HAS_WARP = importlib.util.find_spec("mujoco_warp") is not None
 needs_warp = pytest.mark.skipif(not HAS_WARP, reason="mujoco-warp is not installed: pip install 'go1exp[gpu]'")

@@ -1,6 +1,6 @@
 """What every effect promises, whichever it is: a new one is tested here by being registered.
 
-The robots hang in the air or stand on the ground, below the policy (``env/plant.py``), and follow large, fast targets.
+The robots hang in the air or stand on the ground, below the policy (``sim/env/plant.py``), and follow large targets.
 """
 
 from __future__ import annotations
@@ -18,26 +18,27 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp import data_root, robot
-from go1exp.compose import compose
-from go1exp.config import MANY_TERMS, TaskConfig, parse_task
-from go1exp.drive import DriveSetup
-from go1exp.effects.base import Effect, Measured, Param
-from go1exp.effects.identification import LAST
-from go1exp.effects.rules import on_mount
-from go1exp.effects.stack import HOOKS
-from go1exp.effects.tolerances import Tolerances
-from go1exp.env.core import Go1Core
-from go1exp.env.plant import Plant, drive_setup
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import Sensors, build_model
-from go1exp.schema.contact import MUJOCO_CONTACT
-from go1exp.schema.joint_values import JointValues, numbers, spread
-from go1exp.schema.registry import Entry, Term, bind, members
-from go1exp.tensors.randomness import EnvRandom
-from go1exp.tensors.rotation import rotate_inverse
-from go1exp.terrain import build_terrain
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
+from go1exp import robot
+from go1exp.base.paths import data_root
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.base.tensors.rotation import rotate_inverse
+from go1exp.config.compose import compose
+from go1exp.config.schema.contact import MUJOCO_CONTACT
+from go1exp.config.schema.joint_values import JointValues, numbers, spread
+from go1exp.config.schema.registry import Entry, Term, bind, members
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.effects.base import Effect, Measured, Param
+from go1exp.sim.effects.identification import LAST
+from go1exp.sim.effects.rules import on_mount
+from go1exp.sim.effects.stack import HOOKS
+from go1exp.sim.effects.tolerances import Tolerances
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import Sensors, build_model
+from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
+from go1exp.sim.terrain import build_terrain
 
 DT = 0.002
 EFFECTS, EXCITATIONS = members("effect"), members("excitation")
@@ -290,7 +291,7 @@ def test_a_simpler_effect_exists_and_has_fewer_numbers(entry: Entry) -> None:
 def test_the_excitation_that_shows_an_effect_exists_and_stands_if_the_effect_needs_ground(entry: Entry) -> None:
     how = kind(entry).identification
     assert how.excitation in EXCITATIONS
-    on_feet = EXCITATIONS[how.excitation].target.__module__ == "go1exp.excitations.ground"
+    on_feet = EXCITATIONS[how.excitation].target.__module__ == "go1exp.logs.excitations.ground"
     assert on_feet == how.needs_ground
 
 

@@ -1,4 +1,4 @@
-"""What every registered term promises, by the checks that users call for theirs (``go1exp.testing``)."""
+"""What every registered term promises, by the checks that users call for theirs (``go1exp.extend.testing``)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from torch import Tensor
 
-import go1exp.terms  # noqa: F401  (registers every term)
+import go1exp.extend  # noqa: F401  (registers every term)
+from go1exp.base.tensors.memory import Memory
+from go1exp.config.schema.registry import Entry, foreign, groups, members
+from go1exp.extend.testing import check_term, check_terms
+from go1exp.logs.recording import joint_channels
 from go1exp.mdp.types import Snapshot, TermSetup
-from go1exp.recording import joint_channels
 from go1exp.robot import JOINTS, NOMINAL_STANCE
-from go1exp.schema.registry import Entry, foreign, groups, members
-from go1exp.tensors.memory import Memory
-from go1exp.testing import check_term, check_terms
 
 EVERY = [entry for group in groups() for entry in members(group).values() if entry not in foreign()]
 

@@ -14,14 +14,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
-from go1exp.config import TaskConfig
+from go1exp.config.schema.registry import Entry, members
+from go1exp.extend.testing.randomness import everyone, model_fields, parts, start_states, stream, with_fields
+from go1exp.extend.testing.snapshots import ODD, mirrored, random_snapshot, rows
 from go1exp.mdp.types import Snapshot, TermSetup
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model
-from go1exp.schema.registry import Entry, members
-from go1exp.terrain import build_terrain
-from go1exp.testing.randomness import everyone, model_fields, parts, start_states, stream, with_fields
-from go1exp.testing.snapshots import ODD, mirrored, random_snapshot, rows
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig
+from go1exp.sim.terrain import build_terrain
 
 
 def each(group: str, **traits: Any) -> Any:

@@ -16,7 +16,7 @@ from go1exp.gap.data.cutting import FIT_S, Place, even_clock
 from go1exp.gap.data.standing import rows_at
 from go1exp.gap.data.windows import PAST_S, Windows
 from go1exp.gap.result import GapSettings
-from go1exp.recording import Recording, RecordingError
+from go1exp.logs.recording import Recording, RecordingError
 
 TRIES = 9
 """Rows at which a window may begin: the one with the smoothest motion about it is taken."""

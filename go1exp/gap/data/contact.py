@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from go1exp.effects.tolerances import Tolerances
+from go1exp.base.wording import counted
+from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig, contact_text
+from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.result import GapResult
-from go1exp.recording import Recording
-from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig, contact_text
-from go1exp.schema.registry import ConfigError
-from go1exp.wording import counted
+from go1exp.logs.recording import Recording
+from go1exp.sim.effects.tolerances import Tolerances
 
 SHOWN = 3
 """Recordings of one contact that a message lists."""

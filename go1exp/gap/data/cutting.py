@@ -10,7 +10,7 @@ import numpy as np
 
 from go1exp.gap.data.windows import PAST_S, Windows
 from go1exp.gap.result import GapSettings
-from go1exp.recording import Recording, RecordingError
+from go1exp.logs.recording import Recording, RecordingError
 
 FIT_S = 0.014
 """Half width of the smoothing that gives a window's initial state, s, where samples are not too far apart for it."""

@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 
-from go1exp.recording import Recording
+from go1exp.logs.recording import Recording
 
 
 def fingerprint(recording: Recording) -> str:

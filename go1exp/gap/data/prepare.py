@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import savgol_filter
 
 from go1exp.gap.result import GapSettings
-from go1exp.recording import Recording
+from go1exp.logs.recording import Recording
 
 SMOOTH = 5
 """Samples of the parabola whose slope is the speed where none was recorded, or none that can be trusted."""

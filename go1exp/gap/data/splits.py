@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from go1exp.recording import Meta
+from go1exp.logs.recording import Meta
 
 STRETCH = 3
 """Windows of a stretch."""

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
+from go1exp.base.tensors.rotation import quat_from_rotvec, quat_multiply
 from go1exp.gap.data.cutting import cut, noise_of
 from go1exp.gap.data.trunk import AGREE, SLIDE, TORN, Base, Log, base_state, loaded
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.result import GapSettings
-from go1exp.physics.legs import Legs
-from go1exp.recording import VECTORS, Recording
-from go1exp.robot import RobotConfig
-from go1exp.tensors.rotation import quat_from_rotvec, quat_multiply
+from go1exp.logs.recording import VECTORS, Recording
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.physics.legs import Legs
 
 WINDOW_S, BURN_S, STRIDE_S = 0.2, 0.03, 0.3
 """Longest windows, what is replayed before them, and from one to the next, s (chosen: what is not known of the

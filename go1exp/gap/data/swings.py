@@ -22,9 +22,9 @@ from go1exp.gap.data.standing import IMU_BIAS_SD, IMU_DELAY_SD
 from go1exp.gap.data.trunk import LOADED, Log
 from go1exp.gap.data.windows import PAST_S, Windows
 from go1exp.gap.result import GapSettings
-from go1exp.physics.legs import LegDynamics, Legs
-from go1exp.recording import Recording, RecordingError
-from go1exp.robot import RobotConfig
+from go1exp.logs.recording import Recording, RecordingError
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.physics.legs import LegDynamics, Legs
 
 LONGEST_S, BURN_S = 0.25, 0.02
 """Longest windows, and what is replayed before them, s: a swing of a trot takes 0.2 s."""

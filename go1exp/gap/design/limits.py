@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from go1exp.errors import Expected
+from go1exp.base.errors import Expected
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.design.settings import Safety
 from go1exp.gap.robots.protocol import Robot

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-import go1exp.excitations  # noqa: F401  (registers every excitation)
-from go1exp.excitations import ExcitationError, Motion
+import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
+from go1exp.config.schema.registry import Term, bind, members
 from go1exp.gap.design.limits import Limits
-from go1exp.schema.registry import Term, bind, members
+from go1exp.logs.excitations import ExcitationError, Motion
 
 SIZES = ("amplitude", "large", "stride", "lift", "sway")
 """Parameters of excitations that say how far the joints go."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from go1exp.excitations import Motion
 from go1exp.gap.comparison import Comparison
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.windows import Windows
@@ -16,7 +15,8 @@ from go1exp.gap.design.limits import Limits, Used
 from go1exp.gap.design.plan import Design
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.score.likelihood import Scorer, scorer
-from go1exp.recording import FLAG, Recording, RecordingError, joint_channels
+from go1exp.logs.excitations import Motion
+from go1exp.logs.recording import FLAG, Recording, RecordingError, joint_channels
 
 SETTLE_S = 0.5
 """Time for which the first target is held before a design begins, s."""

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import ConfigDict, Field
 
+from go1exp.config.schema.registry import STRICT, NonNegative, Positive
 from go1exp.gap.result import Count
-from go1exp.schema.registry import STRICT, NonNegative, Positive
 
 Part = Annotated[float, Field(gt=0, le=1)]
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from go1exp.files import write_text
+from go1exp.base.files import write_text
 from go1exp.gap.design.rehearsal import Rehearsal
-from go1exp.recording import FLAG, joint_channels
+from go1exp.logs.recording import FLAG, joint_channels
 
 
 def table(played: Rehearsal, joints: tuple[str, ...], period: float) -> str:

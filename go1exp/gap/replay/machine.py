@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
-import go1exp.actuator
-import go1exp.effects  # noqa: F401  (registers every effect)
-from go1exp.drive import DriveSetup
-from go1exp.effects.tolerances import Tolerances
-from go1exp.schema.joint_values import JointValues
-from go1exp.schema.registry import Term, bind
+import go1exp.sim.actuator
+import go1exp.sim.effects  # noqa: F401  (registers every effect)
+from go1exp.config.schema.joint_values import JointValues
+from go1exp.config.schema.registry import Term, bind
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.effects.tolerances import Tolerances
 
 
 class Machine(Protocol):
@@ -56,7 +56,7 @@ class Machine(Protocol):
             physics_dt: step, s.
             base_quat: attitude of a held base, w-x-y-z.
             threads: of the engine.
-            mounted: a held base has the joints of ``physics/mount.py``; nothing to one that is free.
+            mounted: a held base has the joints of ``sim/physics/mount.py``; nothing to one that is free.
         """
 
 

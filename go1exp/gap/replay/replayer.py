@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import go1exp.effects  # noqa: F401  (registers every effect)
-from go1exp.drive import DriveSetup
-from go1exp.effects.base import Measured
-from go1exp.env.plant import FRICTION, Plant
+import go1exp.sim.effects  # noqa: F401  (registers every effect)
+from go1exp.config.schema.registry import bind
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Rows, bolted, mounted
-from go1exp.physics.backend import PhysicsBackend
-from go1exp.schema.registry import bind
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.effects.base import Measured
+from go1exp.sim.env.plant import FRICTION, Plant
+from go1exp.sim.physics.backend import PhysicsBackend
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 """Attitude of a trunk that is held level, w-x-y-z."""

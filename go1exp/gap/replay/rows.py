@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-import go1exp.effects  # noqa: F401  (registers every effect)
-from go1exp.effects.tolerances import Tolerances, declared, effect_class, sizes
+import go1exp.sim.effects  # noqa: F401  (registers every effect)
 from go1exp.gap.replay.machine import Machine
 from go1exp.robot import MOUNT_HINGES, MOUNT_SLIDES
+from go1exp.sim.effects.tolerances import Tolerances, declared, effect_class, sizes
 
 MOUNT_LOAD = 2 * (*(10.0 for _ in MOUNT_SLIDES), *(2.0 for _ in MOUNT_HINGES))
 """Standard deviation of ``Rows.mount``, N and N m (chosen: a leg of 2 kg that swings at 5 m/s2)."""

@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from go1exp.effects.base import Measured
-from go1exp.env.plant import Plant
+from go1exp.base.tensors.rotation import quat_multiply, rotate_inverse
 from go1exp.gap.data.standing import StandingWindows, base_moved
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Rows
 from go1exp.robot import GRAVITY
-from go1exp.tensors.rotation import quat_multiply, rotate_inverse
+from go1exp.sim.effects.base import Measured
+from go1exp.sim.env.plant import Plant
 
 
 class ImuRecorder:

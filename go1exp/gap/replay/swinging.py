@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from go1exp import robot
-from go1exp.effects.base import Measured
-from go1exp.env.plant import Plant
+from go1exp.base.tensors.rotation import rotate
 from go1exp.gap.data.swings import SwingWindows
 from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Key, Rows
-from go1exp.tensors.rotation import rotate
+from go1exp.sim.effects.base import Measured
+from go1exp.sim.env.plant import Plant
 
 HEAVY = 1.0e6
 """Mass, kg, and moments of inertia, kg m2, of the trunk: legs of some kilograms move it by a hundred-thousandth of

@@ -10,10 +10,10 @@ import numpy as np
 from markupsafe import Markup
 
 import go1exp.gap.report.words as words
-from go1exp.effects.tolerances import Tolerances
+from go1exp.base.svg import PAGE_INCHES, draw
 from go1exp.gap.data.contact import tolerances_of
 from go1exp.gap.result import GapResult, NamedEffect, Overlay
-from go1exp.svg import PAGE_INCHES, draw
+from go1exp.sim.effects.tolerances import Tolerances
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

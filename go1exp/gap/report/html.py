@@ -11,7 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 import go1exp.gap.report.figures as figures
 import go1exp.gap.report.tables as tables
 import go1exp.gap.report.words as words
-from go1exp.files import write_text
+from go1exp.base.files import write_text
 from go1exp.gap.data.contact import tolerances_of
 from go1exp.gap.result import GapResult
 from go1exp.gap.search import clocks

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 import go1exp.gap.report.words as words
+from go1exp.config.schema.contact import contact_text
 from go1exp.gap.data.contact import tolerances_of
 from go1exp.gap.result import Candidate, GapResult, Localisation
-from go1exp.schema.contact import contact_text
 
 SMALLEST = 0.1
 """Excess below which the heat map's colour is that of none."""

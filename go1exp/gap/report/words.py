@@ -10,15 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-import go1exp.effects
-import go1exp.excitations  # noqa: F401  (registers every effect and excitation)
-from go1exp.effects.base import Param
-from go1exp.effects.tolerances import DECLARED, Tolerances
+import go1exp.logs.excitations  # noqa: F401  (registers every effect and excitation)
+from go1exp.config.schema.registry import members
 from go1exp.gap.result import AngleErrors, Clock, ClockChoice, GapResult, GapSettings, Localisation, NamedEffect
 from go1exp.gap.robots.go1_logs import GO1
 from go1exp.gap.search.clocks import OF_CLOCK, span
 from go1exp.gap.sentence import where
-from go1exp.schema.registry import members
+from go1exp.sim.effects.base import Param
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances
 
 NOTHING = "–"
 """Stands for a number that there is not."""

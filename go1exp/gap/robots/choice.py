@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from go1exp.effects.tolerances import Tolerances
+from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.robots.description import Go1Model, ModelConfig
 from go1exp.gap.robots.fixed_base import FixedBase
 from go1exp.gap.robots.hung import hung
 from go1exp.gap.robots.protocol import Robot
-from go1exp.robot import RobotConfig
-from go1exp.schema.contact import ContactConfig
-from go1exp.schema.registry import ConfigError
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.tolerances import Tolerances
 
 
 def robot_of(

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from go1exp.audit import AuditReport
-from go1exp.audit.related import SPEED_CHECKS
 from go1exp.gap.data.prepare import HINT, TELLING, clock_of_speeds, slope
 from go1exp.gap.robots.description import ModelConfig
-from go1exp.recording import Recording, joint_channel, joint_channels
+from go1exp.logs.audit import AuditReport
+from go1exp.logs.audit.related import SPEED_CHECKS
+from go1exp.logs.recording import Recording, joint_channel, joint_channels
 
 
 def flaws_of(recording: Recording, report: AuditReport, config: ModelConfig) -> list[str]:

@@ -11,11 +11,11 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-import go1exp.effects  # noqa: F401  (registers every effect)
-from go1exp import data_root
-from go1exp.effects.tolerances import problems as tolerance_problems
-from go1exp.schema.joint_values import JointValues, each_within, spread
-from go1exp.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
+import go1exp.sim.effects  # noqa: F401  (registers every effect)
+from go1exp.base.paths import data_root
+from go1exp.config.schema.joint_values import JointValues, each_within, spread
+from go1exp.config.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain
+from go1exp.sim.effects.tolerances import problems as tolerance_problems
 
 Name = Annotated[str, Field(min_length=1)]
 Limit = Annotated[JointValues, each_within(1e-9)]

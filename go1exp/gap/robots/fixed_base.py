@@ -11,11 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import go1exp.actuator  # noqa: F401  (registers every actuator)
-from go1exp.actuator.setup import Gains
-from go1exp.audit import AuditReport
-from go1exp.drive import DriveSetup
-from go1exp.effects.tolerances import DECLARED, Tolerances
+import go1exp.sim.actuator  # noqa: F401  (registers every actuator)
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.registry import ConfigError, Entry, Term
 from go1exp.gap.data.cutting import Place, cut
 from go1exp.gap.data.prepare import Ready, noise_in_time, spaced
 from go1exp.gap.data.windows import Windows
@@ -24,12 +22,14 @@ from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.result import Clock, GapSettings, Phase
 from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, gain_warnings, wrong_speeds
 from go1exp.gap.robots.description import ModelConfig
-from go1exp.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import NO_SENSORS
-from go1exp.recording import Recording
-from go1exp.schema.registry import ConfigError, Entry, Term
-from go1exp.tensors.randomness import EnvRandom
+from go1exp.logs.audit import AuditReport
+from go1exp.logs.recording import Recording
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.actuator.setup import Gains
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances
+from go1exp.sim.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import NO_SENSORS
 
 
 class TorqueDrive(Gains):

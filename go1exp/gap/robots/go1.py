@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import ClassVar
 
 from go1exp import robot
-from go1exp.audit import AuditReport
+from go1exp.config.schema.registry import Term
 from go1exp.gap.replay.machine import pd
 from go1exp.gap.robots.go1_logs import go1_flaws
-from go1exp.recording import Recording
-from go1exp.robot import RobotConfig
-from go1exp.schema.registry import Term
+from go1exp.logs.audit import AuditReport
+from go1exp.logs.recording import Recording
+from go1exp.robot.config import RobotConfig
 
 
 class Go1:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from go1exp import robot
-from go1exp.audit import AuditReport
 from go1exp.gap.data.prepare import HINT, TELLING
 from go1exp.gap.data.standing import missing
-from go1exp.recording import Recording
+from go1exp.logs.audit import AuditReport
+from go1exp.logs.recording import Recording
 
 GO1 = "go1"
 ONE_GROUP = (tuple(range(robot.NUM_JOINTS)),)

@@ -9,10 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from go1exp import robot
-from go1exp.audit import AuditReport
-from go1exp.drive import DriveSetup
-from go1exp.effects.tolerances import DECLARED, Tolerances
-from go1exp.env.plant import drive_setup
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.contact import ContactConfig
 from go1exp.gap.data.contact import contact_of
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.data.prepare import Ready
@@ -24,12 +22,14 @@ from go1exp.gap.robots.go1_logs import ONE_GROUP
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.robots.swinging import SwingingGo1
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model
-from go1exp.recording import Recording
-from go1exp.robot import RobotConfig
-from go1exp.schema.contact import ContactConfig
-from go1exp.tensors.randomness import EnvRandom
+from go1exp.logs.audit import AuditReport
+from go1exp.logs.recording import Recording
+from go1exp.robot.config import RobotConfig
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances
+from go1exp.sim.env.plant import drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import build_model
 
 LEGS = tuple(tuple(range(3 * leg, 3 * leg + 3)) for leg in range(robot.NUM_LEGS))
 

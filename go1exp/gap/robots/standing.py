@@ -9,10 +9,8 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from go1exp import robot
-from go1exp.audit import AuditReport
-from go1exp.drive import DriveSetup
-from go1exp.effects.tolerances import DECLARED, Tolerances
-from go1exp.env.plant import drive_setup
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.gap.data.contact import contact_warnings
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet
@@ -23,13 +21,15 @@ from go1exp.gap.replay.standing import StandingReplayer
 from go1exp.gap.result import GapSettings, Phase
 from go1exp.gap.robots.go1 import Go1
 from go1exp.gap.robots.go1_logs import ONE_GROUP
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model
-from go1exp.recording import Recording
-from go1exp.robot import RobotConfig
-from go1exp.schema.contact import MUJOCO_CONTACT, ContactConfig
-from go1exp.tensors.randomness import EnvRandom
-from go1exp.terrain import TerrainConfig, build_terrain
+from go1exp.logs.audit import AuditReport
+from go1exp.logs.recording import Recording
+from go1exp.robot.config import RobotConfig
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances
+from go1exp.sim.env.plant import drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 NO_SENSORS = 1 << 13
 """MuJoCo's mjDSBL_SENSOR: the IMU's readings follow from the motion of the base, and those of contacts cost time."""

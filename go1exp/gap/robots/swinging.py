@@ -9,10 +9,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from go1exp import robot
-from go1exp.audit import AuditReport
-from go1exp.drive import DriveSetup
-from go1exp.effects.tolerances import DECLARED, Tolerances
-from go1exp.env.plant import drive_setup
+from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.swings import SwingWindows, cut_swings, for_swings
 from go1exp.gap.data.windows import Windows
@@ -21,11 +18,14 @@ from go1exp.gap.replay.swinging import HEAVY, SwingReplayer
 from go1exp.gap.result import GapSettings, Phase
 from go1exp.gap.robots.go1 import Go1
 from go1exp.gap.robots.go1_logs import ONE_GROUP
-from go1exp.physics.mujoco_cpu import MujocoCpu
-from go1exp.physics.scene import build_model, weigh_down
-from go1exp.recording import Recording
-from go1exp.robot import RobotConfig
-from go1exp.tensors.randomness import EnvRandom
+from go1exp.logs.audit import AuditReport
+from go1exp.logs.recording import Recording
+from go1exp.robot.config import RobotConfig
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.effects.tolerances import DECLARED, Tolerances
+from go1exp.sim.env.plant import drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import build_model, weigh_down
 
 IMU_PROBE = (0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.0005)
 """Errors of accelerometer, m/s2, gyro, rad/s, and delay, s, by which the influence of the IMU is measured."""

@@ -11,7 +11,7 @@ from go1exp.gap.replay.replayer import Replayer
 from go1exp.gap.replay.rows import Theta, variants
 from go1exp.gap.score.initial_state import settled, stepped
 from go1exp.gap.score.likelihood import Scorer, scorer
-from go1exp.recording import Recording
+from go1exp.logs.recording import Recording
 
 
 def measured(replayer: Replayer, dt: float, coarse: float, clock_s: float) -> tuple[Scorer, dict[str, float]]:

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from go1exp.effects.tolerances import Tolerances, effect_class, sizes
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Theta
 from go1exp.gap.result import Candidate
 from go1exp.gap.search.fit import Model
+from go1exp.sim.effects.tolerances import Tolerances, effect_class, sizes
 
 RELIEF = 4.0
 """Fall of chi2, were its tolerance wider, from which an effect is listed although the tolerances explain the data."""

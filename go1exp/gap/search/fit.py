@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from go1exp.effects.tolerances import Tolerances
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Rows, Theta, null, variants
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table, corrected, differences
 from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import tolerances
+from go1exp.sim.effects.tolerances import Tolerances
 
 STEPS = (1.0, 0.3)
 """Lengths of a Gauss-Newton step that are tried."""

@@ -15,12 +15,12 @@ from functools import partial
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from go1exp.effects.base import Param
-from go1exp.effects.tolerances import declared
 from go1exp.gap.replay.rows import Key, Theta, variants
 from go1exp.gap.score.initial_state import FARTHEST, solved
 from go1exp.gap.score.likelihood import Scorer, gram, scorer
 from go1exp.gap.score.robust import log_chi2
+from go1exp.sim.effects.base import Param
+from go1exp.sim.effects.tolerances import declared
 
 ROUNDS = 2
 """Steps of the initial states, all by the changes that were measured at the nominal model."""

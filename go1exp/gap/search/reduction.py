@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import norm
 
-from go1exp.effects.tolerances import sizes
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search import evidence, places, significance, tolerances
 from go1exp.gap.search.last_fit import bootstrapped
 from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.state import State
+from go1exp.sim.effects.tolerances import sizes
 
 DRAWS = 40
 """Bootstraps from which it is read whether two parameters are equal."""

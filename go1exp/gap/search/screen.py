@@ -9,8 +9,6 @@ from itertools import product
 
 import numpy as np
 
-from go1exp.effects.identification import Identification, Periodic
-from go1exp.effects.tolerances import Tolerances, sizes
 from go1exp.gap.data.windows import Windows
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta, variants
@@ -18,6 +16,8 @@ from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import Layout, Table, differences, predicted
 from go1exp.gap.score.robust import log_chi2
 from go1exp.gap.search import strain, tolerances
+from go1exp.sim.effects.identification import Identification, Periodic
+from go1exp.sim.effects.tolerances import Tolerances, sizes
 
 PROBE = 2.0
 """Change of a parameter by which it is probed, in tolerances."""
@@ -94,7 +94,7 @@ class Motion:
     demand: np.ndarray
 
     def angle(self, value: float) -> np.ndarray:
-        """Return what a shape's value stands for (J,) or (1,); see ``effects/identification.py``."""
+        """Return what a shape's value stands for (J,) or (1,); see ``sim/effects/identification.py``."""
         if math.isnan(value):
             return self.mean.copy()
         if math.isinf(value):

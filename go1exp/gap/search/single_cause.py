@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from go1exp.effects.tolerances import effect_class, sizes
+from go1exp.config.schema.registry import members
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.linear import table
@@ -25,7 +25,7 @@ from go1exp.gap.score.robust import excess, log_chi2, removed
 from go1exp.gap.search import alike, places, profile_likelihood, significance, tolerances
 from go1exp.gap.search.fit import Model, fit, scores
 from go1exp.gap.search.state import State
-from go1exp.schema.registry import members
+from go1exp.sim.effects.tolerances import effect_class, sizes
 
 ITERATIONS = 4
 """Gauss-Newton steps of a fit: joints that stick make a payload's first ones short."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from go1exp.effects.tolerances import Tolerances, sizes
 from go1exp.gap.data.splits import Splits
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Theta
@@ -19,6 +18,7 @@ from go1exp.gap.search import tolerances
 from go1exp.gap.search.fit import LITTLE, Model, descend, scores
 from go1exp.gap.search.screen import free_shapes
 from go1exp.gap.search.tolerances import Freedom
+from go1exp.sim.effects.tolerances import Tolerances, sizes
 
 SETTLED = 0.03
 """Fall of log chi2 in a round of fitting below which the next one is not worth its time: it gains an eighth or so."""

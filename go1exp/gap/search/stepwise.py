@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from go1exp.effects.tolerances import sizes
 from go1exp.gap.replay.rows import Theta
 from go1exp.gap.score.robust import excess
 from go1exp.gap.search import evidence, reduction, significance, single_cause, strain, tolerances
@@ -16,6 +15,7 @@ from go1exp.gap.search.ledger import Ledger
 from go1exp.gap.search.screen import Screened, library, motion, outside, rivals, screen
 from go1exp.gap.search.state import State
 from go1exp.gap.search.trial import Trial, tried
+from go1exp.sim.effects.tolerances import sizes
 
 SILENT = 0.02
 """An effect that adds less than this to the chi2 of every window, at twice its tolerance, is not excited."""

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from go1exp.effects.base import Param
-from go1exp.effects.identification import Identification
-from go1exp.effects.tolerances import Tolerances, effect_class, sizes
+from go1exp.config.schema.registry import members
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Key, Probe, Theta
 from go1exp.gap.score.linear import Layout
-from go1exp.physics import box
-from go1exp.schema.registry import members
+from go1exp.sim.effects.base import Param
+from go1exp.sim.effects.identification import Identification
+from go1exp.sim.effects.tolerances import Tolerances, effect_class, sizes
+from go1exp.sim.physics import box
 
 PRIOR = 0.5
 """Standard deviation of a parameter within its tolerance, in tolerances: it settles what the data leave open."""

@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.config import parse_parts
-from go1exp.effects.base import Effect, Param
-from go1exp.effects.tolerances import Tolerances
-from go1exp.files import write_text
+from go1exp.base.files import write_text
+from go1exp.base.tensors.threads import one_thread
+from go1exp.base.wording import NOT_FOR_TRAINING
+from go1exp.config.schema.contact import contact_text
+from go1exp.config.schema.joint_values import spread
+from go1exp.config.schema.registry import Term, members
 from go1exp.gap.comparison import Comparison, compare, robot_from
 from go1exp.gap.data.contact import tolerances_of
 from go1exp.gap.data.fingerprint import fingerprint
@@ -26,13 +28,11 @@ from go1exp.gap.robots.hung import HungGo1
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.score.robust import excess, removed
 from go1exp.gap.search.fit import scores
-from go1exp.recording import Recording
-from go1exp.robot import RobotConfig
-from go1exp.schema.contact import contact_text
-from go1exp.schema.joint_values import spread
-from go1exp.schema.registry import Term, members
-from go1exp.tensors.threads import one_thread
-from go1exp.wording import NOT_FOR_TRAINING
+from go1exp.logs.recording import Recording
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.base import Effect, Param
+from go1exp.sim.effects.tolerances import Tolerances
+from go1exp.sim.task import parse_parts
 
 ROBOT = "robot"
 """Key of a value that belongs to no joint."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from go1exp.base.tensors.threads import one_thread
 from go1exp.gap.answer import can_stand, not_excited
 from go1exp.gap.comparison import NotComparable, Progress, compare, robot_from
 from go1exp.gap.result import EXIT_CODES, Floors, GapSettings, Localisation
@@ -15,9 +16,8 @@ from go1exp.gap.score.localise import localise
 from go1exp.gap.score.robust import excess
 from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
-from go1exp.recording import Recording
-from go1exp.robot import RobotConfig
-from go1exp.tensors.threads import one_thread
+from go1exp.logs.recording import Recording
+from go1exp.robot.config import RobotConfig
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m", "imu_gyro": "rad/s", "imu_acc": "m/s2"}
 

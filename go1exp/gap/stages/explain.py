@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from go1exp import __version__
-from go1exp.effects.tolerances import declared
+from go1exp.base.tensors.threads import one_thread
 from go1exp.gap.answer import Answer, can_stand, concluded, evidence, not_excited
 from go1exp.gap.comparison import FEWEST_WINDOWS, Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
@@ -27,9 +27,9 @@ from go1exp.gap.search.fit import residuals
 from go1exp.gap.search.stepwise import Search
 from go1exp.gap.search.tolerances import identification
 from go1exp.gap.sentence import advice, sentence
-from go1exp.recording import Recording
-from go1exp.robot import RobotConfig
-from go1exp.tensors.threads import one_thread
+from go1exp.logs.recording import Recording
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.tolerances import declared
 
 FEWEST_SWINGS = 24
 """Windows of legs in the air below which nothing is judged: each shows some of the legs only."""

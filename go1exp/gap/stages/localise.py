@@ -8,8 +8,8 @@ from go1exp.gap.comparison import Progress
 from go1exp.gap.result import GapSettings
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.stages.check import CheckResult, check
-from go1exp.recording import Recording
-from go1exp.robot import RobotConfig
+from go1exp.logs.recording import Recording
+from go1exp.robot.config import RobotConfig
 
 
 def localise(

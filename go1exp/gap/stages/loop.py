@@ -13,10 +13,10 @@ from go1exp.gap.result import GapResult, GapSettings
 from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.stages.explain import explain
 from go1exp.gap.stages.next import NextResult, design
-from go1exp.record.plan import Episode
-from go1exp.record.sensors import SensorConfig
-from go1exp.record.simulate import Rig, play
-from go1exp.recording import Recording
+from go1exp.logs.record.plan import Episode
+from go1exp.logs.record.sensors import SensorConfig
+from go1exp.logs.record.simulate import Rig, play
+from go1exp.logs.recording import Recording
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from go1exp.effects.tolerances import sizes
+from go1exp.base.tensors.threads import one_thread
 from go1exp.gap.certainty import HALF_WIDTH
 from go1exp.gap.comparison import Comparison, Progress, compare, robot_from
 from go1exp.gap.data.fingerprint import fingerprint
@@ -26,10 +26,11 @@ from go1exp.gap.robots.protocol import Robot
 from go1exp.gap.search import significance, tolerances
 from go1exp.gap.search.screen import PROBE
 from go1exp.gap.stages.apply import composed, read_as, terms_of, theta_of
-from go1exp.record.simulate import held_quat
-from go1exp.recording import Recording
-from go1exp.robot import JOINTS, RobotConfig
-from go1exp.tensors.threads import one_thread
+from go1exp.logs.record.simulate import held_quat
+from go1exp.logs.recording import Recording
+from go1exp.robot import JOINTS
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.tolerances import sizes
 
 WIDEST = 0.5
 """Largest relative standard deviation of a size that is believed; an interval across null would have any."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from go1exp.base.tensors.threads import one_thread
 from go1exp.gap.comparison import Comparison, NotComparable, Progress, compare, robot_from
 from go1exp.gap.data.cutting import even_clock, noise_of
 from go1exp.gap.data.standing import AXES, rows_at
@@ -24,9 +25,8 @@ from go1exp.gap.score.initial_state import solved
 from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.robust import excess
 from go1exp.gap.search.fit import residuals
-from go1exp.recording import VECTORS, Recording, joint_channels
-from go1exp.robot import RobotConfig
-from go1exp.tensors.threads import one_thread
+from go1exp.logs.recording import VECTORS, Recording, joint_channels
+from go1exp.robot.config import RobotConfig
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
 TURN, SPEED = ("roll", "pitch", "yaw"), ("base_lin_vel_x_b", "base_lin_vel_y_b", "base_lin_vel_z_b")

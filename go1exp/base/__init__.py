@@ -1,0 +1,1 @@
+"""What knows no robot: errors, files, memory, signals, tensors, drawings."""

@@ -1,0 +1,108 @@
+"""Velocity and position of a legged robot's trunk from its IMU, joints and contacts: a Kalman filter in C++.
+
+``make_filter(go1())`` gives the compiled filter; ``sample`` builds its input. The runtime on the robot uses this
+package, so it imports nothing but NumPy and pydantic.
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from go1exp.config.schema.registry import Expected
+from go1exp.deploy.estimation.config import ChainLeg, FilterConfig, from_json, go1, load, scaler, to_json
+from go1exp.deploy.estimation.readings import WIDTH, Status, sample
+from go1exp.robot import GRAVITY
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from go1exp.deploy.estimation import _kalman
+
+__all__ = [
+    "GRAVITY",
+    "WIDTH",
+    "EstimatorError",
+    "FilterConfig",
+    "Status",
+    "from_json",
+    "go1",
+    "load",
+    "make_filter",
+    "sample",
+    "scaler",
+    "to_json",
+]
+
+SOURCES = ("force", "torque", "height")
+"""The order of ``Source`` in ``cpp/kalman.hpp``."""
+
+
+class EstimatorError(Expected):
+    """The compiled filter is missing or cannot be loaded; the message says how to build it."""
+
+
+def compiled() -> ModuleType:
+    """Return the compiled module.
+
+    Raises:
+        EstimatorError: if it was not built, or was built for another Python.
+    """
+    try:
+        return importlib.import_module("go1exp.deploy.estimation._kalman")
+    except ImportError as error:
+        folder = Path(__file__).parent
+        extensions = [
+            file.name for file in sorted(folder.glob("_kalman.*")) if file.suffix in (".so", ".pyd", ".dylib")
+        ]
+        why = (
+            f"{', '.join(extensions)} does not load: {error}"
+            if extensions
+            else f"no _kalman extension in {folder.name}/"
+        )
+        raise EstimatorError(
+            f"the Kalman filter is not built for this Python ({why}). Install a C++17 compiler (Debian: g++ and "
+            "python3-dev), then `make setup`, or `pip install -e .` in the checkout; its build brings pybind11 and "
+            "Eigen (cmeel-eigen) with it"
+        ) from error
+
+
+def make_filter(config: FilterConfig) -> _kalman.Filter:
+    """Return the compiled filter with these settings, not yet started.
+
+    Raises:
+        EstimatorError: if the extension is missing.
+    """
+    module = compiled()
+    settings = module.Settings()
+    for name in FilterConfig.__dataclass_fields__:
+        setattr(settings, name, _plain(module, name, getattr(config, name)))
+    compiled_filter: _kalman.Filter = module.Filter(settings)
+    return compiled_filter
+
+
+def compiled_legs(config: FilterConfig) -> list[_kalman.Leg]:
+    """Return the compiled legs; ``foot(q)`` of one gives what ``go1exp.deploy.estimation.legs.foot`` does.
+
+    Raises:
+        EstimatorError: if the extension is missing.
+    """
+    legs = _plain(compiled(), "legs", config.legs)
+    assert isinstance(legs, list)
+    return legs
+
+
+def _plain(module: ModuleType, name: str, value: object) -> object:
+    """Convert a setting to the type that the extension takes."""
+    if name == "legs":
+        assert isinstance(value, tuple)
+        return [
+            module.Leg.chain(leg.hip, leg.lengths)
+            if isinstance(leg, ChainLeg)
+            else module.Leg.polynomial(leg.centre, leg.scale, np.array([leg.x, leg.y, leg.z]))
+            for leg in value
+        ]
+    return SOURCES.index(str(value)) if name == "contact_source" else value

@@ -1,0 +1,173 @@
+"""The feet's loads: counts of uncalibrated sensors to newtons, and the forces that balance the joints' torques."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from go1exp.base.errors import Expected
+from go1exp.deploy.estimation import FilterConfig, compiled_legs
+
+LEGS = 4
+SINGULAR = 1e-6
+"""Smallest determinant of a leg's Jacobian, m3/rad3: a straighter leg says nothing about the force along it."""
+
+LIGHT, STANDING = 10.0, 60.0
+"""Sum of the feet's vertical forces by torques below which they carry nothing, and above which a Go1 stands, N
+(chosen: a Go1 weighs 125 N, and its drives' friction looks like up to 2 N a foot)."""
+
+
+class CalibrationError(Expected):
+    """A calibration cannot be read or made; the message says why."""
+
+
+@dataclass(frozen=True)
+class FootCalibration:
+    """What four foot sensors say without load, and how much more for each newton.
+
+    Attributes:
+        zero: (4,) counts without load.
+        scale: (4,) counts per newton; None before the robot has stood.
+    """
+
+    zero: tuple[float, float, float, float]
+    scale: tuple[float, float, float, float] | None = None
+
+    def forces(self, counts: np.ndarray) -> np.ndarray:
+        """Return forces (4,), N, for counts (4,).
+
+        Raises:
+            CalibrationError: without scales.
+        """
+        if self.scale is None:
+            raise CalibrationError("the feet's calibration has no scales: check=true while the robot stands makes them")
+        return (np.asarray(counts, float) - self.zero) / self.scale
+
+    def write(self, path: Path) -> None:
+        """Write JSON."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def read(cls, path: Path) -> FootCalibration:
+        """Read what ``write`` wrote.
+
+        Raises:
+            CalibrationError: if it is no calibration; the message names file and key.
+        """
+        try:
+            content = json.loads(Path(path).read_text())
+            if not isinstance(content, dict) or not {"zero", "scale"} <= set(content):
+                raise ValueError("must be a mapping with the keys zero and scale; check=true makes one")
+            zero, scale = content["zero"], content["scale"]
+            numbers = [*zero, *(scale or [1.0] * LEGS)]
+            if len(zero) != LEGS or len(numbers) != 2 * LEGS or not np.isfinite(numbers).all():
+                raise ValueError("needs four finite numbers in zero, and in scale or null there")
+            if scale and min(scale) <= 0.0:
+                raise ValueError(f"scale = {scale}: must be greater than 0")
+            return cls(tuple(map(float, zero)), tuple(map(float, scale)) if scale else None)  # type: ignore[arg-type]
+        except (ValueError, KeyError, TypeError) as error:
+            raise CalibrationError(f"{path}: is no calibration of the feet: {error}") from None
+
+
+class LoadByBoth:
+    """The feet's loads from calibrated sensors and from the joints' torques together: their mean.
+
+    The torques have the inertia of the swinging leg in them, the sensors an error of their calibration; each alone
+    finds contact in a foot that swings, or loses a loaded one, at other times than the other.
+    """
+
+    def __init__(self, config: FilterConfig, calibration: FootCalibration) -> None:
+        """Take the legs and the calibration.
+
+        Raises:
+            CalibrationError: if the calibration has no scales.
+        """
+        calibration.forces(np.zeros(LEGS))  # raises
+        self._legs, self._calibration = kinematics(config), calibration
+
+    def mixed(self, counts: np.ndarray, by_torque: np.ndarray) -> np.ndarray:
+        """Return loads (4,), N, from counts (4,) and the forces (4,), N, that balance the torques."""
+        load: np.ndarray = 0.5 * (self._calibration.forces(counts) + by_torque)
+        return load
+
+    def loads(self, counts: np.ndarray, q: np.ndarray, torque: np.ndarray, quat: np.ndarray) -> np.ndarray:
+        """Return loads (4,), N, from counts (4,), angles (12,) rad, torques (12,) N m and the attitude w-x-y-z."""
+        return self.mixed(counts, forces_by_torque(q, torque, vertical(quat), self._legs))
+
+
+def vertical(quat: np.ndarray) -> np.ndarray:
+    """Return the vertical (3,) in the trunk's frame, of an attitude w-x-y-z."""
+    w, x, y, z = quat / max(float(np.linalg.norm(quat)), 1e-9)
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+def forces_by_torque(
+    q: np.ndarray, torque: np.ndarray, up: np.ndarray, legs: Sequence[Callable[[np.ndarray], Kinematics]]
+) -> np.ndarray:
+    """Return the vertical forces (4,), N, by which the ground balances the joints' torques: tau + J' f = 0.
+
+    Of a leg whose readings are not finite it is NaN, of a straight leg 0.
+
+    Args:
+        q: (12,) joint angles, rad.
+        torque: (12,) of the joints, N m.
+        up: (3,) the vertical in the trunk's frame.
+        legs: for each leg the function that returns position, Jacobian and turning of its foot (``kinematics``).
+    """
+    jacobians = np.array([leg(angles)[1] for leg, angles in zip(legs, q.reshape(LEGS, 3), strict=True)])
+    unread = ~(np.isfinite(jacobians).all(axis=(1, 2)) & np.isfinite(torque.reshape(LEGS, 3)).all(axis=1))
+    jacobians[unread] = np.eye(3)
+    straight = abs(np.linalg.det(jacobians)) <= SINGULAR
+    jacobians[straight] = np.eye(3)
+    forces = -np.linalg.solve(jacobians.transpose(0, 2, 1), torque.reshape(LEGS, 3, 1))[..., 0] @ up
+    forces[straight] = 0.0
+    forces[unread] = np.nan
+    return np.asarray(forces)
+
+
+Kinematics = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def kinematics(config: FilterConfig) -> list[Callable[[np.ndarray], Kinematics]]:
+    """Return the compiled kinematics of each leg.
+
+    Raises:
+        go1exp.deploy.estimation.EstimatorError: if the compiled filter is missing.
+    """
+    return [leg.foot for leg in compiled_legs(config)]
+
+
+def calibrated(
+    counts: np.ndarray, by_torque: np.ndarray, before: FootCalibration | None = None
+) -> tuple[FootCalibration | None, str]:
+    """Return the calibration after a robot at rest was looked at, and what was learnt in words.
+
+    A robot whose feet carry nothing (lying, or hung) gives zeros, a standing one scales.
+
+    Args:
+        counts: (4,) mean counts of the sensors.
+        by_torque: (4,) mean vertical forces that balance the torques, N.
+        before: what is known already.
+    """
+    total = float(by_torque.sum())
+    if abs(total) < LIGHT:
+        scale = None if before is None else before.scale
+        return FootCalibration(tuple(map(float, counts)), scale), "zeros, from a robot that lies or hangs"  # type: ignore[arg-type]
+    if total < STANDING or by_torque.min() < 0.3 * total / LEGS:
+        return before, f"nothing: the feet carry {total:.0f} N by the torques, which is neither lying nor standing"
+    if before is None:
+        return None, "nothing: it stands, but the zeros are not known; check=true while it lies or hangs comes first"
+    scale = (counts - before.zero) / by_torque
+    if scale.min() <= 0.0:
+        return before, f"nothing: the counts of {legs_below(scale)} do not grow under load"
+    return FootCalibration(before.zero, tuple(map(float, scale))), "scales, from a robot that stands"  # type: ignore[arg-type]
+
+
+def legs_below(values: np.ndarray) -> str:
+    """Return the names of the legs whose values (4,) are not positive."""
+    return ", ".join(name for name, value in zip(("FR", "FL", "RR", "RL"), values, strict=True) if value <= 0.0)

@@ -1,0 +1,161 @@
+"""Builds the bundle of a run: its policy, with everything that the robot's computer needs to run it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import json
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from go1exp import __version__, robot
+from go1exp.base.tensors.threads import one_thread
+from go1exp.config.schema.joint_values import spread
+from go1exp.config.schema.registry import Term
+from go1exp.deploy.estimation import go1, to_json
+from go1exp.deploy.export.graph import DeployedPolicy, ExportError, blocks, to_onnx
+from go1exp.deploy.export.trace import record
+from go1exp.deploy.runtime import bundle
+from go1exp.deploy.runtime.metadata import Metadata, Trained
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.actuator.net import find
+from go1exp.sim.effects.rules import drives
+from go1exp.sim.task import TaskConfig
+from go1exp.train import run_folder
+from go1exp.train.policy import load_network
+
+PACKAGES = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy", "mujoco-core")
+
+AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+"""Parameters of a command term that give the ranges of its velocities."""
+
+CONVENTIONS = {
+    "units": "SI: m, rad, s, N m",
+    "trunk": "x forward, y left, z up; origin and axes are those of the trunk in the vendor's URDF, the IMU's too",
+    "world": "z up",
+    "quaternion": "w-x-y-z, trunk to world",
+    "joint": "angles, speeds and torques have the zero and sign of the vendor's SDK, and its motor order",
+    "drive": "torque = kp (joint_target - joint_pos) - kd joint_vel, at the drives' own rate",
+    "rows": "the first axis of every input and output; 1 on the robot",
+}
+
+Progress = Callable[[int, int], None]
+
+
+def build(
+    run: Path,
+    checkpoint: Path | None = None,
+    *,
+    seconds: float = 5.0,
+    seed: int = 0,
+    on_step: Progress = lambda done, total: None,
+) -> bytes:
+    """Return the bundle of a run: the same bytes for the same run, versions and arguments.
+
+    Args:
+        run: run folder; its own configuration counts.
+        checkpoint: a checkpoint's file; the newest if None.
+        seconds: length of the trace, s.
+        seed: seed of everything random in the trace.
+        on_step: called with the progress of the trace, in steps.
+
+    Raises:
+        ExportError: if an observation term reads what the robot does not measure or has no form in ONNX, a package is
+            missing, or the robot falls before the trace has a row.
+        go1exp.deploy.runtime.archive.BundleError: if ONNX, torch and the environment do not agree.
+        FileNotFoundError: if ``run`` is not a run folder or has no checkpoint.
+        go1exp.config.schema.registry.ConfigError: if its configuration is not one that this version knows.
+    """
+    config = run_folder.read_parsed(run)
+    network, about = load_network(run, config.ppo, checkpoint)
+    module = DeployedPolicy(network, config.task.observation, config.task.action)
+    with one_thread():
+        model = to_onnx(module)
+
+        def policy(observation: Tensor) -> Tensor:
+            with torch.no_grad():
+                return network._predict(observation, deterministic=True)
+
+        trace = record(config.task, policy, module.inputs, seconds, seed, on_step)
+    if not trace:
+        raise ExportError(f"{run}: every step of the trace ended an episode; there is nothing to replay")
+    data = bundle.write(
+        metadata(config.task, module, about), run_folder.read_as_written(run), _versions(run), model, trace
+    )
+    bundle.loads(data, str(run))  # read back: what is handed out has been replayed once
+    return data
+
+
+def metadata(task: TaskConfig, module: DeployedPolicy, about: dict[str, Any]) -> Metadata:
+    """Return the metadata of a task's policy; ``about`` describes its checkpoint, as ``load_network`` returns it."""
+    file = Path(about["file"])
+    config: RobotConfig = task.robot
+    return Metadata(
+        robot="go1",
+        joints=robot.JOINTS,
+        legs=robot.LEGS,
+        inputs=module.inputs,
+        outputs=module.outputs,
+        observation=blocks(task.observation),
+        nominal_stance=tuple(robot.NOMINAL_STANCE.tolist()),
+        action_scale=task.action.scale,
+        action_clip=task.action.clip,
+        kp=gains(task.actuator, "kp"),
+        kd=gains(task.actuator, "kd"),
+        joint_limits=tuple((float(low), float(high)) for low, high in robot.JOINT_POS_LIMITS),
+        torque_limit=tuple(robot.per_joint(config.effort_limit).tolist()),
+        velocity_limit=tuple(robot.per_joint(config.velocity_limit).tolist()),
+        policy_dt=task.sim.policy_dt,
+        physics_dt=task.sim.physics_dt,
+        command_ranges=command_ranges(task.command),
+        conventions=CONVENTIONS,
+        estimator=json.loads(to_json(go1())),
+        trained=Trained(
+            checkpoint=file.name,
+            sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
+            iteration=int(about["iteration"]),
+            num_timesteps=int(about["num_timesteps"]),
+        ),
+    )
+
+
+def gains(actuator: Term, name: str) -> tuple[float, ...] | None:
+    """Return ``kp`` or ``kd`` of an actuator, or of the drives its net was fitted to, per joint; None if unknown."""
+    for term, _ in drives(actuator):
+        if name in term.parameters:
+            return tuple(spread(term.parameters[name], robot.JOINTS).tolist())
+        if "file" in term.parameters:
+            from go1exp.sim.actuator.actuator_net import load  # this package takes seconds to import
+
+            info = load(find(term.parameters["file"])).info
+            values = getattr(info, name)
+            return None if values is None else tuple(values[info.joints.index(joint)] for joint in robot.JOINTS)
+    return None
+
+
+def command_ranges(command: Term) -> dict[str, tuple[float, float]]:
+    """Return lowest and highest commanded velocity by name, for the axes that the command's parameters give."""
+    given = {name: command.parameters[name] for name in AXES if name in command.parameters}
+    pairs = {name: value if isinstance(value, tuple | list) else (value, value) for name, value in given.items()}
+    return {name: (float(pair[0]), float(pair[1])) for name, pair in pairs.items()}
+
+
+def _versions(run: Path) -> dict[str, Any]:
+    """Return the versions of the exporting packages, and those that the run recorded when it was trained."""
+    packages = {}
+    for name in PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            packages[name] = importlib.metadata.version(name)
+    meta = run / "meta.json"
+    return {
+        "go1exp": __version__,
+        "python": platform.python_version(),
+        "packages": packages,
+        "run": json.loads(meta.read_text()) if meta.is_file() else None,
+    }

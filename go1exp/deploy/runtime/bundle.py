@@ -1,0 +1,190 @@
+"""The bundle: everything of a training run that the robot's computer needs, in one sealed file.
+
+``metadata.json`` (``metadata.py``), ``config.json`` (the run's own resolved configuration), ``versions.json``,
+``policy.onnx`` and ``trace.npz``: inputs and outputs of the policy in simulation. Loading replays
+it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from go1exp.deploy.runtime.archive import BundleError, as_json, pack, seal, stored, unpack
+from go1exp.deploy.runtime.metadata import Metadata, Port
+from go1exp.deploy.runtime.policy import OnnxPolicy
+
+METADATA, CONFIG, VERSIONS, POLICY, TRACE = "metadata.json", "config.json", "versions.json", "policy.onnx", "trace.npz"
+MEMBERS = (METADATA, CONFIG, VERSIONS, POLICY, TRACE)
+
+TOLERANCE = 1e-5
+"""Largest difference of a replayed output from the recorded one: rad, and the unit of each observation."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle that has been read, and whose policy gives the same outputs as in simulation.
+
+    Attributes:
+        source: the file.
+        seal: SHA-256 of the whole file.
+        sizes: bytes by member.
+        metadata: description of the policy.
+        config: the run's own resolved configuration.
+        versions: versions of the packages that trained and exported it.
+        policy: sensor readings in, joint targets out.
+        trace: ``input.NAME`` and ``output.NAME`` (rows, size) float32, and ``time`` (rows,) float64, s.
+        differences: largest difference of each output in the replay, by name.
+    """
+
+    source: str
+    seal: str
+    sizes: dict[str, int]
+    metadata: Metadata
+    config: dict[str, Any]
+    versions: dict[str, Any]
+    policy: OnnxPolicy
+    trace: dict[str, np.ndarray]
+    differences: dict[str, float]
+
+
+def write(
+    metadata: Metadata,
+    config: Mapping[str, Any],
+    versions: Mapping[str, Any],
+    policy: bytes,
+    trace: Mapping[str, np.ndarray],
+) -> bytes:
+    """Return the bundle's bytes: the same for the same content.
+
+    Raises:
+        ValueError: if the data hold values that JSON does not have.
+    """
+    documents = {METADATA: metadata.as_dict(), CONFIG: config, VERSIONS: versions}
+    return pack({**{name: as_json(content) for name, content in documents.items()}, POLICY: policy, TRACE: _npz(trace)})
+
+
+def load(path: str | Path) -> Bundle:
+    """Read a bundle and replay its trace.
+
+    Raises:
+        BundleError: if it is not a bundle, a member is not what was packed, or the policy gives other outputs here.
+        OSError: if the file cannot be read.
+    """
+    return loads(Path(path).read_bytes(), str(path))
+
+
+def loads(data: bytes, source: str) -> Bundle:
+    """Read a bundle from its bytes; ``source`` is its name in messages. Errors as ``load``'s."""
+    members = unpack(data, MEMBERS, source)
+    metadata = _metadata(members[METADATA], source)
+    try:
+        policy = OnnxPolicy(members[POLICY], metadata.inputs, metadata.outputs)
+    except ValueError as error:
+        raise BundleError(f"{source}: {POLICY}: {error}") from None
+    trace = _trace(members[TRACE], metadata, source)
+    _check_action(trace, metadata, source)
+    return Bundle(
+        source=source,
+        seal=seal(data),
+        sizes={name: len(content) for name, content in members.items()},
+        metadata=metadata,
+        config=_json(members[CONFIG], f"{source}: {CONFIG}"),
+        versions=_json(members[VERSIONS], f"{source}: {VERSIONS}"),
+        policy=policy,
+        trace=trace,
+        differences=replay(policy, trace, source),
+    )
+
+
+def replay(policy: OnnxPolicy, trace: Mapping[str, np.ndarray], source: str) -> dict[str, float]:
+    """Run the policy on the recorded readings, row by row as on the robot; return the largest difference per output.
+
+    Raises:
+        BundleError: if one exceeds ``TOLERANCE`` or is not a number.
+    """
+    rows = len(trace["time"])
+    inputs = {port.name: trace[f"input.{port.name}"] for port in policy.inputs}
+    steps = [policy({name: values[k : k + 1] for name, values in inputs.items()}) for k in range(rows)]
+    differences = {}
+    for port in policy.outputs:
+        got = np.concatenate([step[port.name] for step in steps])
+        off = np.abs(got.astype(np.float64) - trace[f"output.{port.name}"])
+        worst = float(np.max(off))  # NaN if anything is
+        if not worst <= TOLERANCE:  # true for NaN as well
+            at = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
+            replayed, then = got[at], trace[f"output.{port.name}"][at]
+            raise BundleError(
+                f"{source}: {TRACE}: {port.name}[{at[1]}] at {trace['time'][at[0]]:.2f} s is {replayed:.6g} here and "
+                f"{then:.6g} in the trace; they may differ by {TOLERANCE:g}"
+            )
+        differences[port.name] = worst
+    return differences
+
+
+def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: str) -> None:
+    """Refuse metadata by which the recorded actions do not give the recorded targets."""
+    action, target = (trace[f"output.{name}"].astype(np.float64) for name in ("action", "joint_target"))
+    meant = np.asarray(metadata.nominal_stance) + metadata.action_scale * action
+    if not float(np.max(np.abs(meant - target))) <= TOLERANCE:
+        raise BundleError(f"{source}: {METADATA}: nominal_stance and action_scale are not those of the trace")
+    if not float(np.max(np.abs(action))) <= metadata.action_clip + TOLERANCE:
+        raise BundleError(f"{source}: {METADATA}: action_clip is not that of the trace")
+
+
+def _metadata(content: bytes, source: str) -> Metadata:
+    try:
+        return Metadata.from_dict(_json(content, f"{source}: {METADATA}"))
+    except ValueError as error:
+        raise BundleError(f"{source}: {METADATA}: {error}") from None
+
+
+def _json(content: bytes, where: str) -> dict[str, Any]:
+    try:
+        document = json.loads(content)
+    except ValueError as error:
+        raise BundleError(f"{where}: no JSON ({error})") from None
+    if not isinstance(document, dict):
+        raise BundleError(f"{where}: must be a mapping")
+    return document
+
+
+def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return NumPy's archive of ``arrays``, which ``numpy.load`` reads; the same bytes for the same arrays."""
+    members = {}
+    for name, values in arrays.items():
+        buffer = io.BytesIO()
+        np.lib.format.write_array(buffer, np.ascontiguousarray(values), version=(1, 0), allow_pickle=False)
+        members[f"{name}.npy"] = buffer.getvalue()
+    return stored(members)
+
+
+def _trace(content: bytes, metadata: Metadata, source: str) -> dict[str, np.ndarray]:
+    """Return the arrays of the trace, which must be those of the metadata's inputs and outputs, and finite."""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+    except Exception as error:  # damage of a zip and of the arrays in it has many forms
+        raise BundleError(f"{source}: {TRACE}: not NumPy's arrays ({error})") from None
+
+    def port_sizes(prefix: str, ports: tuple[Port, ...]) -> dict[str, int]:
+        return {f"{prefix}.{port.name}": port.size for port in ports}
+
+    sizes = {**port_sizes("input", metadata.inputs), **port_sizes("output", metadata.outputs)}
+    if arrays.keys() != {"time", *sizes}:
+        odd = ", ".join(sorted(arrays.keys() ^ {"time", *sizes}))
+        raise BundleError(f"{source}: {TRACE}: arrays missing or too many: {odd}")
+    rows = arrays["time"].shape
+    for name, values in arrays.items():
+        kind, shape = (np.float64, rows) if name == "time" else (np.float32, (*rows, sizes[name]))
+        if values.dtype != kind or values.shape != shape or not values.size or len(rows) != 1:
+            raise BundleError(f"{source}: {TRACE}: {name}: {values.dtype} of shape {values.shape} instead of {shape}")
+        if not np.isfinite(values).all():
+            raise BundleError(f"{source}: {TRACE}: {name}: holds values that are not finite")
+    return arrays

@@ -1,0 +1,343 @@
+"""Sources of commanded velocities: numbers, a file, a sine, keys, a gamepad; all within the bundle's ranges.
+
+A source is called with the time since walking began, s, and returns the velocity (3,): x and y in m/s, yaw in rad/s,
+in the trunk's frame. ``poll`` is called in every cycle, also before walking; ``close`` releases what was taken.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib
+import math
+import os
+import select
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from go1exp.base.errors import Expected
+
+AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+"""Names of the ranges in a bundle's metadata, in the order of a command."""
+
+Stop = Callable[[str], None]
+"""``Safety.stop``: called with the name of who asks for the end."""
+
+
+class CommandError(Expected):
+    """A source of commands is not available; the message says why and what would help."""
+
+
+class Source(Protocol):
+    """Gives commanded velocities."""
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the velocity (3,) at ``t`` s since walking began."""
+
+    def poll(self) -> None:
+        """Read keys, sticks and buttons without waiting."""
+
+    def close(self) -> None:
+        """Release the terminal or the gamepad."""
+
+
+class Constant:
+    """One constant velocity."""
+
+    def __init__(self, velocity: Sequence[float]) -> None:
+        """Keep the velocity (3,).
+
+        Raises:
+            CommandError: if it is not three finite numbers.
+        """
+        self._velocity = np.array(velocity, dtype=float)
+        if self._velocity.shape != (3,) or not np.isfinite(self._velocity).all():
+            raise CommandError(f"command {list(velocity)}: must be three finite numbers: x m/s, y m/s, yaw rad/s")
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the velocity (3,)."""
+        return self._velocity
+
+    def poll(self) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+
+class Table(Constant):
+    """Rows of a CSV file, each held until the next one's time; zero before the first."""
+
+    def __init__(self, path: Path) -> None:
+        """Read columns t, x, y, yaw (s, m/s, m/s, rad/s), with or without a line of names.
+
+        Raises:
+            CommandError: if a row is not four finite numbers, times do not grow, or there is none.
+            OSError: if the file cannot be read.
+        """
+        rows: list[list[float]] = []
+        with Path(path).open(newline="") as file:
+            for line, cells in enumerate(csv.reader(file), start=1):
+                if not cells or cells[0].lstrip().startswith("#"):
+                    continue
+                try:
+                    rows.append([float(cell) for cell in cells])
+                except ValueError:
+                    if rows or [cell.strip() for cell in cells] != ["t", "x", "y", "yaw"]:
+                        raise CommandError(f"{path}:{line}: {','.join(cells)!r} must be t,x,y,yaw in numbers") from None
+                    continue
+                if len(cells) != 4 or not all(map(math.isfinite, rows[-1])):
+                    raise CommandError(f"{path}:{line}: must be four finite numbers: t,x,y,yaw")
+                if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
+                    raise CommandError(f"{path}:{line}: t = {rows[-1][0]:g} does not come after {rows[-2][0]:g}")
+        if not rows:
+            raise CommandError(f"{path}: no rows; each must be t,x,y,yaw")
+        super().__init__((0.0, 0.0, 0.0))
+        table = np.array(rows)
+        self._times, self._rows = table[:, 0], table[:, 1:]
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the row in force."""
+        k = int(np.searchsorted(self._times, t + 1e-9)) - 1  # 1e-9: rounding of t must not miss a row's time
+        return self._rows[k] if k >= 0 else self._velocity
+
+
+class Sinusoid(Constant):
+    """Sines of one period for all three velocities, as in the paper's velocity experiment."""
+
+    def __init__(self, amplitude: Sequence[float], period: float) -> None:
+        """Keep amplitudes (3,), m/s, m/s and rad/s, and the period, s.
+
+        Raises:
+            CommandError: if they are not finite numbers, or the period is not positive.
+        """
+        super().__init__(amplitude)
+        if not (period > 0 and math.isfinite(period)):
+            raise CommandError(f"period {period}: must be a positive number of seconds")
+        self._rate = 2.0 * math.pi / period
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the velocity (3,)."""
+        return self._velocity * math.sin(self._rate * t)
+
+
+STEPS = {
+    **dict.fromkeys(("w", "W", "\x1b[A", "\x1bOA"), (0.1, 0.0, 0.0)),
+    **dict.fromkeys(("s", "S", "\x1b[B", "\x1bOB"), (-0.1, 0.0, 0.0)),
+    **dict.fromkeys(("a", "A"), (0.0, 0.1, 0.0)),
+    **dict.fromkeys(("d", "D"), (0.0, -0.1, 0.0)),
+    **dict.fromkeys(("\x1b[D", "\x1bOD"), (0.0, 0.0, 0.2)),
+    **dict.fromkeys(("\x1b[C", "\x1bOC"), (0.0, 0.0, -0.2)),
+}
+"""Key -> change of the velocity: m/s, m/s, rad/s. Arrow keys arrive as three characters."""
+
+ENDS = {"\x1b": "the Esc key", "q": "the q key", "Q": "the q key"}
+"""Keys that end the walk. Q is one of them: in many games it turns, but in a terminal it means the end."""
+
+KEYS = "W S or up down: forward, back; A D: left, right; left right: turn; space: zero; Esc or q: end (twice: brake)"
+
+
+class Keyboard(Constant):
+    """Keys of the terminal change the velocity in steps; space makes it zero, Esc or q ends the walk."""
+
+    def __init__(
+        self,
+        stop: Stop,
+        limit: Callable[[np.ndarray], np.ndarray],
+        descriptor: int | None = None,
+        end: Stop | None = None,
+    ) -> None:
+        """Read the terminal's keys one by one; ``limit`` keeps the resulting velocity within the ranges.
+
+        Raises:
+            CommandError: if there is no terminal.
+        """
+        super().__init__((0.0, 0.0, 0.0))
+        import termios
+        import tty
+
+        try:
+            self._keys = sys.stdin.fileno() if descriptor is None else descriptor
+            self._before = termios.tcgetattr(self._keys)
+            tty.setcbreak(self._keys)
+        except (OSError, ValueError, termios.error) as error:
+            raise CommandError(f"command=keyboard: standard input is no terminal ({error})") from None
+        self._stop, self._end, self._limit = stop, end or stop, limit
+        self._open = True
+
+    def poll(self) -> None:
+        """Read all keys pressed since the last call."""
+        while self._open and select.select([self._keys], [], [], 0)[0]:
+            data = os.read(self._keys, 64)
+            if not data:
+                self._stop("the end of the terminal")
+                return
+            for key in split_keys(data.decode(errors="replace")):
+                self._press(key)
+
+    def _press(self, key: str) -> None:
+        if key in ENDS:
+            self._end(ENDS[key])
+        elif key == " ":
+            self._velocity = np.zeros(3)
+        elif key in STEPS:
+            # rounded: steps of 0.1 that are added up reach zero exactly
+            self._velocity = self._limit(np.round(self._velocity + STEPS[key], 6))
+
+    def close(self) -> None:
+        """Restore the terminal's settings."""
+        if self._open:
+            import termios
+
+            self._open = False
+            termios.tcsetattr(self._keys, termios.TCSADRAIN, self._before)
+
+
+def split_keys(text: str) -> list[str]:
+    """Split the characters that a terminal sent into keys: an arrow is three characters, Esc alone is one."""
+    keys, place = [], 0
+    while place < len(text):
+        size = 3 if text[place] == "\x1b" and text[place + 1 : place + 2] in ("[", "O") else 1
+        keys.append(text[place : place + size])
+        place += size
+    return keys
+
+
+DEAD = 0.1
+"""Dead zone of a stick about its middle, as a share of its range."""
+
+
+class Gamepad(Constant):
+    """Sticks of a gamepad: left for x and y, right for yaw; any of the first two buttons stops the robot."""
+
+    def __init__(self, stop: Stop, ranges: np.ndarray) -> None:
+        """Open the first gamepad; a stick at its end gives the end of the range.
+
+        Raises:
+            CommandError: if pygame is not installed, or there is no gamepad.
+        """
+        super().__init__((0.0, 0.0, 0.0))
+        # pygame needs a video driver even for a gamepad; the robot's computer has no display.
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        try:
+            pygame: Any = importlib.import_module("pygame")
+        except ImportError:
+            raise CommandError("command=gamepad: needs pygame (pip install pygame); or use command=keyboard") from None
+        pygame.init()
+        if not pygame.joystick.get_count():
+            pygame.quit()
+            raise CommandError("command=gamepad: no gamepad is connected; or use command=keyboard")
+        self._pygame = pygame
+        self._pad = pygame.joystick.Joystick(0)
+        self._stop, self._ranges = stop, ranges
+
+    def poll(self) -> None:
+        """Read sticks and buttons."""
+        for event in self._pygame.event.get():
+            if event.type == self._pygame.JOYDEVICEREMOVED:
+                self._stop("the gamepad, which is gone")
+        if self._pad.get_button(0) or self._pad.get_button(1):
+            self._stop("a button of the gamepad")
+        last = self._pad.get_numaxes() - 1
+        # Sticks count right and back as positive, commands left and forward: hence the sign.
+        sticks = -np.array([self._pad.get_axis(min(axis, last)) for axis in (1, 0, 3)])
+        self._velocity = stretched(sticks, self._ranges)
+
+    def close(self) -> None:
+        """Release the gamepad."""
+        self._pygame.quit()
+
+
+def stretched(sticks: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    """Return the velocity (3,) for sticks (3,) from -1 to 1: 0 is zero, the ends are those of ``ranges`` (3, 2)."""
+    moved = np.where(np.abs(sticks) < DEAD, 0.0, sticks)
+    return np.where(moved < 0, -moved * np.minimum(ranges[:, 0], 0.0), moved * np.maximum(ranges[:, 1], 0.0))
+
+
+class Limited:
+    """A source whose commands are limited to ranges.
+
+    Attributes:
+        cut: cycles in which each axis was cut, (3,).
+    """
+
+    def __init__(self, source: Source, ranges: np.ndarray) -> None:
+        """Keep the commands of ``source`` within ``ranges`` (3, 2)."""
+        self._source, self._ranges = source, ranges
+        self.cut = np.zeros(3, dtype=np.int64)
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the command, cut to the ranges; NaN stays NaN, which the controller treats as a fault."""
+        asked = self._source(t)
+        given = np.clip(asked, self._ranges[:, 0], self._ranges[:, 1])
+        self.cut += asked != given
+        return given
+
+    def poll(self) -> None:
+        """Poll the source."""
+        self._source.poll()
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+
+def range_array(given: Mapping[str, tuple[float, float]]) -> np.ndarray:
+    """Return lowest and highest command (3, 2) of a bundle's metadata.
+
+    An axis without a range in the bundle is not limited, because the trained range is not known.
+    """
+    return np.array([given.get(name, (-math.inf, math.inf)) for name in AXES], dtype=float)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """The wanted source: three numbers, a file, ``sinusoid``, ``keyboard`` or ``gamepad``; and the sine's values."""
+
+    command: tuple[float, ...] | str
+    amplitude: tuple[float, ...] = (1.0, 0.3, 0.8)
+    period: float = 10.0
+
+
+def make(wish: Wish, ranges: np.ndarray, stop: Stop, end: Stop | None = None) -> Limited:
+    """Return the wanted source, limited to ``ranges`` (3, 2).
+
+    ``stop`` is called if the drives must brake at once, ``end`` (if given) if an orderly end is asked for; both with
+    the name of what asked.
+
+    Raises:
+        CommandError: if the source is not available.
+        OSError: if its file cannot be read.
+    """
+    source: Source
+    if not isinstance(wish.command, str):
+        source = Constant(wish.command)
+    elif wish.command == "sinusoid":
+        source = Sinusoid(wish.amplitude, wish.period)
+    elif wish.command == "keyboard":
+        source = Keyboard(stop, lambda velocity: np.clip(velocity, ranges[:, 0], ranges[:, 1]), end=end)
+    elif wish.command == "gamepad":
+        # A stick needs an end of the range; an axis without one gets 1 m/s or 1 rad/s.
+        finite = np.where(np.isfinite(ranges), ranges, np.sign(ranges))
+        source = Gamepad(stop, finite)
+    elif Path(wish.command).suffix == ".csv":
+        source = Table(Path(wish.command))
+    else:
+        raise CommandError(
+            f"command {wish.command!r}: must be three numbers such as [0.5,0.0,0.0], a file.csv, "
+            "sinusoid, keyboard or gamepad"
+        )
+    return Limited(source, ranges)
+
+
+def parsed(text: str) -> tuple[float, ...] | str:
+    """Parse a command-line argument: ``0.5,0,0`` is three numbers, anything else a name."""
+    with contextlib.suppress(ValueError):
+        return tuple(float(part) for part in text.strip("[]()").split(","))
+    return text

@@ -1,0 +1,315 @@
+"""One cycle of the runtime: newest state, estimate, policy, safety, command.
+
+The controller does not know which robot the link leads to, where commands come from, or how velocity is estimated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from go1exp.deploy.runtime.bundle import Bundle
+from go1exp.deploy.runtime.packet_delay import PacketDelay
+from go1exp.deploy.runtime.past import PolicyMemory
+from go1exp.deploy.runtime.safety import Safety
+from go1exp.robot.messages import Link, LowCmd, LowState
+
+PHASES = ("waiting", "standing_up", "walking", "lying_down", "damping")
+"""Before the first state; moving to the nominal stance; under the policy; lying down at an orderly end; braking until
+the end."""
+
+LYING = (0.0, 1.3, -2.65)
+"""Hip, thigh and calf angle of every leg of a Go1 that lies on its belly, rad."""
+
+HALTED, STOOD = 0.4, 0.6
+"""Shares of the time for lying down. Until the first, a walking policy is commanded to stand still; at the second, the
+robot has reached the nominal stance. Directly from a gait it would tip over (chosen on a shipped policy)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stages:
+    """How long the stages of a walk take, for every command line that starts one.
+
+    Attributes:
+        stand_up: time from the first pose to the nominal stance, s.
+        lie_down: time that the robot is given to lie down when a walk ends in order, s; 0: the drives brake at once.
+        brake: time for which the drives brake at the end, before ``cycle`` returns False, s.
+        patience: time to wait for the robot's first state, s.
+
+    Raises:
+        ValueError: if a time is negative, or ``patience`` not positive.
+    """
+
+    stand_up: float = 2.0
+    lie_down: float = 2.0
+    brake: float = 2.0
+    patience: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Check the times."""
+        times = {"stand_up": self.stand_up, "lie_down": self.lie_down, "brake": self.brake}
+        problems = [f"{name} = {time}: must be at least 0" for name, time in times.items() if not time >= 0.0]
+        if not self.patience > 0.0:
+            problems.append(f"patience = {self.patience}: must be greater than 0")
+        if problems:
+            raise ValueError("\n".join(problems))
+
+
+class Estimator(Protocol):
+    """Estimates the trunk's velocity from the robot's sensors."""
+
+    def update(self, state: LowState) -> np.ndarray:
+        """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame, at the newest."""
+
+    def ahead(self, age: float) -> np.ndarray:
+        """Return the velocity (3,), m/s, ``age`` s after the newest state; NaN: the age is not known."""
+
+
+class Mover(Protocol):
+    """What walks the robot in place of the bundle's policy."""
+
+    def step(self, velocity: np.ndarray, state: LowState, base_lin_vel: np.ndarray) -> LowCmd:
+        """Return the command of a cycle.
+
+        Args:
+            velocity: (3,) commanded, m/s, m/s, rad/s.
+            state: the newest one.
+            base_lin_vel: (3,) estimate of the trunk's velocity in its own frame, m/s.
+        """
+
+
+CommandSource = Callable[[float], np.ndarray]
+"""Time since walking began, s -> commanded velocity (3,): x and y in m/s, yaw rate in rad/s."""
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """Everything about one cycle, for the log.
+
+    Attributes:
+        t: the runtime's clock, s.
+        phase: one of ``PHASES``.
+        state: the newest state; None before the first.
+        command: the command that was sent; None if none was.
+        velocity: (3,) the commanded velocity as the policy saw it.
+        base_lin_vel: (3,) the estimate; NaN before the first.
+        observation: (O,) input of the network; None unless walking.
+        fresh: the states received since the last cycle, in the order of arrival.
+        sent_at: when the command left, s of the runtime's clock; NaN if none did.
+        age: time since the newest state was measured, less the fastest way, s; NaN if the robot tells no clock.
+    """
+
+    t: float
+    phase: str
+    state: LowState | None
+    command: LowCmd | None
+    velocity: np.ndarray
+    base_lin_vel: np.ndarray
+    observation: np.ndarray | None
+    fresh: Sequence[LowState] = ()
+    sent_at: float = math.nan
+    age: float = math.nan
+
+
+class Controller:
+    """Runs a bundle's policy on the robot at the other end of a link.
+
+    Attributes:
+        phase: one of ``PHASES``.
+        safety: checks every command before it is sent.
+        finished: whether the walk came to its orderly end; a fault of the braking robot after that does not count.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        link: Link,
+        commands: CommandSource,
+        estimator: Estimator,
+        safety: Safety,
+        *,
+        rate: float | None = None,
+        stages: Stages | None = None,
+        kp: np.ndarray | None = None,
+        kd: np.ndarray | None = None,
+        on_cycle: Callable[[Cycle], None] = lambda cycle: None,
+        mover: Mover | None = None,
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            bundle: the policy and its metadata.
+            link: connection to the robot.
+            commands: called in every cycle.
+            estimator: gets every new state.
+            safety: has the robot's limits.
+            rate: cycles per second, Hz; that of training if None.
+            stages: how long they take.
+            kp: (J,) N m/rad; those of the bundle if None.
+            kd: (J,) N m s/rad.
+            on_cycle: called after every cycle.
+            mover: walks in place of the bundle's policy, once every cycle.
+
+        Raises:
+            ValueError: if neither the bundle nor the caller gives gains.
+        """
+        about = bundle.metadata
+        gains = (about.kp if kp is None else kp), (about.kd if kd is None else kd)
+        if gains[0] is None or gains[1] is None:
+            raise ValueError("kp, kd: the bundle does not know any; they have to be given")
+        self._policy, self._link, self._commands = bundle.policy, link, commands
+        self._estimator, self.safety, self._on_cycle = estimator, safety, on_cycle
+        self._kp, self._kd = (np.asarray(values, dtype=float) for values in gains)
+        self._nominal = np.asarray(about.nominal_stance)
+        self._stages = stages or Stages()
+        self._lying = np.tile(LYING, len(self._nominal) // len(LYING))
+        self._begin: float | None = None
+        self._mover = mover
+        self._readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
+        self._memory = PolicyMemory(about, about.policy_dt if rate is None else 1.0 / rate)
+        self._target = self._nominal.copy()
+        self._state: LowState | None = None
+        self._way, self._age = PacketDelay(), math.nan
+        self._early: list[LowState] = []  # received before their cycle; of these so many are in the estimate
+        self._estimated, self._failed_early = 0, cast("Exception | None", None)
+        self._origin, self._halting = self._nominal, False
+        self._since = 0.0
+        self._velocity, self._base = np.zeros(3), np.full(3, np.nan)
+        self._observation: np.ndarray | None = None
+        self.phase, self.finished = "waiting", False
+
+    def cycle(self, now: float) -> bool:
+        """Run one cycle; return whether there should be another. ``now`` is the clock's time, s.
+
+        If anything fails in it, the drives are commanded to brake; only the link and ``on_cycle`` can raise.
+        """
+        self._begin = now if self._begin is None else self._begin
+        fresh, estimated = [*self._early, *self._link.receive()], self._estimated
+        self._early, self._estimated = [], 0
+        for each in fresh:
+            self._way.note(each.t, each.clock)
+            # `not <`: the clock may be NaN
+            self._state = each if self._state is None or not each.clock < self._state.clock else self._state
+        if self._state is not None:
+            self._age = self._way.age(now, self._state.clock)
+        elif now - self._begin > self._stages.patience:
+            self.safety.fail("no_state", f"the robot has not said anything for {self._stages.patience:g} s", now)
+        self._observation = None
+        try:
+            wanted = self._wanted(now, fresh[estimated:])
+        except Exception as error:  # without a new command the robot would go on with its last one
+            self.safety.fail("runtime", f"{type(error).__name__}: {error}", now)
+            wanted = None
+        sent = self.safety.review(self._state, wanted, now)
+        if self.safety.fault is not None and self.phase != "damping":  # also while lying down
+            self.phase, self._since = "damping", now
+        heard = self._state is not None or self.phase == "damping"
+        if heard:
+            self._target = sent.joint_target
+            self._link.send(sent)
+        command = sent if heard else None
+        sent_at = self._link.sent_at if heard else math.nan
+        about = (self._velocity, self._base, self._observation, fresh, sent_at, self._age)
+        self._on_cycle(Cycle(now, self.phase, self._state, command, *about))
+        return self.phase != "damping" or now - self._since < self._stages.brake
+
+    def finish(self, now: float) -> None:
+        """End the walk without a fault: from the next cycle on the robot lies down, then the drives brake."""
+        if self.phase in ("lying_down", "damping"):
+            return
+        if self._stages.lie_down > 0 and self.phase != "waiting":
+            self._halting, self._origin = self.phase == "walking", self._target
+            self.phase, self._since = "lying_down", now
+        else:
+            self.phase, self._since, self.finished = "damping", now, True
+
+    def prepare(self) -> None:
+        """Take the states that have come by now, so that the next cycle has less to do; what fails, fails there."""
+        try:
+            for state in self._link.receive():
+                self._early.append(state)
+                self._estimator.update(state)
+                self._estimated += 1
+        except Exception as error:
+            self._failed_early = error
+
+    def rehearse(self) -> None:
+        """Run the costly parts of a cycle so that caches are warm; nothing is kept and nothing is sent."""
+        if self._state is not None and self.phase == "walking":
+            self._policy(self._readings)
+            command = LowCmd(self._target, self._kp, self._kd)
+            self.safety.rehearse(self._state, command)
+            self._link.rehearse(command)
+
+    def walked(self, now: float) -> float:
+        """Return the time since walking began, s; 0 unless the robot walks now."""
+        return now - self._since if self.phase == "walking" else 0.0
+
+    def _wanted(self, now: float, unestimated: Sequence[LowState]) -> LowCmd | None:
+        """Return the command of the present phase; None if it has none. ``unestimated``: states to estimate from."""
+        state = self._state
+        if state is None or self.phase == "damping":
+            return None
+        if self._failed_early is not None:
+            raise self._failed_early
+        for each in unestimated:
+            self._estimator.update(each)
+        self._base = self._estimator.ahead(self._age)
+        if self.phase == "waiting":
+            self.phase, self._since, self._origin = "standing_up", now, state.joint_pos.copy()
+        if self.phase == "standing_up":
+            stand_up = self._stages.stand_up
+            share = (now - self._since) / stand_up if stand_up > 0 else 1.0
+            if share < 1.0:
+                return LowCmd(self._origin + share * (self._nominal - self._origin), self._kp, self._kd)
+            self.phase, self._since = "walking", now
+        if self.phase == "lying_down":
+            return self._lie(state, now)
+        return self._walk(state, now)
+
+    def _lie(self, state: LowState, now: float) -> LowCmd | None:
+        """Stand still under the policy if it walked, move to the nominal stance, lie down; None when that is done."""
+        share = (now - self._since) / self._stages.lie_down
+        if share < HALTED and self._halting:
+            self._origin = self._target
+            return self._walk(state, now)
+        if share < 1.0 - 1e-9:
+            ways = (HALTED if self._halting else 0.0, STOOD, 1.0), (self._origin, self._nominal, self._lying)
+            k = int(share >= STOOD)
+            begin, end = ways[0][k : k + 2]
+            part = (share - begin) / (end - begin)
+            return LowCmd(ways[1][k] + part * (ways[1][k + 1] - ways[1][k]), self._kp, self._kd)
+        self.phase, self._since, self.finished = "damping", now, True
+        return None
+
+    def _walk(self, state: LowState, now: float) -> LowCmd | None:
+        """Return the policy's command; None, and a fault, if the estimate or the commanded velocity is not finite."""
+        asked = self._commands(now - self._since) if self.phase == "walking" else np.zeros(3)
+        self._velocity = np.asarray(asked, dtype=float)
+        given: dict[str, Any] = {
+            "joint_pos": state.joint_pos,
+            "joint_vel": state.joint_vel,
+            "imu_gyro": state.imu_gyro,
+            "imu_quat": state.imu_quat,
+            "base_lin_vel_b": self._base,
+            "joint_torque": state.joint_torque,
+            "joint_target": self._target,
+            "command": self._velocity,
+            "walked": self.walked(now),
+        }
+        for name, values in given.items():
+            if name in self._readings:
+                self._readings[name][0] = values
+        for fault, name in (("estimator", "base_lin_vel_b"), ("command", "command")):
+            if (self._mover or name in self._readings) and not np.isfinite(given[name]).all():
+                self.safety.fail(fault, f"{name} is {given[name]}", now)
+                return None
+        if self._mover:
+            return self._mover.step(self._velocity, state, self._base)
+        outputs = self._memory(self._policy, self._readings)
+        self._observation = outputs["observation"][0]
+        return LowCmd(outputs["joint_target"][0].astype(float), self._kp, self._kd)

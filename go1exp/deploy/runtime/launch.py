@@ -1,0 +1,150 @@
+"""Starts and ends the process of the simulated robot, so that the runtime does not import torch or the engine."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from go1exp.base.errors import Expected
+
+PATIENCE = 120.0
+"""Longest time for the robot's process to start, s: importing torch is slow on a busy machine."""
+
+
+class RobotError(Expected):
+    """The robot is not available; the message says why."""
+
+
+class RefusedError(RobotError):
+    """The settings of the simulated robot are wrong.
+
+    Attributes:
+        problems: one line for each problem.
+    """
+
+    def __init__(self, problems: list[str]) -> None:
+        """Keep the lines."""
+        super().__init__("; ".join(problems))
+        self.problems = problems
+
+
+SPARE, SPARE_S = 1.5, 30.0
+"""The robot keeps more than the log: lost states make the log reach further back, and it lives on after the walk."""
+
+
+class SimulatedRobot:
+    """A simulated Go1 in a process of its own that listens at a port of this machine.
+
+    Attributes:
+        port: where it listens.
+        report: its report of the walk, after ``close``: datagrams, and how it kept real time.
+        truth: the trunk's true motion by column, with ``clock``, after ``close``; empty for a robot that hangs.
+        obeyed: what was in force, after ``close``: rows of clock, s, whether a command was, and its targets, rad.
+    """
+
+    def __init__(
+        self, bundle: str, sim: Mapping[str, Any], other: Mapping[str, Any], port: int = 0, keep: float = 120.0
+    ) -> None:
+        """Start it and wait until it listens.
+
+        Args:
+            bundle: the file; the robot in it is that of training.
+            sim: how it is set up (``go1exp.deploy.sim_robot.machine.SimConfig``).
+            other: other choices of ``actuator`` and ``effect``; None keeps those of training.
+            port: where to listen; any that is free if 0.
+            keep: newest seconds of the walk's log, for which the truth and what was in force are kept too.
+
+        Raises:
+            RefusedError: if its settings are wrong.
+            RobotError: if it does not come up.
+        """
+        self._folder = tempfile.TemporaryDirectory(prefix="go1exp-")
+        self._truth = Path(self._folder.name) / "truth.npz"
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "go1exp.deploy.sim_robot"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},  # leaves the other cores to the runtime
+            start_new_session=True,  # Ctrl-C in the terminal must reach the runtime only
+        )
+        self.report: dict[str, Any] = {}
+        self.truth: dict[str, np.ndarray] = {}
+        self.obeyed: np.ndarray | None = None
+        given = {"bundle": bundle, "sim": dict(sim), "robot": dict(other), "port": port, "truth": str(self._truth)}
+        given["kept"] = SPARE * keep + SPARE_S
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write((json.dumps(given) + "\n").encode())
+            self._process.stdin.flush()
+            answer = self._answer(PATIENCE)
+        except OSError:
+            answer = {}
+        except BaseException:
+            self._process.kill()  # it does not read its input yet, so closing that would not end it
+            self.close()
+            raise
+        if answer.get("what") != "listening":
+            self.close()
+            if answer.get("problems"):
+                raise RefusedError(answer["problems"])
+            raise RobotError(f"robot=sim: {answer.get('message') or 'its process ended before it listened'}")
+        self.port = int(answer["port"])
+        self.pid = self._process.pid
+
+    def _answer(self, patience: float) -> dict[str, Any]:
+        """Return the next line of the process as JSON; empty if there is none in time."""
+        assert self._process.stdout is not None
+        until, text = time.monotonic() + patience, b""
+        while not text.endswith(b"\n"):
+            left = until - time.monotonic()
+            if left <= 0 or not select.select([self._process.stdout], [], [], left)[0]:
+                return {}
+            part = os.read(self._process.stdout.fileno(), 65536)
+            if not part:
+                return {}
+            text += part
+        answer: dict[str, Any] = json.loads(text)
+        return answer
+
+    def close(self) -> None:
+        """End the process and read its report."""
+        if self._process.returncode is not None:
+            return
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.close()  # the process ends when its input ends
+            self.report = self._answer(10.0)
+            self._process.wait(10.0)
+        except (OSError, subprocess.TimeoutExpired):
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        if self._truth.is_file():
+            with np.load(self._truth) as file:
+                rows, columns = file["rows"], [str(name) for name in file["columns"]]
+                self.obeyed = file["obeyed"]
+            if len(rows) and not np.isnan(rows).any():
+                self.truth = dict(zip(columns, rows.T, strict=True))
+        self._folder.cleanup()
+
+    def __enter__(self) -> SimulatedRobot:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()

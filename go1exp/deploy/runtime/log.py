@@ -1,0 +1,294 @@
+"""The log of a walk: kept in arrays that are allocated before the walk begins, and written after its end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from go1exp import __version__
+from go1exp.base.files import opened
+from go1exp.deploy.runtime.controller import PHASES, Cycle
+from go1exp.deploy.runtime.metadata import Metadata
+
+if TYPE_CHECKING:
+    from go1exp.config.schema.contact import ContactConfig
+    from go1exp.logs.recording import Meta, Recording
+
+STATES_PER_S = 500.0
+"""States that a Go1 sends in a second."""
+
+STATE = (
+    *(("t", 1), ("clock", 1), ("in_force", 1), ("q", 12), ("qd", 12), ("tau_est", 12)),
+    *(("imu_quat", 4), ("imu_gyro", 3), ("imu_acc", 3), ("foot_force", 4)),
+)
+CYCLE = (
+    *(("t", 1), ("phase", 1), ("number", 1), ("damping", 1), ("q_target", 12), ("command", 3), ("estimate", 3)),
+    *(("sent_at", 1), ("age", 1)),
+)
+"""Parts of a row: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0;
+``sent_at`` when it left; ``age`` as in ``Cycle``."""
+
+
+class Ring:
+    """The newest rows of numbers, in an array of fixed size."""
+
+    def __init__(self, parts: tuple[tuple[str, int], ...], size: int) -> None:
+        """Allocate ``size`` rows of ``parts``; filling them with NaN now avoids page faults during the walk."""
+        self._rows = np.full((size, sum(width for _, width in parts)), np.nan)
+        self.columns, place = {}, 0
+        for name, width in parts:
+            self.columns[name] = slice(place, place + width)
+            place += width
+        self.count = 0
+
+    def next(self) -> np.ndarray:
+        """Return the row to be filled next: the oldest, once all are full."""
+        row: np.ndarray = self._rows[self.count % len(self._rows)]
+        self.count += 1
+        return row
+
+    @property
+    def overwritten(self) -> int:
+        """Number of rows that were overwritten."""
+        return max(self.count - len(self._rows), 0)
+
+    def rows(self) -> np.ndarray:
+        """Return the rows that are kept, oldest first."""
+        if self.count <= len(self._rows):
+            return self._rows[: self.count]
+        return np.roll(self._rows, -(self.count % len(self._rows)), axis=0)
+
+    def part(self, name: str) -> np.ndarray:
+        """Return a part of all rows that are kept, (T, width), or (T,) if its width is 1."""
+        return self.part_of(self.rows(), name)
+
+    def part_of(self, rows: np.ndarray, name: str) -> np.ndarray:
+        """Return a part of ``rows`` (T, ...), as ``part`` does of those that are kept."""
+        values = rows[:, self.columns[name]]
+        return values[:, 0] if values.shape[1] == 1 else values
+
+
+@dataclass(frozen=True)
+class About:
+    """Origin of a log.
+
+    Attributes:
+        metadata: of the bundle.
+        kp: (J,) N m/rad, in force while standing up and walking.
+        kd: (J,) N m s/rad.
+        simulated: not measured on hardware.
+        newton: the feet's readings are in newtons; if not, they are left out of the recording.
+        episode: the recording's name.
+        excitation: what moved the robot.
+        hung: whether its trunk was held in the air; the mean of what the IMU says is its attitude then.
+        notes: anything else that a reader must know.
+        trained: the configuration of the policy's run, which says the contact of its feet.
+    """
+
+    metadata: Metadata
+    kp: np.ndarray
+    kd: np.ndarray
+    simulated: bool
+    newton: bool
+    episode: str
+    excitation: str = "policy"
+    hung: bool = False
+    notes: str = ""
+    trained: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Log:
+    """Keeps every cycle in memory; writes nothing during the walk.
+
+    Attributes:
+        states: every received state.
+        cycles: every cycle.
+        phases: when each phase began, s of the runtime's clock.
+        first_command: when the first command was sent, s; None before.
+    """
+
+    def __init__(self, rate: float, keep: float) -> None:
+        """Allocate ``keep`` s at ``rate`` cycles per second; of a longer walk the newest are kept."""
+        self.states = Ring(STATE, math.ceil(keep * STATES_PER_S) + 1)
+        self.cycles = Ring(CYCLE, math.ceil(keep * rate) + 1)
+        self.phases: dict[str, float] = {}
+        self.first_command: float | None = None
+        self._sent = 0
+
+    def note(self, cycle: Cycle) -> None:
+        """Keep a cycle and the states received in it."""
+        for state in cycle.fresh:
+            row = self.states.next()
+            # in place, by the widths of STATE: nothing is allocated during the walk
+            row[0], row[1], row[2] = state.t, state.clock, state.in_force
+            row[3:15], row[15:27], row[27:39] = state.joint_pos, state.joint_vel, state.joint_torque
+            row[39:43], row[43:46], row[46:49], row[49:53] = (
+                *(state.imu_quat, state.imu_gyro, state.imu_acc),
+                state.foot_force,
+            )
+        row = self.cycles.next()
+        row[0], row[1], row[2], row[3] = cycle.t, PHASES.index(cycle.phase), 0, False
+        row[4:16] = np.nan
+        if cycle.command is not None:
+            self._sent += 1
+            self.first_command = cycle.t if self.first_command is None else self.first_command
+            row[2], row[3], row[4:16] = self._sent, cycle.command.damping, cycle.command.joint_target
+        row[16:19], row[19:22] = cycle.velocity, cycle.base_lin_vel
+        row[22], row[23] = cycle.sent_at, cycle.age
+        self.phases.setdefault(cycle.phase, cycle.t)
+
+    def recording(
+        self, about: About, truth: Mapping[str, np.ndarray] | None = None, obeyed: np.ndarray | None = None
+    ) -> Recording | None:
+        """Return the walk from the first command in force to the first that brakes; None if there was none.
+
+        Args:
+            about: its origin.
+            truth: columns of the format by name, with ``clock``, s; rows are joined where the clocks are the same.
+            obeyed: (T, 2 + J) what a simulated robot had in force: its clock, s, whether a command was, targets, rad.
+        """
+        from go1exp.logs.recording import Recording
+
+        rows = self._in_force() if obeyed is None or self._numbered() else self._as_told(obeyed)
+        if rows is None:
+            return None
+        kept, targets = rows
+        clock = self.measured("clock")[kept]
+        t = self.measured("t")[kept] if np.isnan(clock).any() else clock
+        channels = self._channels(about, kept, targets)
+        if truth is not None:
+            channels |= _joined(truth, clock)
+        # A recording needs an increasing clock and finite values; other rows are dropped and counted in the notes.
+        good = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
+        good &= np.isfinite(np.stack(list(channels.values()))).all(axis=0)
+        if good.sum() < 2:
+            return None
+        known = obeyed is not None or (self.measured("in_force")[kept] >= 0).all()
+        notes = [about.notes, "" if known else UNKNOWN_DELAY]
+        notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
+        channels = {name: np.ascontiguousarray(values[good]) for name, values in {"t": t, **channels}.items()}
+        return Recording(_meta(about, channels, "; ".join(note for note in notes if note)), channels)
+
+    def _channels(self, about: About, kept: np.ndarray, targets: np.ndarray) -> dict[str, np.ndarray]:
+        """Return what was measured in the states ``kept`` (S,) bool, by column, each (T,), with targets (T, J)."""
+        from go1exp.logs.recording import FOOT_FORCE, VECTORS, joint_channels
+
+        joints = about.metadata.joints
+        channels: dict[str, np.ndarray] = {}
+        for name in ("q", "qd", "tau_est"):
+            channels |= dict(zip(joint_channels(name, joints), self.measured(name)[kept].T, strict=True))
+        channels |= dict(zip(joint_channels("q_target", joints), targets.T, strict=True))
+        quat = self.measured("imu_quat")[kept]
+        length = np.linalg.norm(quat, axis=1, keepdims=True)
+        quat = quat / np.where(length > 0.5, length, np.nan)  # an IMU that has not started has no attitude
+        vectors = {"imu_quat": quat} | {name: self.measured(name)[kept] for name in ("imu_gyro", "imu_acc")}
+        for name, values in vectors.items():
+            channels |= dict(zip(VECTORS[name], values.T, strict=True))
+        if about.newton:
+            feet = self.measured("foot_force")[kept]
+            channels |= {FOOT_FORCE + leg: feet[:, k] for k, leg in enumerate(about.metadata.legs)}
+        return channels
+
+    def measured(self, name: str) -> np.ndarray:
+        """Return a part of the states that are kept, (T, ...), in the order in which they were measured.
+
+        A state that others overtook on the way arrived, as far as commands go, no later than those.
+        """
+        rows = self.states.rows()
+        clock = self.states.part_of(rows, "clock")
+        if np.isnan(clock).any() or (np.diff(clock) >= 0.0).all():
+            return self.states.part_of(rows, name)
+        part = self.states.part_of(rows, name)[np.argsort(clock, kind="stable")]
+        return np.minimum.accumulate(part[::-1])[::-1] if name == "t" else part
+
+    def _numbered(self) -> bool:
+        """Return whether the robot told in its states which command was in force."""
+        return bool((self.measured("in_force") >= 0).any())
+
+    def _as_told(self, obeyed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""
+        clock = self.measured("clock")
+        if not len(obeyed) or not len(clock) or np.isnan(clock).any():
+            return None
+        nearest = np.clip(np.searchsorted(obeyed[:, 0], clock - 1e-6), 0, len(obeyed) - 1)
+        in_force = (np.abs(obeyed[nearest, 0] - clock) < 1e-6) & (obeyed[nearest, 1] > 0)
+        return (in_force, obeyed[nearest[in_force], 2:]) if in_force.any() else None
+
+    def _in_force(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""
+        sent = self.cycles.part("number") > 0
+        if not sent.any() or not self.states.count:
+            return None
+        number, at = self.cycles.part("number")[sent], self.cycles.part("t")[sent]
+        damping, target = self.cycles.part("damping")[sent] > 0, self.cycles.part("q_target")[sent]
+        known = self.measured("in_force")
+        # If the robot does not report the command in force, the newest one sent by then is taken.
+        by_number, by_time = np.searchsorted(number, known), np.searchsorted(at, self.measured("t"), "right") - 1
+        k = np.where(known >= 0, by_number, by_time)
+        in_force = (k >= 0) & (k < len(number)) & (known != 0) & ((known < 0) | (known >= number[0]))
+        place = np.clip(k, 0, len(number) - 1)
+        in_force &= ~damping[place]
+        return (in_force, target[place[in_force]]) if in_force.any() else None
+
+
+UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell what it obeys, and the way takes time"
+
+
+def _meta(about: About, channels: Mapping[str, np.ndarray], notes: str) -> Meta:
+    """Return the description of a recording with these channels."""
+    from go1exp.logs.recording import VECTORS, Meta
+
+    return Meta(
+        robot=about.metadata.robot,
+        joints=about.metadata.joints,
+        rate_hz=float(np.round(1.0 / np.median(np.diff(channels["t"])), 3)),
+        base="fixed" if about.hung else "floating",
+        base_quat=_attitude(np.stack([channels[name] for name in VECTORS["imu_quat"]])) if about.hung else None,
+        kp=tuple(map(float, about.kp)),
+        kd=tuple(map(float, about.kd)),
+        tau_limit=about.metadata.torque_limit,
+        excitation=about.excitation,
+        episode=about.episode,
+        repeat_of=None,
+        source="simulated" if about.simulated else "measured",
+        tool="go1exp deploy",
+        versions={"go1exp": __version__, "onnxruntime": metadata.version("onnxruntime")},
+        notes=notes,
+        contact=_contact(about.trained),
+    )
+
+
+def _contact(trained: Mapping[str, Any]) -> ContactConfig | None:
+    """Return the contact of a run, None if it cannot be read; one of an older version had MuJoCo's own."""
+    from go1exp.config.schema.contact import MUJOCO_CONTACT, read_contact
+
+    if not trained:
+        return None
+    return read_contact(trained["contact"]) if "contact" in trained else MUJOCO_CONTACT
+
+
+def _attitude(quat: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the mean attitude w-x-y-z of quaternions (4, T), of which q and -q are the same (Markley et al., 2007)."""
+    mean = np.linalg.eigh(quat @ quat.T)[1][:, -1]
+    w, x, y, z = np.where(mean[0] < 0.0, -mean, mean).tolist()
+    return w, x, y, z
+
+
+def _joined(truth: Mapping[str, np.ndarray], clock: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the true columns at the times of a clock; NaN where they are unknown."""
+    nearest = np.clip(np.searchsorted(truth["clock"], clock - 1e-6), 0, len(truth["clock"]) - 1)
+    same = np.abs(truth["clock"][nearest] - clock) < 1e-6
+    return {name: np.where(same, values[nearest], np.nan) for name, values in truth.items() if name != "clock"}
+
+
+def write_cycles(path: Path, log: Log) -> None:
+    """Write the cycles as NumPy's archive: velocities commanded and estimated, targets, phases; the runtime's clock."""
+    content: dict[str, Any] = {name: log.cycles.part(name) for name, _ in CYCLE}
+    with opened(path) as file:
+        np.savez(file, phases=np.array(PHASES), **content)

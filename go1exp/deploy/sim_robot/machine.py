@@ -1,0 +1,303 @@
+"""The simulated Go1's body and drives, one tick of 2 ms at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from go1exp import robot
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.registry import ConfigError, Term
+from go1exp.deploy.runtime.controller import LYING
+from go1exp.deploy.runtime.safety import DEFAULT_KD
+from go1exp.deploy.sim_robot.settings import SimConfig
+from go1exp.robot.config import RobotConfig
+from go1exp.robot.messages import LowCmd, LowState
+from go1exp.sim.effects.base import Measured
+from go1exp.sim.effects.rules import has_gains
+from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import HELD_HEIGHT, build_model
+from go1exp.sim.task import TaskConfig
+from go1exp.sim.terrain import Terrain, TerrainConfig, build_terrain
+
+TICK = 0.002
+"""Period of the drives and of the states that the robot sends, s: the vendor's SDK has 500 Hz."""
+
+SILENCE = 0.05
+"""The drives brake when no command has come for this time, s."""
+
+NOISE = {"joint_pos": 0.05, "joint_vel": 0.1, "imu_gyro": 0.01, "attitude": 0.05}
+"""Half-widths of the paper's Table II: rad, rad/s, rad/s, and of projected gravity, taken as a rotation in rad."""
+
+OWN_NOISE = {"imu_acc": 0.1, "foot_force": 2.0}
+"""Standard deviations of noises that Table II does not list, m/s2 and N, as in ``conf/record.yaml``."""
+
+LYING_HEIGHT = 0.12
+"""Height of the trunk when a lying robot is put down, m."""
+
+SETTLE_S = 1.0
+"""Simulated time in which the robot comes to rest before it takes commands, s."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A robot and the ground that it stands on, without any training.
+
+    Attributes:
+        robot: masses and limits.
+        actuator: its drives.
+        effect: what else acts.
+        contact: how its feet touch the ground.
+        terrain: the ground.
+        tile: row and column of the tile on which it begins.
+    """
+
+    robot: RobotConfig
+    actuator: Term
+    effect: tuple[Term, ...]
+    contact: ContactConfig
+    terrain: TerrainConfig = field(default_factory=TerrainConfig)
+    tile: tuple[int, int] = (0, 0)
+
+
+class Robot:
+    """One Go1 with its sensors.
+
+    Attributes:
+        clock: time of the robot, s.
+        braking: whether its drives only brake: no command for too long, or a damping command.
+    """
+
+    def __init__(self, task: TaskConfig | Body, config: SimConfig) -> None:
+        """Put the task's robot, with its drives and effects, where ``config.start`` says, at rest.
+
+        The robot of a training stands on flat ground, a ``Body`` on its own.
+
+        Raises:
+            ConfigError: if its drives have no gains, since commands set gains; if there is no such tile.
+        """
+        if not has_gains(task.actuator):
+            name = task.actuator.entry.name
+            raise ConfigError(
+                [f"actuator = {name}: has no kp and kd, which the runtime commands with every target; use actuator=pd"]
+            )
+        self._config, self._rng = config, np.random.default_rng(config.seed)
+        held = (1.0, 0.0, 0.0, 0.0) if config.start == "hung" else None
+        terrain = build_terrain(task.terrain if isinstance(task, Body) else TerrainConfig())
+        self._origin = _origin(terrain, task.tile if isinstance(task, Body) else (0, 0))
+        model, blocks = build_model(task.robot, terrain, TICK, contact=task.contact, imu=True, held=held)
+        self._backend = backend = MujocoCpu(model, blocks, 1, threads=1)
+        random = EnvRandom(config.seed, 1, device=backend.qpos.device)
+        self._plant = Plant(backend, drive_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
+        self._plant.startup()
+        actuator = self._plant.actuator
+        self._default_gains = tuple(getattr(actuator, name).numpy().ravel().copy() for name in ("kp", "kd"))
+        self.clock, self.braking = 0.0, False
+        self._commanded, self._in_force = -np.inf, 0
+        self._measured = self.clock, self._in_force
+        self._fed: torch.Tensor | None = None  # from the first feed-forward torque on
+        self._place()
+
+    @property
+    def backend(self) -> MujocoCpu:
+        """What computes its motion."""
+        return self._backend
+
+    def restart(self) -> None:
+        """Put the robot back into its first state, where no command is in force; its clock goes on."""
+        self._commanded, self.braking = -np.inf, False
+        if self._fed is not None:
+            self._fed = torch.zeros_like(self._fed)
+        self._place()
+
+    def take_over(self, old: Robot) -> None:
+        """Go on from where ``old`` is: its pose, speeds, clock, noise and command; drives and effects begin anew."""
+        self.clock, self.braking, self._rng = old.clock, old.braking, old._rng
+        self._commanded, self._in_force, self._measured = old._commanded, old._in_force, old._measured
+        self._target: torch.Tensor = old._target.clone()
+        self._now: dict[str, np.ndarray] = old._now
+        self._true: np.ndarray = old._true
+        self._fed = None if old._fed is None else old._fed.clone()
+        plant, everyone = self._plant, torch.ones(1, dtype=torch.bool)
+        plant.backend.reset(everyone, old.backend.qpos.clone(), old.backend.qvel.clone())
+        plant.reset(everyone, self._target)
+        kp, kd = old._gains
+        self._set_gains(kp, kd)
+        plant.effects.reset(everyone)
+
+    def _place(self) -> None:
+        """Put the robot into its first state and let it come to rest; default gains hold it until a command comes."""
+        plant, start = self._plant, self._config.start
+        joints = np.tile(LYING, robot.NUM_LEGS) if start == "lying" else robot.NOMINAL_STANCE
+        qpos, qvel = torch.zeros_like(plant.backend.qpos), torch.zeros_like(plant.backend.qvel)
+        qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(joints)
+        if start != "hung":
+            qpos[:, :3] = torch.as_tensor(self._origin)
+            qpos[:, 2] += LYING_HEIGHT if start == "lying" else robot.NOMINAL_HEIGHT
+            qpos[:, 3] = 1.0
+        everyone = torch.ones(1, dtype=torch.bool)
+        plant.backend.reset(everyone, qpos, qvel)
+        self._target = qpos[:, -robot.NUM_JOINTS :].clone()
+        plant.reset(everyone, self._target)
+        self._gains = self._default_gains
+        self._set_gains(*((np.zeros(robot.NUM_JOINTS), self._braking_kd) if start == "lying" else self._default_gains))
+        for _ in range(round(SETTLE_S / TICK) - 1):
+            plant.step(self._target)
+        self._advance()
+        plant.effects.reset(everyone)  # an effect that drifts starts now
+
+    _braking_kd = np.full(robot.NUM_JOINTS, DEFAULT_KD)
+
+    def _set_gains(self, kp: np.ndarray, kd: np.ndarray) -> None:
+        """Set the gains of the drives, unless they already have these."""
+        if all(np.array_equal(present, new) for present, new in zip(self._gains, (kp, kd), strict=True)):
+            return
+        self._gains = (np.array(kp), np.array(kd))
+        rows = (torch.as_tensor(values).unsqueeze(0) for values in self._gains)
+        self._plant.set_gains(*(row.to(self._plant.q.dtype) for row in rows))
+
+    def obey(self, command: LowCmd, number: int) -> None:
+        """Put a command into force; ``number`` is the sender's count."""
+        self._commanded, self._in_force = self.clock, number
+        self.braking = command.damping
+        self._target = torch.tensor(command.joint_target, dtype=self._plant.q.dtype).unsqueeze(0)
+        if self._fed is not None or (command.feedforward is not None and command.feedforward.any()):
+            fed = np.zeros(robot.NUM_JOINTS) if command.feedforward is None else command.feedforward
+            self._fed = torch.tensor(fed, dtype=self._plant.q.dtype).unsqueeze(0)
+        self._set_gains(command.kp, command.kd)
+
+    def release(self) -> None:
+        """Do as a command says that asks for nothing: the joints are free, once a command has moved them."""
+        if self.commanded:
+            nothing = np.zeros(robot.NUM_JOINTS)
+            self.obey(LowCmd(self._target[0].numpy().astype(float), nothing, nothing), self._in_force)
+
+    def in_force(self) -> np.ndarray:
+        """Return whether a command was in force in the last step, 1 or 0, and its targets, rad: (13,)."""
+        obeying = self.commanded and not self.braking
+        return np.concatenate([[obeying], self._target[0].numpy()])
+
+    def step(self) -> None:
+        """Advance by a tick; drives without a command for ``SILENCE`` brake."""
+        if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE + 1e-9:
+            self.braking = True
+            self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
+            if self._fed is not None:
+                self._fed = torch.zeros_like(self._fed)
+        self._measured = self.clock, self._in_force
+        self._advance()
+        self.clock = round(self.clock / TICK + 1) * TICK  # a whole number of ticks: no rounding adds up
+
+    def _advance(self) -> None:
+        """Make a step, and keep the readings of the instant at which it begins.
+
+        The engine computes forces and IMU readings of that instant during the step, and has speeds half a step before
+        and after it. Read before the step, they would be one to three milliseconds old.
+        """
+        plant, backend = self._plant, self._plant.backend
+        joints = plant.effects.measure(Measured(plant.q, plant.speed()))
+        pose, q, qd = backend.qpos.clone(), joints.joint_pos.clone(), joints.joint_vel.clone()
+        half = backend.qvel.clone()
+        blocks, readings = backend.sensors, backend.sensordata
+        # Foot forces are one tick old: the estimator's ``settle`` was chosen with such readings.
+        feet = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))[..., 1:].norm(dim=-1)
+        plant.step(self._target, self._fed)
+        speed = 0.5 * (half + backend.qvel)
+        floats = pose.shape[1] > robot.NUM_JOINTS
+        rate = speed[:, 3:6] if floats else readings[:, blocks.imu_gyro]
+        about = {"acc": readings[:, blocks.imu_acc], "quat": readings[:, blocks.imu_quat]}
+        imu = plant.effects.measure(Measured(plant.q, plant.speed(), gyro=rate, **about))
+        readings_now = {"q": q, "qd": qd, "gyro": imu.gyro, "acc": imu.acc, "quat": imu.quat}
+        readings_now |= {"tau_est": plant.reported_torque(), "foot_force": feet}
+        self._now = {name: values[0].numpy().copy() for name, values in readings_now.items() if values is not None}
+        trunk = torch.cat([pose[:, :7], speed[:, :6]], dim=1)[0].numpy() if floats else np.full(13, np.nan)
+        self._true = np.array(trunk)
+
+    @property
+    def commanded(self) -> bool:
+        """Whether any command has come that asked for something."""
+        return bool(np.isfinite(self._commanded))
+
+    @property
+    def readings(self) -> Mapping[str, np.ndarray]:
+        """Readings without noise at the instant at which the last step began, by name: ``tau_est`` (12,), N m, ..."""
+        return self._now
+
+    def pose(self) -> np.ndarray:
+        """Return position, attitude and joint angles (19,) after the last step; a robot that hangs has its place."""
+        qpos: np.ndarray = self.backend.qpos[0].numpy().copy()
+        held = (0.0, 0.0, HELD_HEIGHT, 1.0, 0.0, 0.0, 0.0)
+        return qpos if len(qpos) > robot.NUM_JOINTS else np.concatenate([held, qpos])
+
+    def sense_truth(self) -> np.ndarray:
+        """Return the truth (13,) at the instant at which the last step began (``sense``)."""
+        return self._true
+
+    def sense(self) -> tuple[LowState, np.ndarray]:
+        """Return the sensors' readings of the instant at which the last step began, and the truth (13,) then.
+
+        The truth is position, attitude and velocities of the trunk, in the columns of ``TRUTH``; NaN for a robot that
+        hangs.
+        """
+        readings = noisy(self._now, self._config.noise, self._rng)
+        clock, in_force = self._measured
+        state = LowState(
+            t=clock,
+            clock=clock,
+            in_force=in_force,
+            joint_pos=readings["q"],
+            joint_vel=readings["qd"],
+            joint_torque=self._now["tau_est"],
+            imu_quat=readings["quat"],
+            imu_gyro=readings["gyro"],
+            imu_acc=readings["acc"],
+            foot_force=readings["foot_force"],
+        )
+        return state, self._true
+
+
+def _origin(terrain: Terrain, tile: tuple[int, int]) -> np.ndarray:
+    """Return the centre of a tile on the ground, (3,), m.
+
+    Raises:
+        ConfigError: if there is no such tile.
+    """
+    rows, columns = terrain.tile_origins.shape[:2]
+    if tile[0] >= rows or tile[1] >= columns:
+        raise ConfigError([f"tile = {list(tile)}: the ground has {rows} rows and {columns} columns, counted from 0"])
+    origin: np.ndarray = terrain.tile_origins[tile]
+    return origin
+
+
+def noisy(true: Mapping[str, np.ndarray], share: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return the truth, values (..., size) by name, with ``share`` times the noises above."""
+
+    def even(name: str, like: np.ndarray) -> np.ndarray:
+        return rng.uniform(-1.0, 1.0, like.shape) * share * NOISE[name]
+
+    def normal(name: str, like: np.ndarray) -> np.ndarray:
+        return rng.standard_normal(like.shape) * share * OWN_NOISE[name]
+
+    return {
+        "q": true["q"] + even("joint_pos", true["q"]),
+        "qd": true["qd"] + even("joint_vel", true["qd"]),
+        "quat": turned(true["quat"], even("attitude", true["gyro"])),
+        "gyro": true["gyro"] + even("imu_gyro", true["gyro"]),
+        "acc": true["acc"] + normal("imu_acc", true["acc"]),
+        "foot_force": np.maximum(true["foot_force"] + normal("foot_force", true["foot_force"]), 0.0),
+    }
+
+
+def turned(quat: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Return attitudes (..., 4), w-x-y-z, rotated by small rotation vectors (..., 3), rad, in the body's axes."""
+    w, x, y, z = np.moveaxis(quat, -1, 0)
+    a, b, c = np.moveaxis(0.5 * by, -1, 0)
+    # Quaternion product with (1, a, b, c), the small rotation to first order; normalised below.
+    parts = (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)
+    new = np.stack(parts, axis=-1)
+    return new / np.linalg.norm(new, axis=-1, keepdims=True)

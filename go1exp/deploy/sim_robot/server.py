@@ -1,0 +1,265 @@
+"""The simulated robot behind a UDP socket, in real time, over a network that can delay and lose datagrams."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import socket
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
+from go1exp.deploy.runtime.udp import HOST, arrival, ask_for_stamps
+from go1exp.deploy.sim_robot.machine import TICK, Robot
+from go1exp.deploy.sim_robot.protocols import OLD, language
+from go1exp.deploy.sim_robot.settings import SimConfig
+
+MOST_AT_ONCE = 10
+"""Most ticks that are simulated at once after a delay; for a longer one the robot's clock falls behind for good."""
+
+TRUTH = (
+    *("base_pos_x_w", "base_pos_y_w", "base_pos_z_w", "base_quat_w", "base_quat_x", "base_quat_y", "base_quat_z"),
+    *("base_lin_vel_x_w", "base_lin_vel_y_w", "base_lin_vel_z_w"),
+    *("base_ang_vel_x_b", "base_ang_vel_y_b", "base_ang_vel_z_b"),
+)
+"""Columns of the truth, named as in a recording."""
+
+GONE_S = 1.0
+"""A speaker who has been silent for this time is gone: the next one is heard, s."""
+
+STRANGER = "another sender"
+
+OBEYED = ("obeying", *(f"q_target_{k}" for k in range(12)))
+"""Columns of what was in force: whether a command was, and its targets."""
+
+CHUNK = 5000
+"""Rows of a block: 10 s."""
+
+KEPT_S = 60.0
+"""How much is kept of the truth and of what was in force unless told otherwise, s: nobody reads it of a robot alone."""
+
+ASK_EVERY = 20
+"""Calls between two checks whether to continue."""
+
+
+class Network:
+    """Delays datagrams, each by a time of its own, and loses each with the same probability, independently."""
+
+    def __init__(self, delay: float, loss: float, rng: np.random.Generator, jitter: float = 0.0) -> None:
+        """Delay by ``delay`` s and up to ``jitter`` s more, evenly distributed, and lose a share ``loss``."""
+        self._delay, self._loss, self._rng, self._jitter = delay, loss, rng, jitter
+        self._way: list[tuple[float, int, bytes]] = []
+        self._count = 0
+        self.lost = 0
+
+    def put(self, now: float, data: bytes) -> None:
+        """Send a datagram at ``now``, s."""
+        if self._loss and self._rng.random() < self._loss:
+            self.lost += 1
+            return
+        self._count += 1
+        further = self._jitter * self._rng.random() if self._jitter else 0.0
+        heapq.heappush(self._way, (now + self._delay + further, self._count, data))
+
+    def take(self, now: float) -> list[bytes]:
+        """Return the datagrams that have arrived by ``now``, in the order of arrival."""
+        arrived = []
+        while self._way and self._way[0][0] <= now + 1e-9:
+            arrived.append(heapq.heappop(self._way)[2])
+        return arrived
+
+
+class Truth:
+    """The newest rows of numbers by the robot's clock, kept in blocks so that no array is ever copied to grow."""
+
+    def __init__(self, width: int = len(TRUTH), kept: float = KEPT_S) -> None:
+        """Keep at least the rows of the last ``kept`` s."""
+        blocks = math.ceil(kept / (CHUNK * TICK)) + 1
+        self._pieces = deque([np.zeros((CHUNK, 1 + width))], maxlen=blocks)
+        self._rows = 0
+
+    def add(self, clock: float, values: np.ndarray) -> None:
+        """Keep a row."""
+        if self._rows == CHUNK:
+            self._pieces.append(np.zeros_like(self._pieces[0]))
+            self._rows = 0
+        row = self._pieces[-1][self._rows]
+        row[0], row[1:] = clock, values
+        self._rows += 1
+
+    def rows(self) -> np.ndarray:
+        """Return what is kept: clock, and the columns, (T, 1 + width)."""
+        *whole, last = self._pieces
+        return np.concatenate([*whole, last[: self._rows]])
+
+
+@dataclass
+class Counts:
+    """Counts at the robot's end: datagrams by what happened to them, and how real time was kept.
+
+    Attributes:
+        heard: datagrams of the one who is listened to, those that ask for nothing included.
+        commands: commands put into force.
+        old: commands that came after a newer one (known with protocol=exact only).
+        foreign: datagrams that were not a valid message, or came from another sender.
+        refused: these by their reason.
+        states: states sent.
+        lost: datagrams that the simulated network lost.
+        slipped: time by which the robot's clock fell behind for good, s.
+        ticks: simulated ticks of 2 ms.
+    """
+
+    heard: int = 0
+    commands: int = 0
+    old: int = 0
+    foreign: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+    states: int = 0
+    lost: int = 0
+    slipped: float = 0.0
+    ticks: int = 0
+    timing: dict[str, Any] = field(default_factory=dict)
+
+
+class Server:
+    """A robot at a port of this machine.
+
+    It answers to the first who speaks to it in its protocol. Other senders are refused until that one has been silent
+    for ``GONE_S``.
+
+    Attributes:
+        robot: what is simulated.
+        address: where it listens.
+        counts: what has happened.
+        peer: who it listens to; None before anybody has spoken.
+        truth: the trunk's true motion, the newest of it.
+        obeyed: what was in force, in the columns of ``OBEYED``, the newest of it.
+        on_heard: called for each datagram of ``peer``: its time of arrival, s on ``time.perf_counter``'s clock; itself.
+        on_tick: called after each tick.
+    """
+
+    on_heard: Callable[[float, bytes], None] | None = None
+    on_tick: Callable[[], None] | None = None
+
+    def __init__(self, robot: Robot, config: SimConfig, port: int = 0, host: str = HOST, kept: float = KEPT_S) -> None:
+        """Listen at ``port``, or at any that is free if 0; keep the newest ``kept`` s of truth and commands.
+
+        Raises:
+            OSError: if the port is taken, or the host is not this machine's.
+        """
+        self.robot, self._language = robot, language(config)
+        rng = np.random.default_rng([config.seed, 1])
+        self._uplink, self._downlink = (Network(config.delay, config.loss, rng, config.jitter) for _ in range(2))
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind((host, port))
+            ask_for_stamps(self._socket)
+        except OSError:
+            self._socket.close()
+            raise
+        self.address: tuple[str, int] = self._socket.getsockname()
+        self.peer: tuple[str, int] | None = None
+        self._heard = -math.inf
+        self.counts, self.truth, self.obeyed = Counts(), Truth(kept=kept), Truth(len(OBEYED), kept)
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return self.address[1]
+
+    def serve(self, going: Callable[[], bool], seconds: float | None = None) -> Timing:
+        """Run in real time while ``going``; return how the time was kept."""
+        clock = MonotonicClock()
+        begin, calls = math.inf, 0
+
+        def work(now: float) -> bool:
+            nonlocal begin, calls
+            begin = min(begin, now - TICK * self.counts.ticks) if calls == 0 else begin
+            # Ticks that should have been simulated by now, less those that were.
+            due = int((now - begin) / TICK) + 1 - self.counts.ticks
+            if due > MOST_AT_ONCE:
+                # The start is moved, so that the lost time is never made up for.
+                late = (due - MOST_AT_ONCE) * TICK
+                begin, due = begin + late, MOST_AT_ONCE
+                self.counts.slipped += late
+            for _ in range(due):
+                self.tick()
+            calls += 1
+            return calls % ASK_EVERY != 0 or going()
+
+        timing = run(work, 1.0 / TICK, seconds, clock)
+        self.counts.timing = asdict(timing)
+        return timing
+
+    def tick(self) -> None:
+        """Receive, obey the newest command, simulate one tick, and send the readings of its beginning."""
+        robot, now = self.robot, self.robot.clock
+        self._listen(now)
+        for data in self._uplink.take(now):
+            self._obey(data)
+        # The newest command acts in this tick; the state that is sent is of its beginning.
+        robot.step()
+        state, true = robot.sense()
+        self.truth.add(now, true)
+        self.obeyed.add(now, robot.in_force())
+        data = self._language.written(state, round(now / TICK))
+        if self.peer is not None:
+            self._downlink.put(now, data)
+            for late in self._downlink.take(now):
+                self._send(late)
+        self.counts.ticks += 1
+        self.counts.lost = self._uplink.lost + self._downlink.lost
+        if self.on_tick is not None:
+            self.on_tick()
+
+    def _listen(self, now: float) -> None:
+        while True:
+            try:
+                data, extra, _, sender = self._socket.recvmsg(self._language.size + 1, 64)
+            except BlockingIOError:
+                return
+            except ConnectionRefusedError:
+                continue  # an earlier state was sent to a port that is closed
+            if why := self._language.refusal(data):
+                self._refuse(why)
+            elif self.peer not in (None, sender) and now - self._heard < GONE_S:
+                self._refuse(STRANGER)
+            else:
+                self.peer, self._heard = sender, now
+                self.counts.heard += 1
+                if self.on_heard is not None:
+                    self.on_heard(arrival(extra), data)
+                self._uplink.put(now, data)
+
+    def _refuse(self, why: str) -> None:
+        self.counts.foreign += 1
+        self.counts.refused[why] = self.counts.refused.get(why, 0) + 1
+
+    def _obey(self, data: bytes) -> None:
+        heard = self._language.read(data)
+        if heard == OLD:
+            self.counts.old += 1
+        elif isinstance(heard, str):
+            self._refuse(heard)
+        elif heard.command is None:
+            self.robot.release()
+        else:
+            self.counts.commands += 1
+            self.robot.obey(heard.command, heard.number or self.counts.commands)
+
+    def _send(self, data: bytes) -> None:
+        assert self.peer is not None
+        try:
+            self._socket.sendto(data, self.peer)
+            self.counts.states += 1
+        except (BlockingIOError, ConnectionRefusedError):
+            pass
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._socket.close()

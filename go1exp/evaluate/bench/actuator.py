@@ -1,0 +1,81 @@
+"""``suite=actuator``: what actuator nets and effects cost, and how long a recording takes."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from go1exp.config.schema.registry import Term, members
+from go1exp.evaluate.bench.env import core_subject
+from go1exp.evaluate.bench.measure import rates, ratio
+from go1exp.gap.actuator_net import FitSettings, fit
+from go1exp.logs import recording
+from go1exp.logs.record import plan, simulate
+from go1exp.logs.record.sensors import SensorConfig
+from go1exp.sim.task import TaskConfig
+
+EFFECTS = {
+    "coulomb": {"bound": 0.2},
+    "viscous": {"damping": 0.05},
+    "command_delay": {"delay": 0.01},
+    "lag": {"time": 0.005},
+    "strength": {"scale": 0.95},
+}
+"""Five joint effects, with the values that the suite switches on."""
+
+
+def small_net(rig: simulate.Rig, sensors: SensorConfig, folder: Path) -> Path:
+    """Fit an actuator net of the usual size to a short recording of the rig, and return its file."""
+    wishes = plan.Wishes(((20.0, 0.5),), 10.0, (0, 1, 2), 0, "hung", ((0.0, 0.0),), 0, sensors)
+    motion = Term("multisine", members("excitation")["multisine"], {})
+    made = simulate.play(rig, plan.episodes([motion], wishes), sensors, 0, lambda done, total: None)
+    result = fit(made, FitSettings(share="kind", epochs=15, half_net=False))
+    file = folder / "net.npz"
+    result.net.save(file)
+    return file
+
+
+def record_seconds(rig: simulate.Rig, sensors: SensorConfig, folder: Path) -> float:
+    """Return how long it takes to record and write 60 s of a hung robot with three gain sets, s."""
+    start = time.perf_counter()
+    gains = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))
+    wishes = plan.Wishes(gains, 20.0, (0,), 0, "hung", ((0.0, 0.0),), 0, sensors)
+    motions = [Term(name, members("excitation")[name], {}) for name in ("chirp", "steps", "slow_ramps")]
+    for r in simulate.play(rig, plan.episodes(motions, wishes), sensors, 0, lambda done, total: None):
+        recording.write(folder / f"{r.meta.episode}.parquet", r)
+    return time.perf_counter() - start
+
+
+def run(
+    task: TaskConfig,
+    sensors: SensorConfig,
+    record_dt: float,
+    num_envs: int,
+    rounds: int,
+    seconds: float,
+    on_round: Callable[[int, int], None],
+) -> dict[str, float]:
+    """Measure; return the figures by name. Recordings are simulated at ``record_dt``, s."""
+    rig = simulate.Rig(task.robot, task.actuator, (), task.terrain, task.backend, record_dt)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        net = Term("net", members("actuator")["net"], {"file": str(small_net(rig, sensors, folder)), "period": "exact"})
+        effects = tuple(Term(key, members("effect")[key], values, {"spread": {}}) for key, values in EFFECTS.items())
+        subjects = {
+            "pd": core_subject(task, num_envs),
+            "net": core_subject(dataclasses.replace(task, actuator=net), num_envs),
+            "effects": core_subject(dataclasses.replace(task, effect=effects), num_envs),
+        }
+        measured = rates(subjects, rounds, seconds, on_round)
+        recorded = record_seconds(rig, sensors, folder)
+    return {
+        **{f"{key}_steps_per_s": float(np.median(values)) for key, values in measured.items()},
+        "net_over_pd": ratio(measured, "net", "pd"),
+        "effects_over_none": ratio(measured, "effects", "pd"),
+        "record_s": recorded,
+    }

@@ -1,0 +1,150 @@
+"""``suite=deploy``: timing of the runtime on this machine, and of an empty loop for comparison.
+
+The runtime is ``python -m go1exp.deploy`` in a process of its own, as on the robot's computer, with a network of the
+size of training, against the simulated robot in another process. The policy is hardly trained: it stands.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from go1exp.deploy.export.build import build
+from go1exp.deploy.runtime.bundle import Bundle, loads
+from go1exp.deploy.runtime.go1_wire import (
+    JOINTS,
+    Health,
+    pack_command,
+    pack_state,
+    state_refusal,
+    tick_of,
+    unpack_command,
+    unpack_state,
+)
+from go1exp.deploy.runtime.launch import RobotError, SimulatedRobot
+from go1exp.deploy.runtime.loop import Timing
+from go1exp.deploy.runtime.loop import run as loop
+from go1exp.robot.messages import LowCmd, LowState
+from go1exp.sim.task import parse_train
+from go1exp.train import run_folder, trainer
+
+RATE = 400.0
+CALLS = 500
+
+LITTLE = {"num_envs": 4, "steps": 4, "minibatches": 2, "epochs": 1, "iterations": 1}
+"""Settings of a training that takes a moment."""
+
+
+def run(
+    container: dict[str, Any],
+    num_envs: int,
+    rounds: int,
+    seconds: float,
+    on_round: Callable[[int, int], None],
+) -> dict[str, float]:
+    """Measure; return the medians over the rounds by name. ``container`` is a training's configuration."""
+    little = container | {"ppo": container["ppo"] | LITTLE}
+    results: list[dict[str, float]] = []
+    with tempfile.TemporaryDirectory(prefix="go1exp-") as folder:
+        place = Path(folder)
+        run_folder.write(place / "run", little)
+        trainer.train(parse_train(little), little, place / "run")
+        data = build(place / "run", seconds=0.5)
+        file = place / "walk.zip"
+        file.write_bytes(data)
+        bundle = loads(data, str(file))
+        for k in range(rounds):
+            idle = loop(lambda now: True, RATE, seconds)
+            results.append(
+                _walk(file, seconds, place / str(k))
+                | {"policy_us": _policy(bundle), "packets_us": _packets()}
+                | _jitter(idle)
+            )
+            on_round(k + 1, rounds)
+    return {name: float(np.median([one[name] for one in results])) for name in results[0]}
+
+
+def _jitter(idle: Timing) -> dict[str, float]:
+    """Return the timing of a loop without work."""
+    return {"idle_missed_400hz": 100.0 * idle.missed_share, "idle_period_p99_ms": 1e3 * idle.period_p99}
+
+
+def _policy(bundle: Bundle) -> float:
+    """Return the time of one call of the policy, us: the median."""
+    readings = {port.name: np.zeros((1, port.size), np.float32) for port in bundle.policy.inputs}
+    times = []
+    for _ in range(CALLS):
+        start = time.perf_counter()
+        bundle.policy(readings)
+        times.append(time.perf_counter() - start)
+    return 1e6 * float(np.median(times))
+
+
+def _packets() -> float:
+    """Return the time to pack, check and unpack a command and a state, both ends together, us: the median."""
+    rng = np.random.default_rng(0)
+    command = LowCmd(rng.normal(size=JOINTS), np.full(JOINTS, 20.0), np.full(JOINTS, 0.5))
+    quat = np.array([1.0, 0.0, 0.0, 0.0])
+    q, qd, torque = (rng.normal(size=JOINTS) for _ in range(3))
+    state = LowState(0.0, q, qd, torque, quat, np.zeros(3), np.zeros(3), np.full(4, 30.0))
+    health, rpy = Health(), np.zeros(3)
+    packet = pack_state(state, 2, health, rpy)
+    times = []
+    for _ in range(CALLS):
+        start = time.perf_counter()
+        unpack_command(pack_command(command))
+        pack_state(state, 2, health, rpy)
+        if state_refusal(packet) is None:
+            tick_of(packet)
+            unpack_state(packet, 0.0, 0.0)
+        times.append(time.perf_counter() - start)
+    return 1e6 * float(np.median(times))
+
+
+def _walk(file: Path, seconds: float, out: Path) -> dict[str, float]:
+    """Walk once; return figures from the runtime's report."""
+    arguments = [str(file), "--rate", str(RATE), "--seconds", str(seconds), "--stand-up", "0.2", "--brake", "0.1"]
+    with SimulatedRobot(str(file), {}, {}) as robot:
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "go1exp.deploy",
+                *arguments,
+                "--robot",
+                str(robot.port),
+                "--stale",
+                "5",
+                "--out",
+                str(out),
+            ],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+        )
+    if done.returncode:
+        raise RobotError(f"python -m go1exp.deploy: {done.stderr.strip() or done.stdout.strip().splitlines()[-1]}")
+    account = json.loads(next(out.glob("*.json")).read_text())
+    timing = account["timing"]
+    with np.load(next(out.glob("*.npz"))) as cycles:
+        took = 1e3 * (cycles["sent_at"] - cycles["t"])
+    p50, p99 = np.nanpercentile(took, [50, 99])
+    return {
+        "command_p50_ms": float(p50),
+        "command_p99_ms": float(p99),
+        "cycle_p50_ms": 1e3 * timing["work_p50"],
+        "cycle_p99_ms": 1e3 * timing["work_p99"],
+        "missed_400hz": 100.0 * timing["missed_share"],
+        "period_p99_ms": 1e3 * timing["period_p99"],
+        "start_s": account["first_command_after_s"],
+        "memory_mb": account["memory_mb"],
+    }

@@ -1,0 +1,148 @@
+"""``suite=env``: speed of the environment relative to bare MuJoCo, and memory per environment."""
+
+from __future__ import annotations
+
+import functools
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from go1exp import robot
+from go1exp.config.schema.joint_values import spread
+from go1exp.evaluate.bench.measure import Subject, rates, ratio
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.gym_env import Go1Env
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig
+from go1exp.sim.terrain import build_terrain
+
+ACTION_SCALE = 0.5
+"""Standard deviation of the random actions, policy units (chosen: robots move their feet and few fall)."""
+
+
+def core_subject(task: TaskConfig, num_envs: int) -> Subject:
+    """The whole environment step under random actions."""
+    core = Go1Core(task, num_envs)
+    core.reset()
+    generator = torch.Generator().manual_seed(0)
+
+    def work() -> int:
+        core.step(ACTION_SCALE * torch.randn(num_envs, robot.NUM_JOINTS, generator=generator))
+        return num_envs
+
+    return Subject("environment", work)
+
+
+def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
+    """MuJoCo's batch alone: the same model with its sensors, a PD torque once a policy step, no MDP.
+
+    The torques are computed once per policy step and held, so that nothing but physics is timed between substeps.
+    """
+    terrain = build_terrain(task.terrain)
+    model, _ = build_model(task.robot, terrain, task.sim.physics_dt, contact=task.contact)
+    batch = Batch(model, num_envs, nthread=task.backend.as_reference().threads)
+    qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
+    batch.bind("sensordata")  # so that sensors are computed and copied, as in the environment
+    batch.reset(keyframe=0)
+    origins = terrain.tile_origins.reshape(-1, 3)
+    qpos[:, :3] += origins[np.arange(num_envs) % len(origins)]
+    limit = robot.per_joint(task.robot.effort_limit)
+    kp, kd = (task.actuator.parameters.get(name, usual) for name, usual in (("kp", 20.0), ("kd", 0.5)))
+    kp, kd = spread(kp, robot.JOINTS), spread(kd, robot.JOINTS)
+    rng = np.random.default_rng(0)
+
+    def work() -> int:
+        target = robot.NOMINAL_STANCE + task.action.scale * ACTION_SCALE * rng.normal(size=(num_envs, 12))
+        torque = kp * (target - qpos[:, 7:]) - kd * qvel[:, 6:]
+        np.clip(torque, -limit, limit, out=ctrl)
+        batch.step(nstep=task.sim.decimation)
+        return num_envs
+
+    return Subject("bare mujoco.batch", work)
+
+
+def _one_env(task: TaskConfig, index: int) -> Go1Env:
+    torch.set_num_threads(1)
+    return Go1Env(task=task, env_index=index)
+
+
+def subproc_subject(task: TaskConfig) -> tuple[Subject, Callable[[], None]]:
+    """Our own single environment in SB3's SubprocVecEnv, a process per core; also how to end it."""
+    count = os.cpu_count() or 1
+    vec = SubprocVecEnv([functools.partial(_one_env, task, i) for i in range(count)], start_method="spawn")
+    vec.reset()
+    rng = np.random.default_rng(0)
+
+    def work() -> int:
+        vec.step((ACTION_SCALE * rng.normal(size=(count, robot.NUM_JOINTS))).astype(np.float32))
+        return count
+
+    return Subject(f"SubprocVecEnv of {count} Go1Env", work), vec.close
+
+
+_MEMORY_PROBE = """
+import sys
+from go1exp.evaluate.bench.env import resident_kb_after_steps
+print(resident_kb_after_steps(int(sys.argv[1]), sys.argv[2:]))
+"""
+
+
+def resident_kb_after_steps(num_envs: int, overrides: list[str]) -> int:
+    """Build an environment of ``num_envs``, step it, return this process's peak resident memory, kB.
+
+    From Linux's own account where there is one: ``getrusage`` counts the memory of the process that started this one.
+    """
+    from go1exp.config.compose import compose
+    from go1exp.sim.task import parse_task
+
+    work = core_subject(parse_task(compose("train", overrides)), num_envs).work
+    for _ in range(3):
+        work()
+    try:
+        status = Path("/proc/self/status").read_text()
+        return int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM")))
+    except (OSError, StopIteration):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def memory_per_env_kb(overrides: list[str], few: int = 1, many: int = 2048) -> float:
+    """Return peak memory per environment beyond the first, kB, from two fresh processes."""
+
+    def peak(num_envs: int) -> int:
+        command = [sys.executable, "-c", _MEMORY_PROBE, str(num_envs), *overrides]
+        return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+    return (peak(many) - peak(few)) / (many - few)
+
+
+def run(
+    task: TaskConfig,
+    overrides: list[str],
+    num_envs: int,
+    rounds: int,
+    seconds: float,
+    on_round: Callable[[int, int], None],
+) -> dict[str, float]:
+    """Measure; return the figures by name."""
+    subproc, close = subproc_subject(task)
+    subjects = {"env": core_subject(task, num_envs), "bare": bare_subject(task, num_envs), "subproc": subproc}
+    try:
+        measured = rates(subjects, rounds, seconds, on_round)
+    finally:
+        close()
+    return {
+        "env_steps_per_s": float(np.median(measured["env"])),
+        "bare_steps_per_s": float(np.median(measured["bare"])),
+        "subproc_steps_per_s": float(np.median(measured["subproc"])),
+        "env_over_bare": ratio(measured, "env", "bare"),
+        "env_over_subproc": ratio(measured, "env", "subproc"),
+        "memory_per_env_kb": memory_per_env_kb(overrides),
+    }

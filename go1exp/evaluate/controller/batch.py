@@ -1,0 +1,160 @@
+"""Controllers that drive the robots of an environment, each by what its own sensors say."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from go1exp import robot
+from go1exp.base.tensors.rotation import rotate_inverse
+from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.estimation.many import Filters
+from go1exp.deploy.sim_robot.machine import noisy
+from go1exp.evaluate.controller.types import Command, Controller, Drive, Savable, Sensed
+from go1exp.logs.record.tape import sample
+from go1exp.sim.env.core import Go1Core
+
+VELOCITY_NOISE = 0.02
+"""Half-width of the noise of the paper's Table II on the trunk's exact velocity, m/s."""
+
+
+class Driven:
+    """N controllers in place of a policy: built once, they act in every ``core.step``.
+
+    Each physics step whose time has come, every robot's sensors are read, its controller called, and the answer kept in
+    force: targets, feed-forward torques and gains. Drives without gains get the targets and torques alone.
+
+    It is called like a policy, between steps: robots whose episode begins then get a new start, and the actions that
+    it returns are read by nobody. Further restarts are up to the caller: ``restart``.
+    """
+
+    def __init__(
+        self,
+        core: Go1Core,
+        make: Callable[[], Controller],
+        *,
+        noise: bool,
+        seed: int,
+        trunk_velocity: Literal["exact", "estimated"] = "exact",
+    ) -> None:
+        """Take over the robots of ``core``, which must have been built with ``imu=True``.
+
+        Args:
+            core: the environment; its commands (``core.command.value``) are those of the robots.
+            make: makes one robot's controller.
+            noise: give the sensors the noise of the paper's Table II, and the feet that of a logger.
+            seed: of the noise.
+            trunk_velocity: the true one, or that of the Kalman filter.
+
+        Raises:
+            ConfigError: if the controller's period is no multiple of the physics step.
+            go1exp.deploy.estimation.EstimatorError: if the filter is wanted and not built.
+        """
+        self._core, self._plant, n = core, core.plant, core.num_envs
+        self.controllers: list[Controller] = [make() for _ in range(n)]
+        self._dt = core.task.sim.physics_dt
+        self._every = _whole(self.controllers[0].period, self._dt)
+        self._noise, self._rng = float(noise), np.random.default_rng([seed, 3])
+        self._estimates = trunk_velocity == "estimated"
+        self._filters = Filters(n if self._estimates else 0)
+        self._has_gains = hasattr(self._plant.actuator, "kp")
+        self._target, self._forward = (torch.zeros_like(self._plant.q) for _ in range(2))
+        self._kp, self._kd = (torch.zeros_like(self._plant.q) for _ in range(2))
+        self._steps, self._feeds = 0, False
+        core.driver = self._step
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        """Begin anew with the robots whose episode begins; return zeros (N, 12), which nobody reads."""
+        self.restart(self._core.steps == 0)
+        return torch.zeros(len(observation), robot.NUM_JOINTS)
+
+    def restart(self, mask: Tensor) -> None:
+        """Begin anew with the robots of ``mask`` (N,) bool."""
+        for i in np.flatnonzero(mask.numpy()):
+            self.controllers[i].reset()
+            if self._estimates:
+                self._filters.restart(int(i))
+
+    def save(self) -> Any | None:
+        """Return a copy of what all remember, or None where a controller or the filter cannot be put back."""
+        each = [one.save() for one in self.controllers if isinstance(one, Savable)]
+        if self._estimates or len(each) < len(self.controllers):
+            return None
+        tensors = [tensor.clone() for tensor in self._tensors()]
+        return each, tensors, self._steps, self._feeds, copy.deepcopy(self._rng)
+
+    def load(self, state: Any) -> None:
+        """Put back what ``save`` returned, after the environment was put back."""
+        each, tensors, self._steps, self._feeds, rng = state
+        self._rng = copy.deepcopy(rng)
+        for one, of_controller in zip(self.controllers, each, strict=True):
+            assert isinstance(one, Savable)
+            one.load(of_controller)
+        for tensor, value in zip(self._tensors(), tensors, strict=True):
+            tensor.copy_(value)
+        if self._has_gains:
+            self._plant.set_gains(self._kp, self._kd)
+
+    def _tensors(self) -> tuple[Tensor, ...]:
+        """What is in force, and the last readings, which the engine writes in its next step only."""
+        return self._target, self._forward, self._kp, self._kd, self._core.backend.sensordata
+
+    def _step(self) -> None:
+        """Let the controllers act where their time has come, and advance the physics."""
+        sensed = self._sense()
+        if self._steps % self._every == 0:
+            commands = self._core.command.value.double().numpy()
+            drives = [
+                one.step(_command(row), of_robot)
+                for one, row, of_robot in zip(self.controllers, commands, sensed, strict=True)
+            ]
+            self._put(drives)
+        self._steps += 1
+        self._plant.step(self._target, self._forward if self._feeds else None)
+        self._core.target.copy_(self._target)
+
+    def _put(self, drives: Sequence[Drive]) -> None:
+        """Put what the controllers say into force."""
+        rows = [(self._target, [one.target for one in drives])]
+        self._feeds = drives[0].feedforward is not None  # all are of one kind
+        if self._feeds:
+            rows.append((self._forward, [one.feedforward for one in drives]))  # type: ignore[misc]
+        if self._has_gains:
+            rows += [(self._kp, [one.kp for one in drives]), (self._kd, [one.kd for one in drives])]
+        for tensor, values in rows:
+            tensor.copy_(torch.as_tensor(np.stack(values)))
+        if self._has_gains:
+            self._plant.set_gains(self._kp, self._kd)
+
+    def _sense(self) -> list[Sensed]:
+        """Read the sensors of all robots."""
+        true = {name: values.cpu().double().numpy() for name, values in sample(self._plant, self._target).items()}
+        readings = noisy(true, self._noise, self._rng)
+        if self._estimates:
+            self._filters.update(self._steps * self._dt, readings)
+            velocities = self._filters.velocities
+        else:
+            quat, speed = (torch.as_tensor(true[name]) for name in ("base_quat", "base_lin_vel"))
+            even = self._rng.uniform(-1.0, 1.0, speed.shape) * self._noise * VELOCITY_NOISE
+            velocities = rotate_inverse(quat, speed).numpy() + even
+        names = ("q", "qd", "quat", "gyro")
+        rows = zip(*(readings[name] for name in names), velocities, readings["foot_force"], strict=True)
+        return [Sensed(*row) for row in rows]
+
+
+def _command(row: np.ndarray) -> Command:
+    return float(row[0]), float(row[1]), float(row[2])
+
+
+def _whole(period: float, dt: float) -> int:
+    """Return how many physics steps of ``dt`` s a period has."""
+    ratio = period / dt
+    if ratio < 1.0 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
+        raise ConfigError([f"controller.period = {period:g}: must be a multiple of the physics step, {dt:g} s"])
+    return round(ratio)

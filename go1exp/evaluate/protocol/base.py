@@ -1,0 +1,250 @@
+"""What every protocol is: settings that a file gives, what it plays, the rows, figures and drawings that it makes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from go1exp.config.schema.registry import (
+    ConfigError,
+    Term,
+    as_json,
+    bind_list,
+    explain,
+    find,
+    members,
+    unknown_name,
+    within,
+)
+from go1exp.config.schema.settings import settings
+from go1exp.evaluate.observed import TrunkVelocity
+from go1exp.evaluate.protocol.claims import Claim
+from go1exp.evaluate.protocol.quantities import FINGERPRINT, LIFE, Column, Derived, Row
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from go1exp.evaluate.protocol.lengths import Length
+    from go1exp.evaluate.protocol.plan import Motion
+    from go1exp.evaluate.protocol.stage import Stage
+
+Count = Annotated[int, Field(ge=1)]
+
+Impulse = Annotated[float, Field(gt=0), within(0.0, 500.0, "N s")]
+"""Of a kick, N s: 500 N s give a Go1 39 m/s, and ten times as much ends the simulation."""
+
+Coordinate = Annotated[float, within(-0.5, 0.5, "m")]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+"""Where a kick acts, from the trunk's origin in its frame, m: far off it would turn the trunk without limit."""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One figure of a report.
+
+    Attributes:
+        name: unique in the page; letters and digits.
+        title: above it.
+        caption: what it shows, below it.
+        paint: makes it.
+        wide: takes the width of the page.
+    """
+
+    name: str
+    title: str
+    caption: str
+    paint: Callable[[], Figure]
+    wide: bool = False
+
+
+@dataclass
+class Played:
+    """What came of a protocol.
+
+    Attributes:
+        rows: one for each robot in each condition.
+        curves: plain data for drawings, by name.
+        notes: what a reader should know of how it went.
+    """
+
+    rows: list[Row]
+    curves: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+@settings
+class Protocol:
+    """What every protocol has.
+
+    Attributes:
+        robots: robots of each condition, of each their own draw of everything random.
+        noise: add the observation noise of training.
+        randomize: randomise robots and starts as in training; false takes the nominal robot, which counts once.
+        trunk_velocity: what the policy sees of it, exact, or estimated by the robot's filter from its sensors.
+        measures: further measures of gait and contact by name (go1exp list measure), [] for none.
+        claims: limits of figures by name, and what counts as close.
+    """
+
+    robots: Count
+    noise: bool
+    randomize: bool
+    trunk_velocity: TrunkVelocity
+    measures: tuple[Any, ...]
+    claims: dict[str, Claim]
+
+    keys: ClassVar[tuple[str, ...]] = ()
+    """Columns that say the condition of a row."""
+    robot_columns: ClassVar[tuple[Column, ...]] = ()
+    """Figures of a robot beside those that all protocols have."""
+    alike: ClassVar[bool] = True
+    """Whether the robots of a condition do the same where nothing is random."""
+    always: ClassVar[tuple[str, ...]] = ()
+    """Measures that it cannot do without."""
+
+    def terms(self) -> list[Term]:
+        """Return the measures; raise ConfigError naming those that do not exist."""
+        named = [m if isinstance(m, str) else next(iter(m), "") for m in self.measures]
+        return bind_list("measure", [*(m for m in self.always if m not in named), *self.measures], "measures")
+
+    def columns(self) -> tuple[Column, ...]:
+        """Return every figure of a robot."""
+        from go1exp import robot
+        from go1exp.evaluate.protocol.quantities import columns_of
+
+        return (*LIFE, *self.robot_columns, *columns_of(self.terms(), robot.LEGS))
+
+    def policy_velocities(self) -> dict[str, TrunkVelocity]:
+        """Return what policies see of the trunk's velocity in it, by the key that says so."""
+        return {"trunk_velocity": self.trunk_velocity}
+
+    def derived(self, rows: Sequence[Row]) -> list[Derived]:
+        """Return the figures of all robots together."""
+        return []
+
+    def derived_names(self) -> list[str]:
+        """Return their names."""
+        return []
+
+    def play(self, stage: Stage) -> Played:
+        """Let the robots do it."""
+        raise NotImplementedError
+
+    def lengths(self) -> list[Length]:
+        """Return how long its robots play, an entry for each batch; without any the memory is not looked at."""
+        return []
+
+    def steps(self, stage: Stage) -> float:
+        """Return about how many policy steps, times robots, it takes."""
+        return sum(stage.steps(length.seconds, length.policy_dt) * length.robots for length in self.lengths())
+
+    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Return the figures of its report."""
+        return []
+
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+        """Return the figures that show several subjects together, each by its label."""
+        return []
+
+    def measure(self, motion: Motion, rows: Sequence[Row]) -> None:
+        """Write the measures of what was recorded into the rows of its robots."""
+        from go1exp import robot
+        from go1exp.evaluate.protocol.quantities import add_measures
+        from go1exp.mdp.measures import measured
+
+        if motion.trace is not None and self.terms():
+            add_measures(rows, measured(motion.trace, self.terms()), robot.LEGS)
+
+
+def repeated(name: str, values: Sequence[Any]) -> list[str]:
+    """Return a complaint about a setting that has a value twice: its robots would be one condition."""
+    twice = [v for k, v in enumerate(values) if v in values[:k]]
+    return [f"{name}: has {twice[0]} twice"] if twice else []
+
+
+def lives(motion: Motion) -> list[Row]:
+    """Return the columns that tell of each robot's life, one row for each."""
+    lives_of_robots = zip(motion.fell, motion.left_map, motion.moving_s, motion.fingerprint, strict=True)
+    return [
+        {"fell": bool(fell), "left_map": bool(left), "moving_s": round(float(s), 4), FINGERPRINT: float(mark)}
+        for fell, left, s, mark in lives_of_robots
+    ]
+
+
+# ---------------------------------------------------------------------- from a configuration
+
+GRID = "grid"
+"""The protocol that is the grid of ``go1exp eval`` itself and has no keys here."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A protocol as a configuration chooses it: its key there, the name of its kind, its settings."""
+
+    key: str
+    kind: str
+    protocol: Protocol
+
+
+def chosen(given: Any) -> tuple[list[Chosen], bool]:
+    """Check the group ``protocol`` of a configuration; return its protocols, and whether the grid is among them.
+
+    Raises:
+        ConfigError: with every problem.
+    """
+    if not isinstance(given, Mapping) or not given:
+        raise ConfigError([f"protocol = {given!r}: choose at least one, such as protocol=sinusoid"])
+    selected, problems = [], list[str]()
+    for key, value in given.items():
+        if key == GRID and value in ({}, None):
+            continue
+        try:
+            selected.append(_one(str(key), value))
+        except ConfigError as error:
+            problems += error.problems
+    if problems:
+        raise ConfigError(problems)
+    return selected, GRID in given
+
+
+def kinds(given: Mapping[str, Any]) -> dict[str, type]:
+    """Return the classes of the protocols of a configuration by their keys there, for the help."""
+    names = {key: value.get("term", key) if isinstance(value, Mapping) else key for key, value in given.items()}
+    known = members("protocol")
+    return {key: cast(type, known[name].target) for key, name in names.items() if name in known}
+
+
+def _one(key: str, value: Any) -> Chosen:
+    path = f"protocol.{key}"
+    if not isinstance(value, Mapping):
+        raise ConfigError([f"{path} = {value!r}: must be a mapping of settings"])
+    rest = dict(value)
+    name = str(rest.pop("term", key))
+    entry = find("protocol", name)
+    if entry is None:
+        raise ConfigError([unknown_name(path, name, [GRID, *members("protocol")], "protocol")])
+    kind: Any = entry.target
+    try:
+        protocol: Protocol = TypeAdapter(kind).validate_json(as_json(rest))
+    except ValidationError as error:
+        raise ConfigError(explain(error, path, [f.name for f in fields(kind)])) from None
+    _check_claims(protocol, path)
+    return Chosen(key, name, protocol)
+
+
+def _check_claims(protocol: Protocol, path: str) -> None:
+    """Refuse measures, and claims about figures, that do not exist; raise ConfigError."""
+    try:
+        columns = protocol.columns()
+    except ConfigError as error:
+        raise ConfigError([f"{path}.{problem}" for problem in error.problems]) from None
+    known = [*(c.name for c in columns), "falls_per_minute", *protocol.derived_names()]
+    wrong = [
+        unknown_name(f"{path}.claims.{name}.quantity", claim.quantity, known, "figure")
+        for name, claim in protocol.claims.items()
+        if claim.quantity not in known
+    ]
+    if wrong:
+        raise ConfigError(wrong)

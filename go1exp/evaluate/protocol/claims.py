@@ -1,0 +1,134 @@
+"""What counts as reached: claims about figures, and the verdict on each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from go1exp.config.schema.registry import NonNegative
+from go1exp.config.schema.settings import settings
+from go1exp.evaluate.statistics.intervals import Interval
+
+Word = Literal["reached", "close", "not reached", "not told"]
+
+
+@settings
+class Claim:
+    """A limit of one figure, in every condition that it is about.
+
+    Attributes:
+        quantity: the figure.
+        at_least: its lower limit; null for none.
+        at_most: its upper limit; null for none.
+        tolerance: how far beyond a limit it still counts as close, in the figure's unit.
+        where: only conditions with these values, such as {period: 7.0}; {} takes all.
+        source: whose limit it is.
+    """
+
+    quantity: str
+    at_least: float | None = None
+    at_most: float | None = None
+    tolerance: NonNegative
+    where: dict[str, Any] = field(default_factory=dict)
+    source: str
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.at_least is None and self.at_most is None:
+            raise ValueError("at_most = None: a claim needs at_most or at_least")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim against the condition in which it comes off worst.
+
+    Attributes:
+        name: of the claim.
+        word: what is told.
+        claim: what was claimed.
+        figure: the worst condition's figure with its 95 % interval.
+        condition: that condition.
+        conditions: in how many it was looked for.
+    """
+
+    name: str
+    word: Word
+    claim: Claim
+    figure: Interval
+    condition: Mapping[str, Any]
+    conditions: int
+
+
+def verdict(figure: Interval, claim: Claim) -> Word:
+    """Return the word for a figure with its interval.
+
+    reached: the whole interval is within the limits. not reached: all of it is beyond them and the estimate beyond the
+    tolerance. not told: the interval has both, what is within the limits and what is beyond the tolerance: n is too
+    small; or there is no interval. close: else.
+    """
+    beyond = _excess(figure.estimate, claim)
+    if not all(map(math.isfinite, (figure.estimate, figure.low, figure.high))):
+        return "not told"
+    low, high = sorted((_excess(figure.low, claim), _excess(figure.high, claim)))
+    if _both_sides(figure, claim):
+        low = min(low, 0.0)
+    if high <= 0.0:
+        return "reached"
+    if low > 0.0:
+        return "close" if beyond <= claim.tolerance else "not reached"
+    return "close" if high <= claim.tolerance else "not told"
+
+
+ORDER: tuple[Word, ...] = ("not reached", "not told", "close", "reached")
+"""From the worst to the best."""
+
+
+def judged(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) -> list[Verdict]:
+    """Return a verdict on each claim: that of its worst condition (``quantities.summary``); not told if it has none."""
+    verdicts = []
+    for name, claim in claims.items():
+        candidates = []
+        for entry in summary:
+            figure = entry["figures"].get(claim.quantity)
+            if figure is not None and all(entry["condition"].get(k) == v for k, v in claim.where.items()):
+                estimate, low, high = (_number(figure[k]) for k in ("estimate", "low", "high"))
+                interval = Interval(estimate, low, high, figure["n"])
+                candidates.append(Verdict(name, verdict(interval, claim), claim, interval, entry["condition"], 0))
+        if not candidates:
+            nothing = Interval(math.nan, math.nan, math.nan, 0)
+            verdicts.append(Verdict(name, "not told", claim, nothing, claim.where, 0))
+            continue
+        worst = min(candidates, key=lambda v: (ORDER.index(v.word), -_finite(_excess(v.figure.estimate, claim))))
+        verdicts.append(Verdict(name, worst.word, claim, worst.figure, worst.condition, len(candidates)))
+    return verdicts
+
+
+def limits(claim: Claim) -> str:
+    """Write the limits of a claim."""
+    if claim.at_least is not None and claim.at_most is not None:
+        return f"{claim.at_least:g} to {claim.at_most:g}"
+    return f"at least {claim.at_least:g}" if claim.at_least is not None else f"at most {claim.at_most:g}"
+
+
+def _excess(value: float, claim: Claim) -> float:
+    """By how much a value is beyond the limits; negative within them."""
+    low = -math.inf if claim.at_least is None else claim.at_least - value
+    high = -math.inf if claim.at_most is None else value - claim.at_most
+    return max(low, high)
+
+
+def _both_sides(figure: Interval, claim: Claim) -> bool:
+    """Whether an interval reaches over both limits, with what is within them in between."""
+    if claim.at_least is None or claim.at_most is None:
+        return False
+    return figure.low < claim.at_least and figure.high > claim.at_most
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else math.inf

@@ -1,0 +1,133 @@
+"""Subjects against the first of them: paired by robot and condition, with intervals and words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from go1exp.evaluate.protocol.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
+from go1exp.evaluate.protocol.result import Result
+from go1exp.evaluate.statistics.compare import Word as Word
+from go1exp.evaluate.statistics.compare import word as word
+from go1exp.evaluate.statistics.intervals import (
+    Interval,
+    bootstrap_interval,
+    paired_mean_interval,
+    paired_share_interval,
+    pairs_needed,
+)
+
+DRAWS = 200
+"""Bootstrap samples of the difference of a figure of all robots."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One figure of one subject against the first.
+
+    Attributes:
+        subject: label of the one.
+        quantity: the figure.
+        unit: its unit.
+        condition: what it is about.
+        first: of the first subject, of the pairs.
+        other: of the other subject.
+        difference: other less first, with its interval; n is the pairs.
+        word: whether the other is better.
+        needed: pairs (robots, where a figure is of all) that would tell such a difference; None if it is told, or none
+            was seen.
+    """
+
+    subject: str
+    quantity: str
+    unit: str
+    condition: dict[str, Any]
+    first: float
+    other: float
+    difference: Interval
+    word: Word
+    needed: int | None
+
+
+def compared(first: Result, other: Result) -> list[Difference]:
+    """Return every figure with a better direction of ``other`` against ``first``, of the same protocol."""
+    protocol = first.chosen.protocol
+    columns = [c for c in protocol.columns() if c.better is not None and c.how != "phase"]
+    differences = []
+    of_first, of_other = (by_condition(r.played.rows, protocol.keys) for r in (first, other))
+    for condition in [c for c in of_first if c in of_other]:
+        pairs = _pairs(of_first[condition], of_other[condition])
+        named = dict(zip(protocol.keys, condition, strict=True))
+        for column in columns:
+            if pairs[0] and any(column.name in row for row in pairs[0]):
+                differences.append(_difference(other.label, column, named, *pairs))
+    for a, b in zip(protocol.derived(first.played.rows), protocol.derived(other.played.rows), strict=True):
+        if a.better is not None:
+            differences.append(_of_all(other.label, a, b, first.played.rows, other.played.rows))
+    return differences
+
+
+def _pairs(first: Sequence[Row], other: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    """Return the rows of the robots that are in both, in the same order."""
+    by_robot = {row[ROBOT]: row for row in other}
+    kept = [row for row in first if row[ROBOT] in by_robot]
+    return kept, [by_robot[row[ROBOT]] for row in kept]
+
+
+def _difference(
+    subject: str, column: Column, condition: dict[str, Any], first: Sequence[Row], other: Sequence[Row]
+) -> Difference:
+    a, b = values(first, column.name), values(other, column.name)
+    both = np.isfinite(a) & np.isfinite(b)
+    a, b = a[both], b[both]
+    between = paired_share_interval(a, b) if column.how == "share" else paired_mean_interval(b - a)
+    assert column.better is not None
+    verdict = word(between, column.better)
+    needed = pairs_needed(b - a) if verdict == "not told apart" else None
+    means = (float(a.mean()), float(b.mean())) if len(a) else (math.nan, math.nan)
+    return Difference(subject, column.name, column.unit, condition, *means, between, verdict, needed)
+
+
+def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: Sequence[Row]) -> Difference:
+    """Return the difference of a figure of all robots together, by drawing the same robots of both."""
+    groups = [by_condition(about(rows, a.condition), (ROBOT,)) for rows in (first, other)]
+    robots = [key for key in groups[0] if key in groups[1]]
+
+    def drawn(which: int, sample: NDArray[np.intp]) -> list[Row]:
+        return [row for k in sample for row in groups[which][robots[k]]]
+
+    everyone = np.arange(len(robots))
+    between = bootstrap_interval(
+        lambda sample: b.function(drawn(1, sample)) - a.function(drawn(0, sample)), len(robots), DRAWS
+    )
+    assert a.better is not None
+    verdict, needed = word(between, a.better), None
+    half = 0.5 * (between.high - between.low)
+    if verdict == "not told apart" and math.isfinite(half) and between.estimate:
+        needed = max(2, math.ceil(between.n * (half * POWER / between.estimate) ** 2))
+    pair = (a.function(drawn(0, everyone)), b.function(drawn(1, everyone))) if robots else (math.nan, math.nan)
+    return Difference(subject, a.name, a.unit, dict(a.condition), *pair, between, verdict, needed)
+
+
+POWER = (1.96 + 0.842) / 1.96
+"""How many times its interval's half-width a difference must be to be told in four of five tries."""
+
+
+def as_json(difference: Difference) -> dict[str, Any]:
+    """Return a difference as plain data."""
+    d = difference
+    return {
+        "subject": d.subject,
+        "figure": d.quantity,
+        "condition": d.condition,
+        "first": d.first,
+        "other": d.other,
+        "difference": plain(d.difference, d.unit),
+        "verdict": d.word,
+        "pairs_needed": d.needed,
+    }

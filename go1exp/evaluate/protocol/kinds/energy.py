@@ -1,0 +1,156 @@
+"""``protocol=energy``: what walking asks of the drives and the battery."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from go1exp import robot
+from go1exp.config.schema.registry import protocol
+from go1exp.config.schema.settings import settings
+from go1exp.evaluate.protocol.base import Drawing, Played
+from go1exp.evaluate.protocol.kinds.gait import straight
+from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady
+from go1exp.evaluate.protocol.quantities import Column, Row
+from go1exp.evaluate.protocol.report import paint
+from go1exp.mdp.measures.trace import Trace, mean_over
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from go1exp.evaluate.protocol.plan import Motion
+
+SATURATED = 0.99
+"""Share of the peak torque from which on a drive counts as saturated."""
+
+POINTS = 1500
+"""Most dots of one kind of joint in the scatter."""
+
+PROTECTED_AT = 100.0
+"""Power of one level of the SDK's PowerProtect, W."""
+
+POWER = (
+    Column("power_p99", "W", "sum over joints of |tau qd|, 99th percentile over steps", better="lower"),
+    Column("power_max", "W", "the same, largest", better="lower"),
+)
+
+
+@protocol("energy")
+@settings
+class Energy(Steady):
+    """Cost of transport, heat, power, saturation, and torque over speed inside the motors' envelope, over commands."""
+
+    robot_columns: ClassVar[tuple[Column, ...]] = (
+        *ERRORS,
+        Column("cost_of_transport_abs", "", "the cost with |tau qd|: what is braked is not won back", better="lower"),
+        Column(
+            "heat_per_way", "N m s", "sum of tau^2 over weight and way, a measure of the windings' heat", better="lower"
+        ),
+        *POWER,
+        Column("saturated", "", "share of time and joints at 99 % of peak torque or more", better="lower"),
+        Column(
+            "protect_level",
+            "",
+            "lowest level of the SDK's PowerProtect that the largest power stays below",
+            better="lower",
+        ),
+    )
+    always: ClassVar[tuple[str, ...]] = (
+        *("cost_of_transport", "torque_share_p99", "joint_speed_share_p99", "envelope_share_p99"),
+    )
+
+    def also(self, motion: Motion, rows: Sequence[Row], settle: int) -> None:
+        """Write what the trace says of power and heat."""
+        assert motion.trace is not None
+        figures = effort(motion.trace)
+        for n, row in enumerate(rows):
+            row |= {name: float(v[n]) if np.isfinite(v[n]) else None for name, v in figures.items()}
+
+    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
+        """Return torque and speed of some joints at some instants, by kind of joint."""
+        trace = motion.trace
+        assert trace is not None
+        speed, torque = trace.need("joint_vel")[trace.counts], trace.need("joint_torque")[trace.counts]
+        rng, dots = np.random.default_rng(0), {}
+        for k, kind in enumerate(robot.JOINT_KINDS):
+            both = np.stack([speed[:, k::3].ravel(), torque[:, k::3].ravel()], 1)
+            sample = both[rng.permutation(len(both))[:POINTS]]
+            extremes = both[np.argsort(-np.abs(both[:, 1]))[:50]]
+            dots[kind] = np.concatenate([sample, extremes]).round(3).tolist()
+        return {"scatter": dots}
+
+    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw the cost over speed, and torque over speed."""
+        cost = "Positive mechanical work, and all of it, over weight and way; straight ahead and back; 95 % intervals."
+        dots = (
+            "Dots: all robots and commands, drawn at random, and the 50 largest torques."
+            " Solid: peak torque and top speed. Dashed: the line from peak torque at rest to top speed, which is"
+            " pessimistic."
+        )
+        return [
+            Drawing("cost", "Cost of transport over speed", cost, partial(_cost, {"": summary})),
+            Drawing("scatter", "Torque over speed", dots, partial(_scatter, played.curves["scatter"])),
+        ]
+
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+        """Draw the cost of all subjects."""
+        text = "Positive mechanical work over weight and way; commands straight ahead and back; 95 % intervals."
+        return [Drawing("cost", "Cost of transport over speed", text, partial(_cost, dict(summaries)))]
+
+
+def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:
+    """Return figures (N,) of power, heat and saturation of a trace, NaN for robots without a step that counts."""
+    torque, power = trace.need("joint_torque"), np.abs(trace.need("joint_torque") * trace.need("joint_vel")).sum(-1)
+    speed = np.linalg.norm(trace.need("base_lin_vel_b")[..., :2], axis=-1)
+    weight = trace.need("mass") * robot.GRAVITY
+    way = mean_over(speed, trace.moving)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_way = 1.0 / np.where(way >= 0.1, weight * way, np.nan)
+    share = np.abs(torque) / robot.per_joint(robot.EFFORT_LIMIT)
+    counted = np.where(trace.counts, power, np.nan)
+    sample = trace.counts.any(0)
+    high = {name: np.full(trace.robots, np.nan) for name in ("power_p99", "power_max")}
+    high["power_p99"][sample] = np.nanpercentile(counted[:, sample], 99.0, axis=0)
+    high["power_max"][sample] = np.nanmax(counted[:, sample], axis=0)
+    return {
+        "cost_of_transport_abs": mean_over(power, trace.moving) * per_way,
+        "heat_per_way": mean_over((torque**2).sum(-1), trace.moving) * per_way,
+        **high,
+        "saturated": mean_over((share >= SATURATED).mean(-1), trace.counts),
+        "protect_level": np.ceil(high["power_max"] / PROTECTED_AT),
+    }
+
+
+def _cost(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    figure, axes = paint.panels(1, height=2.3)
+    ax = axes[0, 0]
+    for k, (who, summary) in enumerate(summaries.items()):
+        entries = sorted(straight(summary), key=lambda e: e["condition"]["x"])
+        at = [e["condition"]["x"] for e in entries]
+        paint.intervals(ax, at, entries, "cost_of_transport", paint.COLOURS[k], who or "positive work")
+        if len(summaries) == 1:
+            paint.intervals(ax, at, entries, "cost_of_transport_abs", paint.COLOURS[1], "all work")
+    ax.set(xlabel="commanded vx (m/s)", ylabel="cost of transport")
+    ax.set_ylim(bottom=0.0)
+    paint.legend(figure, ax)
+    return figure
+
+
+def _scatter(dots: Mapping[str, Any]) -> Figure:
+    figure, axes = paint.panels(1, 3, height=2.2)
+    limits = zip(axes[0], dots.items(), robot.EFFORT_LIMIT, robot.VELOCITY_LIMIT, strict=True)
+    for ax, (kind, points), peak, top in limits:
+        both = np.array(points)
+        # A picture in the figure: thousands of dots would each be a shape of the page.
+        ax.plot(both[:, 0], both[:, 1], ".", ms=1.6, color=paint.MEASURED, alpha=0.5, rasterized=True)
+        ax.plot([-top, top, top, -top, -top], [peak, peak, -peak, -peak, peak], color=paint.COMMANDED, lw=1.0)
+        ax.plot([-top, 0, top], [0, peak, 0], color=paint.ERROR, lw=1.0, ls="--")
+        ax.plot([-top, 0, top], [0, -peak, 0], color=paint.ERROR, lw=1.0, ls="--")
+        ax.set_title(kind)
+        ax.set_xlabel("speed (rad/s)")
+    axes[0, 0].set_ylabel("torque (N m)")
+    return figure

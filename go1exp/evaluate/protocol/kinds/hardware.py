@@ -1,0 +1,153 @@
+"""``protocol=hardware``: would an engineer put this policy on a Go1?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from go1exp.config.schema.registry import protocol
+from go1exp.config.schema.settings import settings
+from go1exp.evaluate.protocol.base import Drawing, Played, lives
+from go1exp.evaluate.protocol.claims import judged
+from go1exp.evaluate.protocol.kinds.energy import effort
+from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
+from go1exp.evaluate.protocol.kinds.steady import AXES, ERRORS, Steady
+from go1exp.evaluate.protocol.lengths import Length
+from go1exp.evaluate.protocol.quantities import Column, Derived, Row
+from go1exp.evaluate.protocol.report import paint
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from go1exp.evaluate.protocol.plan import Motion
+    from go1exp.evaluate.protocol.stage import Stage
+
+
+@protocol("hardware")
+@settings
+class Hardware(Steady):
+    """Item by item whether a policy may go on a Go1: torque, speed, power, impact, slip, delay margin, target steps.
+
+    Attributes:
+        delays_ms: time by which targets come late, beside what the robot has of that, rising.
+    """
+
+    delays_ms: Annotated[tuple[Annotated[float, Field(gt=0, le=LATEST_MS)], ...], Field(min_length=1)]
+
+    keys: ClassVar[tuple[str, ...]] = (*AXES, "delay_ms")
+    robot_columns: ClassVar[tuple[Column, ...]] = (
+        *ERRORS,
+        Column("power_p99", "W", "sum over joints of |tau qd|, 99th percentile over steps", better="lower"),
+        Column("power_max", "W", "the same, largest", better="lower"),
+        Column("saturated", "", "share of time and joints at 99 % of peak torque or more", better="lower"),
+    )
+    always: ClassVar[tuple[str, ...]] = (
+        *("torque_share_p99", "joint_speed_share_p99", "envelope_share_p99", "target_step_p99", "slip_share_all"),
+        *("touchdown_speed_p95", "peak_force_p95"),
+    )
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        Steady.__post_init__(self)
+        if sorted(set(self.delays_ms)) != list(self.delays_ms):
+            raise ValueError(f"delays_ms = {list(self.delays_ms)}: must rise")
+
+    def lengths(self) -> list[Length]:
+        """Return those of the commands as they are, and of all of them again with late targets."""
+        late = self.robots * len(self.commands) * len(self.delays_ms)
+        return [*Steady.lengths(self), Length(self.duration_s, late, self.causes(), self.settle_s)]
+
+    def play(self, stage: Stage) -> Played:
+        """Play the commands as they are, and all of them again with late targets, for falls alone."""
+        from go1exp.evaluate.protocol.plan import Plan
+
+        played = Steady.play(self, stage)
+        for row in played.rows:
+            row["delay_ms"] = 0.0
+        t = stage.times(self.duration_s)
+        each = len(self.commands) * self.robots
+        velocities = np.repeat(np.array(self.commands), self.robots, axis=0)
+        command = np.tile(velocities, (len(t), len(self.delays_ms), 1)) * (t >= self.rest_s - 1e-9)[:, None, None]
+        delay = np.repeat(np.array(self.delays_ms) * 1e-3, each)
+        rows = lives(stage.run(Plan(command, delay=delay)))
+        for n, row in enumerate(rows):
+            velocity = map(float, velocities[n % each])
+            row |= {**dict(zip(AXES, velocity, strict=True)), "robot": n % self.robots}
+            row["delay_ms"] = float(self.delays_ms[n // each])
+        played.rows += rows
+        return played
+
+    def also(self, motion: Motion, rows: Sequence[Row], settle: int) -> None:
+        """Write power and saturation."""
+        assert motion.trace is not None
+        figures = effort(motion.trace)
+        for n, row in enumerate(rows):
+            for name in ("power_p99", "power_max", "saturated"):
+                row[name] = float(figures[name][n]) if np.isfinite(figures[name][n]) else None
+
+    def derived(self, rows: Sequence[Row]) -> list[Derived]:
+        """Return the delay margin."""
+        text = "largest delay of the targets up to which no robot falls"
+        return [Derived("delay_margin", "ms", text, {}, "higher", _margin)]
+
+    def derived_names(self) -> list[str]:
+        """Return its name."""
+        return ["delay_margin"]
+
+    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw each item against its limit, and falls over the delay."""
+        bars = (
+            "Worst command's figure over its upper limit, with its 95 % interval; beyond the line the limit is missed."
+            " Green: reached; brown: close; red: not reached; grey: not told."
+        )
+        delay = "Share of robots of all commands that fell, with Wilson's 95 % interval."
+        return [
+            Drawing("items", "Items against their limits", bars, partial(_items, self, summary)),
+            Drawing("delay", "Falls with late targets", delay, partial(_falls, played.rows)),
+        ]
+
+
+def _margin(rows: Sequence[Row]) -> float:
+    """Return the largest delay (ms) up to which none of the rows fell; 0 also if one did without any."""
+    held = 0.0
+    for delay in sorted({row["delay_ms"] for row in rows}):
+        if any(row["fell"] for row in rows if row["delay_ms"] == delay):
+            break
+        held = float(delay)
+    return held
+
+
+def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
+    verdicts = [v for v in judged(hardware.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
+    figure, axes = paint.panels(1, height=0.5 + 0.26 * max(len(verdicts), 1))
+    ax = axes[0, 0]
+    tones = {"reached": "#00705a", "close": "#8a5a00", "not reached": "#a63f00", "not told": "#59616a"}
+    for k, v in enumerate(verdicts):
+        limit = v.claim.at_most or 1.0
+        low, high = (v.figure.estimate if np.isnan(x) else x for x in (v.figure.low, v.figure.high))
+        ax.barh(k, v.figure.estimate / limit, height=0.55, color=tones[v.word], alpha=0.75)
+        ax.plot([low / limit, high / limit], [k, k], color="#1d2125", lw=1.2)
+    ax.axvline(1.0, color="#1d2125", lw=1.0, ls="--")
+    ax.set_yticks(range(len(verdicts)), [v.name.replace("_", " ") for v in verdicts], fontsize=7)
+    ax.invert_yaxis()
+    ax.set_xlabel("figure over limit")
+    return figure
+
+
+def _falls(rows: Sequence[Row]) -> Figure:
+    from go1exp.evaluate.statistics.intervals import share_interval
+
+    figure, axes = paint.panels(1, height=1.9)
+    delays = sorted({row["delay_ms"] for row in rows})
+    entries = []
+    for delay in delays:
+        fell = [bool(row["fell"]) for row in rows if row["delay_ms"] == delay]
+        i = share_interval(sum(fell), len(fell))
+        entries.append({"figures": {"fell": {"estimate": i.estimate, "low": i.low, "high": i.high}}})
+    paint.intervals(axes[0, 0], delays, entries, "fell", paint.MEASURED, "")
+    axes[0, 0].set(xlabel="delay of the targets (ms)", ylabel="share that fell", ylim=(-0.03, 1.03))
+    return figure

@@ -1,0 +1,283 @@
+"""``protocol=push_map``: the largest kick that a walking robot survives, by direction and gait phase."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from go1exp.config.schema.registry import Positive, protocol
+from go1exp.config.schema.settings import settings
+from go1exp.evaluate.protocol.base import Count, Drawing, Impulse, Played, Point, Protocol, lives
+from go1exp.evaluate.protocol.lengths import Cause, Length
+from go1exp.evaluate.protocol.quantities import Column, Derived, Row, values
+from go1exp.evaluate.protocol.report import paint
+from go1exp.evaluate.protocol.signals import Signal
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from go1exp.evaluate.protocol.plan import Motion
+    from go1exp.evaluate.protocol.stage import Session, Stage
+
+Array = NDArray[np.float64]
+
+LONGEST_STRIDE = 0.6
+"""Time after the start in which two touchdowns of FR are looked for, twice, s."""
+
+LEAST_SWING = 0.05
+"""s."""
+
+GUESS = 0.36
+"""Stride of a robot that shows none, s."""
+
+LEAST_SETTLE, LEAST_WATCH = 1.0, 0.5
+"""Shortest times before and after a kick, s."""
+
+
+@protocol("push_map")
+@settings
+class PushMap(Protocol):
+    """Largest kick that is survived, by direction and gait phase, found by bisection; area of the region.
+
+    Attributes:
+        command: what the robots are told.
+        directions: of the force, evenly around the robot.
+        phases: instants of the kick, evenly in the stride of the foot FR.
+        settle_s: time before, s.
+        push_s: duration of the half-sine force, s.
+        point: where it acts, from the trunk's origin in its frame, m.
+        largest: of the kicks, N s.
+        halvings: of the interval in which the threshold lies, from ``largest`` on.
+        watch_s: time after the kick's begin for which a robot must stay up, s.
+    """
+
+    command: Signal
+    directions: Annotated[int, Field(ge=3)]
+    phases: Count
+    settle_s: Annotated[float, Field(ge=LEAST_SETTLE)]
+    push_s: Positive
+    point: Point
+    largest: Impulse
+    halvings: Count
+    watch_s: Annotated[float, Field(ge=LEAST_WATCH)]
+
+    alike: ClassVar[bool] = False
+    keys: ClassVar[tuple[str, ...]] = ("direction_deg",)
+    robot_columns: ClassVar[tuple[Column, ...]] = (
+        Column("impulse", "N s", "largest impulse that is survived", better="higher"),
+    )
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.push_s > self.watch_s:
+            raise ValueError(f"push_s = {self.push_s}: must be at most watch_s = {self.watch_s}")
+
+    @property
+    def count(self) -> int:
+        """All robots: ``robots`` in each direction and phase."""
+        return self.directions * self.phases * self.robots
+
+    @property
+    def _look_s(self) -> float:
+        """Time after settling in which the latest kick begins, s."""
+        return 2 * LONGEST_STRIDE
+
+    def lengths(self) -> list[Length]:
+        """Return that of the walk and one kick: those that follow begin where the first did."""
+        settle, look, watch = self.settle_s, self._look_s, self.watch_s
+        causes = [
+            Cause("settle_s", settle, LEAST_SETTLE, lambda seconds: seconds - look - watch),
+            Cause("watch_s", watch, LEAST_WATCH, lambda seconds: seconds - look - settle),
+        ]
+        return [Length(settle + look + watch, self.count, causes)]
+
+    def steps(self, stage: Stage) -> float:
+        """Return policy steps times robots."""
+        trial = stage.steps(self._look_s + self.watch_s)
+        return (stage.steps(self.settle_s) + (2 + self.halvings) * trial) * self.count
+
+    def play(self, stage: Stage) -> Played:
+        """Let all walk once; from where they are then, kick them again and again, each in its own phase."""
+        from go1exp.evaluate.protocol.disturbances import Impulses
+        from go1exp.evaluate.protocol.plan import Plan
+
+        t = stage.times(self.settle_s + self._look_s + self.watch_s)
+        command = np.repeat(self.command.at(t)[:, None], self.count, 1)
+        nothing = np.zeros((self.count, 1))
+        session = stage.session(Plan(command, impulses=Impulses(nothing, nothing, nothing, self.push_s, self.point)))
+        settle = stage.steps(self.settle_s)
+        walked = session.run(settle)
+        state = session.save()
+        unkicked = session.run(len(t) - settle)
+        robot = np.arange(self.count)
+        direction, phase = robot // (self.phases * self.robots), robot // self.robots % self.phases
+        stride = [touchdowns(unkicked, n) for n in range(self.count)]
+        start = np.array([a + (b - a) * phase[n] / self.phases for n, (a, b) in enumerate(stride)])
+        angle = 2.0 * np.pi * direction / self.directions
+
+        def survives(impulse: Array) -> NDArray[np.bool_]:
+            kicks = Impulses(start[:, None], impulse[:, None], angle[:, None], self.push_s, self.point)
+            return self._trial(session, state, settle, kicks, start, len(t) - settle)
+
+        figures = largest_survived(survives, self.count, self.largest, self.halvings)
+        rows, later = lives(walked), lives(unkicked)
+        for n, row in enumerate(rows):
+            up = bool(unkicked.alive[-1, n])
+            row |= {
+                "direction_deg": float(np.degrees(angle[n])),
+                "robot": int(phase[n] * self.robots + n % self.robots),
+            }
+            row |= {"phase": float(phase[n] / self.phases), "fell": not up and not unkicked.left_map[n]}
+            row["moving_s"] += later[n]["moving_s"]
+            row["impulse"] = float(figures[n]) if up else None
+        censored = int((figures >= self.largest).sum())
+        notes = [f"{censored} robots survived the largest impulse of {self.largest:g} N s: theirs may be larger."]
+        return Played(rows, {}, notes if censored else [])
+
+    def _trial(
+        self, session: Session, state: Any, settle: int, kicks: Any, start: Array, steps: int
+    ) -> NDArray[np.bool_]:
+        """Return who is still up ``watch_s`` after its kick."""
+        session.load(state, settle)
+        session.use(kicks)
+        motion = session.run(steps)
+        end = np.round((start + self.watch_s - motion.t[0]) / motion.dt).astype(int)
+        return motion.alive[np.clip(end, 0, steps - 1), np.arange(self.count)]
+
+    def derived(self, rows: Sequence[Row]) -> list[Derived]:
+        """Return median and 10th percentile of each direction, and the area within the medians."""
+        angles = sorted({row["direction_deg"] for row in rows})
+        figures = [
+            Derived(name, "N s", meaning, {"direction_deg": angle}, "higher", partial(_percentile, percent=percent))
+            for angle in angles
+            for name, percent, meaning in (
+                ("impulse_median", 50.0, "median of the largest impulse survived"),
+                ("impulse_p10", 10.0, "its 10th percentile: nine of ten robots and phases survive it"),
+            )
+        ]
+        area = Derived("area", "(N s)^2", "area within the medians of all directions", {}, "higher", _area)
+        return [*figures, area, Derived("weakest", "N s", "smallest median of all directions", {}, "higher", _weakest)]
+
+    def derived_names(self) -> list[str]:
+        """Return their names."""
+        return ["impulse_median", "impulse_p10", "area", "weakest"]
+
+    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw the map, and what the phase does."""
+        polar = "Largest impulse survived, N s; up is forward: median with its 95 % interval, 10th percentile."
+        phase = (
+            "Median over robots and directions, 10th to 90th percentile, by the phase of FR's stride at which the kick"
+            " begins; it touches down at 0."
+        )
+        return [
+            Drawing("map", "Impulse map", polar, partial(_map, {"": summary})),
+            Drawing("phase", "By gait phase", phase, partial(_phases, played.rows)),
+        ]
+
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+        """Draw the maps of all subjects."""
+        text = "Largest impulse survived, N s; up is forward: median with its 95 % interval."
+        return [Drawing("map", "Impulse map", text, partial(_map, dict(summaries)))]
+
+
+def largest_survived(
+    survives: Callable[[Array], NDArray[np.bool_]], count: int, largest: float, halvings: int
+) -> Array:
+    """Return for each of ``count`` robots the largest impulse that it survives, by bisection, all at once.
+
+    ``survives`` says which robots survive the impulses (count,). Zero counts as survived; a robot that survives
+    ``largest`` has that. The answer is at most ``largest`` / 2^``halvings`` too small, where more is never easier.
+    """
+    low, high = np.zeros(count), np.full(count, largest)
+    top = survives(high)
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        held = survives(middle)
+        low, high = np.where(held, middle, low), np.where(held, high, middle)
+    return np.where(top, largest, low)
+
+
+def touchdowns(motion: Motion, n: int) -> tuple[float, float]:
+    """Return the times of the first two touchdowns of robot ``n``'s foot FR, s; guesses where it has none."""
+    on = motion.front_right[:, n]
+    steps = max(1, round(LEAST_SWING / motion.dt))
+    # Shorter times in the air are bounces and no swings.
+    in_air = np.convolve(on == 0.0, np.ones(steps), "full")[: len(on)] > steps - 0.5
+    landed = 1 + np.flatnonzero((on[1:] > 0.0) & in_air[:-1])
+    times = motion.t[landed] - on[landed]
+    first = float(times[0]) if len(times) else float(motion.t[0])
+    if first > motion.t[0] + LONGEST_STRIDE:
+        first = float(motion.t[0])
+    stride = float(times[1]) - first if len(times) > 1 else GUESS
+    return first, first + (stride if 0.1 < stride < LONGEST_STRIDE else GUESS)
+
+
+def _percentile(rows: Sequence[Row], percent: float) -> float:
+    each = values(rows, "impulse")
+    return float(np.nanpercentile(each, percent)) if np.isfinite(each).any() else np.nan
+
+
+def _medians(rows: Sequence[Row]) -> Array:
+    by: dict[float, list[Row]] = {}
+    for row in rows:
+        by.setdefault(row["direction_deg"], []).append(row)
+    return np.array([_percentile(by[angle], 50.0) for angle in sorted(by)])
+
+
+def _area(rows: Sequence[Row]) -> float:
+    radius = _medians(rows)
+    return float(0.5 * np.sin(2.0 * np.pi / len(radius)) * (radius * np.roll(radius, -1)).sum())
+
+
+def _weakest(rows: Sequence[Row]) -> float:
+    return float(_medians(rows).min())
+
+
+def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    figure, axes = paint.panels(1, height=4.0, subplot_kw={"projection": "polar"})
+    ax = axes[0, 0]
+    for k, (who, summary) in enumerate(summaries.items()):
+        for name, style in (("impulse_median", "-"), ("impulse_p10", ":")):
+            figures = [(e["condition"]["direction_deg"], e["figures"][name]) for e in summary if name in e["figures"]]
+            shown = [(np.radians(a), f) for a, f in figures if f["estimate"] is not None]
+            if not shown or (style == ":" and len(summaries) > 1):
+                continue
+            angle = np.array([a for a, _ in shown] + [shown[0][0] + 2 * np.pi])
+            closed = [f for _, f in shown] + [shown[0][1]]
+            middle, low, high = (
+                [f["estimate"] if f[name] is None else f[name] for f in closed] for name in ("estimate", "low", "high")
+            )
+            text = {"impulse_median": "median", "impulse_p10": "10th percentile"}[name]
+            ax.plot(angle, middle, style, color=paint.COLOURS[k], lw=1.4, label=f"{who} {text}".strip())
+            if style == "-":
+                paint.band(ax, angle, low, high, paint.COLOURS[k])
+    ax.set_theta_zero_location("N")
+    ax.set_ylim(bottom=0.0)
+    ax.set_rlabel_position(112.5)
+    ax.tick_params(labelsize=7)
+    ax.set_xticks(np.arange(8) * np.pi / 4, ["forward", "45°", "left", "135°", "back", "-135°", "right", "-45°"])
+    paint.legend(figure, ax, columns=2)
+    return figure
+
+
+def _phases(rows: Sequence[Row]) -> Figure:
+    figure, axes = paint.panels(1, height=2.0)
+    phases = sorted({row["phase"] for row in rows})
+    each = [values([r for r in rows if r["phase"] == p], "impulse") for p in phases]
+    each = [e[np.isfinite(e)] for e in each]
+    at = [p for p, e in zip(phases, each, strict=True) if len(e)]
+    defined = [e for e in each if len(e)]
+    ax = axes[0, 0]
+    if defined:
+        paint.band(
+            ax, at, [np.quantile(e, 0.1) for e in defined], [np.quantile(e, 0.9) for e in defined], paint.MEASURED
+        )
+        ax.plot(at, [np.median(e) for e in defined], "-o", ms=3.5, color=paint.MEASURED)
+    ax.set(xlabel="phase of FR (cycles)", ylabel="impulse (N s)")
+    ax.set_ylim(bottom=0.0)
+    return figure

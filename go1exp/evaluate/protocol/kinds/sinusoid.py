@@ -1,0 +1,195 @@
+"""``protocol=sinusoid``: sines of all three velocities (paper, Fig. 4 and 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from go1exp.config.schema.registry import Positive, protocol
+from go1exp.config.schema.settings import settings
+from go1exp.evaluate.protocol.base import Drawing, Played, Protocol, lives, repeated
+from go1exp.evaluate.protocol.lengths import Cause, Length
+from go1exp.evaluate.protocol.quantities import Column, Row
+from go1exp.evaluate.protocol.report import paint
+from go1exp.evaluate.protocol.signals import Sine, response
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from go1exp.evaluate.protocol.plan import Motion
+    from go1exp.evaluate.protocol.stage import Stage
+
+AXES = ("x", "y", "yaw")
+
+EVERY = 4
+"""Of so many steps one is kept for drawings."""
+
+
+def _columns() -> tuple[Column, ...]:
+    collected = []
+    for axis, unit in zip(AXES, ("m/s", "m/s", "rad/s"), strict=True):
+        collected += [
+            Column(f"gain_{axis}", "", f"amplitude of {axis} over that of its command"),
+            Column(f"lag_{axis}", "s", f"time by which {axis} comes after its command", better="lower"),
+            Column(f"coherence_{axis}", "", f"how alike the periods of {axis} are", better="higher"),
+            Column(f"rmse_{axis}", unit, f"root mean square error of {axis}, gait included", better="lower"),
+        ]
+    return tuple(collected)
+
+
+@protocol("sinusoid")
+@settings
+class Sinusoid(Protocol):
+    """Sines of all three velocities at once: gain and lag by projection, coherence, error (paper, Fig. 4 and 5).
+
+    Attributes:
+        duration_s: length, s; the first period does not count.
+        ladder: sines, one after the other harder.
+    """
+
+    duration_s: Positive
+    ladder: Annotated[tuple[Sine, ...], Field(min_length=1)]
+
+    keys: ClassVar[tuple[str, ...]] = ("amplitude", "period")
+    robot_columns: ClassVar[tuple[Column, ...]] = _columns()
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.duration_s < 2.0 * self.longest:
+            raise ValueError(f"duration_s = {self.duration_s}: must be at least two periods, {2 * self.longest:g}")
+        if wrong := repeated("ladder", [f"{label(sine)} at {sine.period:g} s" for sine in self.ladder]):
+            raise ValueError(wrong[0])
+
+    @property
+    def longest(self) -> float:
+        """Longest period, s."""
+        return max(sine.period for sine in self.ladder)
+
+    def lengths(self) -> list[Length]:
+        """Return that of all sines as one batch."""
+        causes = [Cause("duration_s", self.duration_s, least=2.0 * self.longest)]
+        return [Length(self.duration_s, self.robots * len(self.ladder), causes, self.longest, bool(self.terms()))]
+
+    def play(self, stage: Stage) -> Played:
+        """Play all sines as one batch: the robots of one are neighbours."""
+        from go1exp.evaluate.protocol.plan import Plan
+
+        t = stage.times(self.duration_s)
+        command = np.concatenate([np.repeat(s.at(t)[:, None], self.robots, 1) for s in self.ladder], 1)
+        listen = round(self.longest / stage.policy_dt) if self.terms() else None
+        motion = stage.run(Plan(command, listen_from=listen))
+        rows = lives(motion)
+        curves: dict[str, Any] = {}
+        for k, sine in enumerate(self.ladder):
+            robots = slice(k * self.robots, (k + 1) * self.robots)
+            condition = {"amplitude": label(sine), "period": sine.period}
+            self._answers(motion, robots, sine, rows[robots], condition)
+            curves[f"{label(sine)} at {sine.period:g} s"] = _curve(motion, robots)
+        self.measure(motion, rows)
+        return Played(rows, {"sines": curves})
+
+    def _answers(self, motion: Motion, robots: slice, sine: Sine, rows: Sequence[Row], condition: Row) -> None:
+        """Write what became of the robots of one sine into their rows."""
+        command, velocity = motion.command[:, robots], motion.velocity[:, robots]
+        gain, lag, coherence = response(velocity, command, motion.t, sine.period)
+        lag = lag + motion.dt  # a command is that of a step's start, a velocity that of its end
+        rmse = np.sqrt(((velocity - command)[motion.t > sine.period] ** 2).mean(0))
+        for n, row in enumerate(rows):
+            row |= {**condition, "robot": n}
+            up = not (row["fell"] or row["left_map"])
+            for a, axis in enumerate(AXES):
+                asked = sine.amplitude[a] != 0.0
+                figures = {"gain": gain, "lag": lag, "coherence": coherence}
+                row |= {f"{name}_{axis}": float(v[n, a]) if up and asked else None for name, v in figures.items()}
+                row[f"rmse_{axis}"] = float(rmse[n, a]) if up else None
+
+    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw the paper's rows for each sine, and gain and lag over frequency."""
+        collected = [
+            Drawing(
+                f"sine{k}",
+                f"Velocity, amplitude {name}",
+                "Black: commanded; blue: measured, thin of one robot, thick the mean of those still up with the 10th"
+                " to 90th percentile; orange: error of the mean.",
+                partial(_rows, curve),
+            )
+            for k, (name, curve) in enumerate(played.curves["sines"].items())
+        ]
+        bode = (
+            "Gain 1 and lag 0 are perfect. 95 % intervals over robots; one line for each amplitude: x (m/s), y (m/s),"
+            " yaw (rad/s); side by side to be seen."
+        )
+        return [Drawing("bode", "Gain and lag over frequency", bode, partial(_bode, {"": summary})), *collected]
+
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+        """Draw gain and lag of all subjects."""
+        text = "Gain 1 and lag 0 are perfect. 95 % intervals; colours are subjects, all amplitudes."
+        return [Drawing("bode", "Gain and lag over frequency", text, partial(_bode, dict(summaries)))]
+
+
+def label(sine: Sine) -> str:
+    """Return the amplitude as text, such as 1 0.5 1."""
+    return " ".join(f"{v:g}" for v in sine.amplitude)
+
+
+def _curve(motion: Motion, robots: slice) -> dict[str, Any]:
+    """Return the velocities of some robots for a drawing; of robots while they are up."""
+    up = motion.alive[::EVERY, robots, None]
+    velocity = np.where(up, motion.velocity[::EVERY, robots], np.nan)
+    any_up = up.any((1, 2))
+    bands = np.full((3, len(velocity), 3), np.nan)
+    bands[0, any_up] = np.nanmean(velocity[any_up], axis=1)
+    bands[1:, any_up] = np.nanpercentile(velocity[any_up], (10.0, 90.0), axis=1)
+    one = velocity[:, 0]
+    named = {"mean": bands[0], "low": bands[1], "high": bands[2], "one": one}
+    named["command"] = motion.command[::EVERY, robots.start]
+    plain = {k: [[None if np.isnan(x) else round(float(x), 4) for x in row] for row in v] for k, v in named.items()}
+    return {"t": [round(float(x), 4) for x in motion.t[::EVERY]], **plain}
+
+
+def _array(values: Any) -> np.ndarray:
+    return np.array(values, dtype=np.float64)
+
+
+def _rows(curve: Mapping[str, Any]) -> Figure:
+    figure, axes = paint.panels(3, sharex=True)
+    t, mean, command = curve["t"], _array(curve["mean"]), _array(curve["command"])
+    low, high, one = (_array(curve[name]) for name in ("low", "high", "one"))
+    for a, name in enumerate(paint.AXES):
+        ax = axes[a, 0]
+        paint.band(ax, t, low[:, a], high[:, a], paint.MEASURED)
+        ax.plot(t, one[:, a], color=paint.MEASURED, lw=0.4, alpha=0.6)
+        ax.plot(t, mean[:, a], color=paint.MEASURED, lw=1.2, label="measured")
+        ax.plot(t, command[:, a], color=paint.COMMANDED, lw=1.0, ls="--", label="commanded")
+        ax.plot(t, mean[:, a] - command[:, a], color=paint.ERROR, lw=0.8, label="error")
+        ax.set_ylabel(name)
+    axes[2, 0].set_xlabel("time (s)")
+    paint.legend(figure, axes[0, 0])
+    return figure
+
+
+def _bode(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    figure, axes = paint.panels(3, 2, sharex=True)
+    lines = [(who, a) for who, s in summaries.items() for a in dict.fromkeys(e["condition"]["amplitude"] for e in s)]
+    for k, (who, amplitude) in enumerate(lines):
+        entries = [e for e in summaries[who] if e["condition"]["amplitude"] == amplitude]
+        entries.sort(key=lambda e: -e["condition"]["period"])
+        colour = paint.COLOURS[(list(summaries).index(who) if len(summaries) > 1 else k) % len(paint.COLOURS)]
+        frequency = [(1.0 + 0.012 * k) / e["condition"]["period"] for e in entries]
+        for a, axis in enumerate(AXES):
+            text = f"{who} {amplitude}".strip() if a == 0 else ""
+            paint.intervals(axes[a, 0], frequency, entries, f"gain_{axis}", colour, text)
+            paint.intervals(axes[a, 1], frequency, entries, f"lag_{axis}", colour, "")
+    for a, axis in enumerate(AXES):
+        axes[a, 0].set_ylabel(f"{axis}: gain")
+        axes[a, 1].set_ylabel("lag (s)")
+        axes[a, 0].axhline(1.0, color="#999999", lw=0.7)
+        axes[a, 1].axhline(0.0, color="#999999", lw=0.7)
+    for ax in axes[2]:
+        ax.set_xlabel("frequency (Hz)")
+    paint.legend(figure, axes[0, 0], columns=2)
+    return figure

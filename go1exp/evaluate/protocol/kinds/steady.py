@@ -1,0 +1,104 @@
+"""What protocols of constant commands share: a batch with the robots of each command side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from go1exp.config.schema.registry import NonNegative, Positive
+from go1exp.config.schema.settings import settings
+from go1exp.evaluate.protocol.base import Played, Protocol, lives, repeated
+from go1exp.evaluate.protocol.lengths import Cause, Length
+from go1exp.evaluate.protocol.quantities import Column, Row
+from go1exp.evaluate.protocol.signals import Constant, Velocity
+
+if TYPE_CHECKING:
+    from go1exp.evaluate.protocol.plan import Motion
+    from go1exp.evaluate.protocol.stage import Stage
+
+AXES = ("x", "y", "yaw")
+
+ERRORS = tuple(
+    Column(f"rmse_{axis}", unit, f"root mean square error of {axis}, gait included", better="lower")
+    for axis, unit in zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)
+)
+
+
+@settings
+class Steady(Protocol):
+    """Constant commands.
+
+    Attributes:
+        commands: each as x m/s, y m/s, yaw rad/s.
+        duration_s: length, s.
+        settle_s: time at its start that counts for falls alone, s.
+        rest_s: time at its start, within ``settle_s``, for which the robots are told to stand, s.
+    """
+
+    commands: Annotated[tuple[Velocity, ...], Field(min_length=1)]
+    duration_s: Positive
+    settle_s: NonNegative
+    rest_s: NonNegative
+
+    keys: ClassVar[tuple[str, ...]] = AXES
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if not self.rest_s <= self.settle_s < self.duration_s:
+            order = f"rest_s = {self.rest_s} and duration_s = {self.duration_s}"
+            raise ValueError(f"settle_s = {self.settle_s}: must lie between {order}")
+        if wrong := repeated("commands", self.commands):
+            raise ValueError(wrong[0])
+
+    def lengths(self) -> list[Length]:
+        """Return that of all commands as one batch."""
+        robots, recorded = self.robots * len(self.commands), bool(self.terms())
+        return [Length(self.duration_s, robots, self.causes(), self.settle_s, recorded)]
+
+    def causes(self) -> list[Cause]:
+        """Return what says how long a batch plays."""
+        return [Cause("duration_s", self.duration_s, least=self.settle_s)]
+
+    def play(self, stage: Stage) -> Played:
+        """Play all commands as one batch."""
+        from go1exp.evaluate.protocol.plan import Plan
+
+        t = stage.times(self.duration_s)
+        signals = [Constant(velocity=c, rest=self.rest_s).at(t) for c in self.commands]
+        command = np.repeat(np.stack(signals, 1), self.robots, axis=1)
+        settle = round(self.settle_s / stage.policy_dt)
+        motion = stage.run(Plan(command, listen_from=settle if self.terms() else None))
+        rows = lives(motion)
+        error = _error(motion, settle)
+        for n, row in enumerate(rows):
+            velocity = self.commands[n // self.robots]
+            row |= {**dict(zip(AXES, map(float, velocity), strict=True)), "robot": n % self.robots}
+            row |= {
+                f"rmse_{axis}": float(v) if np.isfinite(v) else None for axis, v in zip(AXES, error[n], strict=True)
+            }
+        self.measure(motion, rows)
+        self.also(motion, rows, settle)
+        return Played(rows, self.curves(motion, rows, settle))
+
+    def also(self, motion: Motion, rows: Sequence[Row], settle: int) -> None:
+        """Write further figures into the rows; ``settle`` is the step from which they count."""
+
+    def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
+        """Return plain data for drawings."""
+        return {}
+
+
+def _error(motion: Motion, settle: int) -> np.ndarray:
+    """(N, 3) root mean square errors while up, NaN for robots that were not at all."""
+    up = motion.alive[settle:, :, None]
+    square = np.where(up, (motion.velocity - motion.command)[settle:] ** 2, 0.0).sum(0)
+    count = up.sum(0)
+    return np.sqrt(np.divide(square, count, out=np.full(square.shape, np.nan), where=count > 0))
+
+
+def command_text(condition: Mapping[str, Any]) -> str:
+    """Write a command of one or more axes, such as x 0.5, yaw 1."""
+    return ", ".join(f"{axis} {condition[axis]:g}" for axis in AXES if condition[axis]) or "stand"

@@ -1,0 +1,188 @@
+"""From rows, one for each robot in each condition, to figures with n and a 95 % interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from go1exp.config.schema.registry import Term
+from go1exp.evaluate.statistics.intervals import (
+    Interval,
+    mean_interval,
+    phase_interval,
+    rate_interval,
+    share_interval,
+)
+from go1exp.mdp.measures import per_foot
+
+Row = dict[str, Any]
+Condition = tuple[Any, ...]
+
+ROBOT = "robot"
+"""Column with the robot's number in its condition: the same number is the same robot in all conditions' draws."""
+
+FINGERPRINT = "fingerprint"
+"""Column with a number that two robots share only if they did the same, bit for bit."""
+
+DIGITS = 6
+"""Significant digits in the file."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One figure of a robot.
+
+    Attributes:
+        name: of the column.
+        unit: of its values; "" for a share.
+        meaning: in words.
+        how: mean over robots, share of robots for which it is true (Wilson), or phase on a circle.
+        better: the direction that is better, for comparisons; None if neither is.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    how: Literal["mean", "share", "phase"] = "mean"
+    better: Literal["lower", "higher"] | None = None
+
+
+FELL = Column("fell", "", "robots that fell", "share", "lower")
+LEFT = Column("left_map", "", "robots that left the map, which is not surviving", "share", "lower")
+MOVING = Column("moving_s", "s", "time under a command until a fall")
+LIFE = (FELL, LEFT, MOVING)
+"""Of every protocol; falls per moving robot-minute come from the first and the last."""
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A figure of all robots together, such as a threshold.
+
+    Attributes:
+        name: of the figure.
+        unit: of it.
+        meaning: in words.
+        condition: what it is about.
+        better: the direction that is better.
+        function: figure of some rows; NaN where it is not defined. Its interval is by the bootstrap over robots.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    condition: Mapping[str, Any]
+    better: Literal["lower", "higher"] | None
+    function: Callable[[Sequence[Row]], float]
+
+
+def distinct(rows: Iterable[Row], keys: Sequence[str], random: bool) -> list[Row]:
+    """Return the rows without robots that did what one before them did in the same condition.
+
+    Where nothing is random all did the same, whatever the last bits of a batched matrix product say.
+    """
+    known_marks: set[Any] = set()
+    kept = []
+    for row in rows:
+        what = (*(row[k] for k in keys), row[FINGERPRINT] if random else None)
+        if what not in known_marks:
+            known_marks.add(what)
+            kept.append(row)
+    return kept
+
+
+def about(rows: Iterable[Row], condition: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of which a condition is true."""
+    return [row for row in rows if all(row.get(k) == v for k, v in condition.items())]
+
+
+def by_condition(rows: Iterable[Row], keys: Sequence[str]) -> dict[Condition, list[Row]]:
+    """Return the rows of each condition, in the order in which those come."""
+    entries_so_far: dict[Condition, list[Row]] = {}
+    for row in rows:
+        entries_so_far.setdefault(tuple(row[k] for k in keys), []).append(row)
+    return entries_so_far
+
+
+def values(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
+    """Return a column as numbers, NaN where a row has none."""
+    return np.array([math.nan if row.get(name) is None else float(row[name]) for row in rows])
+
+
+def figure(rows: Sequence[Row], column: Column) -> Interval:
+    """Return the figure of one column."""
+    each = values(rows, column.name)
+    if column.how == "share":
+        known = each[np.isfinite(each)]
+        return share_interval(int(known.sum()), len(known))
+    return (phase_interval if column.how == "phase" else mean_interval)(each)
+
+
+def summary(rows: Sequence[Row], keys: Sequence[str], columns: Sequence[Column]) -> list[dict[str, Any]]:
+    """Return an entry of plain data for each condition: its robots, and every figure with interval and n."""
+    entries = []
+    for condition, those in by_condition(rows, keys).items():
+        figures = {c.name: plain(figure(those, c), c.unit) for c in columns if any(c.name in row for row in those)}
+        if FELL.name in figures and MOVING.name in figures:
+            minutes = float(np.nansum(values(those, MOVING.name))) / 60.0
+            figures["falls_per_minute"] = plain(
+                rate_interval(int(np.nansum(values(those, FELL.name))), minutes), "1/min"
+            )
+        entries.append({"condition": dict(zip(keys, condition, strict=True)), "n": len(those), "figures": figures})
+    return entries
+
+
+def plain(interval: Interval, unit: str) -> dict[str, Any]:
+    """Return an interval for JSON, None where it is not defined."""
+    numbers = {"estimate": interval.estimate, "low": interval.low, "high": interval.high}
+    rounded = {k: float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for k, v in numbers.items()}
+    return {**rounded, "n": interval.n, "unit": unit}
+
+
+def resampled(rows: Sequence[Row]) -> tuple[int, Callable[[NDArray[np.intp]], list[Row]]]:
+    """Return the number of robots, and what gives the rows of some of them, one after the other."""
+    groups = list(by_condition(rows, (ROBOT,)).values())
+    return len(groups), lambda robots: [row for k in robots for row in groups[k]]
+
+
+# ---------------------------------------------------------------------- measures of gait and contact as columns
+
+BETTER: dict[str, Literal["lower", "higher"]] = {
+    **dict.fromkeys(("trot_error", "touchdown_speed_p95", "peak_force_p95", "slip_share_all", "slip_share"), "lower"),
+    **dict.fromkeys(("cost_of_transport", "torque_share_p99", "joint_speed_share_p99", "slip_distance"), "lower"),
+    **dict.fromkeys(("envelope_share_p99", "target_step_p99", "heave"), "lower"),
+    **dict.fromkeys(("clearance", "phase_consistency", "gait_clarity"), "higher"),
+}
+"""Measures of which less or more is better; neither of the others."""
+
+
+def columns_of(terms: Sequence[Term], legs: Sequence[str]) -> list[Column]:
+    """Return the columns of measures, one for each foot where they have a value per foot; names have none."""
+    entries_so_far = []
+    for term in terms:
+        unit, doc = str(term.entry.traits["unit"]), term.entry.doc.removesuffix(".")
+        if unit == "name":
+            continue
+        unit = "" if unit == "-" else unit
+        how: Literal["mean", "phase"] = "phase" if term.entry.traits.get("circular") else "mean"
+        names = [f"{term.key}_{leg}" for leg in legs] if per_foot(term.entry) else [term.key]
+        entries_so_far += [Column(name, unit, doc, how, BETTER.get(term.entry.name)) for name in names]
+    return entries_so_far
+
+
+def add_measures(rows: Sequence[Row], measures: Mapping[str, Any], legs: Sequence[str]) -> None:
+    """Write the measures, (N,) or (N, 4) each by name, None if not measured, into the rows of the N robots."""
+    for name, each in measures.items():
+        if each is None or each.dtype.kind == "U":
+            continue
+        for row, value in zip(rows, each, strict=True):
+            parts = (
+                {name: value}
+                if np.ndim(value) == 0
+                else {f"{name}_{leg}": v for leg, v in zip(legs, value, strict=True)}
+            )
+            row |= {k: float(v) if np.isfinite(v) else None for k, v in parts.items()}

@@ -1,0 +1,285 @@
+"""Plays what a protocol asks for: N robots, each with its own command, kicks, delay and ground, as one batch."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from go1exp.config.schema.backends import BackendConfig
+from go1exp.config.schema.registry import Entry, Term, members
+from go1exp.evaluate.delay_margin import EFFECT as DELAY
+from go1exp.evaluate.delay_margin import delayed
+from go1exp.evaluate.drivers import Driver, Progress
+from go1exp.evaluate.engine import require_agreement
+from go1exp.evaluate.observed import TrunkVelocity
+from go1exp.evaluate.protocol.disturbances import Impulses, Kicker, heading
+from go1exp.evaluate.protocol.lengths import Length
+from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Motion, Plan
+from go1exp.evaluate.recorder import Recorder, bytes_per_step
+from go1exp.evaluate.rollout import EvalConfig, evaluation_task
+from go1exp.mdp.commands import FixedVelocity
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all protocols of one call share.
+
+    Attributes:
+        noise: add observation noise.
+        randomize: randomise robots and starts.
+        trunk_velocity: what the policy sees of it.
+        seed: seed of everything random.
+        policy_dt: another period of the policy, s; None keeps that of training.
+        physics_dt: another physics step, s; None keeps that of training.
+        engine: physics engine; None takes MuJoCo on the CPU.
+    """
+
+    noise: bool
+    randomize: bool
+    trunk_velocity: TrunkVelocity
+    seed: int
+    policy_dt: float | None = None
+    physics_dt: float | None = None
+    engine: BackendConfig | None = None
+
+
+class Stage:
+    """One driver on its robots."""
+
+    def __init__(self, driver: Driver, setting: Setting, on_step: Progress = lambda done, total: None) -> None:
+        """Prepare; ``on_step`` is called with the progress of everything that is played after ``expect``."""
+        self.driver, self.setting = driver, setting
+        self._on_step, self._done, self._total = on_step, 0.0, 0.0
+
+    @property
+    def policy_dt(self) -> float:
+        """Period of the policy, s."""
+        return self.setting.policy_dt or self.driver.task.sim.policy_dt
+
+    def times(self, duration: float, policy_dt: float | None = None) -> Array:
+        """Return the instants (T,) at which the policy acts in ``duration`` s."""
+        dt = policy_dt or self.policy_dt
+        return np.asarray(np.arange(self.steps(duration, dt)) * dt, dtype=np.float64)
+
+    def steps(self, duration: float, policy_dt: float | None = None) -> int:
+        """Return how many times the policy acts in ``duration`` s."""
+        return round(duration / (policy_dt or self.policy_dt))
+
+    def physics_dt(self, policy_dt: float) -> float:
+        """Return the physics step with a policy of that period, s."""
+        return self.setting.physics_dt or fitting_step(policy_dt, self.driver.task.sim.physics_dt)
+
+    def bytes_per_second(self, length: Length) -> tuple[float, float]:
+        """Return what robots take, B/s: always, and beside it while what measures need is recorded."""
+        dt = length.policy_dt or self.policy_dt
+        recorded = bytes_per_step(round(dt / self.physics_dt(dt)))
+        return length.robots * STEP_BYTES / dt, length.robots * recorded / dt
+
+    def expect(self, steps_of_robots: float) -> None:
+        """Say how many policy steps, times their robots, are to come: for the progress alone."""
+        self._total += steps_of_robots
+
+    def count(self, steps_of_robots: float) -> None:
+        """Say that so many are done."""
+        self._done += steps_of_robots
+        self._on_step(min(round(self._done), round(self._total) - 1), round(self._total))
+
+    def finished(self) -> None:
+        """Say that all is done."""
+        self._on_step(max(round(self._total), 1), max(round(self._total), 1))
+
+    def run(self, plan: Plan) -> Motion:
+        """Play a plan from its first to its last step."""
+        return self.session(plan).run(len(plan.command))
+
+    def session(self, plan: Plan) -> Session:
+        """Return a plan's robots at the start, to be played piece by piece."""
+        return Session(self, plan)
+
+    def task(self, plan: Plan) -> TaskConfig:
+        """Return the environment of a plan."""
+        setting, of_driver = self.setting, self.driver.task
+        policy_dt = plan.policy_dt or self.policy_dt
+        config = EvalConfig(
+            commands=(),
+            episodes=plan.robots,
+            duration_s=len(plan.command) * policy_dt,
+            settle_s=0.0,
+            noise=setting.noise,
+            randomize=setting.randomize,
+            push=False,
+            train_ground=False,
+            policy_dt=policy_dt,
+            seed=setting.seed,
+            physics_dt=self.physics_dt(policy_dt),
+            engine=setting.engine,
+        )
+        command = Term("command", Entry("command", "scheduled", _Scheduled), {})
+        task = dataclasses.replace(evaluation_task(of_driver, config), terrain=plan.ground, command=command)
+        if plan.friction is not None:
+            task = dataclasses.replace(task, rand=_with_friction(task.rand, plan.friction))
+        return task if plan.delay is None else delayed(task, 0.0)
+
+
+class _Scheduled(FixedVelocity):
+    """Velocities that a session gives: in force, and seen, from the step on for which they are meant."""
+
+    source: Callable[[], Tensor] | None = None
+
+    def advance(self, dt: float, restart: Tensor) -> None:
+        """Take the next ones."""
+        if self.source is not None:
+            self.value.copy_(self.source())
+
+
+class Session:
+    """A plan that is played piece by piece, and that can be put back to where it was saved."""
+
+    def __init__(self, stage: Stage, plan: Plan) -> None:
+        """Build the robots and put them at the start."""
+        self._stage, self.plan = stage, plan
+        self._velocity = plan.trunk_velocity or stage.setting.trunk_velocity
+        task, seed = stage.task(plan), stage.setting.seed
+        require_agreement(task)
+        imu = stage.driver.senses or self._velocity == "estimated"
+        self.core = Go1Core(task, plan.robots, seed, noise=stage.setting.noise, imu=imu)
+        self._pilot = stage.driver.begin(self.core, self._velocity, seed)
+        recording = plan.listen_from is not None
+        self._recorder = Recorder(self.core, len(plan.command) - (plan.listen_from or 0)) if recording else None
+        self._kicker = Kicker(self.core.backend, task.sim.physics_dt, plan.impulses) if plan.impulses else None
+        if plan.delay is not None:  # before the first reset, which puts effects into force
+            late: Tensor = self.core.plant.effects.effects[DELAY].delay  # type: ignore[attr-defined]
+            usual = delay_of_effects(stage.driver.task)
+            late.copy_(torch.from_numpy(plan.delay + usual)[:, None].expand_as(late))
+        assert isinstance(self.core.command, _Scheduled)
+        self._command, self._coming = self.core.command, 0
+        self._command.source = self._next_command
+        self._begin()
+
+    def _begin(self) -> None:
+        self.step = 0
+        n = self.plan.robots
+        self._alive, self._fell, self._left = (np.full(n, value) for value in (True, False, False))
+        self._coming = 0
+        self._observation = self.core.reset()
+        if self._kicker:
+            self._kicker.time = 0.0
+        self._start = self.core.snapshot().base_pos_w[:, :2].numpy().copy()  # type: ignore[index]
+
+    def use(self, impulses: Impulses) -> None:
+        """Kick otherwise from now on."""
+        assert self._kicker is not None
+        self._kicker.use(impulses)
+
+    def save(self) -> Any | None:
+        """Return everything that is needed to be back here, or None if the driver cannot be put back."""
+        pilot = self._pilot.save()
+        if pilot is None:
+            return None
+        counters = [self.step, self._alive.copy(), self._fell.copy(), self._left.copy(), self._observation.clone()]
+        return self.core.state_dict(), pilot, counters, self._kicker.time if self._kicker else 0.0
+
+    def load(self, state: Any | None, step: int) -> None:
+        """Be back at ``step``, where ``save`` was called; without a state, by playing everything up to it again."""
+        if state is None:
+            self._pilot = self._stage.driver.begin(self.core, self._velocity, self._stage.setting.seed)
+            self.core.reseed(self._stage.setting.seed)
+            self._begin()
+            self.run(step)
+            return
+        environment, pilot, (self.step, alive, fell, left, observation), time = state
+        self.core.load_state_dict(environment)
+        self._pilot.load(pilot)
+        self._alive, self._fell, self._left = alive.copy(), fell.copy(), left.copy()
+        self._observation, self._coming = observation.clone(), self.step + 1
+        if self._kicker:
+            self._kicker.time = time
+
+    def run(self, steps: int) -> Motion:
+        """Play the next ``steps`` steps."""
+        n, plan, core = self.plan.robots, self.plan, self.core
+        dt, first = core.task.sim.policy_dt, self.step
+        kept: dict[str, Any] = {name: np.zeros((steps, n)) for name in ("height", "way", "front_right")}
+        kept |= {"velocity": np.zeros((steps, n, 3)), "alive": np.zeros((steps, n), bool)}
+        kept["command"], finished = np.zeros((steps, n, 3)), np.zeros(n, bool)
+        for row in range(steps):
+            kept["command"][row] = self._command.value.numpy()
+            listening = self._recorder is not None and self.step >= (plan.listen_from or 0)
+            if self._recorder and listening:
+                self._recorder.begin_step()
+            result = core.step(self._pilot(self._observation))
+            core.check(result)
+            self._observation = result.observation
+            self._end(result.terminated.numpy(), result.truncated.numpy())
+            if self._recorder and listening:
+                self._recorder.end_step(torch.from_numpy(self._alive))
+            self._keep(kept, row)
+            self.step += 1
+            self._stage.count(n)
+            if plan.finish is not None and ((kept["way"][row] >= plan.finish) | ~self._alive | finished).all():
+                kept = {name: values[: row + 1] for name, values in kept.items()}
+                self._stage.count(n * (steps - row - 1))
+                break
+            if plan.finish is not None:
+                finished |= kept["way"][row] >= plan.finish
+        t = np.asarray((first + 1 + np.arange(len(kept["way"]))) * dt, dtype=np.float64)
+        trace = self._recorder.trace(slice(None)) if self._recorder else None
+        return Motion(dt=dt, t=t, fell=self._fell.copy(), left_map=self._left.copy(), trace=trace, **kept)
+
+    def _next_command(self) -> Tensor:
+        """Return the command (N, 3) of the coming step, in which the state that steering needs is known."""
+        command = self.plan.command[min(self._coming, len(self.plan.command) - 1)]
+        self._coming += 1
+        if self.plan.steer is not None:
+            command = command.copy()
+            qpos = self.core.backend.qpos
+            beside = (qpos[:, 1] - self.core.spawn[:, 1]).numpy()
+            turn = -self.plan.steer[0] * heading(qpos[:, 3:7]).numpy() - self.plan.steer[1] * beside
+            command[:, 2] = np.where(np.any(command != 0.0, axis=-1), np.clip(turn, -1.0, 1.0), 0.0)
+        return torch.from_numpy(command)
+
+    def _end(self, terminated: NDArray[np.bool_], truncated: NDArray[np.bool_]) -> None:
+        """Count who fell and who left the map; they start again and do not count any more."""
+        self._fell |= self._alive & terminated
+        self._left |= self._alive & truncated
+        self._alive &= ~(terminated | truncated)
+
+    def _keep(self, kept: dict[str, Any], row: int) -> None:
+        s = self.core.snapshot()
+        assert s.base_pos_w is not None
+        assert s.base_lin_vel_b is not None
+        kept["velocity"][row, :, :2] = s.base_lin_vel_b[:, :2].numpy()
+        kept["velocity"][row, :, 2] = s.base_ang_vel_b[:, 2].numpy()
+        below = self.core.ground_height(s.base_pos_w[:, :2])
+        kept["height"][row] = (s.base_pos_w[:, 2] - below).numpy()
+        kept["way"][row] = s.base_pos_w[:, 0].numpy() - self._start[:, 0]
+        kept["alive"][row] = self._alive
+        kept["front_right"][row] = s.foot_contact_time[:, 0].numpy()
+
+
+def delay_of_effects(task: TaskConfig) -> float:
+    """Return by how much the targets of a task's robots come late by its effects, s, without their spread."""
+    return sum(float(e.parameters["delay"]) for e in task.effect if e.entry.name == DELAY)
+
+
+def fitting_step(policy_dt: float, physics_dt: float) -> float:
+    """Return the largest physics step, at most ``physics_dt``, of which the policy's period is a whole multiple, s."""
+    return policy_dt / ceil(policy_dt / physics_dt - 1e-6)
+
+
+def _with_friction(terms: tuple[Term, ...], bounds: tuple[float, float]) -> tuple[Term, ...]:
+    """Return randomisations in which the feet's friction is drawn from ``bounds``."""
+    entry = members("rand")["foot_friction"]
+    parameters = entry.check({"range": list(bounds), "operation": "set"}, "friction")[0]
+    others = tuple(t for t in terms if t.entry.name != entry.name)
+    return (*others, Term("foot_friction", entry, parameters, {"when": "reset"}))

@@ -1,0 +1,161 @@
+"""Learning curves: metrics of runs over environment steps and over time, cut where the first of a group ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from go1exp.evaluate.report.groups import Group
+from go1exp.evaluate.report.runs import Run
+from go1exp.evaluate.statistics.runs import iqm_band
+
+Floats = NDArray[np.float64]
+
+RATE = "time/steps_per_s"
+STEPS, HOURS = "steps", "hours"
+AXES = {STEPS: "million environment steps", HOURS: "hours of training"}
+"""What curves are drawn over, and in which unit."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One metric of one group over one axis.
+
+    Attributes:
+        group: its name.
+        metric: column of metrics.csv.
+        axis: steps or hours.
+        x: (T,), million steps or hours.
+        middle: interquartile mean over runs (T,).
+        low: lower bound of its 95 % interval (T,), NaN of one run.
+        high: upper bound (T,).
+        runs: number of runs.
+        last: the last value of each run (runs,).
+    """
+
+    group: str
+    metric: str
+    axis: str
+    x: Floats
+    middle: Floats
+    low: Floats
+    high: Floats
+    runs: int
+    last: Floats
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """What a run logged: (rows,) of each column that was asked for and is there; ``hours`` is training time."""
+
+    columns: dict[str, Floats]
+    available: tuple[str, ...]
+
+
+def read(run: Path, wanted: Sequence[str]) -> tuple[Metrics, str]:
+    """Return a run's metrics, and a remark in one line; empty if nothing is to be said.
+
+    Rows that a crash left half-written are left out, and repeated iterations count once.
+    """
+    table, remark = _table(run / "metrics.csv", ("iteration", "steps", *wanted))
+    timing, _ = _table(run / "timing.csv", ("iteration", "steps", RATE))
+    columns = {name: values for name, values in table.items() if name != _NAMES}
+    available = tuple(table.get(_NAMES, ()))
+    if len(columns.get("steps", ())) and len(timing.get(RATE, ())):
+        passed = np.diff(timing["steps"], prepend=0.0) / np.maximum(timing[RATE], 1e-9) / 3600.0
+        columns[HOURS] = np.interp(columns["steps"], timing["steps"], np.cumsum(passed))
+    return Metrics(columns, available), remark
+
+
+_NAMES = ""
+"""Key under which ``_table`` gives the names of all columns."""
+
+
+def _table(file: Path, wanted: Sequence[str]) -> tuple[dict[str, Floats], str]:
+    """Return columns of a CSV file by name, rows that are whole and ascending in the first column."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    try:
+        data = file.read_bytes()
+    except OSError:
+        return {}, f"{file}: cannot be read"
+    whole, _, rest = data.rpartition(b"\n")
+    names = whole.split(b"\n", 1)[0].decode(errors="replace").strip().split(",")
+    spoilt = [bool(rest.strip())]
+
+    def skip(row: object) -> str:
+        spoilt.append(True)
+        return "skip"
+
+    present = [name for name in dict.fromkeys(wanted) if name in names]
+    if not whole or "iteration" not in names or len(whole.split(b"\n", 2)) < 2:
+        return {}, f"{file}: holds no whole row"
+    try:
+        table = csv.read_csv(
+            pa.BufferReader(whole + b"\n"),
+            parse_options=csv.ParseOptions(invalid_row_handler=skip),
+            convert_options=csv.ConvertOptions(
+                include_columns=present,
+                column_types=dict.fromkeys(present, pa.float64()),
+                null_values=["", "nan", "NaN", "None"],
+                strings_can_be_null=True,
+            ),
+        )
+    except pa.ArrowInvalid as error:
+        return {}, f"{file}: is damaged ({str(error).splitlines()[0][:120]})"
+    columns = {name: table[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in present}
+    rising = np.isfinite(columns["iteration"])
+    rising &= np.diff(np.maximum.accumulate(np.nan_to_num(columns["iteration"])), prepend=0.0) > 0.0
+    kept = {name: values[rising] for name, values in columns.items()}
+    if not rising.all():
+        spoilt.append(True)
+    remark = f"{file}: has rows that are not whole; they are left out" if any(spoilt) else ""
+    return {**kept, _NAMES: np.array(names)}, remark
+
+
+def curves(
+    made: Sequence[Group], metrics: dict[Path, Metrics], wanted: Sequence[str], points: int
+) -> tuple[list[Curve], list[str]]:
+    """Return the curves of all groups, and remarks on what could not be drawn."""
+    drawn, notes = [], []
+    for name in wanted:
+        lacking = [run for group in made for run in group.runs if name not in metrics[run.folder].columns]
+        if lacking:
+            known = metrics[lacking[0].folder].available
+            close = f"; it has {', '.join(known[:6])}, ..." if known else ""
+            notes.append(f"{name}: is not in the metrics of {_listed(lacking)}{close}")
+        for axis in AXES:
+            for group in made:
+                if (curve := _curve(group, metrics, name, axis, points)) is not None:
+                    drawn.append(curve)
+    return drawn, notes
+
+
+def _listed(runs: Sequence[Run]) -> str:
+    return runs[0].label + (f" and {len(runs) - 1} more runs" if len(runs) > 1 else "")
+
+
+def _curve(group: Group, metrics: dict[Path, Metrics], name: str, axis: str, points: int) -> Curve | None:
+    """Return one curve, from where all runs have a value to where the first of them ends."""
+    lines = []
+    for run in group.runs:
+        columns = metrics[run.folder].columns
+        if name in columns and axis in columns:
+            known = np.isfinite(columns[name]) & np.isfinite(columns[axis])
+            if known.sum() >= 2:
+                lines.append((columns[axis][known], columns[name][known]))
+    if not lines:
+        return None
+    start, end = max(x[0] for x, _ in lines), min(x[-1] for x, _ in lines)
+    if end <= start:
+        return None
+    x = np.linspace(start, end, points)
+    values = np.array([np.interp(x, at, value) for at, value in lines])
+    middle, low, high = iqm_band(values)
+    unit = 1e-6 if axis == STEPS else 1.0
+    return Curve(group.name, name, axis, x * unit, middle, low, high, len(lines), values[:, -1])

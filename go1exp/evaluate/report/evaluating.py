@@ -1,0 +1,113 @@
+"""Evaluates runs that have no evaluation yet, all alike: on the grid of commands, and by protocols."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from go1exp.config.schema.registry import TooLongError, bind_list
+from go1exp.evaluate.drivers import PolicyDriver
+from go1exp.evaluate.files import FILE, write
+from go1exp.evaluate.protocol.base import Chosen
+from go1exp.evaluate.protocol.playing import Rates, play
+from go1exp.evaluate.protocol.report.writing import write as write_protocol
+from go1exp.evaluate.report.evaluations import GRID, PROTOCOLS, names
+from go1exp.evaluate.report.runs import Run
+from go1exp.evaluate.report.settings import Evaluation
+from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
+from go1exp.train.policy import load_run
+
+BEST = "best.pt"
+"""The checkpoint that evaluation during training found best, in a run folder."""
+
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """One evaluation of one run: by a protocol, or on the grid for None."""
+
+    run: Run
+    protocol: Chosen | None
+
+    @property
+    def label(self) -> str:
+        """Its name in what is shown."""
+        return f"{self.run.label}, {self.protocol.key if self.protocol else GRID}"
+
+
+def missing(runs: Sequence[Run], protocols: Sequence[Chosen | None] = (None,)) -> list[Wanted]:
+    """Return which of these evaluations (None: the grid) the runs lack that have a checkpoint."""
+    return [
+        Wanted(run, protocol)
+        for run in runs
+        for protocol in protocols
+        if (protocol.key if protocol else GRID) not in names(run) and any((run.folder / "checkpoints").glob("*.pt"))
+    ]
+
+
+def _checkpoint(run: Path, settings: Evaluation) -> Path | None:
+    """Return the checkpoint that is judged; None for the newest."""
+    best = run / BEST
+    return best if settings.checkpoint == "best" and best.is_file() else None
+
+
+def play_protocol(run: Run, protocol: Chosen, settings: Evaluation, on_step: Progress) -> None:
+    """Play a protocol with the policy of a run, as ``go1exp eval`` does, and write its files into the run's folder.
+
+    Raises:
+        ValueError: if the policy cannot be played so.
+    """
+    config, policy, about = load_run(run.folder, _checkpoint(run.folder, settings))
+    driver = PolicyDriver(run.label, config.task, policy, about)
+    velocities = protocol.protocol.policy_velocities().items()
+    problems = [p for key, v in velocities for p in driver.problems(v, f"protocol.{protocol.key}.{key}")]
+    if problems:
+        raise ValueError("; ".join(problems))
+    result = play(protocol, driver, Rates(settings.seed), {"robot": {}}, on_step)
+    write_protocol(result, run.folder / PROTOCOLS)
+
+
+def evaluate_run(run: Path, settings: Evaluation, on_step: Progress) -> dict[str, Any]:
+    """Evaluate the policy of a run folder on the grid, as asked for; return the report of ``evaluate``."""
+    config, policy, about = load_run(run, _checkpoint(run, settings))
+    commands = grid(settings.x, settings.y, settings.yaw, False)
+    unlike = ("commands", "train_ground", "policy_dt", "physics_dt", "trunk_velocity", "engine")
+    shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(EvalConfig) if f.name not in unlike}
+    wanted = EvalConfig(commands=commands, train_ground=False, policy_dt=None, **shared)
+    measures = bind_list("measure", list(settings.measures), "evaluation.measures")
+    return {"policy": about, "robot": {}, **evaluate(config.task, policy, wanted, on_step, measures), "bars": []}
+
+
+def evaluate_missing(
+    wanted: Sequence[Wanted], settings: Evaluation, on_run: Callable[[int, int, str], Progress]
+) -> list[str]:
+    """Evaluate runs one after the other and write what came of them into their folders; return remarks.
+
+    Args:
+        wanted: what to evaluate, and by what.
+        settings: how.
+        on_run: called with the number of the evaluation, how many there are and its label; returns what shows its
+            progress.
+
+    Raises:
+        TooLongError: if what is asked of the runs does not fit into memory.
+    """
+    notes = []
+    for number, each in enumerate(wanted, 1):
+        show = on_run(number, len(wanted), each.label)
+        try:
+            if each.protocol is None:
+                write(evaluate_run(each.run.folder, settings, show), each.run.folder / FILE)
+            else:
+                play_protocol(each.run, each.protocol, settings, show)
+        except TooLongError as error:  # asked of every run: none could be evaluated
+            group = "" if each.protocol else "evaluation."
+            raise TooLongError([group + problem for problem in error.problems]) from None
+        except (OSError, RuntimeError, ValueError) as error:
+            notes.append(f"{each.label}: could not be evaluated ({' '.join(str(error).split())[:160]})")
+    return notes

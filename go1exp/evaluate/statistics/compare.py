@@ -1,0 +1,231 @@
+"""Two groups of training runs: permutation tests, Holm's correction, effect sizes, and the words for what came out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from go1exp.evaluate.statistics.intervals import LEVEL, Interval, alike
+from go1exp.evaluate.statistics.runs import TRIM, WINSORISED_FROM, iqm, iqm_interval
+
+Word = Literal["better", "worse", "not told apart"]
+Direction = Literal["lower", "higher"]
+
+RESAMPLES = 20_000
+"""Permutations of a test; where there are fewer, all of them."""
+
+LEAST_RANDOM_P = 2.0 / (RESAMPLES + 1)
+"""Smallest two-sided p of random permutations, of which what came counts as one."""
+
+ALPHA = 1.0 - LEVEL
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One figure of a group against that of the baseline.
+
+    Attributes:
+        estimate: interquartile mean of the group less that of the baseline, with Yuen's interval; n counts the runs of
+            the smaller group, or the pairs.
+        p: of the permutation test, two-sided.
+        effect: Hedges' g, in standard deviations.
+        improvement: probability that a run of the group has more than one of the baseline; ties count half.
+        least_p: the smallest p that so few runs can give.
+    """
+
+    estimate: Interval
+    p: float
+    effect: float
+    improvement: float
+    least_p: float
+
+
+def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False, seed: int = 0) -> Difference:
+    """Return how the runs (n,) of a group differ from those (m,) of the baseline; NaNs are left out.
+
+    Args:
+        group: one value per run.
+        baseline: the same of the baseline; in the same order if ``paired``.
+        paired: the k-th of both belong together.
+        seed: of the permutations, where not all are made.
+    """
+    a, b = np.asarray(group, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
+    if paired:
+        both = np.isfinite(a) & np.isfinite(b)
+        a, b = a[both], b[both]
+    else:
+        a, b = a[np.isfinite(a)], b[np.isfinite(b)]
+    return Difference(
+        estimate=yuen(a, b, paired),
+        p=permutation_p(a, b, paired, seed),
+        effect=hedges(a, b),
+        improvement=probability_of_improvement(a, b),
+        least_p=least_p(len(a), len(b), paired),
+    )
+
+
+def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, seed: int = 0) -> float:
+    """Return the two-sided p that runs (n,) and (m,) differ; NaN with fewer than two runs in a group.
+
+    Runs change groups, or, ``paired``, the two of a pair change places, in every way or in 20,000, which is exact for
+    any distribution. What is compared are mean ranks (Wilcoxon 1945): one run that failed does not hide the others.
+    """
+    from scipy import stats
+
+    if min(len(a), len(b)) < 2:
+        return math.nan
+    if paired:
+        gain = a - b
+        signed = stats.rankdata(np.abs(gain)) * np.sign(gain)
+        return _p_of_ranks((tuple(np.sort(signed).tolist()),), seed) if gain.any() else 1.0
+    together = stats.rankdata(np.concatenate([a, b]))
+    if alike(np.concatenate([a, b])):
+        return 1.0
+    return _p_of_ranks(tuple(tuple(np.sort(each).tolist()) for each in np.split(together, [len(a)])), seed)
+
+
+@lru_cache(maxsize=4096)
+def _p_of_ranks(ranks: tuple[tuple[float, ...], ...], seed: int) -> float:
+    """Return the p of one sample of signed ranks, or of two of ranks; the same few ranks come again and again."""
+    from scipy import stats
+
+    kind = "samples" if len(ranks) == 1 else "independent"
+    done = stats.permutation_test(
+        tuple(map(np.asarray, ranks)),
+        _mean_difference,
+        permutation_type=kind,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        axis=-1,
+        rng=seed,
+    )
+    return float(done.pvalue)
+
+
+def _mean_difference(*ranks: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
+    """Return the mean of the first, less that of the second if there is one."""
+    first = ranks[0].mean(axis=axis)
+    return np.asarray(first - ranks[1].mean(axis=axis) if len(ranks) > 1 else first)
+
+
+def least_p(n: int, m: int, paired: bool = False) -> float:
+    """Return the smallest two-sided p that ``permutation_p`` of n and m runs can give.
+
+    Where not all ways are made, the one that came counts as a permutation of its own, so that p never is zero.
+    """
+    if min(n, m) < 2:
+        return math.nan
+    ways = 2**n if paired else math.comb(n + m, n)
+    return min(1.0, max(2.0 / ways, LEAST_RANDOM_P))
+
+
+def runs_that_can_tell(paired: bool = False, figures: int = 1, alpha: float = ALPHA) -> int | None:
+    """Return the least number of runs in each group with which one of ``figures`` can be told apart at all.
+
+    None where no number can: so many figures are more than random permutations can tell.
+    """
+    if LEAST_RANDOM_P * figures > alpha:
+        return None
+    n = 2
+    while least_p(n, n, paired) * figures > alpha:
+        n += 1
+    return n
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values adjusted for their number (Holm 1979), in the same order; NaNs stay and do not count."""
+    p = np.asarray(p_values, dtype=np.float64)
+    adjusted = np.full_like(p, np.nan)
+    order = [int(k) for k in np.argsort(p) if np.isfinite(p[k])]
+    largest = 0.0
+    for place, k in enumerate(order):
+        largest = max(largest, min(1.0, float(p[k]) * (len(order) - place)))
+        adjusted[k] = largest
+    return [float(value) for value in adjusted]
+
+
+def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, level: float = LEVEL) -> Interval:
+    """Return the difference of interquartile means with Yuen's interval (1974); of pairs, that of their differences.
+
+    Where runs are all alike within both groups, or all pairs differ alike, nothing says how sure a difference is: the
+    interval is NaN, unless there is no difference.
+    """
+    from scipy import stats
+
+    parts = [a - b] if paired else [a, b]
+    n = min(len(part) for part in parts)
+    if not n:
+        return Interval(math.nan, math.nan, math.nan, 0)
+    estimate = float(iqm(parts[0]) - (0.0 if paired else iqm(b)))
+    if n < 2:
+        return Interval(estimate, math.nan, math.nan, n)
+    trim = TRIM if n >= WINSORISED_FROM else 0.0
+    if all(alike(part, trim) for part in parts):
+        bound = 0.0 if estimate == 0.0 else math.nan
+        return Interval(estimate, bound, bound, n)
+    if paired:
+        return iqm_interval(parts[0], level)
+    centred = (part - np.median(part) for part in parts)  # exact where one group is alike; only the width counts
+    bounds = stats.ttest_ind(*centred, equal_var=False, trim=trim).confidence_interval(level)
+    shift = estimate - 0.5 * (bounds.low + bounds.high)
+    return Interval(estimate, float(bounds.low + shift), float(bounds.high + shift), n)
+
+
+def hedges(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Return Hedges' g: the difference of means in pooled standard deviations, corrected for few runs; or NaN."""
+    n, m = len(a), len(b)
+    if min(n, m) < 2 or (alike(a) and alike(b)):
+        return math.nan
+    pooled = math.sqrt(((n - 1) * a.var(ddof=1) + (m - 1) * b.var(ddof=1)) / (n + m - 2))
+    return float((a.mean() - b.mean()) / pooled * (1.0 - 3.0 / (4.0 * (n + m) - 9.0)))
+
+
+def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
+    """Return the probability that a run of ``a`` has more than one of ``b``, ties half; of (n, tasks), mean over tasks.
+
+    The Mann-Whitney statistic over n m, as in rliable.
+    """
+    x, y = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    if not len(x) or not len(y):
+        return math.nan
+    above, equal = x[:, None] > y[None, :], x[:, None] == y[None, :]
+    return float((above + 0.5 * equal).mean())
+
+
+def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0.8, alpha: float = ALPHA) -> int | None:
+    """Return how many runs in each group would tell a difference like the one seen; None if no number would.
+
+    The normal approximation for two groups, with a quarter of the squared quantile for Student's: n = (z_alpha +
+    z_power)^2 (s_a^2 + s_b^2) / d^2 + z_alpha^2 / 4.
+    """
+    from scipy import stats
+
+    if min(len(a), len(b)) < 2 or a.mean() == b.mean():
+        return None
+    z_alpha, z_power = float(stats.norm.ppf(1.0 - 0.5 * alpha)), float(stats.norm.ppf(power))
+    ratio = (a.var(ddof=1) + b.var(ddof=1)) / (a.mean() - b.mean()) ** 2
+    needed = (z_alpha + z_power) ** 2 * ratio + 0.25 * z_alpha**2
+    least = runs_that_can_tell(alpha=alpha)
+    return max(least, math.ceil(needed)) if least is not None and needed < 1e6 else None
+
+
+def worded(estimate: float, p: float, better: Direction, alpha: float = ALPHA) -> Word:
+    """Return the word for a difference (group less baseline) with its p, which is adjusted already."""
+    if not (math.isfinite(p) and p <= alpha) or estimate == 0.0:
+        return "not told apart"
+    return "better" if (estimate > 0.0) == (better == "higher") else "worse"
+
+
+def word(between: Interval, better: Direction) -> Word:
+    """Return the word for a difference (other less first) whose interval is clear of zero or not."""
+    if not (math.isfinite(between.low) and math.isfinite(between.high)):
+        return "not told apart"
+    if between.low > 0.0 or between.high < 0.0:
+        return "better" if (between.low > 0.0) == (better == "higher") else "worse"
+    return "not told apart"

@@ -1,0 +1,175 @@
+"""MuJoCo Studio's page in a process of its own, so that drawing panels takes no time from the robot.
+
+Studio itself offers a thread. A robot's period is thousands of short calls, each of which lets go of the interpreter's
+lock; a thread that draws panels then holds that lock for up to 5 ms each time, and the robot waits.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+from mujoco.studio import endpoints, messages, viewer_handle
+
+from go1exp.base.errors import Expected
+from go1exp.base.signals import ending
+
+
+class Mailbox:
+    """One end of a pipe that carries Studio's messages.
+
+    Events are carried in order. Of snapshots only the newest of each type counts: they wait here until the other end
+    has taken those before, so that neither end ever waits for the other one.
+    """
+
+    def __init__(self, pipe: Connection) -> None:
+        """Carry messages over ``pipe``."""
+        self._pipe, self._free = pipe, True
+        self._waiting: dict[type[messages.Snapshot], messages.Snapshot] = {}
+        self._came: list[messages.Event] = []
+        self._newest: dict[type[messages.Snapshot], messages.Snapshot] = {}
+        self.over = False
+        self.events, self.snapshots = _Events(self), _Snapshots(self)
+
+    def send(self, kind: str, load: Any = None) -> None:
+        """Send something at once; nothing where the other end has gone."""
+        try:
+            self._pipe.send((kind, load))
+        except OSError:
+            self.over = True
+
+    def offer(self, snapshot: messages.Snapshot) -> None:
+        """Send a snapshot as soon as the other end is free."""
+        self._waiting[type(snapshot)] = snapshot
+        self._pass_on()
+
+    def take_back(self, kind: type[messages.Snapshot]) -> messages.Snapshot | None:
+        """Return a snapshot that still waits here, and keep it no longer."""
+        return self._waiting.pop(kind, None)
+
+    def _pass_on(self) -> None:
+        if self._free and self._waiting:
+            self._free = False
+            self.send("snapshots", list(self._waiting.values()))
+            self._waiting = {}
+
+    def new_events(self) -> list[messages.Event]:
+        """Take in all that has come, and return its events; an end of Studio where the other end has gone."""
+        try:
+            while self._pipe.poll():
+                kind, load = self._pipe.recv()
+                if kind == "event":
+                    self._came.append(load)
+                elif kind == "snapshots":
+                    self._newest |= {type(snapshot): snapshot for snapshot in load}
+                    self.send("taken")
+                else:
+                    self._free = True
+        except (EOFError, OSError):
+            self.over = True
+        self._pass_on()
+        if self.over:
+            self._came.append(messages.ExitEvent())
+        events, self._came = self._came, []
+        return events
+
+    def new_snapshots(self) -> list[messages.Snapshot]:
+        """Return the snapshots that came with the events of the call before: never one of a model not yet told."""
+        newest, self._newest = list(self._newest.values()), {}
+        return newest
+
+    def close(self) -> None:
+        """Close this end."""
+        self._pipe.close()
+
+
+class _Events(messages.EventChannel):
+    """The events of a mailbox, as Studio asks for them."""
+
+    def __init__(self, box: Mailbox) -> None:
+        self._box = box
+
+    def put(self, event: messages.Event) -> None:
+        self._box.send("event", event)
+
+    def get(self) -> list[messages.Event]:
+        return self._box.new_events()
+
+    def close(self) -> None:
+        self._box.close()
+
+
+class _Snapshots(messages.SnapshotChannel):
+    """The snapshots of a mailbox, as Studio asks for them."""
+
+    def __init__(self, box: Mailbox) -> None:
+        self._box = box
+
+    def put(self, snapshot: messages.Snapshot) -> None:
+        self._box.offer(snapshot)
+
+    def reclaim_unconsumed(self, snapshot_type: type[messages.Snapshot]) -> messages.Snapshot | None:
+        return self._box.take_back(snapshot_type)
+
+    def get(self) -> list[messages.Snapshot]:
+        return self._box.new_snapshots()
+
+    def close(self) -> None:
+        self._box.close()
+
+
+def _ends(box: Mailbox) -> dict[str, Any]:
+    """Return a mailbox as the four channels of an endpoint of Studio: it carries both ways."""
+    return {
+        "s2v_snapshot": box.snapshots,
+        "s2v_events": box.events,
+        "v2s_events": box.events,
+        "v2s_snapshot": box.snapshots,
+    }
+
+
+def launch(target: Callable[[endpoints.ViewerEndpoint], None], plugins: list[Any]) -> viewer_handle.ViewerHandle:
+    """Run a viewer in a process of its own, as ``mujoco.studio.launch_thread`` does in a thread.
+
+    The process is a fork: it has what this one has loaded, and starts at once.
+
+    Args:
+        target: makes the viewer on its endpoint and runs it.
+        plugins: of this side.
+
+    Returns:
+        The handle of this side; its use raises ``Expected`` when the page ended by an error.
+    """
+    context = multiprocessing.get_context("fork")
+    ours, theirs = context.Pipe()
+
+    def live() -> None:
+        for number in ending():
+            signal.signal(number, signal.SIG_IGN)  # Ctrl-C is for the robot's process, which then ends this one
+        ours.close()
+        target(endpoints.ViewerEndpoint(**_ends(Mailbox(theirs))))
+
+    process = context.Process(target=live, daemon=True)
+    process.start()
+    theirs.close()
+
+    def end(seconds: float) -> None:
+        process.join(seconds)
+        if process.is_alive():
+            process.kill()
+            process.join()
+
+    def complain() -> None:
+        if process.exitcode == 1:  # of an exception, which it has printed
+            raise Expected("the page's process ended by an error, printed above")
+
+    return viewer_handle.ViewerHandle(
+        endpoints.SimEndpoint(**_ends(Mailbox(ours))),
+        is_alive_fn=process.is_alive,
+        shutdown_fn=end,
+        forward_error_fn=complain,
+        sim_plugins=plugins,
+    )

@@ -1,0 +1,307 @@
+"""A robot that walks while a user steers, pushes and changes it: one period of the policy at a time, no browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from go1exp import robot
+from go1exp.base.errors import Expected
+from go1exp.config.schema.registry import ConfigError, Term
+from go1exp.deploy.estimation import EstimatorError
+from go1exp.evaluate.drivers import Driver
+from go1exp.evaluate.engine import require_agreement
+from go1exp.evaluate.protocol.disturbances import Impulses, Kicker, heading
+from go1exp.evaluate.viewer import requests as wish
+from go1exp.evaluate.viewer.conditions import Ground, Setup, task_under
+from go1exp.evaluate.viewer.estimate import Estimate
+from go1exp.evaluate.viewer.history import History
+from go1exp.mdp.actions import clipped
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig
+
+PUSH_S = 0.1
+"""Duration of a push, s."""
+
+PUSH_SHOWN_S = 0.6
+"""How long its arrow is shown, s."""
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Robots:
+    """What a user may choose from.
+
+    Attributes:
+        drivers: label -> what loads the policy, bundle or controller.
+        grounds: by name.
+        effects: by name, at size 1.
+    """
+
+    drivers: Mapping[str, Callable[[], Driver]]
+    grounds: Mapping[str, Ground]
+    effects: Mapping[str, Term]
+
+
+@dataclass(frozen=True)
+class PushMade:
+    """A push, for its arrow.
+
+    Attributes:
+        time: at which it began, s.
+        impulse: N s.
+        angle: of the force in the world, rad.
+    """
+
+    time: float
+    impulse: float
+    angle: float
+
+
+class Session:
+    """One robot.
+
+    What is asked for (``ask``) is checked before anything changes: what cannot be is refused in ``message``, and the
+    robot walks on as before.
+
+    Attributes:
+        robots: what there is to choose from.
+        core: the environment.
+        setup: what the robot walks under.
+        label: who drives.
+        command: the velocity that is asked for.
+        rewards: names of the reward terms.
+        paused: whether time stands still.
+        speed: simulated seconds per second.
+        time: simulated seconds since the session began.
+        falls: how often the robot fell.
+        message: what a user must know, a line; empty for nothing.
+        push: the last one.
+    """
+
+    def __init__(self, robots: Robots, label: str, setup: Setup, velocity: wish.Velocity) -> None:
+        """Build the robot and put it at the start.
+
+        Raises:
+            ConfigError: if it cannot walk under ``setup``.
+        """
+        self.robots, self.command = robots, velocity
+        self._loaded: dict[str, Driver] = {}
+        self.paused, self.speed, self.time, self.falls = False, 1.0, 0.0, 0
+        self._history: History | None = None
+        self.rewards: tuple[str, ...] = ()
+        self.message, self.push = "", PushMade(-math.inf, 0.0, 0.0)
+        self._since, self._single = 0.0, False
+        self._build(label, setup)
+        self._begin()
+
+    # ------------------------------------------------------------------ building
+
+    def _driver(self, label: str) -> Driver:
+        if label not in self.robots.drivers:
+            raise ConfigError([f"policy {label!r}: known are {', '.join(self.robots.drivers)}"])
+        if label not in self._loaded:
+            self._loaded[label] = self.robots.drivers[label]()
+        return self._loaded[label]
+
+    def task_of(self, label: str, setup: Setup) -> TaskConfig:
+        """Return the task in which a driver walks under ``setup``; raise ConfigError if it cannot."""
+        driver = self._driver(label)
+        if problems := driver.problems(setup.trunk_velocity, "trunk_velocity"):
+            raise ConfigError(problems)
+        return task_under(driver.task, setup, self.robots.grounds, self.robots.effects)
+
+    def _build(self, label: str, setup: Setup) -> None:
+        """Take another driver or setup; nothing changes unless all of it can be built."""
+        task, driver = self.task_of(label, setup), self._driver(label)
+        require_agreement(task)
+        core = Go1Core(task, 1, setup.seed, noise=setup.noise, imu=True)
+        pilot = driver.begin(core, setup.trunk_velocity, setup.seed)
+        self._kicker = Kicker(core.backend, task.sim.physics_dt, one_push(math.nan, 0.0, 0.0))
+        try:
+            self._estimate: Estimate | None = Estimate(core, setup.seed)
+        except EstimatorError:
+            self._estimate = None
+        self.core, self._pilot, self.label, self.setup = core, pilot, label, setup
+        self._limit = np.maximum(robot.per_joint(task.robot.effort_limit), 1e-9)
+        names = tuple(t.key for t in core.terms.rewards)
+        widths = {"command": 3, "true": 3, "estimated": 3, "height": 1, "torque": 12, "contact": 4, "push": 1}
+        widths["reward"] = len(names)
+        if self._history is None or (self.rewards, self._history.dt) != (names, self.dt):
+            self._history = History(widths, self.dt)
+        self.rewards = names
+
+    def _begin(self) -> None:
+        """Put the robot at the start."""
+        core, setup = self.core, self.setup
+        ground = self.robots.grounds[setup.ground]
+        self._aim()
+        core.reset()
+        if ground.tiles:
+            core.level.fill_(round(min(max(setup.level, 0.0), ground.hardest)))
+            if setup.tile in core.terrain.tile_types:
+                core.tile_column.fill_(core.terrain.tile_types.index(setup.tile))
+        self._observation = core.reset()
+        self._fresh()
+
+    def _aim(self) -> None:
+        """Hand the command to the environment."""
+        self.core.command.value[:] = self.core.command.value.new_tensor(self.command)
+
+    def _fresh(self) -> None:
+        """Forget what is only of the episode before."""
+        self._since = 0.0
+        if self._estimate is not None:
+            self._estimate.restart()
+
+    def _hand_over(self, old: Go1Core) -> None:
+        """Go on from where the robot of ``old`` is: its pose, speed and target; drives and effects begin anew.
+
+        The first period of a policy's observations comes from holding the target that was in force.
+        """
+        core, everyone = self.core, torch.ones(1, dtype=torch.bool)
+        core.level.copy_(old.level)
+        core.tile_column.copy_(old.tile_column)
+        core.reset()
+        core.spawn.copy_(old.spawn)
+        core.backend.reset(everyone, old.backend.qpos.clone(), old.backend.qvel.clone())
+        core.target.copy_(old.target)
+        core.plant.reset(everyone, old.target.to(core.backend.qpos.dtype))
+        action = core.task.action
+        nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32)
+        held = clipped((old.target - nominal) / action.scale, action.clip)
+        self._observation = core.step(held).observation
+        if self._estimate is not None:
+            self._estimate.restart()
+
+    # ------------------------------------------------------------------ what is asked for
+
+    def ask(self, request: wish.Request) -> None:
+        """Do what is asked, or say in ``message`` why not."""
+        try:
+            self._fulfil(request)
+        except (ConfigError, Expected) as error:
+            self.message = " ".join(str(error).split())
+
+    def _fulfil(self, request: wish.Request) -> None:
+        match request:
+            case wish.Steer(velocity):
+                self.command = velocity
+            case wish.Push(impulse, direction):
+                self._push(impulse, direction)
+            case wish.Pace(paused, speed):
+                self.paused, self.speed = paused, speed
+            case wish.Step():
+                self._single = True
+            case wish.Reset():
+                self._begin()
+                self.message = ""
+            case wish.Hand(label):
+                self._exchange(label, self.setup)
+            case wish.Effects(sizes):
+                self._exchange(self.label, dataclasses.replace(self.setup, sizes=dict(sizes)))
+            case wish.Conditions():
+                self._exchange(self.label, dataclasses.replace(self.setup, **dataclasses.asdict(request)))
+            case wish.Walk(ground, level, tile):
+                self._build(self.label, dataclasses.replace(self.setup, ground=ground, level=level, tile=tile))
+                self._begin()
+                self.message = ""
+
+    def _exchange(self, label: str, setup: Setup) -> None:
+        """Change who drives or what the robot walks under, while it walks."""
+        old = self.core
+        self._build(label, setup)
+        self._aim()
+        self._hand_over(old)
+        self.message = ""
+
+    def _push(self, impulse: float, direction: float) -> None:
+        self._kicker.use(one_push(self._kicker.time, impulse, direction))
+        angle = float(heading(self.core.backend.qpos[:, 3:7])[0]) + direction
+        self.push = PushMade(self.time, impulse, angle)
+
+    # ------------------------------------------------------------------ time
+
+    @property
+    def history(self) -> History:
+        """The curves."""
+        assert self._history is not None
+        return self._history
+
+    @property
+    def dt(self) -> float:
+        """Period of the policy, s."""
+        return self.core.task.sim.policy_dt
+
+    def due(self) -> bool:
+        """Return whether a period shall pass now: time runs, or a single step was asked for."""
+        return not self.paused or self._single
+
+    def advance(self) -> None:
+        """Let one period of the policy pass.
+
+        Raises:
+            NumericalFault: when a value is not finite.
+        """
+        self._single, core = False, self.core
+        self._aim()
+        result = core.step(self._pilot(self._observation))
+        core.check(result)
+        self._observation = result.observation
+        self.time += self.dt
+        self._since += self.dt
+        why = core.episode_end(result, 0)
+        if why is not None:
+            self.falls += bool(result.terminated[0])
+            self.message = f"{self.time:.1f} s: {why} after {self._since:.1f} s; it starts again"
+            self._fresh()
+        self._remember()
+
+    def _remember(self) -> None:
+        """Add a row to the curves."""
+        s, core = self.core.snapshot(), self.core
+        assert s.base_pos_w is not None
+        assert s.base_lin_vel_b is not None
+        below = core.ground_height(s.base_pos_w[:, :2])
+        reward = np.array([float(v[0]) for v in core.reward_terms().values()]) / self.dt
+        row: dict[str, Vector] = {
+            "command": np.array(self.command),
+            "true": np.array([*s.base_lin_vel_b[0, :2].tolist(), float(s.base_ang_vel_b[0, 2])]),
+            "height": (s.base_pos_w[:, 2] - below).double().numpy(),
+            "torque": s.joint_torque[0].abs().double().numpy() / self._limit,
+            "contact": s.foot_contact[0].double().numpy(),
+            "push": np.array([self.push.impulse if self.time - self.push.time < PUSH_S + self.dt else 0.0]),
+            "reward": reward,
+        }
+        if self._estimate is not None:
+            gyro = core.plant.sense(s).base_ang_vel_b if core.plant.effects.senses else s.base_ang_vel_b
+            row["estimated"] = np.array([*self._estimate.velocity()[:2], float(gyro[0, 2])])
+        self.history.add(row)
+
+    # ------------------------------------------------------------------ what is seen
+
+    def qpos(self) -> Vector:
+        """Return position, attitude and joint angles (19,)."""
+        return np.asarray(self.core.backend.qpos[0].cpu().double().numpy())
+
+    def trained_for(self) -> dict[str, tuple[float, float]]:
+        """Return the ranges of velocity that the policy was trained for, by the names of the command's parameters."""
+        parameters = self._driver(self.label).task.command.parameters
+        return {name: tuple(v) for name, v in parameters.items() if isinstance(v, tuple | list) and len(v) == 2}
+
+    def velocity(self, seconds: float = 0.5) -> Vector:
+        """Return the mean true velocity (3,) of the last ``seconds`` s: x and y, m/s, and yaw rate, rad/s."""
+        return np.asarray(self.history.last("true", seconds).mean(0))
+
+
+def one_push(start: float, impulse: float, direction: float) -> Impulses:
+    """Return one push on one robot; a start that is NaN is none."""
+    begins, size, angle = (np.full((1, 1), v) for v in (start, impulse, direction))
+    return Impulses(begins, size, angle, duration=PUSH_S)

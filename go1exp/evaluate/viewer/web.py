@@ -1,0 +1,252 @@
+"""MuJoCo Studio's web viewer behind a token, on one interface, with windows of our own.
+
+Only this module knows how Studio starts. The loop that moves the robot runs in the calling process, the page in
+another (``page_process``); they exchange messages (``Ask`` and ``Shown``), as Studio's own plugins do.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import mujoco
+
+from go1exp.base.errors import Expected
+from go1exp.evaluate.viewer.gamepad import Gamepad
+from go1exp.evaluate.viewer.gate import Gate, listening, words
+from go1exp.evaluate.viewer.picture_rate import FRAME_S, PictureRate
+from go1exp.evaluate.viewer.requests import Ended
+
+try:
+    from mujoco.studio import messages, plugin, viewer_handle, viewer_protocol, web_viewer
+    from mujoco.studio.web import web_server
+    from websockets.exceptions import ConnectionClosed
+
+    from go1exp.evaluate.viewer import page_process
+except ImportError as error:
+    raise Expected(
+        f"viewer=web needs MuJoCo Studio, which comes with the package mujoco and not with mujoco-core ({error}): "
+        "pip install 'mujoco>=4'"
+    ) from None
+
+READY_S = 20.0
+"""How long the server may take to answer, s."""
+
+LAG_S = 0.1
+"""Time by which the robot may be late before that time is given up, s."""
+
+
+@dataclass(frozen=True)
+class Ask(messages.Event):
+    """From the window to the loop: what a user asks for."""
+
+    request: Any
+
+
+@dataclass(frozen=True)
+class Shown(messages.Snapshot):
+    """From the loop to the window: what is to be drawn. The newest one counts."""
+
+    view: Any
+
+
+@dataclass(frozen=True)
+class Draw(messages.Event):
+    """From the loop to the page: the least time from picture to picture, s."""
+
+    every: float
+
+
+class Show(Protocol):
+    """Something that passes time and is seen: ``session.Session`` with its scene, or a recording."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+
+    def ask(self, request: Any) -> None:
+        """Do what a user asks for."""
+
+    def tick(self) -> float:
+        """Let a moment pass, and return how long it is in real time, s; raises ``Ended`` when all is over."""
+
+    def view(self) -> Any | None:
+        """Return what the window shall draw; None if nothing has changed."""
+
+
+class _Viewer(web_viewer.WebViewer):
+    """Studio's viewer, which takes no models from the browser, is silent on the terminal, and draws not too often."""
+
+    _due, _every = 0.0, FRAME_S
+
+    def prepare_next_frame(self) -> bool:
+        """Wait until another picture is due, then for the browser; return whether there is one to draw for."""
+        time.sleep(max(0.0, self._due - time.monotonic()))
+        wanted = super().prepare_next_frame()
+        self._due = time.monotonic() + self._every
+        return bool(wanted)
+
+    def get_drop_file(self) -> str:
+        """Return no file: what is dropped onto the page would replace the robot."""
+        while not self._drop_queue.empty():
+            self._drop_queue.get_nowait()
+        return ""
+
+    @messages.handler(priority=messages.Priority.INTERNAL)
+    def _on_post_model(self, event: messages.PostModelEvent) -> None:
+        self._update_model()
+
+    @messages.handler
+    def _on_draw(self, event: Draw) -> None:
+        self._every = event.every
+
+
+_opening = threading.Lock()
+
+
+@contextmanager
+def _behind(gate: Gate, pad: Gamepad, sock: Any) -> Iterator[None]:
+    """Let the server that is made inside use ``sock``, ask ``gate``, and hear ``pad``.
+
+    Studio has settings for neither yet. ``_refuses_strangers`` sees to it that the gate is in force in what runs.
+    """
+    usual = web_server.serve, web_server.bind_public_socket, web_viewer._print_url_banner
+    started = threading.Event()
+
+    def serve(handler: Any, **options: Any) -> Any:
+        started.set()
+        guarded = gate.guarded(pad.served(options["process_request"]))
+        return usual[0](handler, **{**options, "process_request": guarded})
+
+    with _opening:
+        web_server.serve = serve
+        web_server.bind_public_socket = lambda host, port=0: sock
+        web_viewer._print_url_banner = lambda host, port: None
+        try:
+            yield
+            started.wait(READY_S)
+        finally:
+            web_server.serve, web_server.bind_public_socket, web_viewer._print_url_banner = usual
+
+
+class _Messenger(plugin.SimPlugin):
+    """Collects what the window asks for."""
+
+    def __init__(self, show: Show) -> None:
+        self._show = show
+
+    @messages.handler
+    def _on_ask(self, event: Ask) -> None:
+        self._show.ask(event.request)
+
+    @messages.handler(priority=messages.Priority.CRITICAL)
+    def _on_load(self, event: messages.LoadModelEvent) -> bool:
+        return True  # the robot is ours: nothing is loaded over it
+
+
+def _not_a_browser_that_left(record: logging.LogRecord) -> bool:
+    """Return whether a message of the server's loop is about anything else than a page that was closed."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, ConnectionClosed | ConnectionError)
+
+
+def _opened(
+    title: str, gate: Gate, pad: Gamepad, sock: Any, windows: list[plugin.ViewerPlugin], show: Show
+) -> viewer_handle.ViewerHandle:
+    """Start Studio's viewer in a process of its own."""
+    logging.getLogger("WebServer").setLevel(logging.WARNING)
+    logging.getLogger("asyncio").addFilter(_not_a_browser_that_left)
+
+    def target(endpoint: Any) -> None:
+        with _behind(gate, pad, sock):
+            viewer = _Viewer(viewer_protocol.ViewerConfig(title=title, gfx="web"), endpoint, plugins=windows)
+        viewer_protocol.run_viewer_loop(viewer)
+
+    return page_process.launch(target, [_Messenger(show)])
+
+
+def _refuses_strangers(port: int, host: str) -> None:
+    """Wait for the server and make sure that it refuses who has no token.
+
+    Raises:
+        Expected: if it does not answer, or shows itself to anyone.
+    """
+    name = host if host not in ("", "0.0.0.0", "::") else "127.0.0.1"
+    address = f"http://{f'[{name}]' if ':' in name else name}:{port}/"
+    ends = time.monotonic() + READY_S
+    while time.monotonic() < ends:
+        try:
+            with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(address, timeout=2.0):
+                raise Expected("this version of MuJoCo Studio shows itself without a token: it was closed")
+        except urllib.error.HTTPError as error:
+            if error.code == 403:
+                return
+            raise Expected(f"MuJoCo Studio answers {error.code} where it should refuse: it was closed") from None
+        except OSError:
+            time.sleep(0.05)
+    raise Expected(f"MuJoCo Studio does not answer on {address}")
+
+
+def run(
+    show: Show,
+    windows: list[plugin.ViewerPlugin],
+    *,
+    title: str,
+    host: str,
+    port: int,
+    pad: Gamepad | None = None,
+    on_open: Callable[[str], None] = print,
+) -> None:
+    """Show something in the browser until Ctrl-C.
+
+    Args:
+        show: what.
+        windows: panels, which send ``Ask`` and take ``Shown``.
+        title: of the page.
+        host: interface to listen on.
+        port: to listen on; 0 takes the first free one.
+        pad: hears of the gamepad at the browser; the windows have it too.
+        on_open: called with the text that says where to look.
+
+    Raises:
+        Expected: if the port is taken, or the server cannot be guarded.
+    """
+    sock = listening(host, port)
+    bound = sock.getsockname()[1]
+    gate = Gate(bound)
+    handle = _opened(title, gate, pad or Gamepad(), sock, windows, show)
+    sock.close()  # the page's process has it now
+    try:
+        with handle:
+            handle.set_model(show.model, data=show.data)
+            _refuses_strangers(bound, host)
+            on_open(words(host, bound, gate.token))
+            _loop(handle, show)
+    except (KeyboardInterrupt, Ended):
+        pass  # the way to end it, or its time is over
+
+
+def _loop(handle: viewer_handle.ViewerHandle, show: Show) -> None:
+    """Let time pass, in step with the clock."""
+    due = time.perf_counter()
+    rate = PictureRate(due)
+    while handle.is_running():
+        due += show.tick()
+        now = time.perf_counter()
+        lost = max(0.0, now - LAG_S - due)
+        due += lost
+        if rate.note(now, lost):
+            handle.send_to_viewer(Draw(rate.every))
+        if show.model is not handle.model:
+            handle.set_model(show.model, data=show.data)
+        view = show.view()
+        if view is not None:
+            handle.send_to_viewer(Shown(view))
+        handle.sync()
+        time.sleep(max(0.0, due - time.perf_counter()))

@@ -1,0 +1,98 @@
+"""Everything that a file of your own terms imports: ``docs/extending.md`` has an example of each kind.
+
+Importing this registers every term of the package first, so that a name of yours that exists already is refused.
+"""
+
+from __future__ import annotations
+
+import go1exp.logs.importers
+import go1exp.logs.record.policy  # noqa: F401  (registers an excitation)
+from go1exp import robot
+from go1exp.base.tensors.memory import Memory
+from go1exp.base.tensors.randomness import Stream
+from go1exp.config.schema.joint_values import JointValues, each_within
+from go1exp.config.schema.registry import (
+    Fraction,
+    NonNegative,
+    Positive,
+    PositiveRange,
+    Range,
+    Speed,
+    SpeedRange,
+    actuator,
+    command,
+    curriculum,
+    effect,
+    event,
+    excitation,
+    importer,
+    measure,
+    observation,
+    randomization,
+    reward,
+    termination,
+)
+from go1exp.logs.excitations import ExcitationError, Motion
+from go1exp.logs.excitations.motion import always_on
+from go1exp.logs.importers.source import columns, joint_columns, rate, recording
+from go1exp.logs.recording import Recording, RecordingError
+from go1exp.mdp import mirror
+from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.measures.trace import NotMeasured, Trace
+from go1exp.mdp.mirror import Mirror
+from go1exp.mdp.types import Snapshot, TermSetup
+from go1exp.robot.drive import DriveSetup, ModelFields
+from go1exp.sim.actuator.setup import Gains
+from go1exp.sim.effects.base import Effect, Gears, Measured, Param
+from go1exp.sim.effects.identification import Identification
+
+__all__ = [
+    "DriveSetup",
+    "Effect",
+    "ExcitationError",
+    "Fraction",
+    "Gains",
+    "Gears",
+    "Identification",
+    "JointValues",
+    "KinematicState",
+    "Measured",
+    "Memory",
+    "Mirror",
+    "ModelFields",
+    "Motion",
+    "NonNegative",
+    "NotMeasured",
+    "Param",
+    "Positive",
+    "PositiveRange",
+    "Range",
+    "Recording",
+    "RecordingError",
+    "Snapshot",
+    "Speed",
+    "SpeedRange",
+    "Stream",
+    "TermSetup",
+    "Trace",
+    "actuator",
+    "always_on",
+    "columns",
+    "command",
+    "curriculum",
+    "each_within",
+    "effect",
+    "event",
+    "excitation",
+    "importer",
+    "joint_columns",
+    "measure",
+    "mirror",
+    "observation",
+    "randomization",
+    "rate",
+    "recording",
+    "reward",
+    "robot",
+    "termination",
+]

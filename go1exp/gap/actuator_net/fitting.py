@@ -1,0 +1,268 @@
+"""Recordings -> a trained actuator net and its report."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from importlib.metadata import version
+
+import numpy as np
+
+from go1exp import __version__
+from go1exp.gap.actuator_net.dataset import JointTorque, Rows, Split, fingerprint, split, windows
+from go1exp.gap.actuator_net.references import Reference, command, linear, pd
+from go1exp.gap.actuator_net.regimes import thresholds
+from go1exp.gap.actuator_net.report import Report, report, rmse
+from go1exp.gap.actuator_net.settings import FitError, FitSettings
+from go1exp.gap.actuator_net.train import Trained, train
+from go1exp.logs.recording import Recording
+from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, group_names
+
+OnProgress = Callable[[str, int, int, float, float], None]
+"""``on_progress(what, done, total, train, validation)``: ``net hip`` or ``half net hip``, epochs, RMSE in N m."""
+
+SLACK = 0.9
+"""Smallest distance of taps in sampling periods: a nominal 500 Hz clock that runs at 498 Hz still allows 2 ms."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """The result of a fit.
+
+    Attributes:
+        net: the network.
+        report: errors of the network and of the references on the held-out episodes.
+        rows: the held-out rows; ``rows.episode`` indexes ``episodes``.
+        episodes: names of all episodes.
+        torque: model -> torque at ``rows`` ``(R,)``, N m: ``net`` and the available references.
+        curves: group -> (epochs, 2) root mean square errors of training and validation, N m.
+    """
+
+    net: ActuatorNet
+    report: Report
+    rows: Rows
+    episodes: tuple[str, ...]
+    torque: dict[str, np.ndarray]
+    curves: dict[str, np.ndarray]
+
+
+def fit(
+    recordings: Sequence[Recording],
+    settings: FitSettings,
+    on_progress: OnProgress | None = None,
+    joint_torque: JointTorque | None = None,
+) -> FitResult:
+    """Train an actuator net and report on the episodes that were held out.
+
+    Args:
+        recordings: of one robot, one episode each.
+        settings: how to fit.
+        on_progress: called after every epoch.
+        joint_torque: torque at the joints of a recording, for ``settings.target = "joint_torque"``.
+
+    Raises:
+        FitError: if recordings do not fit together, or there are too few.
+        RecordingError: if one lacks a channel that the inputs or the target need.
+    """
+    robot, joints, period = _common(recordings, settings)
+    parts = split(recordings, settings.holdout, settings.validation, settings.seed)
+    episodes = tuple(r.meta.episode for r in recordings)
+    rows = windows(
+        recordings, settings.inputs, settings.history, period, settings.target, joint_torque, settings.smoothing
+    )
+    info = _describe(recordings, settings, parts, robot, joints, period)
+    shares = _share_out(rows, parts, episodes, np.array(info.group_of))
+    held_out = shares["held_out"]
+    if len(held_out.rows) == 0:
+        raise FitError("no rows to report on: the held-out episodes are shorter than the history, or drives are off")
+    trained = _train_groups("net", info.groups, shares, settings, settings.hidden, on_progress)
+    net = _assemble(info, trained, shares["train"])
+    torque = _predict(net, held_out)
+    references = _references(info, shares, settings, on_progress)
+    held_out_report = report(
+        held_out.rows, torque, references, thresholds(rows, joints), episodes, parts, settings.target
+    )
+    # The net's file contains its held-out error, which is known only now.
+    provenance = replace(info.provenance, held_out_rmse=rmse(torque - held_out.rows.y))
+    net = replace(net, info=replace(info, provenance=provenance))
+    torques = {"net": torque} | {r.name: r.torque for r in references if r.torque is not None}
+    curves = {name: one.curve for name, one in zip(info.groups, trained, strict=True)}
+    return FitResult(net, held_out_report, held_out.rows, episodes, torques, curves)
+
+
+@dataclass(frozen=True, eq=False)
+class _Share:
+    """The rows of one part of the episodes, and for each row the index ``(R,)`` of the net of its joint."""
+
+    rows: Rows
+    group: np.ndarray
+
+    def of_group(self, k: int) -> Rows:
+        """Return the rows of the joints of net ``k``."""
+        return self.rows.take(self.group == k)
+
+
+def _share_out(rows: Rows, parts: Split, episodes: tuple[str, ...], group_index: np.ndarray) -> dict[str, _Share]:
+    """Split rows by episode; ``group_index`` (J,) is the net of each joint."""
+    shares = {}
+    for part in ("train", "validation", "held_out"):
+        picked = rows.take(np.isin(rows.episode, [episodes.index(name) for name in getattr(parts, part)]))
+        shares[part] = _Share(picked, group_index[picked.joint])
+    return shares
+
+
+def _describe(
+    recordings: Sequence[Recording],
+    settings: FitSettings,
+    parts: Split,
+    robot: str,
+    joints: tuple[str, ...],
+    period: float,
+) -> NetInfo:
+    """Return the metadata of the net's file, with a held-out error of 0 until that is known."""
+    kp, kd = _gains(recordings, settings)
+    provenance = Provenance(
+        recordings={r.meta.episode: fingerprint(r) for r in recordings},
+        **asdict(parts),
+        held_out_rmse=0.0,
+        seed=settings.seed,
+        settings=json.dumps(asdict(settings)),
+        versions={"go1exp": __version__} | {name: version(name) for name in ("torch", "numpy")},
+    )
+    return NetInfo(
+        robot=robot,
+        joints=joints,
+        share=settings.share,
+        groups=group_names(joints, settings.share),
+        inputs=settings.inputs,
+        history=settings.history,
+        period=period,
+        hidden=settings.hidden,
+        target=settings.target,
+        kp=kp,
+        kd=kd,
+        provenance=provenance,
+    )
+
+
+def _train_groups(
+    what: str,
+    groups: tuple[str, ...],
+    shares: Mapping[str, _Share],
+    settings: FitSettings,
+    hidden: tuple[int, ...],
+    on_progress: OnProgress | None,
+) -> list[Trained]:
+    """Train one network for each group of joints, with hidden layers of the widths ``hidden``."""
+    nets = []
+    for k, group in enumerate(groups):
+        on_epoch = None if on_progress is None else partial(on_progress, f"{what} {group}")
+        nets.append(train(shares["train"].of_group(k), shares["validation"].of_group(k), settings, hidden, on_epoch))
+    return nets
+
+
+def _references(
+    info: NetInfo, shares: Mapping[str, _Share], settings: FitSettings, on_progress: OnProgress | None
+) -> list[Reference]:
+    """Return what the net is compared with, on the held-out rows."""
+    training, held_out = shares["train"], shares["held_out"]
+    references = [
+        command(held_out.rows),
+        pd(held_out.rows),
+        linear(training.rows, training.group, held_out.rows, held_out.group),
+    ]
+    if not settings.half_net:
+        return [*references, Reference("half_net", None, "half_net is off")]
+    hidden = tuple(max(1, width // 2) for width in settings.hidden)
+    trained = _train_groups("half net", info.groups, shares, settings, hidden, on_progress)
+    half = _assemble(replace(info, hidden=hidden), trained, training)
+    return [*references, Reference("half_net", _predict(half, held_out))]
+
+
+def _predict(net: ActuatorNet, share: _Share) -> np.ndarray:
+    """Return the net's torque at every row (R,), N m."""
+    torque = np.empty(len(share.rows))
+    for k in np.unique(share.group):
+        torque[share.group == k] = net.torque(share.of_group(k).x, int(k))
+    return torque
+
+
+def _assemble(info: NetInfo, trained: list[Trained], training: _Share) -> ActuatorNet:
+    """Put the groups' networks side by side; the ranges of the inputs are those of the training rows."""
+    per_input = training.rows.x.reshape(len(training.rows), len(info.inputs), info.history)
+    inputs = [per_input[training.group == k] for k in range(len(info.groups))]
+    return ActuatorNet(
+        info,
+        tuple(np.stack(layer) for layer in zip(*(one.weights for one in trained), strict=True)),
+        tuple(np.stack(layer) for layer in zip(*(one.biases for one in trained), strict=True)),
+        skip=np.stack([one.skip for one in trained]),
+        input_mean=np.stack([one.input_mean for one in trained]),
+        input_std=np.stack([one.input_std for one in trained]),
+        output_mean=np.array([one.output_mean for one in trained]),
+        output_std=np.array([one.output_std for one in trained]),
+        input_low=np.stack([values.min(axis=(0, 2)) for values in inputs]),
+        input_high=np.stack([values.max(axis=(0, 2)) for values in inputs]),
+    )
+
+
+def _common(recordings: Sequence[Recording], settings: FitSettings) -> tuple[str, tuple[str, ...], float]:
+    """Return robot, joints and tap period that all recordings share."""
+    if not recordings:
+        raise FitError("no recordings to fit to")
+    first = recordings[0].meta
+    for meta in (r.meta for r in recordings):
+        for key in ("robot", "joints"):
+            if getattr(meta, key) != getattr(first, key):
+                raise FitError(
+                    f"{meta.episode}: {key} is {getattr(meta, key)}, but {getattr(first, key)} in {first.episode}; "
+                    "fit one robot at a time"
+                )
+    rates = {r.meta.episode: r.meta.rate_hz for r in recordings}
+    slowest = min(rates, key=lambda name: rates[name])
+    if settings.period is None:
+        fastest = max(rates, key=lambda name: rates[name])
+        if rates[fastest] * SLACK > rates[slowest]:
+            raise FitError(
+                f"period: set it; {slowest} was recorded at {rates[slowest]:g} Hz, "
+                f"but {fastest} at {rates[fastest]:g} Hz"
+            )
+        return first.robot, first.joints, 1 / rates[slowest]
+    if settings.period < SLACK / rates[slowest]:
+        raise FitError(
+            f"period = {settings.period:g} s: {slowest} was recorded every {1 / rates[slowest]:.4g} s; "
+            "taps closer than that are not in the data"
+        )
+    return first.robot, first.joints, settings.period
+
+
+def _sets(recordings: Sequence[Recording]) -> str:
+    """Return the sets of gains in words, each with its number of recordings, and how one is chosen."""
+    counts = Counter((r.meta.kp, r.meta.kd) for r in recordings)
+    pairs = {key: tuple(set(values) if values else set() for values in key) for key in counts}
+    plain = {key: (*kp, *kd) for key, (kp, kd) in pairs.items() if len(kp) == len(kd) == 1}
+    texts = [
+        f"kp {plain[key][0]:g}, kd {plain[key][1]:g} ({n})" if key in plain else f"by joint or unknown ({n})"
+        for key, n in counts.items()
+    ]
+    chosen = next(iter(plain.values()), None)
+    hint = f"; choose one, as gains=[{chosen[0]:g},{chosen[1]:g}]" if chosen else ""
+    return f"{', '.join(texts)}{hint}"
+
+
+def _gains(
+    recordings: Sequence[Recording], settings: FitSettings
+) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+    """Return the gains that all recordings share; None where they differ and the net does not use the target."""
+    gains = []
+    for key in ("kp", "kd"):
+        values = {getattr(r.meta, key) for r in recordings}
+        if len(values) > 1 and "position_error" in settings.inputs:
+            raise FitError(
+                f"{key} differs between the recordings, and a net of position errors holds for one set of gains: "
+                f"{_sets(recordings)}"
+            )
+        gains.append(values.pop() if len(values) == 1 else None)
+    return gains[0], gains[1]

@@ -1,0 +1,1 @@
+"""Recordings: format, importers, audit, and how they are made."""

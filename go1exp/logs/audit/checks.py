@@ -1,0 +1,155 @@
+"""The audit of one recording: runs every check and makes the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import go1exp.logs.audit.commands as commands
+import go1exp.logs.audit.limits as limits
+import go1exp.logs.audit.related as related
+import go1exp.logs.audit.signals as signals
+import go1exp.logs.audit.single as single
+from go1exp.logs.audit.delay import Delay
+from go1exp.logs.audit.log import Log, finding
+from go1exp.logs.audit.report import ORDER, AuditReport, Channel, Finding, worst
+from go1exp.logs.recording import Recording, problems, read
+
+SHORTEST = 20
+"""Rows of a recording below which nothing is judged (chosen: a median step and its spread need about as many)."""
+
+
+def audit_file(path: Path) -> AuditReport:
+    """Read a recording and audit it.
+
+    Raises:
+        RecordingError: if the file cannot be read or breaks the format.
+    """
+    return audit(read(path))
+
+
+def audit(recording: Recording) -> AuditReport:
+    """Look for what is wrong with a recording; nothing is corrected and nothing is raised.
+
+    A recording that cannot be computed with (no clock, values that are not finite, a clock that runs backward) gets
+    only the findings about its format.
+    """
+    format_findings = [_as_finding(line) for line in problems(recording)]
+    if not _computable(recording):
+        return _report(recording, format_findings, ())
+    log = Log(recording)
+    findings, measured = _run_checks(log)
+    off, still = _times(log, ~log.on), _times(log, log.still)
+    if off:
+        total = sum(b - a for a, b in off)
+        stretches = "1 stretch" if len(off) == 1 else f"{len(off)} stretches"
+        findings.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {stretches}"))
+    if (share := float(log.still.mean())) > limits.STILL_SHARE:
+        findings.append(
+            finding("still", "all", "suspect", share, "", "no joint moves: nothing can be learned from this")
+        )
+    # A format error is not repeated where a check has already called the same channel bad.
+    named = {f.channel for f in findings if f.verdict == "bad"}
+    findings += [f for f in format_findings if f.channel not in named]
+    return _report(recording, findings, _channel_table(log, findings, measured), off, still)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What the checks measured of each channel, by its name: share of repeats, noise floor, delay."""
+
+    repeats: dict[str, float]
+    floors: dict[str, float]
+    delays: dict[str, Delay]
+
+
+def _run_checks(log: Log) -> tuple[list[Finding], _Measured]:
+    """Run every check; findings come in the order in which the report prints those of equal verdict."""
+    stale_findings, repeats = single.stale(log)
+    noise_findings, floors = single.noise(log, repeats)
+    delay_findings, delays = commands.timing(log)
+    findings = [
+        *single.clock(log),
+        *stale_findings,
+        *single.resolution(log),
+        *noise_findings,
+        *single.dead(log),
+        *single.frozen(log),
+        *single.saturation(log),
+        *single.ranges(log),
+        *related.attitude_length(log),
+        *related.speed(log),
+        *related.torque(log),
+        *related.rotation(log),
+        *related.gravity(log),
+        *commands.order_and_sign(log),
+        *delay_findings,
+    ]
+    return findings, _Measured(repeats, floors, delays)
+
+
+def _channel_table(log: Log, findings: list[Finding], measured: _Measured) -> tuple[Channel, ...]:
+    """One line for each column of the recording."""
+    table = []
+    for name, values in log.recording.channels.items():
+        delay = measured.delays.get(name)
+        table.append(
+            Channel(
+                name,
+                worst(f.verdict for f in findings if _concerns(f, name, log)),
+                log.unit(name),
+                float(values.min()),
+                float(values.max()),
+                log.steps.get(name),
+                measured.floors.get(name),
+                measured.repeats.get(name),
+                None if delay is None else delay.time * 1e3,
+                None if delay is None else delay.error * 1e3,
+            )
+        )
+    return tuple(table)
+
+
+def _as_finding(line: str) -> Finding:
+    """Turn a line of ``recording.problems`` (``channel: message``) into a finding."""
+    channel, _, message = line.partition(": ")
+    return Finding("format", channel, "bad", None, "", message)
+
+
+def _computable(recording: Recording) -> bool:
+    channels = recording.channels
+    t = channels.get("t")
+    if t is None or np.ndim(t) != 1 or len(t) < SHORTEST:
+        return False
+    plain = all(isinstance(v, np.ndarray) and v.shape == t.shape and v.dtype.kind in "fb" for v in channels.values())
+    return plain and all(np.isfinite(v).all() for v in channels.values()) and bool(np.all(np.diff(t) > 0))
+
+
+def _concerns(f: Finding, name: str, log: Log) -> bool:
+    """Whether a finding is about this column: by its name, or by its quantity (``imu_acc``)."""
+    return f.channel == name or f.channel == log.quantity.get(name)
+
+
+def _times(log: Log, flags: np.ndarray) -> tuple[tuple[float, float], ...]:
+    return tuple((float(log.t[a]), float(log.t[b - 1])) for a, b in signals.stretches(flags))
+
+
+def _report(
+    recording: Recording,
+    findings: list[Finding],
+    table: tuple[Channel, ...],
+    off: tuple[tuple[float, float], ...] = (),
+    still: tuple[tuple[float, float], ...] = (),
+) -> AuditReport:
+    t = np.asarray(recording.channels.get("t", []), dtype=float)
+    steps = np.diff(t) if t.ndim == 1 else np.empty(0)
+    middle = float(np.median(steps)) if len(steps) else 0.0
+    if t.ndim == 1 and len(t) < SHORTEST:
+        message = f"{len(t)} samples are too few to judge; at least {SHORTEST} are needed"
+        findings = [*findings, finding("length", "all", "suspect", len(t), "samples", message)]
+    ranked = sorted(findings, key=lambda f: -ORDER.index(f.verdict))
+    duration = float(t[-1] - t[0]) if t.ndim == 1 and len(t) else 0.0
+    rate = 1 / middle if middle > 0 else 0.0
+    return AuditReport(recording.meta.episode, len(t), duration, rate, table, tuple(ranked), off, still)

@@ -1,0 +1,162 @@
+"""What all importers use: finding and opening source files, and building a checked recording."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from go1exp import __version__
+from go1exp.base.wording import counted
+from go1exp.config.schema.registry import explain
+from go1exp.logs.recording import Meta, Recording, RecordingError, joint_channels, problems
+from go1exp.robot.go1_fields import TORQUE_NOTE, in_torque_steps
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+"""Attitude of an upright base, w-x-y-z."""
+
+RATE_DIGITS = 6
+"""Significant digits of a rate taken from time stamps."""
+
+
+def files(path: Path, pattern: str) -> list[Path]:
+    """Return ``path`` itself, or the files below the folder ``path`` that match ``pattern``, by name.
+
+    The ending may be in capitals: ``*.csv`` matches ``RUN.CSV``, too.
+
+    Raises:
+        RecordingError: if there is none.
+    """
+    if path.is_file():
+        return [path]
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file or folder")
+    matches = sorted(file for file in path.rglob("*") if fnmatch(file.name.lower(), pattern.lower()) and file.is_file())
+    if not matches:
+        raise RecordingError(f"{path}: no {pattern} in this folder")
+    return matches
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """The arrays of one ``.npz`` by key; every error names the file and the key."""
+
+    path: Path
+    values: Mapping[str, np.ndarray]
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def numbers(self, key: str, *shape: int) -> np.ndarray:
+        """Return the array ``key``, ``(T, *shape)`` float64.
+
+        Raises:
+            RecordingError: if there is no such array, or it has another shape or is not numeric.
+        """
+        values = self._get(key)
+        if values.dtype.kind not in "fiub" or values.ndim != 1 + len(shape) or values.shape[1:] != shape:
+            wanted = ", ".join(["T", *map(str, shape)]) + ("" if shape else ",")
+            raise RecordingError(f"{self.path}: {key}: must be numbers ({wanted}), not {values.dtype} {values.shape}")
+        return values.astype(np.float64)
+
+    def names(self, key: str) -> tuple[str, ...]:
+        """Return the array of strings ``key``."""
+        values = self._get(key)
+        if values.dtype.kind != "U" or values.ndim != 1:
+            raise RecordingError(f"{self.path}: {key}: must be a list of words, not {values.dtype} {values.shape}")
+        return tuple(str(name) for name in values)
+
+    def _get(self, key: str) -> np.ndarray:
+        if key not in self.values:
+            raise RecordingError(f"{self.path}: no array {key!r}; it has {', '.join(self.values) or 'none'}")
+        return self.values[key]
+
+
+def load_npz(path: Path) -> Arrays:
+    """Open a ``.npz`` of plain arrays; nothing is unpickled.
+
+    Raises:
+        RecordingError: if it is truncated, damaged, of another kind, or holds objects.
+    """
+    try:
+        with path.open("rb") as file:  # opened here, because NumPy does not close a damaged file
+            archive = np.load(file, allow_pickle=False)
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise ValueError("one bare array")
+            return Arrays(path, {key: archive[key] for key in archive.files})
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        reason = (
+            "no zip archive of them" if "pickle" in str(error) else error
+        )  # NumPy's message advises to allow pickles
+        raise RecordingError(f"{path}: not a whole .npz of plain arrays ({reason})") from error
+
+
+def rate(path: Path, t: np.ndarray) -> float:
+    """Return the sampling rate, Hz: the inverse of the median step of ``t``.
+
+    Raises:
+        RecordingError: if there are fewer than two time stamps, or they do not advance.
+    """
+    if len(t) < 2:
+        raise RecordingError(f"{path}: t: has {counted(len(t), 'stamp')}; at least 2 are needed")
+    steps = np.diff(t)
+    step = float(np.median(steps))
+    if not (np.isfinite(step) and step > 0):
+        back = np.flatnonzero(~(steps > 0))
+        row = int(back[0]) + 1
+        rows = counted(back.size, "such row")
+        raise RecordingError(
+            f"{path}: t: must increase strictly, but row {row} (from 0) has {t[row]} s after {t[row - 1]} s ({rows}); "
+            "the times are rounded, or the rows are in another order"
+        )
+    return float(f"{1 / step:.{RATE_DIGITS}g}")
+
+
+def columns(names: Iterable[str], values: np.ndarray) -> dict[str, np.ndarray]:
+    """Split ``(T, K)`` into K named columns."""
+    return {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
+
+
+def joint_columns(quantity: str, joints: Iterable[str], values: np.ndarray) -> dict[str, np.ndarray]:
+    """Split ``(T, J)`` into the columns of one quantity."""
+    return columns(joint_channels(quantity, joints), values)
+
+
+def reorder(theirs: Iterable[str], ours: Iterable[str]) -> list[int]:
+    """Return the index that puts the joints of a source into our order, by name."""
+    place = {name: i for i, name in enumerate(theirs)}
+    return [place[name] for name in ours]
+
+
+def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **about: Any) -> Recording:
+    """Build a recording and check it; ``about`` are fields of ``Meta``; unknown ones are left out.
+
+    The notes say it where a Go1's torques have the steps of its packets, as those of ``go1exp deploy`` do.
+
+    Raises:
+        RecordingError: naming ``path``, if anything breaks the format.
+    """
+    # What a source does not state is None in the metadata, not a guess.
+    known: dict[str, Any] = dict.fromkeys(("base_quat", "kp", "kd", "tau_limit", "excitation", "repeat_of"))
+    known |= {"source": "measured", "tool": f"go1exp importer {importer}"}
+    known |= {"versions": {"go1exp": __version__, "numpy": np.__version__}}
+    try:
+        meta = Meta(**(known | about))
+    except ValidationError as error:
+        lines = explain(error, "metadata", Meta.__dataclass_fields__)
+        raise RecordingError("\n".join(f"{path}: {line}" for line in lines)) from error
+    result = Recording(meta, channels)
+    torques = [values for name, values in channels.items() if name.startswith("tau_est_")]
+    if meta.robot == "go1" and torques and in_torque_steps(np.concatenate(torques)):
+        result = replace(result, meta=replace(meta, notes="; ".join(filter(None, (meta.notes, TORQUE_NOTE)))))
+    wrong = problems(result)
+    if wrong:
+        raise RecordingError("\n".join(f"{path}: {line}" for line in wrong))
+    return result

@@ -1,0 +1,266 @@
+"""A file of separated values as columns of numbers; complaints name the file, the column and the line of the file."""
+
+from __future__ import annotations
+
+import codecs
+import difflib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from go1exp.base.wording import counted
+from go1exp.logs.recording import RecordingError
+
+UTF8 = "utf-8"
+
+DELIMITERS = ";\t|,"
+"""What may stand between two columns, the most certain sign of it first."""
+
+WITH_SIGN = {
+    ",": re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*"),
+    ".": re.compile(r"\s*[-+]?\d*\.\d+([eE][-+]?\d+)?\s*"),
+}
+"""Decimal sign -> a number that is written with it."""
+
+_WRONG_WIDTH = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
+"""Arrow's complaint about a row; it counts lines from 1, but not the empty ones below ``skip_lines``."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a file is written.
+
+    Attributes:
+        header: whether the first line has the names of the columns.
+        skip_lines: lines before that.
+        delimiter: what stands between two columns.
+        decimal: decimal point, or comma.
+        encoding: how characters are written as bytes; a name that Python knows.
+    """
+
+    header: bool = True
+    skip_lines: int = 0
+    delimiter: str = ","
+    decimal: str = "."
+    encoding: str = UTF8
+
+    @property
+    def is_utf8(self) -> bool:
+        """Whether the encoding is UTF-8, by whatever name."""
+        return codecs.lookup(self.encoding).name == UTF8
+
+
+class _NoNumber(ValueError):
+    """A cell that is no number: what it is, and in which line of the file it stands."""
+
+    def __init__(self, cell: Any, line: int) -> None:
+        super().__init__(f"must be numbers, but line {line} has {cell!r}")
+        self.cell, self.line = str(cell), line
+
+
+def names(path: Path, layout: Layout) -> list[str]:
+    """Return the names of the columns: those of the first line, or 1, 2, 3."""
+    return list(_table(path, layout).column_names)
+
+
+def read(path: Path, wanted: Mapping[str, str], layout: Layout) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return the columns that are asked for, (T,) each, and the names of the others.
+
+    Args:
+        path: the file.
+        wanted: name of a column -> what it is for.
+        layout: how the file is written.
+
+    Raises:
+        RecordingError: if it is no table, lacks a column, or holds what is no number; with every such column.
+    """
+    table = _table(path, layout)
+    present = table.column_names
+    lacking = [name for name in wanted if name not in present]
+    hint = _question(present[0], layout) if len(present) == 1 else _no_names(present, layout)
+    # Where the delimiter is another one, or names are missing, no name is right, and one complaint will do.
+    wrong = [_missing(path, name, wanted[name], present) + hint for name in (lacking[:1] if hint else lacking)]
+    values: dict[str, np.ndarray] = {}
+    other_sign: list[tuple[str, _NoNumber]] = []
+    for name in [name for name in wanted if name in present]:
+        try:
+            values[name] = _numbers(table.column(name), path, layout)
+        except _NoNumber as error:
+            if _other_sign(error.cell, layout):
+                other_sign.append((name, error))
+            else:
+                wrong.append(f"{path}: column {name!r}: {error}{_question(error.cell, layout)}")
+        except ValueError as error:
+            wrong.append(f"{path}: column {name!r}: {error}")
+    if other_sign:
+        name, first = other_sign[0]
+        others = f" and {counted(len(other_sign) - 1, 'other column')}" if other_sign[1:] else ""
+        wrong.append(f"{path}: column {name!r}{others}: {first}{_question(first.cell, layout)}")
+    if wrong:
+        raise RecordingError("\n".join(wrong))
+    return values, [name for name in present if name not in wanted]
+
+
+def line_of(path: Path, row: int, layout: Layout) -> int:
+    """Return the line of the file, from 1, of a row of numbers, from 0: empty lines are no rows."""
+    rows = ((number, text) for number, text in _lines(path, layout) if text)
+    return next(islice(rows, row + int(layout.header), None), (row, ""))[0]
+
+
+def _lines(path: Path, layout: Layout) -> Iterable[tuple[int, str]]:
+    """Return the lines of a file below ``skip_lines``, with their numbers from 1."""
+    with path.open(encoding=layout.encoding, errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            if number > layout.skip_lines:
+                yield number, line.rstrip("\n")
+
+
+def _table(path: Path, layout: Layout) -> Any:
+    """Return the file as a table of Arrow, whose names have no blanks round them.
+
+    Raises:
+        RecordingError: if it is no table, or two columns have one name.
+    """
+    import pyarrow as pa
+    from pyarrow import csv as arrow_csv
+
+    # One block, so that Arrow sees the whole column before it chooses a type: 0 in the first rows may be 0.5 later.
+    # A character of another encoding may take up to three bytes of UTF-8, which Arrow makes of it.
+    size = path.stat().st_size * (1 if layout.is_utf8 else 3) + 1
+    options = arrow_csv.ReadOptions(
+        use_threads=False,
+        block_size=min(max(size, 2**20), 2**31 - 1),
+        skip_rows=layout.skip_lines,
+        autogenerate_column_names=not layout.header,
+        encoding="utf8" if layout.is_utf8 else layout.encoding,
+    )
+    parse = arrow_csv.ParseOptions(delimiter=layout.delimiter)
+    convert = arrow_csv.ConvertOptions(decimal_point=layout.decimal)
+    try:
+        if layout.is_utf8:
+            _refuse_utf16(path)
+        table = arrow_csv.read_csv(path, options, parse, convert)
+        given = list(table.column_names)
+    except UnicodeError:
+        raise RecordingError(
+            f"{path}: has characters that are not {layout.encoding.upper()}; save it as UTF-8, "
+            "or give its encoding, such as encoding: latin-1"
+        ) from None
+    except (pa.ArrowException, OSError) as error:
+        why = _uneven(path, str(error), layout) or f"not a table of numbers ({str(error).splitlines()[0]})"
+        raise RecordingError(f"{path}: {why}") from error
+    if not layout.header:
+        given = [str(k + 1) for k in range(table.num_columns)]
+    stripped = [name.strip() for name in given]
+    twice = sorted({name for name in stripped if stripped.count(name) > 1})
+    if twice:
+        called = ", ".join(map(repr, twice))
+        raise RecordingError(f"{path}: two columns are called {called}; names must differ{_no_names(stripped, layout)}")
+    if table.num_rows == 0:
+        raise RecordingError(f"{path}: has no rows of numbers")
+    return table.rename_columns(stripped)
+
+
+def _refuse_utf16(path: Path) -> None:
+    """Raise RecordingError if a file begins as UTF-16 does."""
+    with path.open("rb") as file:
+        start = file.read(2)
+    if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        raise RecordingError(f"{path}: is UTF-16, not UTF-8; save it as UTF-8, or give encoding: utf-16")
+
+
+def _uneven(path: Path, message: str, layout: Layout) -> str | None:
+    """Word Arrow's complaint about a row that is longer or shorter than the others; None if it is another one."""
+    match = _WRONG_WIDTH.search(message)
+    if match is None:
+        return None
+    number, expected, given = map(int, match.groups())
+    filled = [(at, text) for at, text in _lines(path, layout) if text]
+    at, text = filled[min(number - layout.skip_lines, len(filled)) - 1]
+    first, head = filled[0]
+    line = f"line {at} has {counted(given, 'cell')}, but line {first} has {expected}"
+    if _other_delimiter(head, layout) and expected == 1:
+        return line + _question(text, layout)
+    later = "; if the names of the columns are not in the first line, give skip_lines" if given > expected else ""
+    return f"{line}; every line must have as many as the first{later}"
+
+
+def _missing(path: Path, name: str, what: str, present: Iterable[str]) -> str:
+    """Word the complaint about a column that the file does not have."""
+    lower = {other.lower(): other for other in present}
+    close = [lower[n] for n in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.5)]
+    hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
+    return f"{path}: no column {name!r} (for {what}); {hint}it has {', '.join(present)}"
+
+
+def _no_names(names: Iterable[str], layout: Layout) -> str:
+    """Ask whether the file has names of columns at all, if the first line is nothing but numbers; else empty."""
+    try:
+        _ = [float(name.replace(layout.decimal, ".")) for name in names]
+    except ValueError:
+        return ""
+    return "; is the first line numbers, not names? Then give header: false" if layout.header else ""
+
+
+def _other_delimiter(text: str, layout: Layout) -> str | None:
+    """Return another delimiter that stands in a text."""
+    return next((d for d in DELIMITERS if d != layout.delimiter and d in text), None)
+
+
+def _other_sign(cell: str, layout: Layout) -> str | None:
+    """Return the other decimal sign if a cell is a number that is written with it."""
+    sign = "," if layout.decimal == "." else "."
+    return sign if WITH_SIGN[sign].fullmatch(cell) else None
+
+
+def _question(text: str, layout: Layout) -> str:
+    """Ask for the delimiter and the decimal sign that a cell, a row or names look like; empty if they look right."""
+    if sign := _other_sign(text, layout):
+        return f"; is the decimal {sign!r}? Then give decimal: {json.dumps(sign)}"
+    other = _other_delimiter(text, layout)
+    if other is None:
+        return ""
+    sign = next((s for s in (_other_sign(cell, layout) for cell in text.split(other)) if s and s != other), None)
+    give = f"Then give delimiter: {json.dumps(other)}"
+    if sign is None:
+        return f"; is the delimiter {other!r}? {give}"
+    return f"; is the delimiter {other!r}, and the decimal {sign!r}? {give} and decimal: {json.dumps(sign)}"
+
+
+def _numbers(column: Any, path: Path, layout: Layout) -> np.ndarray:
+    """Return a column of Arrow (T,), float64 or whole numbers.
+
+    Raises:
+        ValueError: if a cell is empty or is no finite number; with the line of the first such cell.
+    """
+    import pyarrow as pa
+
+    at = partial(line_of, path, layout=layout)
+    if pa.types.is_boolean(column.type) or pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
+        empty = np.flatnonzero(column.is_null().to_numpy())
+        if empty.size:
+            cells, verb = counted(empty.size, "cell"), "is" if empty.size == 1 else "are"
+            raise ValueError(f"{cells} {verb} empty or NaN, the first in line {at(int(empty[0]))}; leave such rows out")
+        if pa.types.is_boolean(column.type):
+            column = column.cast(pa.uint8())
+        numbers: np.ndarray = column.to_numpy()  # whole numbers stay whole: float64 cannot hold ns since 1970
+        strange = np.flatnonzero(~np.isfinite(numbers))
+        if strange.size:
+            first = int(strange[0])
+            raise ValueError(f"{numbers[first]} in line {at(first)}; every value must be finite")
+        return numbers
+    for row, cell in enumerate(column.to_pylist()):
+        try:
+            if _other_sign(str(cell), layout):
+                raise ValueError
+            float(cell.replace(layout.decimal, ".") if isinstance(cell, str) else cell)
+        except (TypeError, ValueError):
+            raise _NoNumber(cell, at(row)) from None
+    raise ValueError(f"must be numbers, but is read as {column.type}")

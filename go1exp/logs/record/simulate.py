@@ -1,0 +1,284 @@
+"""Moves simulated robots and returns their recordings."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from go1exp import __version__, robot
+from go1exp.base.tensors.randomness import EnvRandom
+from go1exp.config.schema.backends import BackendConfig
+from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.config.schema.joint_values import spread
+from go1exp.config.schema.registry import ConfigError, Term
+from go1exp.logs.record.plan import Episode
+from go1exp.logs.record.sensors import SensorConfig, log
+from go1exp.logs.record.tape import Tape
+from go1exp.logs.recording import Meta, Recording
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.effects.rules import drives, has_gains, on_mount
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.engine import make_backend
+from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.task import TaskConfig, time_rules
+from go1exp.sim.terrain import TerrainConfig, build_terrain
+
+SETTLE_S = 1.0
+"""Time for which the first target is held before the recording begins, s (not before a drop)."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The robots of a recording: model, drives, effects, ground, engine, and the physics step, s.
+
+    ``contact`` is that of the feet. None is MuJoCo's own for motions, and for a policy the one that it was trained on.
+    """
+
+    robot: RobotConfig
+    actuator: Term
+    effect: tuple[Term, ...]
+    terrain: TerrainConfig
+    backend: BackendConfig
+    physics_dt: float
+    contact: ContactConfig | None = None
+
+
+def held_quat(hang: tuple[float, float]) -> tuple[float, float, float, float]:
+    """Return the attitude w-x-y-z of a trunk held at this roll and pitch, rad (about x, then about y)."""
+    w, x, y, z = Rotation.from_euler("xyz", [*hang, 0.0]).as_quat(scalar_first=True)
+    return float(w), float(x), float(y), float(z)
+
+
+def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
+    """Simulate episodes side by side and return their recordings, in the same order.
+
+    All must be of equal length. Episodes with the same base (held at the same attitude, standing, or dropped) are
+    simulated as one batch. ``on_step`` is called with the progress.
+    """
+    recordings: dict[str, Recording] = {}
+    # (attitude of the trunk, dropped or not): episodes of one kind run as one batch
+    places = list(dict.fromkeys((e.hang, e.motion.height > 0) for e in episodes))
+    for k, place in enumerate(places):
+        group = [e for e in episodes if (e.hang, e.motion.height > 0) == place]
+
+        def part(done: int, total: int, k: int = k) -> None:
+            on_step(k * total + done, len(places) * total)
+
+        recordings |= {r.meta.episode: r for r in _play_alike(rig, group, sensors, seed, part)}
+    return [recordings[e.name] for e in episodes]
+
+
+def _play_alike(
+    rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress
+) -> list[Recording]:
+    """Simulate episodes that share a base."""
+    plant = _build_plant(rig, episodes, seed)
+    _put_down(plant, episodes, rig.physics_dt)
+    per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
+    tape = Tape(plant, per_sample, len(episodes[0].motion.target))
+    _follow_motions(plant, tape, episodes, sensors.rate_hz, per_sample, on_step)
+    tape.stop()
+    return [_recording(rig, sensors, e, tape.true(k)) for k, e in enumerate(episodes)]
+
+
+def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
+    """Build one robot for each episode, with the gains of that episode."""
+    n, hang = len(episodes), episodes[0].hang
+    model, blocks = build_model(
+        rig.robot,
+        build_terrain(rig.terrain),
+        rig.physics_dt,
+        contact=rig.contact or MUJOCO_CONTACT,
+        imu=True,
+        held=None if hang is None else held_quat(hang),
+        mounted=on_mount(rig.effect),
+    )
+    backend = make_backend(rig.backend, model, blocks, n)
+    random = EnvRandom(seed, n, device=backend.qpos.device, alike=True)  # one robot, in all its recordings
+    plant = Plant(backend, drive_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
+    if has_gains(rig.actuator):
+        # (n, 1) each, then the same gain for all joints: (n, 12)
+        kp, kd = (torch.tensor([[getattr(e, g)] for e in episodes], dtype=plant.q.dtype) for g in ("kp", "kd"))
+        plant.set_gains(kp.expand_as(plant.q), kd.expand_as(plant.q))
+    plant.startup()
+    return plant
+
+
+def _put_down(plant: Plant, episodes: Sequence[Episode], physics_dt: float) -> None:
+    """Reset every robot to the first angles of its motion and, unless it is to fall, let it settle there."""
+    backend = plant.backend
+    everyone = torch.ones(len(episodes), dtype=torch.bool)
+    qpos, qvel = torch.zeros_like(backend.qpos), torch.zeros_like(backend.qvel)
+    qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(np.stack([e.motion.start for e in episodes]))
+    if episodes[0].hang is None:  # a free trunk has seven coordinates before the joints: position, then quaternion
+        qpos[:, 2] = robot.NOMINAL_HEIGHT + torch.tensor([e.motion.height for e in episodes])
+        qpos[:, 3] = 1.0
+    backend.reset(everyone, qpos, qvel)
+    start = qpos[:, -robot.NUM_JOINTS :].clone()
+    plant.reset(everyone, start)
+    if episodes[0].motion.height == 0:
+        for _ in range(round(SETTLE_S / physics_dt)):
+            plant.step(start)
+        plant.effects.reset(everyone)  # an effect that drifts within an episode starts with the recording
+
+
+def _follow_motions(
+    plant: Plant, tape: Tape, episodes: Sequence[Episode], rate_hz: float, per_sample: int, on_step: Progress
+) -> None:
+    """Send every robot the targets of its motion, one each ``per_sample`` physics steps, while ``tape`` records.
+
+    When drives come back on, the target moves from the measured angle to the commanded one within ``soft_start``: a
+    sudden pull would hit the joint's torque limit.
+    """
+    targets = torch.as_tensor(np.stack([e.motion.target for e in episodes], axis=1), dtype=plant.q.dtype)  # (T, n, 12)
+    enabled = torch.as_tensor(np.stack([e.motion.torque_enable for e in episodes], axis=1))  # (T, n)
+    rows = len(targets)
+    soft = torch.tensor([[e.motion.soft_start] for e in episodes], dtype=plant.q.dtype)
+    # s since the drives came back on; infinite at the start, where nothing is blended
+    since, origin = torch.full_like(soft, torch.inf), targets[0].clone()
+    plant.enabled = enabled[0]
+    for row in range(rows):
+        back_on = (enabled[row] & ~plant.enabled).unsqueeze(1)
+        since = torch.where(back_on, 0.0, since + 1.0 / rate_hz)
+        origin = torch.where(back_on, plant.q, origin)
+        share = (since / soft.clamp(min=1e-9)).clamp(max=1.0)
+        target = torch.lerp(origin, targets[row], share)
+        plant.enabled = tape.enabled = enabled[row]
+        for _ in range(per_sample):
+            plant.step(target)
+        if row % 100 == 99 or row + 1 == rows:
+            on_step(row + 1, rows)
+
+
+def _recording(rig: Rig, sensors: SensorConfig, episode: Episode, true: Mapping[str, np.ndarray]) -> Recording:
+    """Return the recording of one robot."""
+    return Recording(
+        meta(
+            rig.robot,
+            sensors,
+            contact=rig.contact or MUJOCO_CONTACT,
+            base="floating" if episode.hang is None else "fixed",
+            base_quat=None if episode.hang is None else held_quat(episode.hang),
+            kp=(episode.kp,) * robot.NUM_JOINTS,
+            kd=(episode.kd,) * robot.NUM_JOINTS,
+            excitation=episode.excitation,
+            episode=episode.name,
+            repeat_of=episode.repeat_of,
+        ),
+        log(true, sensors, np.random.default_rng(episode.seed)),
+    )
+
+
+def meta(config: RobotConfig, sensors: SensorConfig, **changes: Any) -> Meta:
+    """Return the metadata of a simulated Go1's recording; they do not reveal which effects the robot has."""
+    limit = tuple(float(v) for v in robot.per_joint(config.effort_limit))
+    usual: dict[str, Any] = {"robot": "go1", "joints": robot.JOINTS, "rate_hz": sensors.rate_hz, "tau_limit": limit}
+    about: dict[str, Any] = {"source": "simulated", "tool": "go1exp record", "notes": ""}
+    versions = {"go1exp": __version__, "mujoco": version("mujoco-core")}
+    return Meta(**usual, **about, versions=versions, **changes)
+
+
+def policy_task(rig: Rig, trained: TaskConfig, seconds: float) -> TaskConfig:
+    """Return the task in which a policy is recorded: the rig's robot under the commands of training, on flat ground.
+
+    Raises:
+        ConfigError: if the periods do not divide each other.
+    """
+    period = trained.sim.policy_dt
+    # Two periods more than recorded, so that no time limit ends an episode.
+    sim = dataclasses.replace(
+        trained.sim, physics_dt=rig.physics_dt, episode_s=(round(seconds / period) + 2) * period, spread_starts=False
+    )
+    if problems := time_rules(sim):
+        raise ConfigError(problems)
+    parts = {f.name: getattr(rig, f.name) for f in dataclasses.fields(rig) if f.name != "physics_dt"}
+    parts["contact"] = rig.contact or trained.contact
+    return dataclasses.replace(trained, sim=sim, rand=(), event=(), curriculum=(), **parts)
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A policy to record.
+
+    Attributes:
+        trained: the task that it was trained in.
+        policy: observations (N, O) -> actions (N, 12); or None, and ``drive``.
+        names: names of the episodes, one robot each.
+        seconds: length of each, s.
+        hang: roll and pitch of a held trunk, rad, if the feet are to be in the air; None on the ground.
+        drive: lets controllers move the robots of an environment, and returns what is called in place of the policy.
+        excitation: what the recordings call it.
+    """
+
+    trained: TaskConfig
+    policy: Callable[[torch.Tensor], torch.Tensor] | None
+    names: Sequence[str]
+    seconds: float
+    hang: tuple[float, float] | None
+    drive: Callable[[Go1Core], Callable[[torch.Tensor], torch.Tensor]] | None = None
+    excitation: str = "policy"
+
+
+def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step: Progress) -> list[Recording]:
+    """Move robots by a policy under random commands and return the recordings.
+
+    A robot that falls is recorded up to its fall.
+    """
+    held = None if walk.hang is None else held_quat(walk.hang)
+    core = Go1Core(policy_task(rig, walk.trained, walk.seconds), len(walk.names), seed, imu=True, held=held, alike=True)
+    observation = core.reset()
+    policy = walk.policy if walk.drive is None else walk.drive(core)
+    assert policy is not None
+    per_sample = round(1.0 / (sensors.rate_hz * rig.physics_dt))
+    samples_per_step = round(core.task.sim.policy_dt * sensors.rate_hz)
+    if not math.isclose(samples_per_step, core.task.sim.policy_dt * sensors.rate_hz, rel_tol=1e-6):
+        period = core.task.sim.policy_dt
+        raise ConfigError(
+            [f"sensors.rate_hz = {sensors.rate_hz:g}: must sample the policy's {period:g} s a whole number of times"]
+        )
+    steps = round(walk.seconds / core.task.sim.policy_dt)
+    tape = Tape(core.plant, per_sample, steps * samples_per_step)
+    rows = np.full(len(walk.names), steps * samples_per_step)
+    walking = torch.ones(len(walk.names), dtype=torch.bool)
+    for step in range(steps):
+        result = core.step(policy(observation))
+        observation = result.observation
+        fell = walking & (result.terminated | result.truncated)
+        rows[fell.numpy()] = (step + 1) * samples_per_step
+        walking &= ~fell
+        on_step(step + 1, steps)
+    tape.stop()
+    recordings = []
+    for k, name in enumerate(walk.names):
+        true = {key: values[: rows[k]] for key, values in tape.true(k).items()}
+        about = meta(
+            rig.robot,
+            sensors,
+            contact=core.task.contact,
+            base="floating" if held is None else "fixed",
+            base_quat=held,
+            kp=configured(rig.actuator, "kp"),
+            kd=configured(rig.actuator, "kd"),
+            excitation=walk.excitation,
+            episode=name,
+            repeat_of=None,
+        )
+        recordings.append(Recording(about, log(true, sensors, np.random.default_rng([seed, k]))))
+    return recordings
+
+
+def configured(actuator: Term, gain: str) -> tuple[float, ...] | None:
+    """Return a gain as configured, per joint, without the effects on it; None if the actuator has no gains."""
+    value = next((term.parameters[gain] for term, _ in drives(actuator) if gain in term.parameters), None)
+    return None if value is None else tuple(float(v) for v in spread(value, robot.JOINTS))

@@ -1,0 +1,1 @@
+"""The simulated robot: physics, actuators, effects, terrain, environment."""

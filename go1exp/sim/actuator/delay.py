@@ -1,0 +1,86 @@
+"""``actuator=delay``: any drive, whose targets arrive late."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import torch
+from pydantic import AfterValidator, Field
+
+from go1exp.base.tensors.delay_line import DelayLine
+from go1exp.config.schema.registry import actuator, ordered
+from go1exp.robot.drive import DriveSetup
+from go1exp.sim.actuator.setup import Actuator, takes_feedforward
+from go1exp.sim.actuator.wrapped import Drive, build
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Seconds = Annotated[float, Field(ge=0.0, le=0.2)]
+Delays = Annotated[tuple[Seconds, Seconds], AfterValidator(ordered)]
+"""``[shortest, longest]``, s."""
+
+
+@actuator("delay")
+class Delay:
+    """Another drive, to which the target comes late by a time that each robot draws anew for each episode.
+
+    tau(t) = drive(target(t - delay), q(t), qd(t)): computer and bus delay the command, and the motor controller's own
+    feedback is not delayed. Between two physics steps the target is interpolated. The default goes from none to what
+    the actuator net of walk-these-ways has learnt from a Go1: its targets act 20 ms late.
+
+    Attributes:
+        drive: the drive inside.
+        delay: (N, 1) each robot's delay, s; the shortest before the first reset.
+    """
+
+    def __init__(self, setup: DriveSetup, *, command: Delays = (0.0, 0.02), drive: Drive) -> None:
+        """Wrap ``drive``; ``command`` is the range that delays are drawn from, s."""
+        self.drive: Actuator = build(setup, drive)
+        self.delay = setup.zeros()[:, :1] + command[0]
+        self._range, self._random = command, setup.random
+        joints = len(setup.joints)
+        self._line = DelayLine(setup.num_envs, joints, command[1], setup.physics_dt, setup.dtype, setup.device)
+        self._fed: DelayLine | None = None  # feedforward on its way; only where there is any
+
+    @property
+    def kp(self) -> Tensor:
+        """Position gain (N, J) of the drive inside, live, N m/rad; AttributeError if it has none."""
+        return self.drive.kp  # type: ignore[attr-defined]
+
+    @property
+    def kd(self) -> Tensor:
+        """Speed gain (N, J) of the drive inside, live, N m s/rad; AttributeError if it has none."""
+        return self.drive.kd  # type: ignore[attr-defined]
+
+    def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
+        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is late as well."""
+        late = self._line.advance(target, self.delay)
+        if feedforward is None:
+            return self.drive.torque(late, q, qd)
+        assert takes_feedforward(self.drive)  # the plant has asked
+        if self._fed is None:
+            self._fed = self._line.twin()
+        return self.drive.torque(late, q, qd, self._fed.advance(feedforward, self.delay))
+
+    def reset(self, mask: Tensor) -> None:
+        """Draw new delays in the rows of ``mask`` (N,) and take the next target for one long in force."""
+        low, high = self._range
+        drawn = self._random.stream("actuator.delay").uniform(1, low=low, high=high).to(self.delay.dtype)
+        self.delay.copy_(torch.where(mask.unsqueeze(1), drawn.clamp(low, high), self.delay))
+        self._line.reset(mask)
+        if self._fed:
+            self._fed.reset(mask)
+        self.drive.reset(mask)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the delays, the targets on their way and the history of the drive inside."""
+        state = {"delay": self.delay.clone(), "line": self._line.state_dict(), "drive": self.drive.state_dict()}
+        return state | ({"fed": self._fed.state_dict()} if self._fed else {})
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``, in place."""
+        self.delay.copy_(state["delay"])
+        self._line.load_state_dict(state["line"])
+        self._fed = self._line.restored(state.get("fed"))
+        self.drive.load_state_dict(state["drive"])

@@ -1,0 +1,238 @@
+"""What a physical effect is: parameters, a law, and the places where it acts.
+
+One effect is one file with one class. Training, evaluation and the gap workflow use the same object; at its null values
+the robot moves as without it, bit for bit.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import AfterValidator, Field
+
+from go1exp.base.tensors.memory import Memory
+from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.joint_values import JointValues, each_within
+from go1exp.robot.drive import DriveSetup, ModelFields
+from go1exp.sim.effects.identification import Identification
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Param:
+    """One parameter of an effect.
+
+    Attributes:
+        name: also the attribute that holds its values.
+        unit: ``-`` for none.
+        low: smallest value that makes sense.
+        high: largest.
+        null: value at which the effect is absent; a shape parameter, which matters only when another is not null,
+            has its usual value here.
+        tolerance: deviation from ``null`` that a user would not care about; the gap workflow names no effect within it.
+            Infinite for a shape parameter.
+        per: ``joint`` or ``robot``.
+        doc: what it is, in a few words.
+        least: smallest value but ``null``, where that one is a word for what the model has anyway and no value by
+            itself (``Effect.nominal``), of a parameter of the robot; ``low`` if None.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    null: float
+    tolerance: float
+    per: Literal["joint", "robot"]
+    doc: str
+    least: float | None = None
+
+    @property
+    def smallest(self) -> float:
+        """Smallest value at which the effect is there."""
+        return self.low if self.least is None else self.least
+
+    @property
+    def annotation(self) -> Any:
+        """Type of the YAML value."""
+        if self.least is not None:
+            return Annotated[float, Field(ge=self.low, le=self.high), AfterValidator(self._apart)]
+        if self.per == "joint":
+            return Annotated[JointValues, each_within(self.low, self.high)]
+        return Annotated[float, Field(ge=self.low, le=self.high)]
+
+    def _apart(self, value: float) -> float:
+        """Return a value that is null or large enough."""
+        if value != self.null and value < self.smallest:
+            raise ValueError(f"must be at least {self.smallest:g}, or {self.null:g} for that of the model")
+        return value
+
+
+@dataclass
+class Measured:
+    """What the robot's own sensors say, true values on the way in; what is not measured is None.
+
+    Attributes:
+        joint_pos: (N, J) rad.
+        joint_vel: (N, J) rad/s.
+        gravity: (N, 3) direction of gravity in the IMU's frame, unit length.
+        gyro: (N, 3) rad/s in the IMU's frame.
+        acc: (N, 3) specific force in the IMU's frame, m/s2.
+        quat: (N, 4) orientation of the IMU in the world, w-x-y-z.
+    """
+
+    joint_pos: Tensor
+    joint_vel: Tensor
+    gravity: Tensor | None = None
+    gyro: Tensor | None = None
+    acc: Tensor | None = None
+    quat: Tensor | None = None
+
+
+@dataclass
+class Gears:
+    """How the gears between motors and joints yield (``sim/effects/two_mass.py``); zeros for gears that do not.
+
+    Attributes:
+        compliance: (N, J) twist per torque, rad/(N m).
+        gap: (N, J) play, rad.
+        damping: (N, J) damping ratio of the rotor on the gears' spring, the joint held.
+    """
+
+    compliance: Tensor
+    gap: Tensor
+    damping: Tensor
+
+
+class Effect(Memory):
+    """Base of all effects.
+
+    A subclass has a ``title``, lists its ``params``, annotates one attribute for each, and overrides the hooks that it
+    needs and no others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
+
+    On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
+    ``on_target`` and ``on_feedforward``, ``on_encoder``, ``on_error``, the actuator, ``on_drive``, ``on_transmission``,
+    ``on_gears``, then ``on_joint``, ``on_friction``, ``on_load`` and ``on_base`` beside it. Whoever reads the drives'
+    torques asks ``on_report``.
+    """
+
+    title: ClassVar[str] = ""
+    """What it is, as the object of a sentence: "the model lacks ..."."""
+    params: ClassVar[tuple[Param, ...]] = ()
+    identification: ClassVar[Identification] = Identification()
+    """How it is looked for in recordings."""
+    fields: ClassVar[tuple[str, ...]] = ()
+    """Model fields that ``edit_model`` writes."""
+    joint_values: ClassVar[tuple[str, ...]] = ()
+    """Parameters with a value per joint (filled in by itself)."""
+    mounts: ClassVar[bool] = False
+    """Whether it acts on joints between the world and a trunk that is held (``sim/physics/mount.py``)."""
+    order: ClassVar[int] = 0
+    """Place among the effects of the same hook: smaller is nearer to the command."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.joint_values = tuple(p.name for p in cls.params if p.per == "joint")
+        cls.memory = (*(p.name for p in cls.params), *cls.memory)
+        keyword, positional = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+        cls.__signature__ = inspect.Signature(  # type: ignore[attr-defined]  # the registry's schema
+            [
+                inspect.Parameter("setup", positional),
+                *(inspect.Parameter(p.name, keyword, default=p.null, annotation=p.annotation) for p in cls.params),
+            ]
+        )
+
+    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+        """Spread the values over joints and environments; joints that a mapping leaves out have the null value."""
+        self.setup = setup
+        for p in self.params:
+            given = values.get(p.name, p.null)
+            full = setup.rows(given) if p.per == "joint" else setup.zeros()[:, :1] + float(given)  # type: ignore[arg-type]
+            setattr(self, p.name, full.nan_to_num(nan=p.null))
+
+    @classmethod
+    def nominal(cls, contact: ContactConfig) -> Mapping[str, float]:
+        """Return, by parameter, what a robot with this contact has where the null value leaves that of the model."""
+        return {}
+
+    def prepare(self) -> None:
+        """Work out what follows from the values; called when they have changed (``Plant.refresh``)."""
+
+    # ------------------------------------------------------------------ where an effect may act
+
+    def on_target(self, target: Tensor) -> Tensor:
+        """Return the position target that the drive acts on."""
+        return target
+
+    def on_feedforward(self, torque: Tensor) -> Tensor:
+        """Return the feed-forward torque that reaches the drive; only called where there is any (``Plant.step``)."""
+        return torque
+
+    def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the angle and speed that the drive's encoder reads. Called more than once a step: changes nothing."""
+        return q, qd
+
+    def on_error(self, target: Tensor, q: Tensor) -> Tensor:
+        """Return the target as the drive compares it with ``q``, the angle that its encoder reads."""
+        return target
+
+    def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gains that the drive really has."""
+        return kp, kd
+
+    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+        """Return the torque that the motor really makes. q, qd: the encoder's."""
+        return torque
+
+    def on_report(self, torque: Tensor) -> Tensor:
+        """Return what the drive reports of its ``torque``. Called more than once a step: changes nothing."""
+        return torque
+
+    def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+        """Return the torque that reaches the joint, whose true angle and speed are q and qd."""
+        return torque
+
+    def on_gears(self, gears: Gears) -> Gears:
+        """Return how the gears yield, given how they do so far; what goes through them reaches the joint."""
+        return gears
+
+    def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Return a further torque that acts on the joint and is not the drive's."""
+        raise NotImplementedError
+
+    def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:
+        """Return the bound of the joint's dry friction under the drive's ``torque``; ``bound`` is that so far."""
+        return bound
+
+    def on_load(self, bound: Tensor, torque: Tensor, outside: Tensor) -> Tensor:
+        """Return the bound of the joint's dry friction with that of its loaded gears; ``bound`` is that so far.
+
+        ``torque`` is the drive's, ``outside`` what weight, Coriolis and centrifugal forces of the links make at the
+        joint. A weight that is held at rest has ``outside = -torque``.
+        """
+        return bound
+
+    def on_base(self, wrench: Tensor) -> Tensor:
+        """Return the external wrench (N, 6) on the trunk; ``wrench`` is that so far.
+
+        A force on the trunk's origin in the world's frame, N, then a torque in the trunk's frame, N m.
+        """
+        return wrench
+
+    def on_sensor(self, measured: Measured) -> Measured:
+        """Change what the robot's sensors say, as policy and logger see it (encoders are ``on_encoder``'s)."""
+        return measured
+
+    def edit_model(self, model: ModelFields) -> None:
+        """Change ``fields`` of the model in place, every row; they hold the values without this effect."""
+
+    def reset(self, mask: Tensor) -> None:
+        """Begin a new episode in the rows of ``mask`` (N,)."""
+
+    def elapse(self, seconds: Tensor) -> None:
+        """Take up an episode that began ``seconds`` (N,) ago; called after ``reset``, where a replay begins later."""

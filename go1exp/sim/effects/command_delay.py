@@ -1,0 +1,66 @@
+"""``effect=command_delay``: targets take force late."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from go1exp.config.schema.registry import effect
+from go1exp.sim.effects.base import Param
+from go1exp.sim.effects.delayed import Delayed
+from go1exp.sim.effects.identification import Identification
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from go1exp.base.tensors.delay_line import DelayLine
+    from go1exp.config.schema.joint_values import JointValues
+    from go1exp.robot.drive import DriveSetup
+
+
+@effect("command_delay")
+class CommandDelay(Delayed):
+    """The drive acts on the target of a while ago: target(t - delay); its own feedback is not delayed.
+
+    Computer, bus and motor controller take their time: 2 to 40 ms on robots of this class (a judgement). The published
+    Go1 actuator net acts one policy step (20 ms) late. A log whose commands and states have clocks of their own shows a
+    shift between them as a delay; in a narrow band so do ``kp_scale`` and armature.
+    """
+
+    title = "a delay of commands"
+    params = (Param("delay", "s", 0.0, 0.06, 0.0, 0.001, "joint", "age of the target"),)
+    identification = Identification(
+        nominal=True,
+        rank=10,
+        levels=({"delay": 0.01},),
+        excitation="steps",
+    )
+
+    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+        """Allocate the past of targets; that of feed-forward torques is allocated with the first of them."""
+        super().__init__(setup, **values)
+        self._fed: DelayLine | None = None
+
+    def on_feedforward(self, torque: Tensor) -> Tensor:
+        """Return the feed-forward torque of ``delay`` ago: it comes with the target."""
+        if self._fed is None:
+            self._fed = self._line.twin()
+        return self._fed.at(torque, self._steps)
+
+    def reset(self, mask: Tensor) -> None:
+        """Let the next target and torque stand for the whole past in the rows of ``mask`` (N,)."""
+        super().reset(mask)
+        if self._fed:
+            self._fed.reset(mask)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of the values and the past."""
+        return {**super().state_dict(), **({"fed": self._fed.state_dict()} if self._fed else {})}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Write values and past back."""
+        super().load_state_dict(state)
+        self._fed = self._line.restored(state.get("fed"))
+
+    def on_target(self, target: Tensor) -> Tensor:
+        """Return the target of ``delay`` ago."""
+        return self.late(target)

@@ -1,0 +1,112 @@
+"""A motor behind gears that yield: the law of ``flexibility`` and ``backlash``, which act in series.
+
+The rotor (inertia J, reflected to the joint) turns by a twist x beyond the joint. With the gears' compliance s, their
+play b and a structural damping time t, the torque F that reaches the joint obeys::
+
+    J (x'' + q'') = torque - F          s F = e + t e'          e = x - clamp(x, -b/2, b/2)
+
+The drive's encoder reads the rotor: q + x. Both effects together are one spring and one dead zone in series.
+
+Numerics. The joint's own motion is the engine's, in leapfrog: it kicks the joint once a step by F. A stiff spring would
+make that unstable, and a rigid gear (s = 0) has no spring at all. So F is taken at the instant of the kick by the
+trapezoidal rule (Newmark, 1959), in which the twist's acceleration appears; solving for F leaves::
+
+    F = (J e + beta torque) / (J s + beta) - A q''         A = J beta / (J s + beta)         beta ~ dt^2 / 4
+
+The second part is an inertia that moves with the joint, and the engine gets it as such: exact for a soft spring, where
+A vanishes, and for a rigid gear, where all of the rotor moves with the joint; stable for every s; second order in the
+step. An oscillation that the step cannot resolve is damped out: towards s = 0 the rule becomes one that reaches the
+end of the play within the step and stays there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+
+from go1exp.base.tensors.memory import Memory
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from go1exp.robot.drive import DriveSetup
+    from go1exp.sim.effects.base import Gears
+
+LIGHTEST = 1e-5
+"""A rotor counts for at least this, kg m2; the Go1's have 0.004 and more."""
+
+
+class TwoMass(Memory):
+    """The rotors of N robots behind their gears.
+
+    Attributes:
+        twist: (N, J) angle of the rotor beyond the joint, rad.
+        rate: (N, J) its speed half a step earlier, rad/s.
+    """
+
+    memory = ("twist", "rate", "_earlier", "_pull", "_share")
+
+    def __init__(self, setup: DriveSetup) -> None:
+        """Begin untwisted."""
+        self._dt = setup.physics_dt
+        self.twist, self.rate, self._earlier = setup.zeros(), setup.zeros(), setup.zeros()
+        self._pull, self._share = setup.zeros(), setup.zeros()
+
+    def reset(self, mask: Tensor) -> None:
+        """Untwist the rows of ``mask`` (N,)."""
+        for name in self.memory:
+            getattr(self, name).masked_fill_(mask.unsqueeze(1), 0.0)
+
+    def motor(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return angle and speed of the rotors, given those of the joints, all (N, J) at this instant."""
+        return q + self.twist, qd + torch.lerp(self._earlier, self.rate, 1.5)
+
+    def transmit(self, gears: Gears, torque: Tensor, inertia: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the engine needs for this step.
+
+        Args:
+            gears: how the gears yield.
+            torque: (N, J) on the rotors, N m.
+            inertia: (N, J) of the rotors, kg m2.
+
+        Returns:
+            ``rigid``: (N, J) bool, gears that do not yield, and whose rotor is the engine's.
+            ``through``: (N, J) torque on the joint, N m.
+            ``carried``: (N, J) inertia that moves with the joint, kg m2.
+        """
+        dt, s = self._dt, gears.compliance
+        rotor = inertia.clamp(min=LIGHTEST)
+        unresolved = dt**4 / (dt**4 + 16.0 * (rotor * s) ** 2)  # 0: well resolved by the step, 1: rigid
+        damping = 2.0 * gears.damping * torch.sqrt(s * rotor) + unresolved * dt
+        beta = 0.25 * (1.0 + unresolved) * dt**2 + 0.5 * damping * dt
+
+        ahead = self.twist + damping * self.rate
+        # Where the rotor alone would go. What the joint will do is not known: one that has just been hit did
+        # something else in the step before.
+        loose = ahead + beta * torque / rotor
+        half = 0.5 * gears.gap
+        end = torch.minimum(torch.maximum(loose, -half), half)
+        pressed = (loose != end) | (gears.gap == 0.0)
+        stretch, divisor = ahead - end, rotor * s + beta
+
+        rigid = (s == 0.0) & (gears.gap == 0.0)
+        through = torch.where(pressed, (rotor * stretch + beta * torque) / divisor, 0.0)
+        carried = torch.where(pressed, rotor * beta / divisor, 0.0)
+        self._pull.copy_(
+            torch.where(pressed, (s * torque - stretch) / divisor, torque / rotor).masked_fill_(rigid, 0.0)
+        )
+        self._share.copy_(torch.where(pressed, rotor * s / divisor, 1.0).masked_fill_(rigid, 0.0))
+        return rigid, torch.where(rigid, torque, through), torch.where(rigid, inertia, carried)
+
+    def follow(self, acceleration: Tensor) -> None:
+        """Turn the rotors, given the joints' ``acceleration`` (N, J) in the step that has been made, rad/s2."""
+        self._earlier.copy_(self.rate)
+        self.rate += self._dt * (self._pull - self._share * acceleration)
+        self.twist += self._dt * self.rate
+
+
+def resonance(compliance: float, rotor: float, joint: float) -> float:
+    """Return the frequency, Hz, at which rotor and joint (inertias in kg m2) swing against each other."""
+    return math.sqrt((1.0 / rotor + 1.0 / joint) / compliance) / (2.0 * math.pi)

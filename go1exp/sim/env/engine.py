@@ -1,0 +1,98 @@
+"""The physics engine that a configuration names, and the policy step as one piece of work for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from go1exp.config.schema.backends import BackendConfig, CpuBackend, PhysxBackend, WarpBackend
+from go1exp.mdp.types import StepResult
+from go1exp.sim.physics.backend import PhysicsBackend
+from go1exp.sim.physics.mujoco_cpu import MujocoCpu
+from go1exp.sim.physics.scene import Sensors
+
+T = TypeVar("T")
+
+
+def make_backend(config: BackendConfig, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+    """Build the physics engine that the configuration names.
+
+    Raises:
+        go1exp.config.schema.registry.Expected: if its packages are not installed.
+        go1exp.config.schema.registry.ConfigError: if its device is not there.
+    """
+    return BUILDERS[config.name](config, model, sensors, num_envs)
+
+
+def _cpu(config: CpuBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+    return MujocoCpu(model, sensors, num_envs, config.threads)
+
+
+def _warp(config: WarpBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+    from go1exp.sim.physics.mujoco_warp import MujocoWarp  # its packages are an extra
+
+    limits = {"nconmax": config.nconmax, "njmax": config.njmax}
+    return MujocoWarp(model, sensors, num_envs, device=config.device, **limits)
+
+
+def _physx(config: PhysxBackend, model: Any, sensors: Sensors, num_envs: int) -> PhysicsBackend:
+    from go1exp.sim.physics.physx import PhysxCpu  # its package is an extra
+
+    return PhysxCpu(model, sensors, num_envs, config)
+
+
+BUILDERS: dict[str, Callable[..., PhysicsBackend]] = {"cpu": _cpu, "warp": _warp, "physx": _physx}
+"""How each engine is built, by the names of ``go1exp.config.schema.backends.BACKENDS``."""
+
+
+class Captures(Protocol):
+    """A backend that can record what is done to its device and repeat it at once."""
+
+    def capture(self, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
+        """Run ``work`` a few times, record it, and return the replay and what ``work`` returned, live."""
+
+
+class Steps(Protocol):
+    """An environment whose step may be part of a graph."""
+
+    backend: Any
+
+    def step_by_call(self, action: Tensor) -> StepResult:
+        """Step."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that steps change."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put it back."""
+
+
+def captured(env: Steps, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
+    """Record ``work``, which steps ``env`` call by call, as one graph; the runs before that leave no trace in ``env``.
+
+    Returns:
+        the replay, and what ``work`` returned, written anew by each replay.
+    """
+    backend: Captures = env.backend
+    state = env.state_dict()
+    recorded = backend.capture(work)
+    env.load_state_dict(state)
+    return recorded
+
+
+class CapturedStep:
+    """The step of an environment as one graph."""
+
+    def __init__(self, env: Steps, action: Tensor) -> None:
+        """Record it for actions (N, A) like this one."""
+        self._action = torch.zeros_like(action)
+        self._replay, self._result = captured(env, lambda: env.step_by_call(self._action))
+
+    def __call__(self, action: Tensor) -> StepResult:
+        """Step; the result's tensors are always the same ones."""
+        self._action.copy_(action)
+        self._replay()
+        return self._result

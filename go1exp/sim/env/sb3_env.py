@@ -1,0 +1,99 @@
+"""The numpy border to Stable-Baselines3."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from go1exp import robot
+from go1exp.mdp.types import StepResult
+from go1exp.sim.env.core import Go1Core
+
+
+def spaces(core: Go1Core) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """Return the observation and action space of one environment."""
+    clip = core.task.action.clip
+    return (
+        gym.spaces.Box(-np.inf, np.inf, (core.observation_size,), np.float32),
+        gym.spaces.Box(-clip, clip, (robot.NUM_JOINTS,), np.float32),
+    )
+
+
+class Go1VecEnv(VecEnv):
+    """``Go1Core`` as SB3 wants it: copies, one ``done`` flag, and the truth about it in ``infos``.
+
+    An info is filled only for episodes that ended: ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``
+    with return ``r`` and length ``l`` in steps.
+
+    Raises:
+        NumericalFault: from ``step`` when a state, torque, reward or observation is not finite.
+    """
+
+    def __init__(self, core: Go1Core) -> None:
+        self.core = core
+        super().__init__(core.num_envs, *spaces(core))
+        self._actions = torch.zeros_like(core.action)
+
+    def reset(self) -> VecEnvObs:
+        """Start all episodes anew; observations (N, O) float32."""
+        if self._seeds[0] is not None:
+            self.core.reseed(self._seeds[0])
+        self._reset_seeds()
+        return self.core.reset().cpu().numpy()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions (N, 12) for ``step_wait``."""
+        self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.core.device)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Advance one policy step."""
+        result = self.core.step(self._actions)
+        self.core.check(result)
+        done = (result.terminated | result.truncated).cpu().numpy()
+        return (
+            result.observation.cpu().numpy(),
+            result.reward.cpu().numpy().copy(),  # SB3 adds the bootstrap value in place
+            done,
+            self._infos(result, done),
+        )
+
+    def _infos(self, result: StepResult, done: np.ndarray) -> list[dict[str, Any]]:
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in done.nonzero()[0]:
+            infos[i] = {
+                "terminal_observation": result.final_observation[i].cpu().numpy().copy(),
+                "TimeLimit.truncated": bool(result.truncated[i]),
+                "episode": {"r": float(result.episode_return[i]), "l": int(result.episode_length[i])},
+            }
+        return infos
+
+    def close(self) -> None:
+        """Nothing to release: threads end with the object."""
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of the core, once per environment asked for; raise AttributeError if it has none."""
+        value = None if attr_name == "render_mode" else getattr(self.core, attr_name)
+        return [value] * self._count(indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Refuse: the environments share one core."""
+        raise NotImplementedError(f"{attr_name!r}: environments of a batch cannot differ in attributes")
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Refuse: there are no single environments to call."""
+        raise NotImplementedError(f"{method_name!r}: environments of a batch have no methods of their own")
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """Nothing is wrapped."""
+        return [False] * self._count(indices)
+
+    def _count(self, indices: VecEnvIndices) -> int:
+        if indices is None:
+            return self.core.num_envs
+        return len(indices) if isinstance(indices, Sequence | Iterable) else 1  # type: ignore[arg-type]

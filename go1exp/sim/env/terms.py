@@ -1,0 +1,153 @@
+"""The configured rewards, observations and terminations of a batch, called on one Snapshot after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from go1exp.config.schema.backends import WarpBackend
+from go1exp.config.schema.history import frame_width, width
+from go1exp.config.schema.registry import ConfigError, Term
+from go1exp.mdp.foot_impacts import impossible
+from go1exp.mdp.types import Snapshot, TermSetup
+from go1exp.sim.env.frames import Frames
+from go1exp.sim.task import TaskConfig
+
+Call = Callable[[Snapshot], Tensor]
+
+TIME_LIMIT, LEFT_MAP, IMPOSSIBLE = "time limit", "left the map", "a force that physics cannot make"
+"""Ends of an episode that are no failure."""
+
+
+class StepTerms:
+    """Rewards, observations and terminations of N robots.
+
+    A term is a function, or a class whose object remembers something (``docs/extending.md``): it is called once a step,
+    an observation's ``advance`` once a step before it is read, and ``reset(mask)`` where an episode begins.
+
+    Attributes:
+        rewards: terms with a weight that is not zero.
+        values: (N, R) of the rewards in the last step, without their weights.
+        weights: (R,) times the policy's period.
+        sums: (R,) float64, of weighted rewards since ``core.drain_metrics``.
+        failed: (N, T) bool, which terminations were true in the last step.
+        left_map: (N,) bool, who was at the edge of the ground in the last step.
+        impossible: (N,) bool, whose feet met a force that physics cannot make in it (``mdp/foot_impacts.py``).
+        distrusts: whether such a force ends an episode, or is believed.
+        observed: terms of the observation, in the order of their columns; those of the critic are the last ones.
+        observation_size: O.
+        policy_size: columns that are the policy's.
+        frames: noise and history of the observation.
+        read: fields of the Snapshot that are computed only because an observation reads them.
+    """
+
+    def __init__(self, task: TaskConfig, num_envs: int, device: torch.device, critic: bool = False) -> None:
+        """Build the terms of ``task``; with ``critic`` those that only the value function sees, too."""
+        setup = TermSetup(num_envs, device, task.sim.policy_dt)
+        self._remembering: dict[str, Any] = {}
+
+        def calls(group: str, terms: Sequence[Term]) -> list[Call]:
+            """Return the terms as functions of a Snapshot."""
+            made: list[Call] = [t(setup) if t.entry.remembers else t for t in terms]
+            named = zip(terms, made, strict=True)
+            self._remembering |= {f"{group}.{t.key}": call for t, call in named if t.entry.remembers}
+            return made
+
+        self.rewards = [t for t in task.reward if t.slots["weight"] != 0.0]
+        self._reward_calls = calls("reward", self.rewards)
+        weights = [t.slots["weight"] * task.sim.policy_dt for t in self.rewards]
+        self.weights = torch.tensor(weights, dtype=torch.float32, device=device)
+        self.values = setup.zeros(len(self.rewards))
+        self.sums = torch.zeros(len(self.rewards), dtype=torch.float64, device=device)
+        self._terminations = task.termination
+        self._termination_calls = calls("termination", task.termination)
+        self.failed = torch.zeros(num_envs, len(task.termination), dtype=torch.bool, device=device)
+        # Seen with MuJoCo Warp alone; engines that judge a policy must not hide a fall behind it.
+        self.distrusts = isinstance(task.backend, WarpBackend)
+        self.left_map, self.impossible = torch.zeros(2, num_envs, dtype=torch.bool, device=device).unbind(0)
+        beside = task.critic if critic else ()
+        self._observation_calls, self._critic_calls = calls("observation", task.observation), calls("critic", beside)
+        self._advancing, self._critic_advancing = (
+            [part for key, part in self._remembering.items() if key.startswith(f"{group}.")]
+            for group in ("observation", "critic")
+        )
+        self.observed = (*task.observation, *beside)
+        self.read = {name for t in self.observed for name in t.entry.traits.get("reads", ())}
+        widths = [width(t) for t in self.observed]
+        self.observation_size, self.policy_size = sum(widths), sum(widths[: len(task.observation)])
+        self.frames = Frames(self.observed, setup)
+
+    def terminated(self, s: Snapshot) -> Tensor:
+        """(N,) bool, any termination is true."""
+        for k, term in enumerate(self._termination_calls):
+            self.failed[:, k] = self._shaped("termination", self._terminations[k], term(s))
+        return self.failed.any(-1)
+
+    def cut_short(self, left_map: Tensor, s: Snapshot) -> Tensor:
+        """(N,) bool, whose episode ends without a failure of the robot; ``left_map`` (N,) bool."""
+        assert s.foot_peak_force is not None
+        self.left_map.copy_(left_map)
+        if not self.distrusts:
+            return self.left_map
+        self.impossible.copy_(impossible(s.foot_peak_force))
+        return self.left_map | self.impossible
+
+    def reward(self, s: Snapshot) -> Tensor:
+        """(N,) sum of weight x term x policy period."""
+        for k, term in enumerate(self._reward_calls):
+            self.values[:, k] = self._shaped("reward", self.rewards[k], term(s))
+        weighted = self.values * self.weights
+        self.sums += weighted.sum(0)
+        return weighted.sum(-1)
+
+    def advance(self, sensed: Snapshot, s: Snapshot) -> None:
+        """Let observations that remember something take in a step: as the sensors saw it, the critic's as it was."""
+        for term in self._advancing:
+            term.advance(sensed)
+        for term in self._critic_advancing:
+            term.advance(s)
+
+    def observation(self, sensed: Snapshot, s: Snapshot) -> Tensor:
+        """(N, F) values of all observations: what the sensors saw, and behind it the critic's, of the truth."""
+        values = [*(term(sensed) for term in self._observation_calls), *(term(s) for term in self._critic_calls)]
+        return torch.cat(
+            [self._shaped("observation", t, v) for t, v in zip(self.observed, values, strict=True)], dim=-1
+        )
+
+    def _shaped(self, group: str, term: Term, value: Tensor) -> Tensor:
+        """Return what a term gave, if it is one value, or an observation's ``size``, for each robot.
+
+        Raises:
+            ConfigError: if not. One number for all robots would be spread over them without a word.
+        """
+        size = (frame_width(term),) if group == "observation" else ()
+        if value.shape == (self.values.shape[0], *size):
+            return value
+        wanted = f"(N, {size[0]}) as its size says" if size else "(N,), one value per robot"
+        given = f"gives {tuple(value.shape)} for {self.values.shape[0]} robots"
+        raise ConfigError([f"{group}.{term.key}: {given}, must be {wanted}"])
+
+    def reset(self, mask: Tensor) -> None:
+        """Begin new episodes in the rows of ``mask`` (N,)."""
+        for term in self._remembering.values():
+            term.reset(mask)
+
+    def reward_terms(self) -> dict[str, Tensor]:
+        """Return what each term contributed to the last step's reward, (N,) each, weight and period included."""
+        weighted = self.values * self.weights
+        return {t.key: weighted[:, k] for k, t in enumerate(self.rewards)}
+
+    def end(self, env: int, terminated: bool, truncated: bool) -> str | None:
+        """Say why an episode ended in the last step: the first termination that was true, or ``TIME_LIMIT`` ..."""
+        if terminated:
+            return self._terminations[int(self.failed[env].int().argmax())].key
+        if truncated:
+            return LEFT_MAP if self.left_map[env] else IMPOSSIBLE if self.impossible[env] else TIME_LIMIT
+        return None
+
+    def parts(self) -> dict[str, Any]:
+        """Return what remembers something: terms by group and key, and the frames."""
+        return {**self._remembering, **({"frames": self.frames} if self.frames.memory else {})}

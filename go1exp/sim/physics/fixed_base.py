@@ -1,0 +1,123 @@
+"""Any chain of hinges on a fixed base, from a MuJoCo file -> one compiled model as the plant expects it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+
+from go1exp.config.schema.registry import Expected
+from go1exp.robot import MOUNT
+from go1exp.sim.physics.mount import add_mount
+from go1exp.sim.physics.scene import RIGID
+
+BASE = "trunk"
+"""Name that the base body gets, whatever the file calls it: effects on the attitude of a held robot look for it."""
+
+
+class FixedBaseError(Expected):
+    """A MuJoCo file that does not hold the robot that a configuration says."""
+
+
+def build_fixed_base(
+    file: Path,
+    base: str,
+    joints: Sequence[str],
+    effort: Sequence[float],
+    physics_dt: float,
+    base_quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+    mounted: bool = False,
+) -> mujoco.MjModel:
+    """Compile a robot that is bolted down.
+
+    Joints that are not asked for are held at zero, those of the base included; so are touching shapes and the file's
+    own motors and sensors left out. Each link takes the name of its joint, so that effects on links find it.
+
+    Args:
+        file: MJCF, whose path names what it includes.
+        base: body that is bolted down.
+        joints: hinges in the order in which the model will have them, J.
+        effort: peak torque of each, (J,) N m.
+        physics_dt: timestep, s.
+        base_quat: attitude of the base, w-x-y-z, base to world; it replaces the file's.
+        mounted: the base has the joints of ``sim/physics/mount.py``, before its own.
+
+    Raises:
+        FixedBaseError: if the file is missing or no MJCF, has no such body or hinge, has them in another order, or has
+            two of them in one link.
+    """
+    if not file.is_file():
+        raise FixedBaseError(f"mjcf = {str(file)!r}: no such file")
+    try:
+        spec = mujoco.MjSpec.from_file(str(file))
+    except ValueError as error:
+        raise FixedBaseError(f"mjcf = {str(file)!r}: not a MuJoCo model ({_in_a_line(error)})") from None
+    _checked(spec, file, base, joints)
+    for joint in list(spec.joints):
+        if joint.name not in joints:
+            spec.delete(joint)
+    for part in (*spec.actuators, *spec.sensors, *spec.keys):
+        spec.delete(part)
+    trunk = spec.body(base)
+    trunk.quat, trunk.name = list(base_quat), BASE
+    if mounted:
+        add_mount(trunk)
+    for name, limit in zip(joints, effort, strict=True):
+        joint = spec.joint(name)
+        joint.parent.name = name
+        # Dry friction is as rigid as a step allows (see sim/physics/scene.py).
+        joint.solref_friction, joint.solimp_friction = [2.0 * physics_dt, 1.0], list(RIGID)
+        motor = spec.add_actuator()
+        motor.name, motor.target, motor.trntype = name, name, mujoco.mjtTrn.mjTRN_JOINT
+        motor.forcelimited, motor.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
+    spec.option.timestep = physics_dt
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    without = mujoco.mjtDisableBit
+    for flag in (without.mjDSBL_AUTORESET, without.mjDSBL_ISLAND, without.mjDSBL_CONTACT, without.mjDSBL_SENSOR):
+        spec.option.disableflags |= int(flag)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise FixedBaseError(f"mjcf = {str(file)!r}: does not compile ({_in_a_line(error)})") from None
+    order = [model.joint(k).name for k in range(len(MOUNT) if mounted else 0, model.njnt)]
+    if order != list(joints):
+        raise FixedBaseError(f"joints: must be in the order of {str(file)!r}: {', '.join(order)}")
+    return model
+
+
+def _in_a_line(error: ValueError) -> str:
+    """Return MuJoCo's complaint in one line; its later lines say where in the file."""
+    return " ".join(str(error).split())
+
+
+def _checked(spec: mujoco.MjSpec, file: Path, base: str, joints: Sequence[str]) -> None:
+    """Raise what is wrong with the names."""
+    bodies, hinges = [b.name for b in spec.bodies], {}
+    if base not in bodies[1:]:
+        known = ", ".join(name for name in bodies[1:] if name)
+        raise FixedBaseError(f"base = {base!r}: no body of {str(file)!r}; it has {known or 'none with a name'}")
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            hinges[joint.name] = joint.parent.name or str(joint.parent.id)
+    for name in joints:
+        if name not in hinges:
+            raise FixedBaseError(f"joints: {name!r} is no hinge of {str(file)!r}; it has {', '.join(hinges) or 'none'}")
+    links = [hinges[name] for name in joints]
+    twice = next((link for link in links if links.count(link) > 1), None)
+    if twice is not None:
+        raise FixedBaseError(f"joints: two of them move the body {twice!r}; give each a body of its own")
+    if base in links:
+        raise FixedBaseError(f"base = {base!r}: is moved by a joint of the list")
+
+
+def feel_each_other(model: mujoco.MjModel, a: int, b: int) -> bool:
+    """Return whether one of two degrees of freedom carries the other."""
+
+    def above(dof: int) -> set[int]:
+        ancestors = {dof}
+        while (dof := int(model.dof_parentid[dof])) >= 0:
+            ancestors.add(dof)
+        return ancestors
+
+    return a in above(b) or b in above(a)

@@ -1,0 +1,173 @@
+"""Robot + ground + sensors -> one compiled MuJoCo model, the same for every backend.
+
+Whatever the MDP needs beyond qpos and qvel is a sensor declared here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+
+from go1exp import robot
+from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.physics.model import load_robot
+from go1exp.sim.physics.mount import add_mount
+from go1exp.sim.physics.terrain_geom import FLOOR, add_to_spec
+from go1exp.sim.terrain import Terrain
+
+DECORATION_GROUP = 2
+"""Geom group of the shapes that are only for the eye; they cost kinematics and are left out of training."""
+
+HELD_HEIGHT = 1.0
+"""Height at which a held trunk hangs, m: no foot reaches the ground."""
+
+RIGID = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""MuJoCo's impedance of dry friction; its default of 0.9 to 0.95 lets a joint creep."""
+
+_DATA_FOUND = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
+_DATA_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+_REDUCE_NONE, _REDUCE_NETFORCE = 0, 3
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Where each quantity lies in ``sensordata``: contiguous blocks, so that reading one is a view, not a copy.
+
+    Legs in the order of ``robot.LEGS``.
+    """
+
+    foot_pos_w: slice
+    """4 x 3: centre of the foot spheres, m."""
+    foot_vel_w: slice
+    """4 x 3: their velocity, m/s."""
+    foot_contact: slice
+    """4 x 4: number of contacts of the foot sphere with the ground, then the ground's net force on it (world), N."""
+    link_contacts: slice
+    """13: number of contacts of thighs (4), calves with their feet (4), trunk with head (1), hips (4)."""
+    imu_gyro: slice
+    """3: angular velocity in the IMU's frame, rad/s; empty, like the next two, unless asked for."""
+    imu_acc: slice
+    """3: specific force in the IMU's frame, m/s2."""
+    imu_quat: slice
+    """4: orientation of the IMU in the world, w-x-y-z."""
+
+
+NO_SENSORS = Sensors(*[slice(0, 0)] * 7)
+"""Blocks of a model without any."""
+
+
+def build_model(
+    config: RobotConfig,
+    terrain: Terrain | None,
+    physics_dt: float,
+    decoration: bool = False,
+    *,
+    contact: ContactConfig = MUJOCO_CONTACT,
+    imu: bool = False,
+    held: tuple[float, float, float, float] | None = None,
+    mounted: bool = False,
+) -> tuple[mujoco.MjModel, Sensors]:
+    """Compile the scene.
+
+    Args:
+        config: which Go1.
+        terrain: the ground, which touches every collision shape of the robot; None for a robot that touches nothing and
+            is nowhere seen: without shapes, sites and sensors a step is a twentieth shorter.
+        physics_dt: timestep, s.
+        decoration: keep the shapes that are only for the eye (they change no trajectory).
+        contact: of the feet with the ground.
+        imu: add the IMU's sensors (they cost time and a policy does not need them).
+        held: orientation w-x-y-z in which the trunk is held in the air, as on a stand; None lets it go. A held robot's
+            state is its joints' alone.
+        mounted: the held trunk has the joints of ``sim/physics/mount.py``, whose state stands before that of the legs.
+    """
+    spec = load_robot(config.inertia)
+    if held is not None:
+        spec.delete(spec.joint("root"))
+        for key in list(spec.keys):  # their state has a free trunk
+            spec.delete(key)
+        spec.body("trunk").pos, spec.body("trunk").quat = [0.0, 0.0, HELD_HEIGHT], list(held)
+        if mounted:
+            add_mount(spec.body("trunk"))
+    for geom in list(spec.geoms):
+        if terrain is None or (geom.group == DECORATION_GROUP and not decoration):
+            spec.delete(geom)
+    spec.option.timestep = physics_dt
+    # A fault must be seen, not healed: MuJoCo would otherwise reset a robot whose state is not finite.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    # One robot is one island: looking for more costs a tenth of the step and changes nothing.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    # Torques are computed outside, so nothing but joint damping could be implicit, and Euler treats that so as well.
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    for kind, name in enumerate(robot.JOINT_KINDS):
+        for leg in robot.LEGS:
+            joint = spec.joint(f"{leg}_{name}")
+            joint.armature = config.armature[kind]
+            joint.damping[0] = config.damping[kind]
+            joint.frictionloss = config.friction_loss[kind]
+            # Dry friction is as rigid as a step allows: it stops a joint within one (see docs/actuators.md).
+            joint.solref_friction, joint.solimp_friction = [2.0 * physics_dt, 1.0], list(RIGID)
+            motor = spec.actuator(f"{leg}_{name}")
+            motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            motor.forcerange = [-config.effort_limit[kind], config.effort_limit[kind]]
+    if terrain is None:
+        for part in (*spec.sites, *spec.lights, *spec.cameras):
+            spec.delete(part)
+        return spec.compile(), NO_SENSORS
+    add_to_spec(spec, terrain)
+    _set_contact(spec, contact)
+    sensors = _add_sensors(spec, imu)
+    return spec.compile(), sensors
+
+
+def weigh_down(model: mujoco.MjModel, heavy: float) -> None:
+    """Make a trunk so heavy that legs do not move it: a mass, kg, and moments of inertia about its origin, kg m2."""
+    trunk = model.body("trunk").id
+    model.body_mass[trunk], model.body_inertia[trunk] = heavy, heavy
+    model.body_ipos[trunk], model.body_iquat[trunk] = 0.0, (1.0, 0.0, 0.0, 0.0)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _set_contact(spec: mujoco.MjSpec, contact: ContactConfig) -> None:
+    """Give the feet their contact: they have priority over the ground, so that what they say holds for the pair."""
+    spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{contact.cone.upper()}")
+    spec.option.impratio = contact.impratio
+    for leg in robot.LEGS:
+        spec.geom(f"{leg}_foot").solref[0] = contact.time_constant
+
+
+def _add_sensors(spec: mujoco.MjSpec, imu: bool) -> Sensors:
+    """Declare the sensors, block by block, and return where they will lie."""
+    site, geom, body = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
+    end = 0
+
+    def block(
+        targets: list[str], size: int, kind: mujoco.mjtSensor, objtype: mujoco.mjtObj, intprm: list[int]
+    ) -> slice:
+        nonlocal end
+        start = end
+        for target in targets:
+            name = f"{target}_{kind.name.removeprefix('mjSENS_').lower()}"
+            sensor = spec.add_sensor(
+                name=name, type=kind, objtype=objtype, objname=target, intprm=[*intprm, 0, 0, 0][:3]
+            )
+            if objtype == geom:  # the force is the first's on the second
+                sensor.objname, sensor.reftype, sensor.refname = FLOOR, geom, target
+            end += size
+        return slice(start, end)
+
+    feet = [f"{leg}_foot" for leg in robot.LEGS]
+    links = [f"{leg}_{part}" for part in ("thigh", "calf") for leg in robot.LEGS]
+    links += ["trunk", *(f"{leg}_hip" for leg in robot.LEGS)]
+    contact, on_imu = mujoco.mjtSensor.mjSENS_CONTACT, ["imu"] if imu else []
+    return Sensors(
+        foot_pos_w=block(feet, 3, mujoco.mjtSensor.mjSENS_FRAMEPOS, site, []),
+        foot_vel_w=block(feet, 3, mujoco.mjtSensor.mjSENS_FRAMELINVEL, site, []),
+        foot_contact=block(feet, 4, contact, geom, [_DATA_FOUND | _DATA_FORCE, _REDUCE_NETFORCE, 1]),
+        link_contacts=block(links, 1, contact, body, [_DATA_FOUND, _REDUCE_NONE, 1]),
+        imu_gyro=block(on_imu, 3, mujoco.mjtSensor.mjSENS_GYRO, site, []),
+        imu_acc=block(on_imu, 3, mujoco.mjtSensor.mjSENS_ACCELEROMETER, site, []),
+        imu_quat=block(on_imu, 4, mujoco.mjtSensor.mjSENS_FRAMEQUAT, site, []),
+    )
