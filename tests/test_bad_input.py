@@ -271,7 +271,7 @@ def test_of_several_sets_of_gains_a_fit_takes_the_one_that_is_chosen(run: Run, t
     small = ("hidden=[4]", "epochs=1", "half_net=false", "plots=false", "share=all")
     status, text = run("fit-actuator", "recordings=logs", "gains=[35,0.5]", "out=nets/mine", *small)
     assert status == 0, text
-    from go1exp.gap.actuator_net import load
+    from go1exp.sim.actuator.actuator_net import load
 
     assert load(tmp_path / "nets/mine/net.npz").info.kp == (35.0,) * len(JOINTS)
 

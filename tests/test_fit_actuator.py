@@ -18,16 +18,14 @@ from go1exp.gap.actuator_net import (
     FitError,
     FitResult,
     FitSettings,
-    NetFileError,
     fit,
-    load,
     plot,
     smooth_motion,
     text,
 )
 from go1exp.gap.actuator_net.dataset import fingerprint, split, windows
 from go1exp.logs.recording import Meta, Recording, RecordingError, problems
-from go1exp.sim.actuator.actuator_net import ActuatorNet, InputName
+from go1exp.sim.actuator.actuator_net import ActuatorNet, InputName, NetFileError, load
 
 JOINTS = ("FR_hip", "FR_calf")
 KP, KD = 20.0, 0.5

@@ -22,7 +22,7 @@ from go1exp import robot
 from go1exp.logs.recording import RecordingError, read_folder
 
 HERE = Path(cases.__file__).parent
-ALLOWED = {"go1exp", "go1exp.logs.recording", "go1exp.robot"}
+ALLOWED = {"go1exp", "go1exp.base.paths", "go1exp.logs.recording", "go1exp.robot"}
 EVERY = np.arange(12)
 NONE = np.zeros(12, dtype=bool)
 

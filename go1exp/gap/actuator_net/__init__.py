@@ -14,18 +14,14 @@ if TYPE_CHECKING:
     from go1exp.gap.actuator_net.report import Report, text
     from go1exp.gap.actuator_net.settings import FitError, FitSettings
     from go1exp.gap.actuator_net.smoothing import SmoothMotion, smooth_motion
-    from go1exp.sim.actuator.actuator_net import ActuatorNet, NetFileError, load
 
 __all__ = [
-    "ActuatorNet",
     "FitError",
     "FitResult",
     "FitSettings",
-    "NetFileError",
     "Report",
     "SmoothMotion",
     "fit",
-    "load",
     "plot",
     "smooth_motion",
     "text",
@@ -33,7 +29,6 @@ __all__ = [
 
 _MODULES = {
     **dict.fromkeys(("FitResult", "fit"), "fitting"),
-    **dict.fromkeys(("ActuatorNet", "NetFileError", "load"), "net"),
     "plot": "plots",
     **dict.fromkeys(("Report", "text"), "report"),
     **dict.fromkeys(("FitError", "FitSettings"), "settings"),
