@@ -24,7 +24,21 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 RELATIVE = {file.relative_to(PACKAGE).as_posix(): file for file in FILES}
 
 ORDER = {
-    "": ("base", "config", "robot", "mdp", "sim", "train", "logs", "gap", "deploy", "evaluate", "extend", "cli"),
+    "": (
+        "base",
+        "config",
+        "robot",
+        "mdp",
+        "sim",
+        "train",
+        "logs",
+        "gap",
+        "deploy",
+        "evaluate",
+        "extend",
+        "cli",
+        "__main__.py",
+    ),
     "sim": ("terrain.py", "physics", "actuator", "effects", "task.py", "env", "gym.py"),
     "gap": (
         *("actuator_net", "result.py", "files.py", "data", "replay", "robots", "score", "search", "comparison.py"),
