@@ -12,6 +12,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from go1exp.sim.env.core import Go1Core
+from go1exp.sim.task import TaskConfig
 
 UNFIT = {
     "aten.lift_fresh.default": "a tensor made of numbers of the host, such as an index that is a list",
@@ -52,11 +53,26 @@ def without_engine(core: Go1Core) -> Iterator[None]:
 ROUGH = ("terrain=rough", "terrain.cols=2", "terrain.border=2.0", "curriculum=terrain_level")
 
 
+CHANGING = ("actuator.command", "contact.time_constant", "reward.gait.weight", "reward.gait.full_cycle")
+
+
 @pytest.mark.parametrize(
     "choices", [(*ROUGH, "+observation.height_scan={}"), ("experiment=trot", "backend=cpu"), ("reward=paper_literal",)]
 )
 def test_a_step_holds_nothing_that_a_graph_cannot(choices: tuple[str, ...], make_core: Callable[..., Go1Core]) -> None:
     core = make_core(*choices)
+    core.reset()
+    with without_engine(core):
+        core.step_by_call(torch.zeros(4, 12))  # constants are made once
+        with Watch() as watch:
+            core.step_by_call(torch.zeros(4, 12))
+    assert watch.unfit == []
+
+
+def test_a_step_whose_settings_change_holds_nothing_that_a_graph_cannot(make_task: Callable[..., TaskConfig]) -> None:
+    core = Go1Core(make_task("reward=paper_trot", "actuator=delay", "backend.threads=1"), 4, changing=CHANGING)
+    for path in CHANGING:
+        core.change(path, (0.0, 0.01) if path == "actuator.command" else 0.01)
     core.reset()
     with without_engine(core):
         core.step_by_call(torch.zeros(4, 12))  # constants are made once

@@ -21,6 +21,7 @@ from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import checkpoint, preflight, run_folder, trainer
 from go1exp.train.device import DevicePPO
 from go1exp.train.group import Group, joined
+from go1exp.train.schedule import Schedule
 
 SMALL = (
     *("ppo=paper", "ppo.num_envs=128", "ppo.steps=4", "ppo.hidden=[16,8]", "ppo.minibatches=2", "ppo.epochs=2"),
@@ -38,8 +39,12 @@ def settings(*overrides: str) -> tuple[TrainConfig, dict[str, Any]]:
 
 
 def alone(config: TrainConfig) -> DevicePPO:
-    core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True, critic=True)
-    return DevicePPO(config.ppo, Go1VecEnv(core), 0, "cpu")
+    changing = {ramp.path for ramp in config.schedule.values()}
+    core = Go1Core(config.task, config.ppo.num_envs, 0, spread_starts=True, critic=True, changing=changing)
+    ppo = DevicePPO(config.ppo, Go1VecEnv(core), 0, "cpu")
+    ppo.schedule = Schedule(config.schedule, core)
+    ppo.after_iteration = lambda ppo: ppo.schedule.advance(ppo.num_timesteps, {})
+    return ppo
 
 
 @pytest.fixture
@@ -58,8 +63,9 @@ def shared(tmp_path: Path) -> Callable[..., tuple[trainer.AdaptivePPO, Path]]:
 def test_two_members_train_as_one_learner_would_and_its_checkpoint_is_one_learners(
     shared: Callable[..., tuple[trainer.AdaptivePPO, Path]],
 ) -> None:
-    ppo, run = shared()
-    config, _ = settings()
+    ramp = "+schedule.x={set: reward.joint_velocity.weight, from: -0.015, to: -1.0, over: 512}"
+    ppo, run = shared(ramp)
+    config, _ = settings(ramp)
     one = alone(config)
     one.learn(2 * 128 * 4)
     for (name, mine), theirs in zip(ppo.policy.named_parameters(), one.policy.parameters(), strict=True):
@@ -70,7 +76,7 @@ def test_two_members_train_as_one_learner_would_and_its_checkpoint_is_one_learne
     assert_close(state["last_obs"], usual["last_obs"], rtol=1e-2, atol=1e-3)
     assert_close(state["env"]["core"]["steps"], usual["env"]["core"]["steps"])
     checkpoint.restore(alone(config), state)  # goes on with one GPU
-    ppo, _ = shared("ppo.iterations=3")  # and with two, from the checkpoint
+    ppo, _ = shared(ramp, "ppo.iterations=3")  # and with two, from the checkpoint
     assert ppo.iteration == 3
 
 

@@ -39,7 +39,7 @@ ORDER = {
         "cli",
         "__main__.py",
     ),
-    "sim": ("terrain.py", "physics", "actuator", "effects", "task.py", "env", "gym.py"),
+    "sim": ("terrain.py", "physics", "actuator", "effects", "schedule.py", "task.py", "env", "gym.py"),
     "gap": (
         *("actuator_net", "result.py", "files.py", "data", "replay", "robots", "score", "search", "comparison.py"),
         *("design", "certainty.py", "answer.py", "sentence.py", "report", "stages"),

@@ -131,19 +131,21 @@ def _group_page(
             else:
                 for name, v in _flat({path: value}).items():
                     lines += _beside(f"{name}={_plain(v)}", texts.get(name, ""))
-        lines += _slots(group)
-    return lines
+    return lines + _slots(group)
 
 
 def _slots(group: str) -> list[str]:
     """Explain the keys that every term of a group may have beside its own parameters."""
+    from go1exp.config.schema.schedule import Ramp
     from go1exp.config.schema.settings import attributes
     from go1exp.sim.task import MANY_TERMS
 
-    slots = MANY_TERMS.get(group)
-    texts = attributes(slots) if slots else {}
+    slots = MANY_TERMS.get(group, Ramp if group == "schedule" else None)
+    texts, item = (attributes(slots) if slots else {}), "NAME" if slots is Ramp else "TERM"
     return (
-        ["", *(line for name, text in texts.items() for line in _beside(f"{group}.TERM.{name}", text))] if texts else []
+        ["", *(line for name, text in texts.items() for line in _beside(f"{group}.{item}.{name}", text))]
+        if texts
+        else []
     )
 
 

@@ -248,7 +248,7 @@ def joint_deviation_(s: Snapshot, *, standing_scale: NonNegative = 5.0, speed_th
     return torch.where(is_moving(s, speed_threshold), distance, standing_scale * distance)
 
 
-@reward("joint_position_limit")
+@reward("joint_position_limit", fixed=("soft_factor",))
 def joint_position_limit(s: Snapshot, *, soft_factor: Fraction = 0.95) -> Tensor:
     """Joints at a limit: number of joints outside the range shrunk by ``soft_factor`` about its centre, 0 to 12.
 

@@ -48,7 +48,7 @@ class Trot(Memory):
     ) -> None:
         """Start without phases; ``scale`` without unit, ``full_cycle`` in s, ``speed_threshold`` in m/s."""
         self._dt, self._scale, self._speed_threshold = setup.dt, scale, speed_threshold
-        self._full_cycle = max(full_cycle, SHORTEST_CYCLE)
+        self._full_cycle = full_cycle
         self.since = setup.zeros(4)  # s since the touchdown that began the cycle
         self.cycle = setup.zeros(4)  # s, the last cycle's length
         self.swing = setup.zeros(4)  # s, longest time in the air since then

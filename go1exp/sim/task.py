@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -36,8 +36,10 @@ from go1exp.config.schema.registry import (
     explain,
     unknown_name,
 )
+from go1exp.config.schema.schedule import Ramp
 from go1exp.mdp import mirror
 from go1exp.robot.config import RobotConfig
+from go1exp.sim import schedule
 from go1exp.sim.effects.rules import drive_problems
 from go1exp.sim.terrain import TerrainConfig
 
@@ -152,6 +154,7 @@ class TrainConfig:
     eval: EvalDuring = BESIDE["eval"]
     video: VideoDuring = BESIDE["video"]
     stop: StopRule = BESIDE["stop"]
+    schedule: Mapping[str, Ramp] = field(default_factory=dict)
 
 
 class RewardSlots(BaseModel):
@@ -376,7 +379,7 @@ def parse_train(container: Mapping[str, Any]) -> TrainConfig:
     task_names = tuple(f.name for f in fields(TaskConfig))
     others = ("ppo", "logger", "checkpoint", *BESIDE)
     top = tuple(f.name for f in fields(ProcessConfig))
-    known = (*task_names, *others, *top)
+    known = (*task_names, *others, *top, "schedule")
     problems = [
         f"{unknown_name(key, key, known, 'key')} (given: {value!r})"
         for key, value in container.items()
@@ -384,11 +387,12 @@ def parse_train(container: Mapping[str, Any]) -> TrainConfig:
     ]
     parts, of_parts = parse_parts(container, (*task_names, *others))
     process, of_process = _section(ProcessConfig, {k: container[k] for k in top if k in container}, "")
-    problems += of_parts + of_process + _cross_rules(parts)
+    ramps, of_ramps = schedule.parse(container.get("schedule", {}), parts)
+    problems += of_parts + of_process + _cross_rules(parts) + of_ramps
     stop, during = parts.get("stop"), parts.get("eval")
     if stop and during and (stop.figure or "").startswith(EVALUATED) and not during.every:
         problems.append(f"stop.figure = {stop.figure!r}: is of the evaluations beside a training; set eval.every")
     if problems:
         raise ConfigError(problems)
     task = TaskConfig(**{name: parts[name] for name in task_names})
-    return TrainConfig(task=task, **{name: parts[name] for name in others}, process=process)
+    return TrainConfig(task=task, **{name: parts[name] for name in others}, process=process, schedule=ramps)

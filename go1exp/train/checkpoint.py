@@ -126,6 +126,7 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     ppo.policy.optimizer.load_state_dict(state["optimizer"])
     ppo.iteration = state["iteration"]
     ppo.num_timesteps = state["num_timesteps"]
+    ppo.schedule.load_state_dict(state.get("schedule", {}), ppo.num_timesteps)
     ppo._n_updates = state["n_updates"]
     # SB3 makes these two when learning starts, unless the first is there already.
     ppo.ep_info_buffer = deque(state["episodes"], maxlen=ppo._stats_window_size)
@@ -155,6 +156,7 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
     assert isinstance(ppo._last_obs, np.ndarray)
     core, starts = _core(ppo), np.asarray(ppo._last_episode_starts)
     local = (core.state_dict(), torch.from_numpy(ppo._last_obs.copy()), torch.from_numpy(starts.copy()))
+    schedule = ppo.schedule.state_dict()
     return {
         "format": FORMAT,
         "iteration": ppo.iteration,
@@ -164,6 +166,7 @@ def _state(ppo: AdaptivePPO) -> dict[str, Any]:
         "policy": ppo.policy.state_dict(),
         "optimizer": ppo.optimizer_state(),
         **ppo.group.whole(dict(zip(ROBOTS, local, strict=True)), core.num_envs),
+        **({"schedule": schedule} if schedule else {}),
         "rng": {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,

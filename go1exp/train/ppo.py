@@ -31,6 +31,7 @@ from go1exp.sim.task import PPOConfig
 from go1exp.train import symmetry
 from go1exp.train.group import Group
 from go1exp.train.loss import ppo_loss, write_advantages
+from go1exp.train.schedule import Schedule
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 KL_FACTOR = 2.0
@@ -196,6 +197,7 @@ class AdaptivePPO(PPO):
 
     Attributes:
         group: the GPUs that train together.
+        schedule: the settings of the task that change between two iterations.
         mirror: of its samples, with ``ppo.symmetry``; else None.
     """
 
@@ -203,6 +205,7 @@ class AdaptivePPO(PPO):
     rollout_buffer: MeanRolloutBuffer
     policy: GaussianPolicy
     group = Group()
+    schedule = Schedule()
 
     def __init__(self, config: PPOConfig, env: VecEnv, seed: int, device: str) -> None:
         self.config = config
@@ -334,4 +337,4 @@ class AdaptivePPO(PPO):
         return {**state, "param_groups": groups}
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "after_iteration", "_kl", "_old_log_std"]
+        return [*super()._excluded_save_params(), "after_iteration", "schedule", "_kl", "_old_log_std"]

@@ -12,6 +12,7 @@ from go1exp.sim.effects.rules import drives
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TrainConfig
 from go1exp.train import memory_need, metrics
+from go1exp.train.schedule import check_measures
 
 LEAST_ROBOTS = 64
 """On each of several GPUs: a tensor is taken for the robots' by its length, which no other has (``train/group.py``)."""
@@ -21,13 +22,14 @@ def check(config: TrainConfig) -> None:
     """Refuse a training that this machine cannot run. Makes no file.
 
     Raises:
-        ConfigError: if a device, a package or an account is not there, if it does not fit into memory, or if an
-            actuator net does not fit the robot or the physics step.
+        ConfigError: if a device, a package or an account is not there, if it does not fit into memory, if a schedule
+            waits for an unknown metric, or if an actuator net does not fit the robot or the physics step.
         go1exp.base.errors.Expected: if a net's file is damaged.
         FileNotFoundError: if it is not there.
     """
     check_devices(config)
     check_shares(config)
+    check_measures(config)
     memory_need.check(config, engine_device(config))
     metrics.check_account(config.logger)
     if any("file" in term.parameters for term, _ in drives(config.task.actuator)):

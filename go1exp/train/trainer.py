@@ -29,6 +29,7 @@ from go1exp.train.early_stop import EarlyStop
 from go1exp.train.group import Group
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
+from go1exp.train.schedule import Schedule
 
 LAST_PRESS = 3
 """The Ctrl-C that ends training without a checkpoint of the iteration under way."""
@@ -62,11 +63,15 @@ def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
     group, seed = group or Group(), config.process.seed
     local = group.rows(config.ppo.num_envs)
     share: dict[str, Any] = {"num_envs": local.stop - local.start, "first_env": local.start}
+    share["changing"] = {ramp.path for ramp in config.schedule.values()}
     core = Go1Core(config.task, seed=seed, **share, spread_starts=config.task.sim.spread_starts, critic=True)
     device = str(core.device) if config.process.device == "auto" else config.process.device
     if core.device.type == torch.device(device).type == "cuda" or group.size > 1:
-        return DevicePPO(config.ppo, Go1VecEnv(core), seed, device, group)
-    return AdaptivePPO(config.ppo, Go1VecEnv(core), seed, device)
+        ppo: AdaptivePPO = DevicePPO(config.ppo, Go1VecEnv(core), seed, device, group)
+    else:
+        ppo = AdaptivePPO(config.ppo, Go1VecEnv(core), seed, device)
+    ppo.schedule = Schedule(config.schedule, core)
+    return ppo
 
 
 def train(config: TrainConfig, container: dict[str, Any], run: Path, first: start.Weights | None = None) -> AdaptivePPO:
@@ -189,12 +194,16 @@ class _Closing:
         self._clock = now
         for key, value in ppo.group.metrics(env.core.drain_metrics(steps)).items():
             self.logger.record(key, value)
+        for key, value in ppo.schedule.metrics().items():
+            self.logger.record(key, value)
         for key, value in (self.beside.collect() if self.beside else {}).items():
             self.logger.record(key, value)
         logged = dict(self.logger.name_to_value)
         if self.progress:
             self.progress.update(ppo.iteration, logged)
         self.logger.dump(step=ppo.num_timesteps)
+        measures = {name: logged[name] for name in ppo.schedule.measures if name in logged}
+        ppo.schedule.advance(ppo.num_timesteps, ppo.group.agreed(measures) if ppo.schedule.measures else {})
         last = ppo.iteration >= self.config.ppo.iterations
         reason = ppo.group.agreed(self.stop.reason(ppo.iteration, logged) if self.stop and not last else "")
         stopping = ppo.group.agreed(self.asked_to_stop())

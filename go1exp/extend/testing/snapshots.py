@@ -127,8 +127,28 @@ class _Made:
 
 
 def check_reward(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:
-    """One finite float32 number per robot."""
-    _check(entry, checked(entry, parameters), exact, (), torch.float32)
+    """One finite float32 number per robot; a number among the parameters may be a tensor () that changes in place."""
+    values = checked(entry, parameters)
+    _check(entry, values, exact, (), torch.float32)
+    for name, value in values.items():
+        if isinstance(value, float) and name not in entry.traits.get("fixed", ()):
+            _check_changing(entry, values, name)
+
+
+def _check_changing(entry: Entry, values: dict[str, Any], name: str) -> None:
+    """Check that a parameter written in place acts as if it had been configured (``conf/schedule``)."""
+    trials = (values[name] + d for d in (0.1, -0.1, 0.01, 1.0))
+    other = next((v for v in trials if not entry.check({**values, name: v}, "")[1]), None)
+    if other is None:
+        return
+    live = torch.tensor(values[name])
+    changing = _Made(entry, {**values, name: live}, ODD)
+    live.fill_(other)
+    configured = _Made(entry, {**values, name: other}, ODD)
+    promise = f'{name} must act when it is a tensor that changes; if it cannot, say @reward(name, fixed=("{name}",))'
+    for seed in range(4):
+        s = random_snapshot(ODD, seed)
+        expect(entry, torch.allclose(changing(s), configured(s), rtol=1e-4, atol=1e-5), promise)
 
 
 def check_observation(entry: Entry, parameters: dict[str, Any], exact: bool) -> None:

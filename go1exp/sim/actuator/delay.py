@@ -38,7 +38,8 @@ class Delay:
         """Wrap ``drive``; ``command`` is the range that delays are drawn from, s."""
         self.drive: Actuator = build(setup, drive)
         self.delay = setup.zeros()[:, :1] + command[0]
-        self._range, self._random = command, setup.random
+        self._range: tuple[float, float] | Tensor = command
+        self._random = setup.random
         joints = len(setup.joints)
         self._line = DelayLine(setup.num_envs, joints, command[1], setup.physics_dt, setup.dtype, setup.device)
         self._fed: DelayLine | None = None  # feedforward on its way; only where there is any
@@ -52,6 +53,16 @@ class Delay:
     def kd(self) -> Tensor:
         """Speed gain (N, J) of the drive inside, live, N m s/rad; AttributeError if it has none."""
         return self.drive.kd  # type: ignore[attr-defined]
+
+    def set_range(self, shortest: float, longest: float) -> None:
+        """Draw delays from another range, s, within that of ``command``; from each robot's next episode on.
+
+        In place from the second call on: the first one comes before a step is captured.
+        """
+        if isinstance(self._range, tuple):
+            self._range = torch.zeros(2, dtype=self.delay.dtype, device=self.delay.device)
+        for bound, value in zip(self._range, (shortest, longest), strict=True):
+            bound.fill_(value)
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
         """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is late as well."""

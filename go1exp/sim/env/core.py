@@ -7,7 +7,7 @@ makes environment i of a batch compute exactly what it would compute alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from math import inf
 from typing import Any
@@ -18,12 +18,14 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.base.tensors.rotation import projected_gravity, rotate_inverse
+from go1exp.config.schema.schedule import Value
 from go1exp.mdp.actions import clipped, joint_target, of_shape
 from go1exp.mdp.clearance import lift
 from go1exp.mdp.commands import UniformVelocity
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight, HeightScan
 from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.randomizations import FEET
 from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.sim.effects.rules import on_mount
 from go1exp.sim.env.engine import CapturedStep, make_backend
@@ -34,6 +36,7 @@ from go1exp.sim.env.restarts import Restarts
 from go1exp.sim.env.task_log import TaskLog
 from go1exp.sim.env.terms import StepTerms
 from go1exp.sim.physics.scene import build_model
+from go1exp.sim.schedule import CONTACT_TIME, DELAY, FEET_CONTACT_FIELD
 from go1exp.sim.task import TaskConfig
 from go1exp.sim.terrain import build_terrain
 
@@ -58,6 +61,7 @@ class Go1Core:
         held: attitude w-x-y-z in which the trunks are held in the air; None lets them go.
         alike: draw the effects and drives once, for all robots: one robot, many times (for a logger).
         critic: append what only the critic sees to the observations (training only).
+        changing: keys of the settings that ``change`` may write (training only).
     """
 
     driver: Callable[[], None] | None = None
@@ -76,6 +80,7 @@ class Go1Core:
         held: tuple[float, float, float, float] | None = None,
         alike: bool = False,
         critic: bool = False,
+        changing: Collection[str] = (),
     ) -> None:
         self.task, self.num_envs, self.noise, self._spread_starts = task, num_envs, noise, spread_starts
         self.terrain, time = build_terrain(task.terrain), task.sim
@@ -87,12 +92,10 @@ class Go1Core:
         self._held, self._state = held, KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
         drives = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
-        self._build_terms(drives, critic)
+        self.terms = StepTerms(task, num_envs, self.device, critic, changing)
+        self._build_terms(drives)
         self._restarts = Restarts(self._restart, (self.random, drives))
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
-
+        zeros = partial(torch.zeros, num_envs, dtype=torch.float32, device=self.device)
         self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self._last_action, self.target = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self.joint_acc, self.spawn = zeros(robot.NUM_JOINTS), zeros(3)
@@ -102,15 +105,12 @@ class Go1Core:
         self.feet = Feet(num_envs, task.sim.physics_dt, self.device)
         self.gait_log = GaitLog(num_envs, time.policy_dt, self.device)
         self.task_log = TaskLog(time.policy_dt, self.device)
-        contacts = (self._link_contacts, self._foot_contact[..., 0])
-        self._touched, self._calf_touched = map(torch.zeros_like, contacts)
+        self._touched, self._calf_touched = map(torch.zeros_like, (self._link_contacts, self._foot_contact[..., 0]))
         self._nominal = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float32, device=self.device)
         self._started = False
         self._deferred = self.device.type == "cuda"  # where to look at a value is to wait for it
         self._evidence, self.captures = Evidence(), task.backend.captures
         self._captured: CapturedStep | None = None
-
-    # ------------------------------------------------------------------ construction
 
     def _build_ground(self, first_env: int) -> None:
         """Prepare height lookup, tiles and the place of each environment on them."""
@@ -124,11 +124,11 @@ class Go1Core:
         self._grade = to_device(t.difficulty_per_level)[self.tile_column]
         extent = to_device(t.extent if self._bounded else (-inf, inf, -inf, inf))
         self._map = extent[[0, 2]] + MAP_MARGIN, extent[[1, 3]] - MAP_MARGIN
-        rules = [t() for t in self.task.curriculum]
-        start = getattr(rules[0], "start_level_max", self._max_level) if rules else self._max_level
-        self._start_levels = min(start, self._max_level) + 1
+        self._curriculum = [t() for t in self.task.curriculum]
+        start = min([self._max_level, *(getattr(rule, "start_level_max", inf) for rule in self._curriculum[:1])])
+        self._start_levels = int(start) + 1
 
-    def _build_terms(self, drives: EnvRandom, critic: bool) -> None:
+    def _build_terms(self, drives: EnvRandom) -> None:
         """Turn the configured terms into callables, and make per-environment the model fields that will vary."""
         task = self.task
         setup = drive_setup(task.robot, task.sim.physics_dt, self.backend, drives)
@@ -137,24 +137,31 @@ class Go1Core:
         if isinstance(self.command, UniformVelocity):
             self.command.ground = self.level, self._grade
         self.events = {t.key: t(self.random.stream(f"event.{t.key}")) for t in task.event}
-        self._curriculum = [t() for t in task.curriculum]
-        self.terms = StepTerms(task, self.num_envs, self.device, critic)
         self.observation_size = self.terms.observation_size
-        scan = HeightScan(self._ground if self._bounded else None, self.device)
-        self._scan = scan if "height_scan" in self.terms.read else None
+        ground = self._ground if self._bounded else None
+        self._scan = HeightScan(ground, self.device) if "height_scan" in self.terms.read else None
         self._model_terms = [t for t in task.rand if t.entry.traits["kind"] == "model"]
         self._state_terms = [t for t in task.rand if t.entry.traits["kind"] == "state"]
         for term in self._model_terms:
             for name in term.entry.traits["fields"]:
                 self.backend.field(name)
-        blocks = self.backend.sensors
-        readings = self.backend.sensordata
+        blocks, readings = self.backend.sensors, self.backend.sensordata
         self._foot_contact = readings[:, blocks.foot_contact].unflatten(1, (robot.NUM_LEGS, 4))
         self._link_contacts = readings[:, blocks.link_contacts]
         self._foot_pos_w = readings[:, blocks.foot_pos_w].unflatten(1, (robot.NUM_LEGS, 3))
         self._foot_vel_w = readings[:, blocks.foot_vel_w].unflatten(1, (robot.NUM_LEGS, 3))
 
-    # ------------------------------------------------------------------ reset
+    def change(self, path: str, value: Value) -> None:
+        """Change a setting of a running environment (``sim/schedule.py``), in place: a captured step sees it too.
+
+        A delay counts from each robot's next episode on, everything else from the next step on.
+        """
+        if path == DELAY:
+            self.plant.actuator.set_range(*value)  # type: ignore[attr-defined, misc]  # checked with the schedule
+        elif path == CONTACT_TIME:
+            self.backend.field(FEET_CONTACT_FIELD)[:, self.backend.ids("geom", FEET), 0] = value  # type: ignore[assignment]
+        else:
+            self.terms.change(path, value)  # type: ignore[arg-type]
 
     def reset(self) -> Tensor:
         """Start all episodes anew and return the first observations (N, O)."""
@@ -209,8 +216,6 @@ class Go1Core:
         for tensor in (self.steps, self._first_step, self.episode_return):
             tensor.masked_fill_(mask, 0)
 
-    # ------------------------------------------------------------------ step
-
     def step(self, action: Tensor) -> StepResult:
         """Apply actions (N, 12) for one policy period.
 
@@ -261,11 +266,11 @@ class Go1Core:
         self._calf_touched.zero_()
         for _ in range(self.task.sim.decimation):
             self.plant.step(target) if self.driver is None else self.driver()
-            feet = self._foot_contact[..., 0]
             self.feet.update(self._foot_contact[..., 1:], self._foot_vel_w)
             # Counts, largest over the substeps; a calf's contacts without those of its foot.
             torch.maximum(self._touched, self._link_contacts, out=self._touched)
-            torch.maximum(self._calf_touched, self._link_contacts[:, CALVES] - feet, out=self._calf_touched)
+            calves = self._link_contacts[:, CALVES] - self._foot_contact[..., 0]
+            torch.maximum(self._calf_touched, calves, out=self._calf_touched)
         self.joint_acc.copy_(self.plant.joint_acceleration())
 
     def _advance_world(self, restart: Tensor) -> None:
@@ -284,15 +289,12 @@ class Go1Core:
         """Apply the curriculum to the episodes that ended."""
         for rule in self._curriculum:
             travelled = (self._state.base_pos_w[:, :2] - self.spawn[:, :2]).norm(dim=-1).float()
-            # A first episode may have begun part-way through its time.
-            time = (self.task.sim.episode_steps - self._first_step) * self.task.sim.policy_dt
-            commanded = self.command.value[:, :2].norm(dim=-1) * time
+            steps = self.task.sim.episode_steps - self._first_step  # a first episode may begin part-way
+            commanded = self.command.value[:, :2].norm(dim=-1) * (steps * self.task.sim.policy_dt)
             anywhere = self.random.stream("relevel").integers(self._max_level + 1, 1).squeeze(1)
-            tile = self.task.terrain.tile_size
-            after = rule(self.level, travelled, commanded, tile, self._max_level, anywhere)
+            size = self.task.terrain.tile_size
+            after = rule(self.level, travelled, commanded, size, self._max_level, anywhere)
             self.level.copy_(torch.where(ended, after, self.level))
-
-    # ------------------------------------------------------------------ what the MDP sees
 
     def ground_height(self, xy: Tensor) -> Tensor | float:
         """Height of the ground at world positions (..., 2), (...), m; of flat ground the number 0."""
@@ -338,8 +340,6 @@ class Go1Core:
             self.random.stream("noise").uniform(frames, low=-1.0) if self.noise else None
         )
 
-    # ------------------------------------------------------------------ what a step was made of
-
     def reward_terms(self) -> dict[str, Tensor]:
         """Return what each reward term added to the last step's reward, (N,) each; they sum up to it."""
         return self.terms.reward_terms()
@@ -347,8 +347,6 @@ class Go1Core:
     def episode_end(self, result: StepResult, env: int) -> str | None:
         """Return the termination that ended an episode, ``left the map``, ``time limit``, or None if it goes on."""
         return self.terms.end(env, bool(result.terminated[env]), bool(result.truncated[env]))
-
-    # ------------------------------------------------------------------ faults, metrics, state
 
     def check(self, result: StepResult) -> None:
         """Raise NumericalFault if anything in the step is not finite. Waits for the device."""
@@ -381,8 +379,8 @@ class Go1Core:
 
     def _parts(self) -> dict[str, Any]:
         """Everything with a state of its own."""
-        events = {f"event.{name}": part for name, part in self.events.items()}
         names = ("backend", "random", "plant", "command", "feet", "gait_log", "task_log")
+        events = {f"event.{name}": part for name, part in self.events.items()}
         return {**{name: getattr(self, name) for name in names}, **events, **self.terms.parts()}
 
     def state_dict(self) -> dict[str, Any]:

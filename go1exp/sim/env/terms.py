@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.mdp.foot_impacts import impossible
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.sim.env.frames import Frames
+from go1exp.sim.schedule import WEIGHT
 from go1exp.sim.task import TaskConfig
 
 Call = Callable[[Snapshot], Tensor]
@@ -29,7 +31,7 @@ class StepTerms:
     an observation's ``advance`` once a step before it is read, and ``reset(mask)`` where an episode begins.
 
     Attributes:
-        rewards: terms with a weight that is not zero.
+        rewards: terms with a weight that is not zero, or that may change.
         values: (N, R) of the rewards in the last step, without their weights.
         weights: (R,) times the policy's period.
         sums: (R,) float64, of weighted rewards since ``core.drain_metrics``.
@@ -44,9 +46,20 @@ class StepTerms:
         read: fields of the Snapshot that are computed only because an observation reads them.
     """
 
-    def __init__(self, task: TaskConfig, num_envs: int, device: torch.device, critic: bool = False) -> None:
-        """Build the terms of ``task``; with ``critic`` those that only the value function sees, too."""
+    def __init__(
+        self,
+        task: TaskConfig,
+        num_envs: int,
+        device: torch.device,
+        critic: bool = False,
+        changing: Collection[str] = (),
+    ) -> None:
+        """Build the terms of ``task``; with ``critic`` those that only the value function sees, too.
+
+        ``changing`` has the keys of the settings that ``change`` may write, such as ``reward.gait.weight``.
+        """
         setup = TermSetup(num_envs, device, task.sim.policy_dt)
+        self._dt, self._changing = task.sim.policy_dt, {path: torch.zeros((), device=device) for path in changing}
         self._remembering: dict[str, Any] = {}
 
         def calls(group: str, terms: Sequence[Term]) -> list[Call]:
@@ -56,9 +69,10 @@ class StepTerms:
             self._remembering |= {f"{group}.{t.key}": call for t, call in named if t.entry.remembers}
             return made
 
-        self.rewards = [t for t in task.reward if t.slots["weight"] != 0.0]
+        kept = (t for t in task.reward if t.slots[WEIGHT] != 0.0 or f"reward.{t.key}.{WEIGHT}" in changing)
+        self.rewards = [self._with_changing(t) for t in kept]
         self._reward_calls = calls("reward", self.rewards)
-        weights = [t.slots["weight"] * task.sim.policy_dt for t in self.rewards]
+        weights = [t.slots[WEIGHT] * task.sim.policy_dt for t in self.rewards]
         self.weights = torch.tensor(weights, dtype=torch.float32, device=device)
         self.values = setup.zeros(len(self.rewards))
         self.sums = torch.zeros(len(self.rewards), dtype=torch.float64, device=device)
@@ -79,6 +93,20 @@ class StepTerms:
         widths = [width(t) for t in self.observed]
         self.observation_size, self.policy_size = sum(widths), sum(widths[: len(task.observation)])
         self.frames = Frames(self.observed, setup)
+
+    def _with_changing(self, term: Term) -> Term:
+        """Return a reward whose parameters that may change are tensors (), in the place of numbers."""
+        live = {name: self._changing.get(f"reward.{term.key}.{name}") for name in term.parameters}
+        tensors = {name: tensor.fill_(term.parameters[name]) for name, tensor in live.items() if tensor is not None}
+        return replace(term, parameters={**term.parameters, **tensors}) if tensors else term
+
+    def change(self, path: str, value: float) -> None:
+        """Change ``reward.KEY.weight`` or a parameter ``reward.KEY.NAME``, in place, from the next step on."""
+        key, _, name = path.removeprefix("reward.").rpartition(".")
+        if name == WEIGHT:
+            self.weights[[t.key for t in self.rewards].index(key)].fill_(value * self._dt)
+        else:
+            self._changing[path].fill_(value)
 
     def terminated(self, s: Snapshot) -> Tensor:
         """(N,) bool, any termination is true."""

@@ -1,0 +1,130 @@
+"""The group ``schedule``: which settings of a task may change while a policy is trained, and within what bounds.
+
+A name of the group is one ramp (``config/schema/schedule.py``)::
+
+    soft_landings: {set: reward.touchdown_speed.weight, from: 0.0, to: -20.0, start: 70e6, over: 30e6}
+    smooth: {set: reward.action_smoothness.weight, from: -0.5, to: -1.5, start: 70e6, over: 30e6}
+    delay: {set: actuator.command, from: [0.0, 0.0], to: [0.0, 0.03], start: 40e6, over: 20e6}
+    stiff: {set: contact.time_constant, from: 0.02, to: 0.005, when: {measure: gait/trot_error, below: 0.1}, over: 20e6}
+
+``start`` and ``over`` count steps of all robots together since the run began. The values in the groups ``reward``,
+``actuator`` and ``contact`` are those of a run without the schedule, and those with which the policy is evaluated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.registry import Term, as_json, explain, unknown_name
+from go1exp.config.schema.schedule import Ramp, Value
+
+DELAY = "actuator.command"
+CONTACT_TIME = "contact.time_constant"
+WEIGHT = "weight"
+FEET_CONTACT_FIELD = "geom_solref"
+"""Model field that holds the time constant of the feet's contacts."""
+
+KEYS = ("set", "from", "to", "start", "over", "when")
+
+
+def parse(settings: Any, parts: Mapping[str, Any]) -> tuple[dict[str, Ramp], list[str]]:
+    """Validate the group ``schedule`` against the other parts of a configuration; return its ramps and the problems."""
+    if not isinstance(settings, Mapping):
+        return {}, [f"schedule = {settings!r}: must be a mapping of ramps"]
+    ramps: dict[str, Ramp] = {}
+    problems: list[str] = []
+    for key, given in settings.items():
+        try:
+            ramps[str(key)] = TypeAdapter(Ramp).validate_json(as_json(given))
+        except ValidationError as error:
+            problems += explain(error, f"schedule.{key}", KEYS)
+    setters: dict[str, str] = {}
+    for key, ramp in ramps.items():
+        if ramp.path in setters:
+            problems.append(f"schedule.{key}.set = {ramp.path!r}: is set by schedule.{setters[ramp.path]} too")
+        setters[ramp.path] = key
+        problems += _target_problems(f"schedule.{key}", ramp, parts)
+    return ramps, problems
+
+
+def changeable(parts: Mapping[str, Any]) -> list[str]:
+    """Return the keys of all settings that a schedule may change: reward weights and numbers, delay, contact."""
+    paths = [f"reward.{t.key}.{name}" for t in parts.get("reward") or () for name in (WEIGHT, *_numbers(t))]
+    return [*paths, *([DELAY] if _is_delay(parts) else []), CONTACT_TIME]
+
+
+def _numbers(term: Term) -> list[str]:
+    """Return the parameters of a reward that are one number each and act when they change."""
+    fixed = term.entry.traits.get("fixed", ())
+    values = term.parameters.items()
+    return [k for k, v in values if isinstance(v, int | float) and not isinstance(v, bool) and k not in fixed]
+
+
+def _is_delay(parts: Mapping[str, Any]) -> bool:
+    actuator = parts.get("actuator")
+    return actuator is not None and actuator.entry.name == "delay"
+
+
+def _target_problems(path: str, ramp: Ramp, parts: Mapping[str, Any]) -> list[str]:
+    """Return what is wrong with the setting that a ramp names and with its two values."""
+    known = changeable(parts)
+    if ramp.path not in known:
+        if ramp.path == DELAY and parts.get("actuator"):
+            return [f"{path}.set = {DELAY!r}: needs actuator=delay"]
+        return [unknown_name(f"{path}.set", ramp.path, known, "setting")]
+    problems = []
+    for end, value in (("from", ramp.first), ("to", ramp.last)):
+        of_value = _value_problems(f"{path}.{end}", ramp.path, value, parts)
+        problems += of_value[:1]
+    if ramp.path == CONTACT_TIME:
+        problems += _contact_problems(path, parts)
+    return problems
+
+
+def _value_problems(path: str, target: str, value: Value, parts: Mapping[str, Any]) -> list[str]:
+    """Return what is wrong with one value of a setting, each beginning with ``path``."""
+    if target == CONTACT_TIME:
+        adapter = TypeAdapter(ContactConfig)
+        return _problems_of(adapter, {"time_constant": value, "cone": "pyramidal", "impratio": 1.0}, path)
+    if target == DELAY:
+        term = parts["actuator"]
+        of_delay = _renamed(term.entry.check({**term.parameters, "command": value}, "")[1], "command", path)
+        longest = term.parameters["command"][1]
+        if not of_delay and isinstance(value, tuple) and value[1] > longest:
+            of_delay = [f"{path} = {list(value)!r}: exceeds {DELAY} = {list(term.parameters['command'])}, the longest"]
+        return of_delay
+    key, _, name = target.removeprefix("reward.").rpartition(".")
+    term = next(t for t in parts["reward"] if t.key == key)
+    if name == WEIGHT:
+        return [] if isinstance(value, float) else [f"{path} = {list(value)!r}: must be one number"]
+    return _renamed(term.entry.check({**term.parameters, name: value}, "")[1], name, path)
+
+
+def _problems_of(adapter: TypeAdapter[Any], settings: Mapping[str, Any], path: str) -> list[str]:
+    try:
+        adapter.validate_json(as_json(settings))
+    except ValidationError as error:
+        return _renamed(explain(error, "", settings), "time_constant", path)
+    return []
+
+
+def _renamed(problems: list[str], name: str, path: str) -> list[str]:
+    """Put the key path of a ramp in the place of the parameter's name at the beginning of each message."""
+    return [f"{path}{problem.removeprefix(name)}" for problem in problems]
+
+
+def _contact_problems(path: str, parts: Mapping[str, Any]) -> list[str]:
+    """Refuse a ramp of the contact beside terms that set the contact of each robot."""
+    others = [f"rand.{t.key}" for t in parts.get("rand") or () if _sets_contact(t.entry.traits.get("fields"))]
+    others += [f"effect.{t.key}" for t in parts.get("effect") or () if _sets_contact(t.entry.target.fields)]
+    return [
+        f"{path}.set = {CONTACT_TIME!r}: {other} sets the contact of each robot; use one of the two" for other in others
+    ]
+
+
+def _sets_contact(fields: Any) -> bool:
+    return FEET_CONTACT_FIELD in (fields or ())

@@ -1,0 +1,129 @@
+"""A schedule at work: the settings of a task that change between two iterations (``sim/schedule.py``)."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from go1exp.config.schema.backends import WarpBackend
+from go1exp.config.schema.beside import EVALUATED
+from go1exp.config.schema.registry import ConfigError, unknown_name
+from go1exp.config.schema.schedule import Ramp, Value
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.gait_log import GaitLog
+from go1exp.sim.env.task_log import TaskLog
+from go1exp.sim.schedule import WEIGHT
+from go1exp.sim.task import TrainConfig
+
+PREFIX = "schedule/"
+"""Begin of the metrics that hold the values in force."""
+
+LEARNER = (
+    *("loss", "policy_gradient_loss", "value_loss", "entropy_loss", "clip_fraction", "approx_kl", "kl"),
+    *("explained_variance", "std", "learning_rate"),
+)
+"""Metrics ``train/`` that every learner logs."""
+
+
+class Schedule:
+    """The ramps of a training.
+
+    A value is a function of the steps since the run began, or since the iteration at whose end a metric reached its
+    threshold. Together with those steps, the recent values of the metrics are the state that a checkpoint holds.
+    """
+
+    def __init__(self, ramps: Mapping[str, Ramp] | None = None, core: Go1Core | None = None) -> None:
+        """Put the first values into force in ``core``, which was built with ``changing`` of the same settings."""
+        self._ramps, self._core = dict(ramps or {}), core
+        self._triggers = {key: ramp.when for key, ramp in self._ramps.items() if ramp.when}
+        self._recent = {key: deque[float](maxlen=trigger.iterations) for key, trigger in self._triggers.items()}
+        self._started: dict[str, int | None] = dict.fromkeys(self._triggers)
+        self._values: dict[str, Value] = {}
+        self._apply(0)
+
+    @property
+    def measures(self) -> set[str]:
+        """Metrics that start a ramp."""
+        return {trigger.measure for trigger in self._triggers.values()}
+
+    def advance(self, steps: int, metrics: Mapping[str, float]) -> None:
+        """Put the values of the next iteration into force.
+
+        Args:
+            steps: of all robots together so far.
+            metrics: of the iteration that ended; those of ``measures`` at least, the same in each process of a group.
+
+        Raises:
+            ConfigError: if a metric is missing.
+        """
+        for key, trigger in self._triggers.items():
+            if trigger.measure not in metrics:
+                raise ConfigError([unknown_name(f"schedule.{key}.when.measure", trigger.measure, metrics, "metric")])
+            value, recent = float(metrics[trigger.measure]), self._recent[key]
+            if self._started[key] is not None or math.isnan(value):  # NaN: nothing was measured in this iteration
+                continue
+            recent.append(value)
+            if len(recent) == trigger.iterations and trigger.satisfied_by(sum(recent) / len(recent)):
+                self._started[key] = steps
+        self._apply(steps)
+
+    def _apply(self, steps: int) -> None:
+        """Write the values at ``steps`` into the environment, those that differ from the present ones."""
+        for key, ramp in self._ramps.items():
+            start = self._started[key] if key in self._triggers else ramp.start or 0.0
+            value = ramp.value(-math.inf if start is None else steps - start)
+            if self._core is not None and self._values.get(key) != value:
+                self._core.change(ramp.path, value)
+            self._values[key] = value
+
+    def metrics(self) -> dict[str, float]:
+        """Return the values in force; of a range its two ends."""
+        named: dict[str, float] = {}
+        for key, value in self._values.items():
+            if isinstance(value, tuple):
+                named |= {f"{PREFIX}{key}_low": value[0], f"{PREFIX}{key}_high": value[1]}
+            else:
+                named[f"{PREFIX}{key}"] = value
+        return named
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the steps do not tell, as plain data; empty without a trigger."""
+        return {k: {"recent": list(self._recent[k]), "started": self._started[k]} for k in self._triggers}
+
+    def load_state_dict(self, state: Mapping[str, Any], steps: int) -> None:
+        """Continue from ``state_dict`` after ``steps`` of all robots together."""
+        for key, of_key in state.items():
+            self._recent[key] = deque(of_key["recent"], maxlen=self._triggers[key].iterations)
+            self._started[key] = of_key["started"]
+        self._apply(steps)
+
+
+def check_measures(config: TrainConfig) -> None:
+    """Refuse a ramp that waits for a metric which the training does not log.
+
+    Raises:
+        ConfigError: naming it and the nearest ones.
+    """
+    paths = {ramp.path for ramp in config.schedule.values()}
+    rewarded = [t for t in config.task.reward if t.slots[WEIGHT] or f"reward.{t.key}.{WEIGHT}" in paths]
+    cpu = torch.device("cpu")
+    known = [f"reward/{t.key}" for t in rewarded]
+    known += [*GaitLog(1, 1.0, cpu).drain(), *TaskLog(1.0, cpu).drain(), "rollout/return", "rollout/length"]
+    known += [f"train/{name}" for name in LEARNER]
+    known += ["curriculum/terrain_level"] if config.task.terrain.kind != "flat" else []
+    known += ["physics/overflow"] if isinstance(config.task.backend, WarpBackend) else []
+    wanted = {key: ramp.when.measure for key, ramp in config.schedule.items() if ramp.when}
+    strange = {f"schedule.{key}.when.measure": name for key, name in wanted.items() if name not in known}
+    if strange:
+        raise ConfigError(
+            [
+                f"{path} = {name!r}: an evaluation takes its time, so that no two trainings would be the same"
+                if name.startswith(EVALUATED)
+                else unknown_name(path, name, known, "metric")
+                for path, name in strange.items()
+            ]
+        )
