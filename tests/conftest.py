@@ -25,7 +25,7 @@ import torch
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.actuator_net import ActuatorNet, NetInfo, Provenance, group_names
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig, parse_task
@@ -104,10 +104,10 @@ def make_core(make_task: Callable[..., TaskConfig]) -> Callable[..., Go1Core]:
 
 
 @pytest.fixture
-def drives() -> Callable[..., DriveSetup]:
+def drives() -> Callable[..., ActuatorSetup]:
     """Describe the drives of n Go1 robots at 2 ms; keyword arguments change that."""
 
-    def make(n: int, **changes: Any) -> DriveSetup:
+    def make(n: int, **changes: Any) -> ActuatorSetup:
         def spread(values: tuple[float, float, float]) -> torch.Tensor:
             return torch.as_tensor(robot.per_joint(values))
 
@@ -122,7 +122,7 @@ def drives() -> Callable[..., DriveSetup]:
             "device": torch.device("cpu"),
             "dtype": torch.float64,
         }
-        return DriveSetup(**{**usual, **changes})
+        return ActuatorSetup(**{**usual, **changes})
 
     return make
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.schema.registry import ConfigError, Term, members
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.actuator_net import ActuatorNet, NetFileError, load
 from go1exp.sim.actuator.delay import Delay
 from go1exp.sim.actuator.grouped_mlp import FEWEST, LANES, GroupedMLP, padded_rows
@@ -25,11 +25,11 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 from tests.rounding import alone_and_in_a_batch
 
-Drives = Callable[..., DriveSetup]
+Drives = Callable[..., ActuatorSetup]
 EFFORT = np.array([23.7, 23.7, 35.55] * 4)
 
 
-def motor(setup: DriveSetup, **parameters: Any) -> Any:
+def motor(setup: ActuatorSetup, **parameters: Any) -> Any:
     return members("actuator")["dc_motor"].target(setup, **parameters)
 
 
@@ -125,7 +125,7 @@ def test_a_motor_without_numbers_has_the_robots(drives: Drives) -> None:
 # ---------------------------------------------------------------------- delay
 
 
-def repeater(setup: DriveSetup, shortest: float, longest: float) -> Delay:
+def repeater(setup: ActuatorSetup, shortest: float, longest: float) -> Delay:
     """A delayed drive whose torque is its target."""
     delay = Delay(setup, command=(shortest, longest), drive={"term": "pd", "kp": 1.0, "kd": 0.0})
     delay.reset(torch.ones(setup.num_envs, dtype=torch.bool))
@@ -507,7 +507,7 @@ def test_counting_samples_hides_most_of_the_overshoot_of_the_recorded_drive(
 # ---------------------------------------------------------------------- net: refusals
 
 
-def refusal(setup: DriveSetup, path: Path, **parameters: Any) -> list[str]:
+def refusal(setup: ActuatorSetup, path: Path, **parameters: Any) -> list[str]:
     with pytest.raises(ConfigError) as caught:
         Net(setup, file=str(path), **parameters)
     assert all(p.startswith(f"actuator net {path}: ") for p in caught.value.problems)
@@ -536,7 +536,7 @@ def test_a_net_for_something_else_is_refused(make_net: Callable[..., Path], driv
     (said,) = refusal(drives(1), make_net(robot="go2"))
     assert said == "is for robot 'go2', not for 'go1'"
     both = refusal(drives(1), make_net(inputs=("position_error", "tau_cmd"), period=0.02))
-    assert both[0].startswith("wants tau_cmd, which a drive that is told positions does not have")
+    assert both[0].startswith("wants tau_cmd, which a position controller does not have")
     assert len(both) == 2
 
 

@@ -18,7 +18,7 @@ from torch.testing import assert_close
 from go1exp import robot
 from go1exp.config.schema.registry import Entry, Term
 from go1exp.mdp.types import StepResult
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
@@ -610,7 +610,7 @@ def test_the_reward_is_the_sum_of_the_configured_terms_on_the_snapshot_of_the_st
 class Recorder:
     """An actuator that holds still and remembers what it is asked."""
 
-    def __init__(self, setup: DriveSetup) -> None:
+    def __init__(self, setup: ActuatorSetup) -> None:
         self.setup, self.calls = setup, 0
         self.resets: list[list[bool]] = []
 

@@ -19,10 +19,10 @@ from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Gears, Measured
 from go1exp.sim.effects.two_mass import TwoMass, resonance
-from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, parse_task
@@ -64,7 +64,7 @@ def rig(
         term, problems = bind("effect", name, dict(values), f"effect.{name}")
         assert term, problems
         terms.append(term)
-    plant = Plant(backend, drive_setup(task().robot, dt, backend, EnvRandom(0, n)), task().actuator, terms)
+    plant = Plant(backend, actuator_setup(task().robot, dt, backend, EnvRandom(0, n)), task().actuator, terms)
     plant.set_gains(*(torch.full_like(plant.q, gain) for gain in (kp, kd)))
     plant.startup()
     qpos = torch.zeros_like(backend.qpos)
@@ -505,7 +505,7 @@ def test_flexibility_and_backlash_are_in_series() -> None:
 
 
 def test_within_the_gap_no_torque_passes_and_the_joint_has_lost_its_rotor(drives: Any) -> None:
-    setup: DriveSetup = drives(1)
+    setup: ActuatorSetup = drives(1)
     rotors = TwoMass(setup)
     torque = torch.full((1, 12), 0.5, dtype=torch.float64)
     rotor = torch.full_like(torque, 0.0045)

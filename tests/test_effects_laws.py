@@ -24,11 +24,11 @@ from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import Term, bind
 from go1exp.deploy.runtime import go1_wire
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.actuator.envelope import envelope
 from go1exp.sim.effects.base import Effect
-from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
@@ -70,7 +70,7 @@ def stand(
         model.opt.gravity[:] = 0.0
     change(model)
     backend = MujocoCpu(model, sensors, 1, 1)
-    setup = drive_setup(task().robot, dt, backend, EnvRandom(0, 1))
+    setup = actuator_setup(task().robot, dt, backend, EnvRandom(0, 1))
     drive = term("actuator", "pd", {"kp": kp, "kd": kd})
     plant = Plant(backend, setup, drive, [term("effect", n, v) for n, v in effects.items()])
     plant.startup()
@@ -117,9 +117,9 @@ INSTANT: dict[str, dict[str, Slow]] = {
         "on_joint": lambda e, q, qd: (e["backward"] - e["forward"]) / 2,
         "on_friction": lambda e, b, tau, qd: b + (e["backward"] + e["forward"]) / 2,
     },
-    "strength": {"on_drive": lambda e, tau, q, qd: e["scale"] * tau},
+    "strength": {"on_actuator": lambda e, tau, q, qd: e["scale"] * tau},
     "torque_speed_limit": {
-        "on_drive": lambda e, tau, q, qd: slow_limit(tau, qd, e["E"], e["V"], e["peak"], e["droop"], e["stall"])
+        "on_actuator": lambda e, tau, q, qd: slow_limit(tau, qd, e["E"], e["V"], e["peak"], e["droop"], e["stall"])
     },
     "kp_scale": {"on_gains": lambda e, kp, kd: e["scale"] * kp},
     "kd_scale": {"on_gains": lambda e, kp, kd: e["scale"] * kd},
@@ -145,7 +145,7 @@ def noise(n: int, scale: float, seed: int) -> Tensor:
 
 @pytest.mark.parametrize("name", INSTANT)
 def test_a_law_without_memory_agrees_with_one_reckoned_joint_by_joint(
-    name: str, drives: Callable[..., DriveSetup]
+    name: str, drives: Callable[..., ActuatorSetup]
 ) -> None:
     setup = drives(8)
     effect = term("effect", name, {})(setup)
@@ -155,7 +155,7 @@ def test_a_law_without_memory_agrees_with_one_reckoned_joint_by_joint(
         "on_joint": (q, qd),
         "on_friction": (q.abs(), torque, qd),
         "on_load": (q.abs(), torque, 10.0 * q),
-        "on_drive": (torque, q, qd),
+        "on_actuator": (torque, q, qd),
         "on_gains": (q.abs(), qd.abs()),
         "on_encoder": (q, qd),
         "on_error": (q + 0.002 * qd, q),
@@ -178,14 +178,14 @@ def test_a_law_without_memory_agrees_with_one_reckoned_joint_by_joint(
 def drive(effect: Effect, demand: Tensor) -> Tensor:
     """Let torques (T, N, J) through an effect."""
     still = torch.zeros_like(demand[0])
-    return torch.stack([effect.on_drive(tau, still, still) for tau in demand])
+    return torch.stack([effect.on_actuator(tau, still, still) for tau in demand])
 
 
 def demands(steps: int, n: int) -> Tensor:
     return torch.stack([noise(n, 5.0, 100 + k) for k in range(steps)])
 
 
-def test_lag_agrees_with_scipys_solution_for_linear_pieces(drives: Callable[..., DriveSetup]) -> None:
+def test_lag_agrees_with_scipys_solution_for_linear_pieces(drives: Callable[..., ActuatorSetup]) -> None:
     effect = term("effect", "lag", {})(drives(4))
     scatter(effect, 5)
     demand = demands(60, 4)
@@ -200,14 +200,16 @@ def test_lag_agrees_with_scipys_solution_for_linear_pieces(drives: Callable[...,
 
 @pytest.mark.parametrize(
     ("name", "hook"),
-    [("torque_delay", "on_drive"), ("command_delay", "on_target"), ("command_delay", "on_feedforward")],
+    [("torque_delay", "on_actuator"), ("command_delay", "on_target"), ("command_delay", "on_feedforward")],
 )
-def test_a_delay_agrees_with_interpolation_in_the_past(name: str, hook: str, drives: Callable[..., DriveSetup]) -> None:
+def test_a_delay_agrees_with_interpolation_in_the_past(
+    name: str, hook: str, drives: Callable[..., ActuatorSetup]
+) -> None:
     effect = term("effect", name, {})(drives(5))
     scatter(effect, 6)
     demand = demands(60, 5)
     still = torch.zeros_like(demand[0])
-    more = (still, still) if hook == "on_drive" else ()
+    more = (still, still) if hook == "on_actuator" else ()
     found = torch.stack([getattr(effect, hook)(x, *more) for x in demand])
     t = DT * np.arange(60)
     for i in range(5):
@@ -216,7 +218,7 @@ def test_a_delay_agrees_with_interpolation_in_the_past(name: str, hook: str, dri
             np.testing.assert_allclose(found[:, i, j], expected, rtol=0, atol=1e-10)
 
 
-def test_strength_drift_agrees_with_a_clock_of_its_own(drives: Callable[..., DriveSetup]) -> None:
+def test_strength_drift_agrees_with_a_clock_of_its_own(drives: Callable[..., ActuatorSetup]) -> None:
     effect = term("effect", "strength_drift", {})(drives(5))
     scatter(effect, 7)
     effect.rate.mul_(50.0)  # so that some reach their floor within the test
@@ -262,7 +264,7 @@ def test_bounds_of_dry_friction_add_up() -> None:
 # ---------------------------------------------------------------------- known answers
 
 
-def test_lag_answers_a_step_with_an_exponential(drives: Callable[..., DriveSetup]) -> None:
+def test_lag_answers_a_step_with_an_exponential(drives: Callable[..., ActuatorSetup]) -> None:
     effect = term("effect", "lag", {"time": 0.01})(drives(1))
     demand = torch.ones(30, 1, 12, dtype=torch.float64)
     demand[0] = 0.0
@@ -272,14 +274,14 @@ def test_lag_answers_a_step_with_an_exponential(drives: Callable[..., DriveSetup
     np.testing.assert_allclose((1 - found[2:]) / (1 - found[1:-1]), math.exp(-DT / 0.01), rtol=1e-10)
 
 
-def test_lag_and_delay_of_a_ramp_are_the_ramp_of_a_while_ago(drives: Callable[..., DriveSetup]) -> None:
+def test_lag_and_delay_of_a_ramp_are_the_ramp_of_a_while_ago(drives: Callable[..., ActuatorSetup]) -> None:
     ramp = (3.0 * DT * torch.arange(200, dtype=torch.float64)).reshape(-1, 1, 1).expand(-1, 1, 12)
     for name, values in (("lag", {"time": 0.007}), ("torque_delay", {"delay": 0.007})):
         found = drive(term("effect", name, values)(drives(1)), ramp)
         np.testing.assert_allclose(found[100:, 0], ramp[100:, 0] - 3.0 * 0.007, atol=1e-7)
 
 
-def test_lag_vanishes_smoothly(drives: Callable[..., DriveSetup]) -> None:
+def test_lag_vanishes_smoothly(drives: Callable[..., ActuatorSetup]) -> None:
     demand = demands(50, 1)
     change = float(demand.diff(dim=0).abs().max()) / DT
     apart = []
@@ -291,7 +293,7 @@ def test_lag_vanishes_smoothly(drives: Callable[..., DriveSetup]) -> None:
     assert apart == sorted(apart)
 
 
-def test_an_absent_lag_remembers_nothing_not_even_what_is_not_finite(drives: Callable[..., DriveSetup]) -> None:
+def test_an_absent_lag_remembers_nothing_not_even_what_is_not_finite(drives: Callable[..., ActuatorSetup]) -> None:
     demand = demands(5, 1)
     demand[1] = math.nan
     found = drive(term("effect", "lag", {})(drives(1)), demand)
@@ -314,7 +316,7 @@ def test_the_torque_speed_line_of_a_go1() -> None:
     assert flat[1].tolist() == [23.7] * 8
 
 
-def test_torque_speed_limit_is_that_line(drives: Callable[..., DriveSetup]) -> None:
+def test_torque_speed_limit_is_that_line(drives: Callable[..., ActuatorSetup]) -> None:
     """Droop 1 with the vendor's 30.1 rad/s; a battery down by a fifth moves the line down and in."""
     setup = drives(2)
     full = torch.full((2, 12), 50.0, dtype=torch.float64)
@@ -322,14 +324,14 @@ def test_torque_speed_limit_is_that_line(drives: Callable[..., DriveSetup]) -> N
         effect = term("effect", "torque_speed_limit", {"peak": share, "droop": 1.0 / share})(setup)
         for qd in (0.0, 8.0, 16.0, 24.0):
             expected = (share - qd / setup.velocity_limit) * setup.effort_limit
-            found = effect.on_drive(full, full, torch.full_like(full, qd))
+            found = effect.on_actuator(full, full, torch.full_like(full, qd))
             assert torch.allclose(found, torch.maximum(expected, -share * setup.effort_limit).expand(2, 12))
 
 
-def test_torque_speed_limit_without_limit_lets_pass_what_exceeds_the_peak(drives: Callable[..., DriveSetup]) -> None:
+def test_torque_speed_limit_without_limit_lets_pass_what_exceeds_the_peak(drives: Callable[..., ActuatorSetup]) -> None:
     demand = noise(3, 40.0, 0)
     effect = term("effect", "torque_speed_limit", {"stall": 2.0})(drives(3))
-    assert torch.equal(effect.on_drive(demand, demand, noise(3, 40.0, 1)), demand)
+    assert torch.equal(effect.on_actuator(demand, demand, noise(3, 40.0, 1)), demand)
 
 
 def test_the_limit_comes_last_in_whatever_order_effects_are_named() -> None:
@@ -369,7 +371,7 @@ def test_scaled_gains_are_those_gains() -> None:
 
 @pytest.mark.parametrize("steps", [1.0, 3.0])
 def test_fixed_point_cuts_gains_and_torques_as_the_go1s_packets_do(
-    steps: float, drives: Callable[..., DriveSetup]
+    steps: float, drives: Callable[..., ActuatorSetup]
 ) -> None:
     setup = drives(1)
     law = term("effect", "fixed_point", {"steps": steps})(setup)
@@ -632,7 +634,7 @@ def test_a_weight_that_is_held_loads_the_gears_from_both_sides(external: float, 
 
 
 def test_without_a_share_from_outside_the_gears_feel_the_drive_alone_bit_for_bit(
-    drives: Callable[..., DriveSetup],
+    drives: Callable[..., ActuatorSetup],
 ) -> None:
     effect: Any = term("effect", "load_friction", {"coefficient": 0.13})(drives(8))
     bound, torque, outside = noise(8, 1.0, 5).abs(), noise(8, 25.0, 6), noise(8, 9.0, 7)

@@ -38,7 +38,7 @@ from go1exp.gap.stages.explain import explain
 from go1exp.logs.record.simulate import policy_task
 from go1exp.logs.recording import Recording, write
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.effects.rules import drive_problems
+from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
 from go1exp.sim.task import parse_parts, parse_task
 from tests import laboratory
@@ -220,9 +220,11 @@ def test_time_constants_that_no_step_carries_are_refused_and_0_is_none() -> None
 def test_a_spread_needs_a_value_to_be_about() -> None:
     pd = bind("actuator", "pd", {"kp": 20.0, "kd": 0.5}, "actuator")[0]
     assert pd is not None
-    (problem,) = drive_problems(pd, bound(spread={"time_constant": 0.003})[0]["effect"], robot.JOINTS)
+    (problem,) = actuator_problems(pd, bound(spread={"time_constant": 0.003})[0]["effect"], robot.JOINTS)
     assert problem.startswith("effect.ground_compliance.spread.time_constant: needs effect.ground_compliance")
-    assert not drive_problems(pd, bound(time_constant=0.02, spread={"time_constant": 0.003})[0]["effect"], robot.JOINTS)
+    assert not actuator_problems(
+        pd, bound(time_constant=0.02, spread={"time_constant": 0.003})[0]["effect"], robot.JOINTS
+    )
 
 
 # ---------------------------------------------------------------------- searches

@@ -22,7 +22,7 @@ from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind, members
 from go1exp.sim.effects.rules import on_mount
-from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import Sensors, build_model
 from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
@@ -74,7 +74,7 @@ def hanging(dt: float, effects: Mapping[str, Any]) -> Plant:
         assert term, problems
         terms.append(term)
     backend = MujocoCpu(*held(dt, on_mount(terms)), n, 1)
-    plant = Plant(backend, drive_setup(task().robot, dt, backend, EnvRandom(0, n)), task().actuator, terms)
+    plant = Plant(backend, actuator_setup(task().robot, dt, backend, EnvRandom(0, n)), task().actuator, terms)
     kp, kd = (torch.tensor([[g[i]] for g in GAINS], dtype=torch.float64).expand(n, robot.NUM_JOINTS) for i in (0, 1))
     plant.set_gains(kp, kd)
     plant.startup()

@@ -37,7 +37,7 @@ from go1exp.logs.recording import read_folder
 from go1exp.sim.effects.rules import on_mount
 from go1exp.sim.effects.soft_mount import SoftMount
 from go1exp.sim.effects.tolerances import DECLARED
-from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, parse_task
@@ -144,7 +144,7 @@ def hanging(dt: float, rows: list[Mapping[str, float]], mount: bool = True) -> P
     ground = build_terrain(task().terrain)
     backend = MujocoCpu(*build_model(task().robot, ground, dt, held=(1.0, 0.0, 0.0, 0.0), mounted=mount), len(rows), 1)
     terms = [soft({})] if mount else []
-    plant = Plant(backend, drive_setup(task().robot, dt, backend, EnvRandom(0, len(rows))), task().actuator, terms)
+    plant = Plant(backend, actuator_setup(task().robot, dt, backend, EnvRandom(0, len(rows))), task().actuator, terms)
     for k, values in enumerate(rows):
         for name, value in values.items():
             getattr(plant.effects.effects["soft_mount"], name)[k] = value
@@ -266,7 +266,7 @@ def test_rows_without_compliance_are_simulated_bolted() -> None:
 def test_a_free_trunk_has_no_mount() -> None:
     ground = build_terrain(task().terrain)
     backend = MujocoCpu(*build_model(task().robot, ground, 0.002), 1, 1)
-    setup = drive_setup(task().robot, 0.002, backend, EnvRandom(0, 1))
+    setup = actuator_setup(task().robot, 0.002, backend, EnvRandom(0, 1))
     assert (setup.floating, setup.mounted) == (True, False)
     assert SoftMount(setup, roll=0.01).fields == ()
 

@@ -25,12 +25,12 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.cli.record import RIG, _motions
     from go1exp.cli.settings import GapLoopSettings
     from go1exp.gap.robots.description import Go1Model, parse_model
-    from go1exp.sim.effects.rules import drive_problems
+    from go1exp.sim.effects.rules import actuator_problems
 
     readers: dict[str, Any] = {"excitation": _motions, "model": parse_model}
     settings, parts = parse_with_groups(GapLoopSettings, container, RIG, **readers)
     refuse_unknown(settings.search.effects)
-    problems = drive_problems(parts["actuator"], parts["effect"], go1.JOINTS)
+    problems = actuator_problems(parts["actuator"], parts["effect"], go1.JOINTS)
     if not isinstance(parts["model"], Go1Model):
         problems.append("model: the simulated robot is a Go1; only model.tolerances can be changed here")
     if settings.support != "hung":

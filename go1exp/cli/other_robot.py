@@ -36,10 +36,10 @@ def replaced(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
     """
     from go1exp import robot
     from go1exp.config.schema.registry import ConfigError
-    from go1exp.sim.effects.rules import drive_problems
+    from go1exp.sim.effects.rules import actuator_problems
 
     changed = dataclasses.replace(task, **parts)
-    if problems := drive_problems(changed.actuator, changed.effect, robot.JOINTS):
+    if problems := actuator_problems(changed.actuator, changed.effect, robot.JOINTS):
         raise ConfigError(problems)
     return changed
 

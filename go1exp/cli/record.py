@@ -64,13 +64,13 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.runs import trained
     from go1exp.cli.settings import RecordSettings
-    from go1exp.sim.effects.rules import drive_problems, has_gains
+    from go1exp.sim.effects.rules import actuator_problems, has_gains
 
     readers = {"excitation": _motions, "controller": parse_controller}
     groups = rig_groups(container)
     settings, parts = parse_with_groups(RecordSettings, container, groups, **readers)
     motions = parts["excitation"]
-    problems = drive_problems(parts["actuator"], parts["effect"], robot.JOINTS)
+    problems = actuator_problems(parts["actuator"], parts["effect"], robot.JOINTS)
     names = {m.entry.name for m in motions}
     if MPC in names:
         problems += _misfits(settings, parts)

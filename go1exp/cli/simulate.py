@@ -19,10 +19,10 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp.deploy.runtime.address import parsed_address
     from go1exp.deploy.sim_robot.machine import Body, Robot
     from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
-    from go1exp.sim.effects.rules import drive_problems
+    from go1exp.sim.effects.rules import actuator_problems
 
     settings, parts = parse_with_groups(SimSettings, container, BODY)
-    if problems := drive_problems(parts["actuator"], parts["effect"], robot.JOINTS):
+    if problems := actuator_problems(parts["actuator"], parts["effect"], robot.JOINTS):
         raise ConfigError(problems)
     where, page = parsed_address(settings.address, HERE), address(settings.host, settings.port)
     body, config = Body(**parts, tile=settings.tile), subset(SimConfig, settings)

@@ -41,13 +41,13 @@ from go1exp.mdp.kinematics import KinematicState
 from go1exp.mdp.measures.trace import NotMeasured, Trace
 from go1exp.mdp.mirror import Mirror
 from go1exp.mdp.types import Snapshot, TermSetup
-from go1exp.robot.drive import DriveSetup, ModelFields
+from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.actuator.setup import Gains
 from go1exp.sim.effects.base import Effect, Gears, Measured, Param
 from go1exp.sim.effects.identification import Identification
 
 __all__ = [
-    "DriveSetup",
+    "ActuatorSetup",
     "Effect",
     "ExcitationError",
     "Fraction",

@@ -77,7 +77,7 @@ def gait_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
 
 @observation("joint_torque", size=12, mirror=JOINTS)
 def joint_torque(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
-    """Torques of the drives, (N, 12) N m, times ``scale``."""
+    """Torques of the actuators, (N, 12) N m, times ``scale``."""
     return s.joint_torque * scale
 
 

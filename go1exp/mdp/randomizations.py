@@ -19,7 +19,7 @@ from go1exp.base.tensors.restitution import damping_ratio
 from go1exp.base.tensors.rotation import quat_from_rotvec, quat_multiply
 from go1exp.config.schema.registry import PositiveRange, Range, SpeedRange, ordered, randomization
 from go1exp.mdp.kinematics import KinematicState
-from go1exp.robot.drive import ModelFields
+from go1exp.robot.actuators import ModelFields
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -40,7 +40,7 @@ from go1exp.config.schema.schedule import Ramp
 from go1exp.mdp import mirror
 from go1exp.robot.config import RobotConfig
 from go1exp.sim import schedule
-from go1exp.sim.effects.rules import drive_problems
+from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.terrain import TerrainConfig
 
 CountOrZero = Annotated[int, Field(ge=0)]
@@ -333,7 +333,7 @@ def _cross_rules(parts: Mapping[str, Any]) -> list[str]:
     """Rules between sections."""
     problems = []
     if actuator := parts.get("actuator"):
-        problems += drive_problems(actuator, parts.get("effect") or (), robot.JOINTS)
+        problems += actuator_problems(actuator, parts.get("effect") or (), robot.JOINTS)
     if sim := parts.get("sim"):
         problems += time_rules(sim)
     if (ppo := parts.get("ppo")) and ppo.num_envs * ppo.steps % ppo.minibatches:

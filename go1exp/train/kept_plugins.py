@@ -116,7 +116,7 @@ def _used(container: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             yield REGISTERED_AS.get(group, group), str((settings or {}).get("term", key))
     for group in ONE_TERM:
         inner: Any = container.get(group)
-        while isinstance(inner, Mapping):  # a drive may be in a drive
+        while isinstance(inner, Mapping):  # an actuator may wrap another
             yield group, str(inner.get("term"))
             inner = inner.get("drive")
 

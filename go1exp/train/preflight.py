@@ -8,7 +8,7 @@ import torch
 
 from go1exp.config.schema.backends import PhysxBackend, WarpBackend
 from go1exp.config.schema.registry import ConfigError
-from go1exp.sim.effects.rules import drives
+from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TrainConfig
 from go1exp.train import memory_need, metrics
@@ -32,7 +32,7 @@ def check(config: TrainConfig) -> None:
     check_measures(config)
     memory_need.check(config, engine_device(config))
     metrics.check_account(config.logger)
-    if any("file" in term.parameters for term, _ in drives(config.task.actuator)):
+    if any("file" in term.parameters for term, _ in nested_actuators(config.task.actuator)):
         Go1Core(config.task, 1)
 
 

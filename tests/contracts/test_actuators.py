@@ -15,7 +15,7 @@ import go1exp.sim.task  # noqa: F401  (registers every member)
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.schema.registry import members
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.setup import Actuator
 from tests.rounding import alone_and_in_a_batch
 
@@ -41,7 +41,7 @@ def net_file(make_net: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture
-def build(name: str, drives: Callable[..., DriveSetup], net_file: Path) -> Callable[..., Actuator]:
+def build(name: str, drives: Callable[..., ActuatorSetup], net_file: Path) -> Callable[..., Actuator]:
     """Build the member for n robots, the first of them number ``first`` of a batch; their first episode begins."""
     member, _, inner = name.partition(" of ")
     parameters = NEEDS.get(member, lambda net: {})(net_file)
@@ -146,7 +146,7 @@ def test_a_saved_state_is_a_copy(build: Callable[..., Actuator]) -> None:
     assert all(torch.equal(a, b) for a, b in zip(before, numbers(state), strict=True))
 
 
-def test_pd_is_the_law_of_the_firmware(drives: Callable[..., DriveSetup]) -> None:
+def test_pd_is_the_law_of_the_firmware(drives: Callable[..., ActuatorSetup]) -> None:
     pd = members("actuator")["pd"].target(drives(1), kp=20.0, kd=0.5)
     target, q, qd = torch.zeros(3, 1, 12, dtype=torch.float64)
     target[0, 0], q[0, 0], qd[0, 0] = 0.3, 0.1, -2.0  # 20 x 0.2 + 0.5 x 2

@@ -27,14 +27,14 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.contact import MUJOCO_CONTACT
 from go1exp.config.schema.joint_values import JointValues, numbers, spread
 from go1exp.config.schema.registry import Entry, Term, bind, members
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect, Measured, Param
 from go1exp.sim.effects.identification import LAST
 from go1exp.sim.effects.rules import on_mount
 from go1exp.sim.effects.stack import HOOKS
 from go1exp.sim.effects.tolerances import Tolerances
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import Sensors, build_model
 from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
@@ -97,7 +97,7 @@ class Rig:
         model, sensors = compiled(held, mounted or on_mount(effects))
         self.backend = MujocoCpu(model, sensors, n, 1)
         self.random = EnvRandom(3, n, first_env)
-        setup = drive_setup(task().robot, DT, self.backend, self.random)
+        setup = actuator_setup(task().robot, DT, self.backend, self.random)
         self.held, self.plant, self.clock = held, Plant(self.backend, setup, task().actuator, effects), 0
         self.plant.startup()
         self.stance = torch.as_tensor(robot.NOMINAL_STANCE, dtype=torch.float64).repeat(n, 1)
@@ -501,7 +501,7 @@ def calls(effect: Effect, n: int, k: int) -> Iterator[tuple[str, tuple[Any, ...]
         "on_encoder": (q, qd),
         "on_error": (q, three[0].repeat(1, 4)),
         "on_gains": (torque.abs(), qd.abs()),
-        "on_drive": (torque, q, qd),
+        "on_actuator": (torque, q, qd),
         "on_report": (torque,),
         "on_transmission": (torque, q, qd),
         "on_joint": (q, qd),
@@ -526,7 +526,7 @@ def tensors_of(result: Any) -> tuple[Tensor, ...]:
 
 
 @each
-def test_hooks_leave_their_arguments_as_they_are(entry: Entry, drives: Callable[..., DriveSetup]) -> None:
+def test_hooks_leave_their_arguments_as_they_are(entry: Entry, drives: Callable[..., ActuatorSetup]) -> None:
     effect = term(entry.name, probes(entry))(drives(4))
     for k in range(5):
         for hook, arguments, tensors in calls(effect, 4, 10 * k):
@@ -540,7 +540,7 @@ def test_hooks_leave_their_arguments_as_they_are(entry: Entry, drives: Callable[
 
 
 @each
-def test_a_sensor_that_the_robot_lacks_stays_unmeasured(entry: Entry, drives: Callable[..., DriveSetup]) -> None:
+def test_a_sensor_that_the_robot_lacks_stays_unmeasured(entry: Entry, drives: Callable[..., ActuatorSetup]) -> None:
     effect = term(entry.name, probes(entry))(drives(4))
     seen = effect.on_sensor(Measured(joint_noise(4, 1.0, 0), joint_noise(4, 1.0, 1)))
     assert (seen.gravity, seen.gyro, seen.acc) == (None, None, None)
@@ -548,7 +548,7 @@ def test_a_sensor_that_the_robot_lacks_stays_unmeasured(entry: Entry, drives: Ca
 
 
 @each
-def test_reading_the_encoder_twice_gives_the_same(entry: Entry, drives: Callable[..., DriveSetup]) -> None:
+def test_reading_the_encoder_twice_gives_the_same(entry: Entry, drives: Callable[..., ActuatorSetup]) -> None:
     effect = term(entry.name, probes(entry))(drives(4))
     q, qd = joint_noise(4, 1.0, 0), joint_noise(4, 5.0, 1)
     before = effect.state_dict()
@@ -576,7 +576,7 @@ def test_spreads_are_drawn_for_each_robot_within_the_bounds(entry: Entry) -> Non
 
 
 @each
-def test_values_can_differ_between_joints(entry: Entry, drives: Callable[..., DriveSetup]) -> None:
+def test_values_can_differ_between_joints(entry: Entry, drives: Callable[..., ActuatorSetup]) -> None:
     for p in kind(entry).params:
         if p.per == "joint":
             mixed = {"FR": p.low, "calf": p.high, "RL_hip": 0.5 * (p.low + p.high)}
@@ -596,7 +596,7 @@ def test_all_effects_together_leave_a_robot_that_moves() -> None:
 
 
 @pytest.mark.parametrize("name", BRAKES)
-def test_a_brake_only_brakes(name: str, drives: Callable[..., DriveSetup]) -> None:
+def test_a_brake_only_brakes(name: str, drives: Callable[..., ActuatorSetup]) -> None:
     """Power of the torque on the joint, with dry friction at its bound, is nowhere positive."""
     entry, setup = EFFECTS[name], drives(500)
     effect = term(name, {})(setup)

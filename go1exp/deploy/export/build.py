@@ -25,7 +25,7 @@ from go1exp.deploy.runtime import bundle
 from go1exp.deploy.runtime.metadata import Metadata, Trained
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.actuator.net import find
-from go1exp.sim.effects.rules import drives
+from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.task import TaskConfig
 from go1exp.train import run_folder
 from go1exp.train.policy import load_network
@@ -127,7 +127,7 @@ def metadata(task: TaskConfig, module: DeployedPolicy, about: dict[str, Any]) ->
 
 def gains(actuator: Term, name: str) -> tuple[float, ...] | None:
     """Return ``kp`` or ``kd`` of an actuator, or of the drives its net was fitted to, per joint; None if unknown."""
-    for term, _ in drives(actuator):
+    for term, _ in nested_actuators(actuator):
         if name in term.parameters:
             return tuple(spread(term.parameters[name], robot.JOINTS).tolist())
         if "file" in term.parameters:

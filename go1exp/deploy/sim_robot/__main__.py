@@ -27,7 +27,7 @@ from go1exp.deploy.sim_robot.machine import Robot
 from go1exp.deploy.sim_robot.server import KEPT_S, TRUTH, Server
 from go1exp.deploy.sim_robot.settings import SimConfig
 from go1exp.robot import JOINTS
-from go1exp.sim.effects.rules import drive_problems
+from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.task import TaskConfig, parse_parts, parse_train
 
 WITHOUT_POLICY: dict[str, Any] = {
@@ -54,7 +54,7 @@ def bundle_task(bundle: str, other: dict[str, Any]) -> TaskConfig:
     parts, problems = parse_parts(chosen, tuple(chosen))
     if not problems:
         task = dataclasses.replace(task, **parts)
-        problems = drive_problems(task.actuator, task.effect, JOINTS)
+        problems = actuator_problems(task.actuator, task.effect, JOINTS)
     if problems:
         raise ConfigError(problems)
     return task

@@ -19,7 +19,7 @@ from go1exp.robot.config import RobotConfig
 from go1exp.robot.messages import LowCmd, LowState
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.effects.rules import has_gains
-from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import HELD_HEIGHT, build_model
 from go1exp.sim.task import TaskConfig
@@ -93,7 +93,7 @@ class Robot:
         model, blocks = build_model(task.robot, terrain, TICK, contact=task.contact, imu=True, held=held)
         self._backend = backend = MujocoCpu(model, blocks, 1, threads=1)
         random = EnvRandom(config.seed, 1, device=backend.qpos.device)
-        self._plant = Plant(backend, drive_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
+        self._plant = Plant(backend, actuator_setup(task.robot, TICK, backend, random), task.actuator, task.effect)
         self._plant.startup()
         actuator = self._plant.actuator
         self._default_gains = tuple(getattr(actuator, name).numpy().ravel().copy() for name in ("kp", "kd"))

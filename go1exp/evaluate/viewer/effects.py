@@ -12,7 +12,7 @@ from go1exp.config.schema.contact import ContactConfig
 from go1exp.config.schema.joint_values import JointValues, numbers
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.sim.effects.base import Param
-from go1exp.sim.effects.rules import drive_problems
+from go1exp.sim.effects.rules import actuator_problems
 from go1exp.sim.effects.tolerances import Tolerances
 from go1exp.sim.task import parse_parts
 
@@ -68,7 +68,7 @@ def acting(
     terms = tuple(
         effects[name] if size == 1.0 else resized(effects[name], size, contact) for name, size in chosen.items()
     )
-    if problems := drive_problems(actuator, terms, robot.JOINTS):
+    if problems := actuator_problems(actuator, terms, robot.JOINTS):
         raise ConfigError(problems)
     return terms
 

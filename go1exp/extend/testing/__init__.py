@@ -16,7 +16,7 @@ from typing import Any
 import go1exp.extend  # noqa: F401  (registers every term)
 from go1exp.config.schema import plugins
 from go1exp.config.schema.registry import Entry
-from go1exp.extend.testing import drives, motions, randomness, snapshots, traces
+from go1exp.extend.testing import actuators, motions, randomness, snapshots, traces
 from go1exp.extend.testing.description import check_description
 
 CHECKS = {
@@ -27,8 +27,8 @@ CHECKS = {
     "command": randomness.check_command,
     "event": randomness.check_event,
     "curriculum": randomness.check_curriculum,
-    "actuator": drives.check_actuator,
-    "effect": drives.check_effect,
+    "actuator": actuators.check_actuator,
+    "effect": actuators.check_effect,
     "excitation": motions.check_excitation,
     "measure": traces.check_measure,
 }

@@ -9,7 +9,7 @@ import go1exp.sim.actuator
 import go1exp.sim.effects  # noqa: F401  (registers every effect)
 from go1exp.config.schema.joint_values import JointValues
 from go1exp.config.schema.registry import Term, bind
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.tolerances import Tolerances
 
 
@@ -48,7 +48,7 @@ class Machine(Protocol):
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, DriveSetup]:
+    ) -> tuple[Any, ActuatorSetup]:
         """Return a backend with ``num`` robots, and their drives.
 
         Args:

@@ -15,7 +15,7 @@ from go1exp.config.schema.registry import bind
 from go1exp.gap.data.windows import PAST_S, Windows, averaged, held
 from go1exp.gap.replay.machine import Machine
 from go1exp.gap.replay.rows import Rows, bolted, mounted
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.env.plant import FRICTION, Plant
 from go1exp.sim.physics.backend import PhysicsBackend
@@ -42,7 +42,7 @@ class Replayer:
     max_rows: int
     threads: int
     made: int = 0
-    _backends: dict[tuple[int, float, bool], tuple[Any, DriveSetup, set[str]]] = field(default_factory=dict)
+    _backends: dict[tuple[int, float, bool], tuple[Any, ActuatorSetup, set[str]]] = field(default_factory=dict)
     _inputs: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     def run(self, rows: Rows, dt: float) -> np.ndarray:

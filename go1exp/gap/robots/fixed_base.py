@@ -24,7 +24,7 @@ from go1exp.gap.robots.completion import clock_warnings, completed, flaws_of, ga
 from go1exp.gap.robots.description import ModelConfig
 from go1exp.logs.audit import AuditReport
 from go1exp.logs.recording import Recording
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.setup import Gains
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
 from go1exp.sim.physics.fixed_base import FixedBaseError, build_fixed_base, feel_each_other
@@ -35,7 +35,7 @@ from go1exp.sim.physics.scene import NO_SENSORS
 class TorqueDrive(Gains):
     """A drive that is commanded a torque: its target is a torque, N m, clipped at the peak. Gains do nothing."""
 
-    def __init__(self, setup: DriveSetup) -> None:
+    def __init__(self, setup: ActuatorSetup) -> None:
         """Note the peak torque."""
         self.kp, self.kd = setup.zeros(), setup.zeros()
         self._limit = setup.effort_limit
@@ -108,7 +108,7 @@ class FixedBase:
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, DriveSetup]:
+    ) -> tuple[Any, ActuatorSetup]:
         """Return a backend with ``num`` robots, and their drives."""
         backend = MujocoCpu(self.model(physics_dt, base_quat, mounted), NO_SENSORS, num, threads)
         like = backend.qpos
@@ -116,7 +116,7 @@ class FixedBase:
         def tensor(values: Sequence[float]) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=like.dtype, device=like.device)
 
-        setup = DriveSetup(
+        setup = ActuatorSetup(
             num_envs=num,
             physics_dt=physics_dt,
             joints=self.joints,

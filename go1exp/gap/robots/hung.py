@@ -24,10 +24,10 @@ from go1exp.gap.robots.standing import StandingGo1
 from go1exp.gap.robots.swinging import SwingingGo1
 from go1exp.logs.audit import AuditReport
 from go1exp.logs.recording import Recording
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
-from go1exp.robot.drive import DriveSetup
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
-from go1exp.sim.env.plant import drive_setup
+from go1exp.sim.env.plant import actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
 
@@ -70,12 +70,12 @@ class HungGo1(Go1):
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, DriveSetup]:
+    ) -> tuple[Any, ActuatorSetup]:
         """Return a backend with ``num`` held robots, and their drives."""
         w, x, y, z = base_quat
         model, blocks = build_model(self.config, None, physics_dt, held=(w, x, y, z), mounted=mounted)
         backend = MujocoCpu(model, blocks, num, threads)
-        return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> Robot:
         """Return the Go1 on its feet, or its legs in the air, if its trunk is free in a recording, else this one.

@@ -23,10 +23,10 @@ from go1exp.gap.robots.go1 import Go1
 from go1exp.gap.robots.go1_logs import ONE_GROUP
 from go1exp.logs.audit import AuditReport
 from go1exp.logs.recording import Recording
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
-from go1exp.robot.drive import DriveSetup
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
-from go1exp.sim.env.plant import drive_setup
+from go1exp.sim.env.plant import actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.terrain import TerrainConfig, build_terrain
@@ -69,13 +69,13 @@ class StandingGo1(Go1):
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, DriveSetup]:
+    ) -> tuple[Any, ActuatorSetup]:
         """Return a backend with ``num`` free robots, and their drives; ``base_quat`` is not used."""
         ground = build_terrain(TerrainConfig(kind="flat"))
         model, blocks = build_model(self.config, ground, physics_dt, contact=self.contact)
         model.opt.disableflags |= NO_SENSORS
         backend = MujocoCpu(model, blocks, num, threads)
-        return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "whole") -> StandingGo1:
         """Return itself: it can be compared with recordings of a held trunk too."""

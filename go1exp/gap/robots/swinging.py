@@ -20,10 +20,10 @@ from go1exp.gap.robots.go1 import Go1
 from go1exp.gap.robots.go1_logs import ONE_GROUP
 from go1exp.logs.audit import AuditReport
 from go1exp.logs.recording import Recording
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
-from go1exp.robot.drive import DriveSetup
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
-from go1exp.sim.env.plant import drive_setup
+from go1exp.sim.env.plant import actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model, weigh_down
 
@@ -55,12 +55,12 @@ class SwingingGo1(Go1):
 
     def build(
         self, num: int, physics_dt: float, base_quat: Sequence[float], threads: int, mounted: bool = False
-    ) -> tuple[Any, DriveSetup]:
+    ) -> tuple[Any, ActuatorSetup]:
         """Return a backend with ``num`` robots in the air on heavy trunks, and their drives."""
         model, blocks = build_model(self.config, None, physics_dt)
         weigh_down(model, HEAVY)
         backend = MujocoCpu(model, blocks, num, threads)
-        return backend, drive_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
+        return backend, actuator_setup(self.config, physics_dt, backend, EnvRandom(0, num, device=backend.qpos.device))
 
     def suited(self, recordings: Sequence[Recording], phase: Phase = "swing") -> SwingingGo1:
         """Return itself."""

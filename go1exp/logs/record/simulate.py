@@ -24,10 +24,10 @@ from go1exp.logs.record.sensors import SensorConfig, log
 from go1exp.logs.record.tape import Tape
 from go1exp.logs.recording import Meta, Recording
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.effects.rules import drives, has_gains, on_mount
+from go1exp.sim.effects.rules import has_gains, nested_actuators, on_mount
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import make_backend
-from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, time_rules
 from go1exp.sim.terrain import TerrainConfig, build_terrain
@@ -106,7 +106,7 @@ def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
     )
     backend = make_backend(rig.backend, model, blocks, n)
     random = EnvRandom(seed, n, device=backend.qpos.device, alike=True)  # one robot, in all its recordings
-    plant = Plant(backend, drive_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
+    plant = Plant(backend, actuator_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
     if has_gains(rig.actuator):
         # (n, 1) each, then the same gain for all joints: (n, 12)
         kp, kd = (torch.tensor([[getattr(e, g)] for e in episodes], dtype=plant.q.dtype) for g in ("kp", "kd"))
@@ -280,5 +280,5 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
 
 def configured(actuator: Term, gain: str) -> tuple[float, ...] | None:
     """Return a gain as configured, per joint, without the effects on it; None if the actuator has no gains."""
-    value = next((term.parameters[gain] for term, _ in drives(actuator) if gain in term.parameters), None)
+    value = next((term.parameters[gain] for term, _ in nested_actuators(actuator) if gain in term.parameters), None)
     return None if value is None else tuple(float(v) for v in spread(value, robot.JOINTS))

@@ -1,4 +1,4 @@
-"""What the motion asks of the drives."""
+"""What the motion asks of the actuators."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def cost_of_transport(trace: Trace, *, least_speed: NonNegative = 0.1) -> Array:
 
 @measure("torque_share_p99", unit="-")
 def torque_share_p99(trace: Trace) -> Array:
-    """Torque over the drive's peak torque, 99th percentile over steps and joints (N,)."""
+    """Torque over the actuator's peak torque, 99th percentile over steps and joints (N,)."""
     return percentile_over(_torque_share(trace), trace.counts, HIGH)
 
 
 @measure("joint_speed_share_p99", unit="-")
 def joint_speed_share_p99(trace: Trace) -> Array:
-    """Joint speed over the drive's top speed, 99th percentile over steps and joints (N,)."""
+    """Joint speed over the actuator's top speed, 99th percentile over steps and joints (N,)."""
     return percentile_over(_speed_share(trace), trace.counts, HIGH)
 
 

@@ -35,7 +35,7 @@ Share = Literal["all", "kind", "none"]
 """One net for all joints, one for each kind of joint (``FR_hip``: ``hip``), or one for each joint."""
 
 Target = Literal["tau_est", "joint_torque"]
-"""What the net was taught: torque that the drive reports, or torque at the joint from inverse dynamics."""
+"""What the net was taught: torque that the actuator reports, or torque at the joint from inverse dynamics."""
 
 Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, Field(min_length=1)]

@@ -8,7 +8,7 @@ import torch
 
 from go1exp.config.schema.joint_values import JointValues, each_within
 from go1exp.config.schema.registry import actuator
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.envelope import envelope
 from go1exp.sim.actuator.pd import Gain
 from go1exp.sim.actuator.setup import Gains
@@ -37,7 +37,7 @@ class DCMotor(Gains):
 
     def __init__(
         self,
-        setup: DriveSetup,
+        setup: ActuatorSetup,
         *,
         kp: Gain = 20.0,
         kd: Gain = 0.5,
@@ -47,7 +47,7 @@ class DCMotor(Gains):
         """Keep the gains, N m/rad and N m s/rad, and the line.
 
         Args:
-            setup: the drives.
+            setup: the actuators.
             kp: position gain, N m/rad.
             kd: speed gain, N m s/rad.
             stall: torque of the line at rest, N m; None, or a joint left out: the robot's peak torque.
@@ -68,12 +68,12 @@ class DCMotor(Gains):
         """Nothing to forget."""
 
 
-def line(setup: DriveSetup, stall: JointValues | None, speed: JointValues | None) -> tuple[Tensor, Tensor]:
+def line(setup: ActuatorSetup, stall: JointValues | None, speed: JointValues | None) -> tuple[Tensor, Tensor]:
     """Return stall torques and top speeds (J,) of motors, where they are not given those of the robot's limits."""
     return _or(setup, stall, setup.effort_limit), _or(setup, speed, setup.velocity_limit)
 
 
-def _or(setup: DriveSetup, values: JointValues | None, usual: Tensor) -> Tensor:
+def _or(setup: ActuatorSetup, values: JointValues | None, usual: Tensor) -> Tensor:
     """Spread ``values`` over the joints (J,); those that they do not name have the ``usual`` ones."""
     if values is None:
         return usual

@@ -1,4 +1,4 @@
-"""``actuator=delay``: any drive, whose targets arrive late."""
+"""``actuator=delay``: any actuator, with delayed commands."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pydantic import AfterValidator, Field
 
 from go1exp.base.tensors.delay_line import DelayLine
 from go1exp.config.schema.registry import actuator, ordered
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.setup import Actuator, takes_feedforward
-from go1exp.sim.actuator.wrapped import Drive, build
+from go1exp.sim.actuator.wrapped import InnerActuator, build
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,18 +23,18 @@ Delays = Annotated[tuple[Seconds, Seconds], AfterValidator(ordered)]
 
 @actuator("delay")
 class Delay:
-    """Another drive, to which the target comes late by a time that each robot draws anew for each episode.
+    """Another actuator, whose command is delayed by a time that each robot draws anew for each episode.
 
-    tau(t) = drive(target(t - delay), q(t), qd(t)): computer and bus delay the command, and the motor controller's own
-    feedback is not delayed. Between two physics steps the target is interpolated. The default goes from none to what
-    the actuator net of walk-these-ways has learnt from a Go1: its targets act 20 ms late.
+    tau(t) = actuator(target(t - delay), q(t), qd(t)): computer and bus delay the command, and the motor controller's
+    own feedback is not delayed. Between two physics steps the target is interpolated. The default goes from none to
+    what the actuator net of walk-these-ways has learnt from a Go1: a command delay of 20 ms.
 
     Attributes:
-        drive: the drive inside.
+        drive: the actuator inside.
         delay: (N, 1) each robot's delay, s; the shortest before the first reset.
     """
 
-    def __init__(self, setup: DriveSetup, *, command: Delays = (0.0, 0.02), drive: Drive) -> None:
+    def __init__(self, setup: ActuatorSetup, *, command: Delays = (0.0, 0.02), drive: InnerActuator) -> None:
         """Wrap ``drive``; ``command`` is the range that delays are drawn from, s."""
         self.drive: Actuator = build(setup, drive)
         self.delay = setup.zeros()[:, :1] + command[0]
@@ -46,12 +46,12 @@ class Delay:
 
     @property
     def kp(self) -> Tensor:
-        """Position gain (N, J) of the drive inside, live, N m/rad; AttributeError if it has none."""
+        """Position gain (N, J) of the actuator inside, live, N m/rad; AttributeError if it has none."""
         return self.drive.kp  # type: ignore[attr-defined]
 
     @property
     def kd(self) -> Tensor:
-        """Speed gain (N, J) of the drive inside, live, N m s/rad; AttributeError if it has none."""
+        """Velocity gain (N, J) of the actuator inside, live, N m s/rad; AttributeError if it has none."""
         return self.drive.kd  # type: ignore[attr-defined]
 
     def set_range(self, shortest: float, longest: float) -> None:
@@ -65,14 +65,14 @@ class Delay:
             bound.fill_(value)
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
-        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; feedforward is late as well."""
-        late = self._line.advance(target, self.delay)
+        """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s; ``feedforward`` is delayed too."""
+        delayed = self._line.advance(target, self.delay)
         if feedforward is None:
-            return self.drive.torque(late, q, qd)
+            return self.drive.torque(delayed, q, qd)
         assert takes_feedforward(self.drive)  # the plant has asked
         if self._fed is None:
             self._fed = self._line.twin()
-        return self.drive.torque(late, q, qd, self._fed.advance(feedforward, self.delay))
+        return self.drive.torque(delayed, q, qd, self._fed.advance(feedforward, self.delay))
 
     def reset(self, mask: Tensor) -> None:
         """Draw new delays in the rows of ``mask`` (N,) and take the next target for one long in force."""
@@ -85,7 +85,7 @@ class Delay:
         self.drive.reset(mask)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the delays, the targets on their way and the history of the drive inside."""
+        """Return the delays, the targets on their way and the history of the actuator inside."""
         state = {"delay": self.delay.clone(), "line": self._line.state_dict(), "drive": self.drive.state_dict()}
         return state | ({"fed": self._fed.state_dict()} if self._fed else {})
 

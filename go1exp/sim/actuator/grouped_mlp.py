@@ -1,9 +1,9 @@
 """Small networks, each applied to many columns, fast enough to be part of a physics step.
 
-A drive's net is tiny and is evaluated for every joint of every robot at every physics step, so what counts is how often
-the numbers pass through memory. Columns are samples and rows are units, so that every row is one long vector; buffers
-and the calls on them are made once; the columns are worked through in blocks that stay in the processor's cache; biases
-are a further column of the weights, against a row of ones, which spares a pass over the block.
+An actuator's net is tiny and is evaluated for every joint of every robot at every physics step, so what counts is how
+often the numbers pass through memory. Columns are samples and rows are units, so that every row is one long vector;
+buffers and the calls on them are made once; the columns are worked through in blocks that stay in the processor's
+cache; biases are a further column of the weights, against a row of ones, which spares a pass over the block.
 
 No column depends on the others. That holds to the bit where the matrix library adds up the products of a column in one
 order however many columns there are. MKL does when each of its threads gets at least 12 columns and when there is more

@@ -1,4 +1,4 @@
-"""``actuator=net``: a drive learnt from recordings."""
+"""``actuator=net``: an actuator learnt from recordings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.base.tensors.memory import Memory
 from go1exp.config.schema.registry import ConfigError, actuator
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.grouped_mlp import GroupedMLP, padded_rows
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from go1exp.sim.actuator.actuator_net import NetInfo
 
 INPUTS = ("position_error", "velocity", "position")
-"""What a drive that is told positions has to offer a net."""
+"""Inputs of a net that a position controller has."""
 
 
 def find(file: str) -> Path:
@@ -51,12 +51,12 @@ class Net(Memory):
 
     tau(t) = net(e(t), e(t - P), e(t - 2P), ..., qd(t), qd(t - P), ...) with e = target - q, clipped at the peak torque.
     The spacing P of the history is the net's own; at another one the same weights are another actuator. The net that
-    walk-these-ways published shows it: fitted at 20 ms, it is kp 20 on the *previous* error with kd 0.5, a drive that
-    is 20 ms late; stepped at 5 ms, as there and in Isaac Lab, it is 5 ms late with kd 0.75 (computed from its weights).
-    So where P is not the physics step, ``period`` must say what to do:
+    walk-these-ways published shows it: fitted at 20 ms, it is kp 20 on the *previous* error with kd 0.5, an actuator
+    that is 20 ms late; stepped at 5 ms, as there and in Isaac Lab, it is 5 ms late with kd 0.75 (computed from its
+    weights). So where P is not the physics step, ``period`` must say what to do:
 
     - ``exact``: refuse.
-    - ``hold``: sample every P and keep the torque in between, as a drive with a clock of P does. P must be a whole
+    - ``hold``: sample every P and keep the torque in between, as an actuator with a clock of P does. P must be a whole
       multiple of the physics step. Each robot's clock starts with its episode.
     - ``resample``: evaluate at every physics step on the history P, 2P, ... ago, linear between the steps.
 
@@ -64,14 +64,14 @@ class Net(Memory):
     """
 
     def __init__(
-        self, setup: DriveSetup, *, file: NetFile, period: Literal["exact", "hold", "resample"] = "exact"
+        self, setup: ActuatorSetup, *, file: NetFile, period: Literal["exact", "hold", "resample"] = "exact"
     ) -> None:
         """Load the net.
 
         Raises:
             NetFileError: if the file is no actuator net, or damaged.
-            ConfigError: if the net is another robot's, wants what a position drive does not have, or has a period for
-                which ``period`` will not do.
+            ConfigError: if the net is another robot's, wants what a position controller does not have, or has a period
+                for which ``period`` will not do.
         """
         from go1exp.sim.actuator.actuator_net import load  # what fits nets takes seconds to import
 
@@ -128,7 +128,7 @@ class Net(Memory):
         """Return the joint torques (N, J), N m; target and q in rad, qd in rad/s.
 
         ``feedforward`` is added at every step to what the net says or holds, and the sum is clipped: the recordings
-        that a net learns from have none, so that it knows nothing of how a drive would delay it.
+        that a net learns from have none, so that it knows nothing of how an actuator would delay it.
         """
         made = self._made(target, q, qd)
         return made if feedforward is None else torch.clamp(made + feedforward, -self._limit, self._limit)
@@ -205,8 +205,8 @@ class Net(Memory):
             self._wait.masked_fill_(mask, 0)
 
 
-def _misfits(info: NetInfo, setup: DriveSetup) -> list[str]:
-    """Return why a net is not one for these drives."""
+def _misfits(info: NetInfo, setup: ActuatorSetup) -> list[str]:
+    """Return why a net is not one for these actuators."""
     problems = []
     if missing := [joint for joint in setup.joints if joint not in info.joints]:
         problems.append(f"is for {info.robot!r} with joints {', '.join(info.joints)}; there is none for {missing[0]}")
@@ -214,7 +214,7 @@ def _misfits(info: NetInfo, setup: DriveSetup) -> list[str]:
         problems.append(f"is for robot {info.robot!r}, not for 'go1'")
     if strange := [name for name in info.inputs if name not in INPUTS]:
         problems.append(
-            f"wants {', '.join(strange)}, which a drive that is told positions does not have; fit a net with inputs "
+            f"wants {', '.join(strange)}, which a position controller does not have; fit a net with inputs "
             f"of {', '.join(INPUTS)}"
         )
     return problems

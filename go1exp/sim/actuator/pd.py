@@ -8,7 +8,7 @@ import torch
 
 from go1exp.config.schema.joint_values import JointValues, each_within
 from go1exp.config.schema.registry import actuator
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.setup import Gains
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class PD(Gains):
 
     joint_values = ("kp", "kd")
 
-    def __init__(self, setup: DriveSetup, *, kp: Gain = 20.0, kd: Gain = 0.5) -> None:
+    def __init__(self, setup: ActuatorSetup, *, kp: Gain = 20.0, kd: Gain = 0.5) -> None:
         """Keep the gains, kp in N m/rad and kd in N m s/rad (20 and 0.5: the paper, section II-B.2)."""
         self.kp, self.kd = setup.rows(kp), setup.rows(kd)
         self._limit = setup.effort_limit

@@ -17,8 +17,8 @@ class Actuator(Protocol):
     def torque(self, target: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return joint torques (N, J), N m, for targets and angles in rad and speeds in rad/s.
 
-        A drive that can be fed forward has a fourth argument, ``feedforward: Tensor | None = None``, (N, J), N m: added
-        to its own torque before the limit, and as late as the target where it delays that (``TakesFeedforward``).
+        An actuator that can be fed forward has a fourth argument, ``feedforward: Tensor | None = None``, (N, J), N m:
+        added to its own torque before the limit, and as late as the target where it delays that (``TakesFeedforward``).
         """
 
     def reset(self, mask: Tensor) -> None:
@@ -35,11 +35,11 @@ class TakesFeedforward(Actuator, Protocol):
     """An actuator to which a torque can be added, as a Go1's motors add ``LowCmd.tau``."""
 
     def torque(self, target: Tensor, q: Tensor, qd: Tensor, feedforward: Tensor | None = None) -> Tensor:
-        """Return joint torques (N, J), N m, that of the law plus ``feedforward``, within the drive's limit."""
+        """Return joint torques (N, J), N m, that of the law plus ``feedforward``, within the actuator's limit."""
 
 
 def takes_feedforward(actuator: Actuator) -> TypeGuard[TakesFeedforward]:
-    """Return whether a drive, and the one that it may wrap, can be fed forward."""
+    """Return whether an actuator, and the one that it may wrap, can be fed forward."""
     inner = getattr(actuator, "drive", None)
     itself = "feedforward" in inspect.signature(actuator.torque).parameters
     return itself and (inner is None or takes_feedforward(inner))
@@ -47,7 +47,7 @@ def takes_feedforward(actuator: Actuator) -> TypeGuard[TakesFeedforward]:
 
 @runtime_checkable
 class HasGains(Protocol):
-    """An actuator whose gains, both (N, J), can be written in place: its own, or those of the drive that it wraps."""
+    """An actuator whose gains, both (N, J), can be written in place: its own or the wrapped actuator's."""
 
     @property
     def kp(self) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 
 from go1exp.config.schema.joint_values import JointValues, each_within
 from go1exp.config.schema.registry import actuator
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.dc_motor import Speed, line
 from go1exp.sim.actuator.pd import Gain
 from go1exp.sim.actuator.setup import Gains
@@ -28,7 +28,7 @@ class Voltage(Gains):
 
     duty = (kp (target - q) - kd qd) / stall within -1 to 1; tau = supply stall duty - (stall / speed) qd within the
     peak torque. So a joint at speed gets less than its error asks for although its duty is full, and one that is pushed
-    is braked although its duty is none; ``pd`` and ``dc_motor`` clip torques. Hobby servos are such drives: tau =
+    is braked although its duty is none; ``pd`` and ``dc_motor`` clip torques. Hobby servos are such actuators: tau =
     (kt / R) (U - kt qd), Duclusaud et al. (BAM, arXiv 2410.08650), with stall = U kt / R and speed = U / kt at the
     nominal voltage. Inductance (below 1 ms) is left out. Gains are torques at rest and at the nominal voltage.
     """
@@ -37,7 +37,7 @@ class Voltage(Gains):
 
     def __init__(
         self,
-        setup: DriveSetup,
+        setup: ActuatorSetup,
         *,
         kp: Gain = 20.0,
         kd: Gain = 0.0,
@@ -48,7 +48,7 @@ class Voltage(Gains):
         """Keep the gains and the motor's line at the nominal voltage.
 
         Args:
-            setup: the drives; the peak torque is what the current limit allows.
+            setup: the actuators; the peak torque is what the current limit allows.
             kp: position gain, N m/rad.
             kd: speed gain of the controller, beside the back EMF, N m s/rad.
             stall: torque at rest with full duty, N m; None, or a joint left out: the robot's peak torque.

@@ -1,4 +1,4 @@
-"""A drive inside a drive, as a configuration writes it."""
+"""An actuator inside an actuator, as a configuration writes it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
 from go1exp.config.schema.registry import bind, members
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 
 
 def _checked(settings: dict[str, Any]) -> dict[str, Any]:
@@ -22,11 +22,11 @@ def _checked(settings: dict[str, Any]) -> dict[str, Any]:
     raise PydanticCustomError("problems", "{lines}", {"lines": "\n".join(problems)})
 
 
-Drive = Annotated[dict[str, Any], AfterValidator(_checked)]
+InnerActuator = Annotated[dict[str, Any], AfterValidator(_checked)]
 """``{term: pd, kp: 20.0, ...}``: type of a parameter called ``drive``."""
 
 
-def build(setup: DriveSetup, drive: dict[str, Any]) -> Any:
+def build(setup: ActuatorSetup, drive: dict[str, Any]) -> Any:
     """Return the actuator that ``drive`` describes."""
     parameters = {k: v for k, v in drive.items() if k != "term"}
     return members("actuator")[drive["term"]].target(setup, **parameters)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from go1exp.config.schema.registry import effect
-from go1exp.robot.drive import ModelFields
+from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import TWO_GAIN_SETS, Identification
 

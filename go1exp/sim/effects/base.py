@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field
 from go1exp.base.tensors.memory import Memory
 from go1exp.config.schema.contact import ContactConfig
 from go1exp.config.schema.joint_values import JointValues, each_within
-from go1exp.robot.drive import DriveSetup, ModelFields
+from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.effects.identification import Identification
 
 if TYPE_CHECKING:
@@ -116,9 +116,9 @@ class Effect(Memory):
     needs and no others. All tensors are (N, J) unless said, angles in rad, speeds in rad/s, torques in N m.
 
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
-    ``on_target`` and ``on_feedforward``, ``on_encoder``, ``on_error``, the actuator, ``on_drive``, ``on_transmission``,
-    ``on_gears``, then ``on_joint``, ``on_friction``, ``on_load`` and ``on_base`` beside it. Whoever reads the drives'
-    torques asks ``on_report``.
+    ``on_target`` and ``on_feedforward``, ``on_encoder``, ``on_error``, the actuator, ``on_actuator``,
+    ``on_transmission``, ``on_gears``, then ``on_joint``, ``on_friction``, ``on_load`` and ``on_base`` beside it.
+    Whoever reads the drives' torques asks ``on_report``.
     """
 
     title: ClassVar[str] = ""
@@ -147,7 +147,7 @@ class Effect(Memory):
             ]
         )
 
-    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+    def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Spread the values over joints and environments; joints that a mapping leaves out have the null value."""
         self.setup = setup
         for p in self.params:
@@ -185,7 +185,7 @@ class Effect(Memory):
         """Return the gains that the drive really has."""
         return kp, kd
 
-    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+    def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque that the motor really makes. q, qd: the encoder's."""
         return torque
 

@@ -9,7 +9,7 @@ import torch
 
 from go1exp.base.tensors.rotation import quat_multiply, rotate, rotate_inverse
 from go1exp.config.schema.registry import effect
-from go1exp.robot.drive import ModelFields
+from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Measured, Param
 from go1exp.sim.effects.identification import TWO_ATTITUDES, Identification
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from go1exp.base.tensors.delay_line import DelayLine
     from go1exp.config.schema.joint_values import JointValues
-    from go1exp.robot.drive import DriveSetup
+    from go1exp.robot.actuators import ActuatorSetup
 
 
 @effect("command_delay")
@@ -35,7 +35,7 @@ class CommandDelay(Delayed):
         excitation="steps",
     )
 
-    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+    def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Allocate the past of targets; that of feed-forward torques is allocated with the first of them."""
         super().__init__(setup, **values)
         self._fed: DelayLine | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from go1exp.base.tensors.delay_line import DelayLine
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ class Delayed(Effect):
 
     delay: Tensor
 
-    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+    def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Allocate the past."""
         super().__init__(setup, **values)
         (longest,) = (p.high for p in self.params if p.name == "delay")

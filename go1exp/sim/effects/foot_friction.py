@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from go1exp import robot
 from go1exp.config.schema.registry import effect
-from go1exp.robot.drive import ModelFields
+from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import Identification
 

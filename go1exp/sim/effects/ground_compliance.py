@@ -10,7 +10,7 @@ import torch
 from go1exp import robot
 from go1exp.config.schema.contact import ContactConfig
 from go1exp.config.schema.registry import effect
-from go1exp.robot.drive import ModelFields
+from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import Identification
 

@@ -9,7 +9,7 @@ import torch
 
 from go1exp.base.tensors.restitution import damping_ratio
 from go1exp.config.schema.registry import effect
-from go1exp.robot.drive import ModelFields
+from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import Identification
 

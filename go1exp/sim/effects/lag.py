@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.config.schema.registry import effect
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import SHARP_EDGES, Identification
 
@@ -36,7 +36,7 @@ class Lag(Effect):
     order = 40
     time: Tensor
 
-    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+    def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Begin settled."""
         super().__init__(setup, **values)
         self._made, self._asked = setup.zeros(), setup.zeros()
@@ -54,7 +54,7 @@ class Lag(Effect):
         self._now.copy_(1.0 - mean)
         self._absent.copy_(self.time == 0.0)
 
-    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+    def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque made, given the demand."""
         made = (self._kept * self._made).addcmul_(self._before, self._asked).addcmul_(self._now, torque)
         made = torch.where(self._fresh | self._absent, torque, made)

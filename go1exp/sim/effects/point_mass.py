@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from go1exp.robot.drive import ModelFields
+from go1exp.robot.actuators import ModelFields
 
 if TYPE_CHECKING:
     from torch import Tensor

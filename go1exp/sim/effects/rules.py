@@ -13,7 +13,7 @@ from go1exp.config.schema.registry import Term, members, unknown_name
 from go1exp.sim.effects.base import Effect
 
 
-def drives(actuator: Term) -> Iterator[tuple[Term, str]]:
+def nested_actuators(actuator: Term) -> Iterator[tuple[Term, str]]:
     """Yield the actuator and, if it is a wrapper, those in it from the outside in, each with its key path."""
     term, path = actuator, "actuator"
     yield term, path
@@ -25,7 +25,7 @@ def drives(actuator: Term) -> Iterator[tuple[Term, str]]:
 
 def has_gains(actuator: Term) -> bool:
     """Return whether the drive has a position and a speed gain; a wrapper has those of the ``drive`` in it."""
-    *_, (innermost, _) = drives(actuator)
+    *_, (innermost, _) = nested_actuators(actuator)
     return bool(innermost.entry.traits.get("gains"))
 
 
@@ -62,9 +62,11 @@ def _leaves_the_model(term: Term, name: str) -> bool:
     return name in params and params[name].least is not None and term.parameters[name] == params[name].null
 
 
-def drive_problems(actuator: Term, effects: Iterable[Term], joints: Sequence[str]) -> list[str]:
+def actuator_problems(actuator: Term, effects: Iterable[Term], joints: Sequence[str]) -> list[str]:
     """Return what is wrong with actuator and effects together, one line each with its key path."""
-    problems = [problem for term, path in drives(actuator) for problem in _values_problems(term, path, joints)]
+    problems = [
+        problem for term, path in nested_actuators(actuator) for problem in _values_problems(term, path, joints)
+    ]
     for term in effects:
         path = f"effect.{term.key}"
         problems += _values_problems(term, path, joints)

@@ -10,7 +10,7 @@ import torch
 from go1exp.config.schema.joint_values import JointValues
 from go1exp.config.schema.registry import effect
 from go1exp.robot import MOUNT, MOUNT_SLIDES
-from go1exp.robot.drive import DriveSetup, ModelFields
+from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import Identification
 
@@ -71,7 +71,7 @@ class SoftMount(Effect):
     pitch: Tensor
     damping: Tensor
 
-    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+    def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Leave the model as it is where there is no mount in it."""
         super().__init__(setup, **values)
         if not setup.mounted:

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.registry import Term
-from go1exp.robot.drive import CompiledModel, DriveSetup, ModelFields
+from go1exp.robot.actuators import ActuatorSetup, CompiledModel, ModelFields
 from go1exp.sim.actuator.setup import Actuator, HasGains
 from go1exp.sim.effects.base import Effect, Gears, Measured
 from go1exp.sim.effects.two_mass import TwoMass
 
 HOOKS = (
-    *("on_target", "on_feedforward", "on_encoder", "on_error", "on_gains", "on_drive", "on_report"),
+    *("on_target", "on_feedforward", "on_encoder", "on_error", "on_gains", "on_actuator", "on_report"),
     *("on_transmission", "on_gears", "on_joint", "on_friction", "on_load", "on_base"),
 )
 
@@ -44,7 +44,7 @@ class EffectStack:
         rotors: of gears that yield; None if no effect makes them.
     """
 
-    def __init__(self, terms: Sequence[Term], setup: DriveSetup) -> None:
+    def __init__(self, terms: Sequence[Term], setup: ActuatorSetup) -> None:
         """Build the effects of ``terms``."""
         self._setup = setup
         self.effects: dict[str, Effect] = {t.key: t(setup) for t in terms}
@@ -133,10 +133,10 @@ class EffectStack:
             target = effect.on_error(target, q)
         return target
 
-    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+    def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque that the motors make."""
-        for effect in self._acting["on_drive"]:
-            torque = effect.on_drive(torque, q, qd)
+        for effect in self._acting["on_actuator"]:
+            torque = effect.on_actuator(torque, q, qd)
         return torque
 
     def on_report(self, torque: Tensor) -> Tensor:

@@ -33,6 +33,6 @@ class Strength(Effect):
     order = 10
     scale: Tensor
 
-    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+    def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque made."""
         return torque * self.scale

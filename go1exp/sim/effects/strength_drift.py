@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.config.schema.registry import effect
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect, Param
 
 if TYPE_CHECKING:
@@ -35,12 +35,12 @@ class StrengthDrift(Effect):
     rate: Tensor
     floor: Tensor
 
-    def __init__(self, setup: DriveSetup, **values: JointValues) -> None:
+    def __init__(self, setup: ActuatorSetup, **values: JointValues) -> None:
         """Begin an episode."""
         super().__init__(setup, **values)
         self._time = setup.zeros()[:, :1]
 
-    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+    def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque made; the step's time passes."""
         remaining = torch.maximum(1.0 - self.rate * self._time, self.floor)
         self._time += self.setup.physics_dt

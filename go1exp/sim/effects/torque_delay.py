@@ -33,6 +33,6 @@ class TorqueDelay(Delayed):
     )
     order = 30
 
-    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+    def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque asked for ``delay`` ago."""
         return self.late(torque)

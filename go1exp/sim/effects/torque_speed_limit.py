@@ -54,7 +54,7 @@ class TorqueSpeedLimit(Effect):
     droop: Tensor
     stall: Tensor
 
-    def on_drive(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
+    def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque within the limits."""
         effort = self.peak * self.setup.effort_limit
         low, high = envelope(qd, effort, self.stall * effort, self.setup.velocity_limit / self.droop)

@@ -31,7 +31,7 @@ from go1exp.base.tensors.memory import Memory
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from go1exp.robot.drive import DriveSetup
+    from go1exp.robot.actuators import ActuatorSetup
     from go1exp.sim.effects.base import Gears
 
 LIGHTEST = 1e-5
@@ -48,7 +48,7 @@ class TwoMass(Memory):
 
     memory = ("twist", "rate", "_earlier", "_pull", "_share")
 
-    def __init__(self, setup: DriveSetup) -> None:
+    def __init__(self, setup: ActuatorSetup) -> None:
         """Begin untwisted."""
         self._dt = setup.physics_dt
         self.twist, self.rate, self._earlier = setup.zeros(), setup.zeros(), setup.zeros()

@@ -31,7 +31,7 @@ from go1exp.sim.effects.rules import on_mount
 from go1exp.sim.env.engine import CapturedStep, make_backend
 from go1exp.sim.env.evidence import Evidence, accuse
 from go1exp.sim.env.gait_log import GaitLog
-from go1exp.sim.env.plant import Plant, drive_setup
+from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.env.restarts import Restarts
 from go1exp.sim.env.task_log import TaskLog
 from go1exp.sim.env.terms import StepTerms
@@ -59,7 +59,7 @@ class Go1Core:
         spread_starts: let first episodes begin at random times (training only).
         imu: simulate the IMU's sensors too, for a logger.
         held: attitude w-x-y-z in which the trunks are held in the air; None lets them go.
-        alike: draw the effects and drives once, for all robots: one robot, many times (for a logger).
+        alike: draw the effects and actuators once, for all robots: one robot, many times (for a logger).
         critic: append what only the critic sees to the observations (training only).
         changing: keys of the settings that ``change`` may write (training only).
     """
@@ -91,10 +91,10 @@ class Go1Core:
         self.random = EnvRandom(seed, num_envs, first_env, self.device, units=self.backend.units)
         self._held, self._state = held, KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
-        drives = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
+        actuators = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
         self.terms = StepTerms(task, num_envs, self.device, critic, changing)
-        self._build_terms(drives)
-        self._restarts = Restarts(self._restart, (self.random, drives))
+        self._build_terms(actuators)
+        self._restarts = Restarts(self._restart, (self.random, actuators))
         zeros = partial(torch.zeros, num_envs, dtype=torch.float32, device=self.device)
         self.action, self.previous_action = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
         self._last_action, self.target = zeros(robot.NUM_JOINTS), zeros(robot.NUM_JOINTS)
@@ -128,10 +128,10 @@ class Go1Core:
         start = min([self._max_level, *(getattr(rule, "start_level_max", inf) for rule in self._curriculum[:1])])
         self._start_levels = int(start) + 1
 
-    def _build_terms(self, drives: EnvRandom) -> None:
+    def _build_terms(self, actuators: EnvRandom) -> None:
         """Turn the configured terms into callables, and make per-environment the model fields that will vary."""
         task = self.task
-        setup = drive_setup(task.robot, task.sim.physics_dt, self.backend, drives)
+        setup = actuator_setup(task.robot, task.sim.physics_dt, self.backend, actuators)
         self.plant = Plant(self.backend, setup, task.actuator, task.effect)
         self.command = task.command(self.random.stream("command"))
         if isinstance(self.command, UniformVelocity):

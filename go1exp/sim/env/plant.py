@@ -2,12 +2,12 @@
 
 Training, evaluation, recording and identification all step this, so that an effect means the same to each.
 
-Numerics. MuJoCo's Euler step is a leapfrog: qpos belongs to the step's instant, qvel to half a step before it. A drive
-that took both at face value would react half a step late to speed and half a step early to its target, which at 2 ms
-moves a 0.2 rad step by 5 mrad against 0.25 ms. So the drive gets the speed extrapolated to the instant of qpos, and a
-target that changes counts for half of the step in which it changes: second order in the step, 0.3 mrad.
-Dry friction changes its sign within the step in which a joint turns. MuJoCo's has the sign of the speed at its end all
-the step long; the difference is given beside it.
+Numerics. MuJoCo's Euler step is a leapfrog: qpos belongs to the step's instant, qvel to half a step before it. An
+actuator that took both at face value would react half a step late to speed and half a step early to its target, which
+at 2 ms moves a 0.2 rad step by 5 mrad against 0.25 ms. So the actuator gets the speed extrapolated to the instant of
+qpos, and a target that changes counts for half of the step in which it changes: second order in the step, 0.3 mrad. Dry
+friction changes its sign within the step in which a joint turns. MuJoCo's has the sign of the speed at its end all the
+step long; the difference is given beside it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.mdp.types import Snapshot
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.config import RobotConfig
-from go1exp.robot.drive import DriveSetup
 from go1exp.sim.actuator.setup import Actuator, TakesFeedforward, takes_feedforward
 from go1exp.sim.effects.base import Measured
 from go1exp.sim.effects.stack import EffectStack
@@ -33,8 +33,8 @@ from go1exp.sim.physics.backend import PhysicsBackend
 FRICTION, ARMATURE = "dof_frictionloss", "dof_armature"
 
 
-def drive_setup(config: RobotConfig, physics_dt: float, backend: PhysicsBackend, random: EnvRandom) -> DriveSetup:
-    """Describe the Go1's drives on ``backend``."""
+def actuator_setup(config: RobotConfig, physics_dt: float, backend: PhysicsBackend, random: EnvRandom) -> ActuatorSetup:
+    """Describe the Go1's actuators on ``backend``."""
 
     def spread(hip_thigh_calf: tuple[float, float, float]) -> Tensor:
         return torch.as_tensor(robot.per_joint(hip_thigh_calf), dtype=like.dtype, device=like.device)
@@ -42,7 +42,7 @@ def drive_setup(config: RobotConfig, physics_dt: float, backend: PhysicsBackend,
     like = backend.qpos
     freedom = backend.qvel.shape[1]
     floating = like.shape[1] != freedom  # a free joint has a quaternion
-    return DriveSetup(
+    return ActuatorSetup(
         num_envs=backend.num_envs,
         physics_dt=physics_dt,
         joints=robot.JOINTS,
@@ -58,23 +58,23 @@ def drive_setup(config: RobotConfig, physics_dt: float, backend: PhysicsBackend,
 
 
 class Plant:
-    """N robots with their drives and effects on a physics backend.
+    """N robots with their actuators and effects on a physics backend.
 
     Attributes:
         q: (N, J) true joint angles, live, rad.
         qd: (N, J) true joint speeds half a step before ``q``, live, rad/s.
-        torque: (N, J) what the drives made in the last step, N m.
-        actuator: the drives.
+        torque: (N, J) what the actuators made in the last step, N m.
+        actuator: the actuators.
         effects: what else acts.
-        enabled: (N,) bool, which robots' drives are on, or None for all; one that is off asks for no torque.
+        enabled: (N,) bool, which robots' actuators are on, or None for all; one that is off asks for no torque.
         observer: called before every step with the target (N, J) that takes force in it.
     """
 
     enabled: Tensor | None = None
     observer: Callable[[Tensor], None] | None = None
 
-    def __init__(self, backend: PhysicsBackend, setup: DriveSetup, actuator: Term, effects: Sequence[Term]) -> None:
-        """Put drives and effects on ``backend``, whose last J coordinates are the joints."""
+    def __init__(self, backend: PhysicsBackend, setup: ActuatorSetup, actuator: Term, effects: Sequence[Term]) -> None:
+        """Put actuators and effects on ``backend``, whose last J coordinates are the joints."""
         self.backend, self._dt = backend, setup.physics_dt
         joints = len(setup.joints)
         self._joints = slice(backend.qvel.shape[1] - joints, None)
@@ -113,7 +113,7 @@ class Plant:
         self.refresh()
 
     def refresh(self) -> None:
-        """Put the effects' present values into force: in their laws, the model and the drives."""
+        """Put the effects' present values into force: in their laws, the model and the actuators."""
         self.effects.prepare()
         if self.effects.fields:
             self.backend.rebase(self.effects.model_values(self.backend))
@@ -141,7 +141,7 @@ class Plant:
             self._outside.copy_(torch.where(rows, -self._bias[:, self._joints], self._outside))
 
     def reported_torque(self) -> Tensor:
-        """(N, J) what the drives report of ``torque``, N m; never to be written to."""
+        """(N, J) what the actuators report of ``torque``, N m; never to be written to."""
         return self.effects.on_report(self.torque)
 
     def speed(self) -> Tensor:
@@ -151,14 +151,14 @@ class Plant:
     def step(self, target: Tensor, feedforward: Tensor | None = None) -> None:
         """Advance one physics step.
 
-        A torque that is fed forward is added where a Go1's motor adds ``LowCmd.tau``: to the drive's own torque, before
-        the drive's limit and before what effects do to a torque (``strength``, ``lag``, ...). It travels with the
-        target: where it changes it counts for half of the step, and ``command_delay`` delays both.
+        A torque that is fed forward is added where a Go1's motor adds ``LowCmd.tau``: to the actuator's own torque,
+        before the actuator's limit and before what effects do to a torque (``strength``, ``lag``, ...). It travels with
+        the target: where it changes it counts for half of the step, and ``command_delay`` delays both.
 
         - ``pd``: in the sum that is clipped at the peak torque.
         - ``dc_motor``: in the sum that is clipped at what the motor can make at that speed.
         - ``voltage``: in the duty that is clipped, before the back EMF.
-        - ``delay``: as late as the target, then as the drive inside says.
+        - ``delay``: as late as the target, then as the actuator inside says.
         - ``net``: added to what the net says or holds, and clipped at the peak torque; its history has no part of it.
 
         Args:
@@ -166,7 +166,7 @@ class Plant:
             feedforward: (N, J) torque, in force from now on, N m; None for none. Once there was one, None means zeros.
 
         Raises:
-            go1exp.config.schema.registry.ConfigError: if the drive takes none.
+            go1exp.config.schema.registry.ConfigError: if the actuator takes none.
         """
         if self.observer:
             self.observer(target)
@@ -183,7 +183,7 @@ class Plant:
             made = self._fed_forward(command, encoder, feedforward)
         if self.enabled is not None:  # a demand of zero, which a lag or a delay treats as any other
             made = made * self.enabled.unsqueeze(1)
-        self.torque.copy_(effects.on_drive(made, *encoder))
+        self.torque.copy_(effects.on_actuator(made, *encoder))
         if self._bounded:
             bound = effects.on_friction(self._bound, self.torque, qd)
             if self._outside is not None:
@@ -204,7 +204,7 @@ class Plant:
             self._rotors.follow(self.joint_acceleration())
 
     def _fed_forward(self, command: Tensor, encoder: tuple[Tensor, Tensor], feedforward: Tensor | None) -> Tensor:
-        """Return the drives' torque for a target, with the torque that is fed forward."""
+        """Return the actuators' torque for a target, with the torque that is fed forward."""
         if self._fed is None:
             if not takes_feedforward(self.actuator):
                 kind, known = type(self.actuator).__name__, "use actuator=pd, dc_motor, voltage, delay or net"
@@ -216,7 +216,7 @@ class Plant:
         return cast("TakesFeedforward", self.actuator).torque(command, *encoder, arriving)
 
     def _act_beside(self, geared: Tensor, q: Tensor, qd: Tensor, turn: Tensor | None) -> Tensor:
-        """Apply what acts on the joints beside the drive's torque ``geared``, and return what is left of that."""
+        """Apply what acts on the joints beside the actuator's torque ``geared``, and return what is left of that."""
         beside = self.effects.on_joint(q, qd)
         if turn is not None:
             beside = beside + self._late_friction(turn)
@@ -255,7 +255,7 @@ class Plant:
     _STATE = ("before", "target", "bound", "inertia")
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what the drives and effects remember."""
+        """Return what the actuators and effects remember."""
         physics = {name: getattr(self, f"_{name}").clone() for name in self._STATE}
         parts = {"actuator": self.actuator.state_dict(), "effects": self.effects.state_dict()}
         if self._rotors:

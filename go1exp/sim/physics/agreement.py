@@ -27,7 +27,7 @@ HIGH = 2.0
 """Height of the trunk, m: nothing touches."""
 
 GAINS = 20.0, 0.5
-"""Stiffness N m/rad and damping N m s/rad of the drives in the fall."""
+"""Stiffness N m/rad and damping N m s/rad of the actuators in the fall."""
 
 TOLERANCES: dict[str, tuple[float, str]] = {
     "names and order": (0.0, "names"),
@@ -195,7 +195,7 @@ def _masses_and_gravity(reference: PhysicsBackend, engine: PhysicsBackend) -> di
 
 
 def _fall(reference: PhysicsBackend, engine: PhysicsBackend) -> dict[str, float]:
-    """Compare robots that fall with a zero action: drives hold the stance."""
+    """Compare robots that fall with a zero action: actuators hold the stance."""
     count, degrees = engine.num_envs, engine.num_envs - 1
     qpos = _poses(count, 0.2, seed=1)
     qvel = np.random.default_rng(2).normal(0.0, 0.3, (count, degrees))

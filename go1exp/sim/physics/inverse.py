@@ -13,7 +13,7 @@ from go1exp.sim.physics.scene import build_model
 def joint_torques(
     config: RobotConfig, base_quat: tuple[float, float, float, float], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> np.ndarray:
-    """Return M(q) qdd + c(q, qd) + g(q) of a robot whose trunk is held: what drive and friction together gave.
+    """Return M(q) qdd + c(q, qd) + g(q) of a robot whose trunk is held: what actuator and friction together gave.
 
     Args:
         config: the robot; its damping and dry friction are the model's own, so that they are not in the result.

@@ -81,7 +81,7 @@ class MujocoCpu:
         return self._baseline[name] if name in self._baseline else self.compiled(name).unsqueeze(0)
 
     def applied(self) -> Tensor:
-        """Live generalised forces beside the drives'."""
+        """Live generalised forces beside the actuators'."""
         if self._applied is None:
             self._applied = torch.from_numpy(self._batch.bind("qfrc_applied"))
         return self._applied

@@ -207,7 +207,7 @@ class MujocoWarp:
         return self._compiled[name]
 
     def applied(self) -> Tensor:
-        """Live generalised forces beside the drives'."""
+        """Live generalised forces beside the actuators'."""
         return self._qfrc_applied
 
     def bias(self) -> Tensor:

@@ -89,7 +89,7 @@ class FootFriction:
         Args:
             mass: MuJoCo's sparse lower triangle of M (N, nC).
             acceleration: change of qvel over the step (N, nv).
-            known: drives, gravity, inertia and applied forces, MuJoCo's ``qfrc_smooth`` (N, nv).
+            known: actuators, gravity, inertia and applied forces, MuJoCo's ``qfrc_smooth`` (N, nv).
         """
         row, column = self._place
         dense = np.zeros((len(mass), self._nv, self._nv))

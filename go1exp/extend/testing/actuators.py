@@ -16,7 +16,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.joint_values import numbers
 from go1exp.config.schema.registry import ConfigError, Entry, Term, bind
 from go1exp.extend.testing.description import alike, checked, expect
-from go1exp.robot.drive import DriveSetup
+from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import MANY_TERMS, TaskConfig, parse_task
@@ -25,8 +25,8 @@ PHYSICS_DT = 0.002
 ALONE = "a robot must get the same alone and in a batch"
 
 
-def go1_drives(n: int, first_env: int = 0, **changes: Any) -> DriveSetup:
-    """Describe the drives of n Go1 robots at 2 ms; keyword arguments change that."""
+def go1_actuators(n: int, first_env: int = 0, **changes: Any) -> ActuatorSetup:
+    """Describe the actuators of n Go1 robots at 2 ms; keyword arguments change that."""
 
     def per_joint(values: tuple[float, float, float]) -> Tensor:
         return torch.as_tensor(robot.per_joint(values))
@@ -42,7 +42,7 @@ def go1_drives(n: int, first_env: int = 0, **changes: Any) -> DriveSetup:
         "device": torch.device("cpu"),
         "dtype": torch.float64,
     }
-    return DriveSetup(**{**usual, **changes})
+    return ActuatorSetup(**{**usual, **changes})
 
 
 def _noise(n: int, scale: float, seed: int) -> Tensor:
@@ -61,12 +61,12 @@ def check_actuator(entry: Entry, parameters: dict[str, Any], exact: bool) -> Non
     values = checked(entry, parameters)
 
     def make(n: int, first: int = 0) -> Any:
-        made = entry.target(go1_drives(n, first), **values)
+        made = entry.target(go1_actuators(n, first), **values)
         made.reset(torch.ones(n, dtype=torch.bool))
         return made
 
     batch, alone = make(5), make(1, 3)
-    limit = go1_drives(1).effort_limit
+    limit = go1_actuators(1).effort_limit
     within = f"torques must stay within {limit.tolist()[:3]} N m"
     one, fresh = make(5), make(5)
     for k in range(30):

@@ -46,8 +46,8 @@ class CompiledModel(Protocol):
 
 
 @dataclass(frozen=True)
-class DriveSetup:
-    """The drives of N robots.
+class ActuatorSetup:
+    """The actuators of N robots.
 
     Attributes:
         num_envs: N.
