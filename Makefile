@@ -13,7 +13,7 @@ LOCK_VENV := build/lock-venv
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo quick test test-all test-slurm test-ray test-tune test-vendor check sanitise bench runtime image lock clean
+.PHONY: help setup demo quick test test-all test-slurm test-ray test-tune check sanitise bench runtime image lock clean
 
 help: ## list the verbs
 	@echo "usage: make VERB"
@@ -86,16 +86,6 @@ test-ray: setup ## sweeps on a Ray cluster of this machine, one node of which is
 	@$(PIP) install -qq "ray>=2.60,<3"
 	@echo "test-ray 2/2: pytest"
 	@GO1EXP_TEST_RAY=1 $(BIN)/python -m pytest -q --slow=all tests/test_ray.py
-
-# A folder of its own, so that the vendor's package, whose metadata asks for much else, never enters .venv.
-VENDOR := build/vendor
-
-test-vendor: setup ## the vendor's own client of the Go1 against our simulated robot; Python 3.11 on x86-64
-	@echo "test-vendor 1/2: unitree-legged-sdk in $(VENDOR)"
-	@rm -rf $(VENDOR)
-	@$(PIP) install -qq --no-deps --only-binary :all: --target $(VENDOR) unitree-legged-sdk==3.8.20231105
-	@echo "test-vendor 2/2: pytest"
-	@GO1EXP_TEST_VENDOR=1 PYTHONPATH=$(VENDOR) $(BIN)/python -m pytest -q -s --slow=all tests/test_go1_vendor.py
 
 check: setup ## formatting, lint and types; changes nothing
 	@echo "check 1/3: ruff format"

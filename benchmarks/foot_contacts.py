@@ -26,7 +26,6 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.deploy.estimation import go1, make_filter, readings
 from go1exp.deploy.estimation.feet import FootCalibration, LoadByBoth, forces_by_torque, kinematics
-from go1exp.deploy.estimation.legs import foot
 from go1exp.deploy.estimation.replay import samples
 from go1exp.deploy.runtime.estimate import BOTH, TORQUE
 from go1exp.logs.record.simulate import Rig, Walk, play_policy
@@ -34,6 +33,7 @@ from go1exp.logs.recording import VECTORS, Recording
 from go1exp.sim.task import parse_task
 
 CONFIG = go1()
+LEGS = kinematics(CONFIG)
 BOXES = ("boxes_proportion=1.0", "bumps_proportion=0.0", "ramps_proportion=0.0", "flat_proportion=0.0")
 
 
@@ -56,8 +56,7 @@ def by_torque(rows: np.ndarray) -> np.ndarray:
     """Return the vertical forces (T, 4), N, that balance the torques."""
     up = Rotation.from_quat(rows[:, readings.QUAT], scalar_first=True).as_matrix()[:, 2]
     each = zip(rows[:, readings.Q], rows[:, readings.TAU], up, strict=True)
-    legs = kinematics(CONFIG)
-    return np.array([forces_by_torque(q, torque, vertical, legs) for q, torque, vertical in each])
+    return np.array([forces_by_torque(q, torque, vertical, LEGS) for q, torque, vertical in each])
 
 
 def counts(force: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, FootCalibration]:
@@ -75,7 +74,7 @@ def odometry(rows: np.ndarray, load: np.ndarray, smooth: float) -> np.ndarray:
     velocity, last = np.zeros((len(rows), 3)), np.zeros(3)
     for k, row in enumerate(rows):
         q, qd, gyro = (row[part] for part in (readings.Q, readings.QD, readings.GYRO))
-        feet = [foot(leg, one) for leg, one in zip(CONFIG.legs, q.reshape(4, 3), strict=True)]
+        feet = [leg(one) for leg, one in zip(LEGS, q.reshape(4, 3), strict=True)]
         moving = np.array([j @ v + np.cross(gyro, p) for (p, j, _), v in zip(feet, qd.reshape(4, 3), strict=True)])
         standing = load[k] > 25.0
         last = -moving[standing].mean(axis=0) if standing.any() else last

@@ -33,7 +33,7 @@ class World:
     Attributes:
         now: the time, s.
         robot: at the other end; None before it is started.
-        obeyed: by number, what the robot has taken into force.
+        applied: the commands that the robot applied, oldest first.
         targets: of each tick: the robot's clock, the target in force, and whether it braked.
         spins: what the runtime's clocks were asked to spin.
         closed: the simulated robot was closed.
@@ -43,7 +43,7 @@ class World:
         self.now, self.spoil = BEGIN, spoil
         self.robot: Robot | None = None
         self.server: Server | None = None
-        self.obeyed: dict[int, LowCmd] = {}
+        self.applied: list[LowCmd] = []
         self.targets: list[tuple[float, np.ndarray, bool]] = []
         self.spins: list[float] = []
         self.between: Callable[[], None] = lambda: None
@@ -60,13 +60,13 @@ class World:
 
 
 class Listening(Robot):
-    """A robot that tells what it obeys, and whose sensors may be spoilt."""
+    """A robot that tells what it applies, and whose sensors may be spoilt."""
 
     world: World
 
-    def obey(self, command: LowCmd, number: int) -> None:
-        self.world.obeyed[number] = command
-        super().obey(command, number)
+    def apply(self, command: LowCmd) -> None:
+        self.world.applied.append(command)
+        super().apply(command)
 
     def sense(self) -> tuple[LowState, np.ndarray]:
         state, true = super().sense()
@@ -106,7 +106,7 @@ class InProcess:
         self.port = self._server.port
         self.report: dict[str, Any] = {}
         self.truth: dict[str, np.ndarray] = {}
-        self.obeyed: np.ndarray | None = None
+        self.applied: np.ndarray | None = None
 
     def __enter__(self) -> InProcess:
         return self
@@ -115,7 +115,7 @@ class InProcess:
         self.world.closed = True
         empty = Deadlines(TICK, 1).timing()
         self.report = asdict(self._server.counts) | {"timing": asdict(empty)}
-        self.obeyed = self._server.obeyed.rows()
+        self.applied = self._server.applied.rows()
         rows = self._server.truth.rows()
         if not np.isnan(rows).any():
             self.truth = dict(zip(("clock", *TRUTH), rows.T, strict=True))

@@ -172,7 +172,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("export check", ("go1exp export check: file: required",)),
         ("export check a.zip +deep=1", ("deep: unknown key",)),
         ("deploy", ("bundle: required", "go1exp deploy runs/NAME/bundle.zip")),
-        ("deploy a.zip robot=dog rate=1", ("2 problems", "robot = 'dog'", "'sim', 'go1' or 'go1_sdk'", "rate = 1")),
+        ("deploy a.zip robot=dog rate=1", ("2 problems", "robot = 'dog'", "'sim' or 'go1'", "rate = 1")),
         ("sim protocol=exact", ("no such key 'protocol'",)),
         ("deploy a.zip command=[1,0]", ("command.2: required",)),
         ("deploy a.zip sim.los=0.1", ("sim.los=0.1", "did you mean 'sim.loss'")),

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.mocap import judge
 from go1exp.base.paths import data_root
 from go1exp.deploy.estimation import go1, make_filter, readings, scaler
-from go1exp.deploy.estimation.kalman import NumpyFilter
-from go1exp.deploy.estimation.mocap import judge
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.importers.scaler_walk_mocap import motion_capture
 from go1exp.logs.importers.source import load_npz
 from go1exp.logs.recording import VECTORS, RecordingError
 from go1exp.robot import NOMINAL_STANCE
 from go1exp.robot.attitude import vertical
+from tests.kalman import NumpyFilter
 
 DATA = Path(os.environ.get("GO1EXP_DATA", data_root().parent / "shared/data")) / "scaler_walk_mocap"
 

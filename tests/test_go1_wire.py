@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from go1exp.deploy.runtime import go1_wire as wire
 from go1exp.deploy.runtime.udp import Go1Link
 from go1exp.deploy.sim_robot.machine import Robot
-from go1exp.deploy.sim_robot.protocols import Go1, roll_pitch_yaw
-from go1exp.deploy.sim_robot.server import Server
+from go1exp.deploy.sim_robot.server import Packets, Server, roll_pitch_yaw
 from go1exp.deploy.sim_robot.settings import SimConfig
+from go1exp.robot import go1_fields as fields
 from go1exp.robot.messages import LowCmd, LowState
 
 # Bytes of unitree-legged-sdk 3.8.20231105, received on a socket: InitCmdData, then twelve motors set to
@@ -101,21 +101,21 @@ def test_the_checksum_is_that_of_the_vendor_and_of_its_definition() -> None:
 
 
 def test_every_field_has_its_offset_unit_and_source() -> None:
-    assert (wire.COMMAND_TYPE.itemsize, wire.STATE_TYPE.itemsize) == (614, 807)
-    offsets = {name: wire.STATE_TYPE.fields[name][1] for name in wire.STATE_TYPE.names}  # type: ignore[index,union-attr]
+    assert (fields.COMMAND_TYPE.itemsize, fields.STATE_TYPE.itemsize) == (614, 807)
+    offsets = {name: fields.STATE_TYPE.fields[name][1] for name in fields.STATE_TYPE.names}  # type: ignore[index,union-attr]
     told = {"imu": 22, "motor": 75, "battery": 715, "foot_force": 739, "foot_force_est": 747, "tick": 755}
     assert {name: offsets[name] for name in told} == told
     assert (offsets["remote"], offsets["reserve"], offsets["crc"]) == (759, 799, 803)
-    assert wire.dtype_of(wire.MOTOR_COMMAND).itemsize == 27
-    assert wire.dtype_of(wire.MOTOR_STATE).itemsize == 32
-    for fields in (wire.COMMAND, wire.STATE, wire.MOTOR_COMMAND, wire.MOTOR_STATE, wire.IMU, wire.BATTERY):
-        assert all(field.unit and field.source for field in fields)
+    assert fields.dtype_of(fields.MOTOR_COMMAND).itemsize == 27
+    assert fields.dtype_of(fields.MOTOR_STATE).itemsize == 32
+    for packet in (fields.COMMAND, fields.STATE, fields.MOTOR_COMMAND, fields.MOTOR_STATE, fields.IMU, fields.BATTERY):
+        assert all(field.unit and field.source for field in packet)
 
 
 BEGINNING = "2sBB2I2IH"
 LAYOUT = {
-    "command": (wire.COMMAND_TYPE, BEGINNING + 20 * "BffhHH3I" + "4B" + "40B" + "II"),
-    "state": (wire.STATE_TYPE, BEGINNING + "4f3f3f3fb" + 20 * "BffhhffhbII" + "4BiH2b2b10B" + "4h4hI" + "40B" + "II"),
+    "command": (fields.COMMAND_TYPE, BEGINNING + 20 * "BffhHH3I" + "4B" + "40B" + "II"),
+    "state": (fields.STATE_TYPE, BEGINNING + "4f3f3f3fb" + 20 * "BffhhffhbII" + "4BiH2b2b10B" + "4h4hI" + "40B" + "II"),
 }
 """The packets as ``struct`` writes them, after the SDK's headers and nothing of ours."""
 
@@ -171,7 +171,7 @@ def test_a_state_written_by_hand_is_read_as_the_vendors_client_read_it() -> None
     assert bytes(by_hand) == GOOD
     assert wire.tick_of(GOOD) == 123456789
     read = wire.unpack_state(GOOD, 7.0, 1.5)
-    assert (read.t, read.clock, read.in_force) == (7.0, 1.5, -1)
+    assert (read.t, read.clock) == (7.0, 1.5)
     assert read.joint_torque[3] == -13.6328125  # -13.6363 cut towards zero
     for name in ("joint_pos", "joint_vel", "imu_quat", "imu_gyro", "imu_acc", "foot_force"):
         np.testing.assert_allclose(getattr(read, name), getattr(state(), name), rtol=1e-7, err_msg=name)
@@ -292,7 +292,7 @@ def test_a_state_is_refused_likewise() -> None:
     assert wire.refusal(GOOD, 807) is None
 
 
-LISTENER = Go1(SimConfig())
+LISTENER = Packets(SimConfig())
 
 
 def mutated(packet: bytes) -> st.SearchStrategy[tuple[bytes, bool]]:
@@ -335,21 +335,21 @@ class Statue:
     clock = 0.0
 
     def __init__(self) -> None:
-        self.obeyed: list[LowCmd] = []
+        self.applied_commands: list[LowCmd] = []
 
-    def obey(self, asked: LowCmd, number: int) -> None:
-        self.obeyed.append(asked)
+    def apply(self, asked: LowCmd) -> None:
+        self.applied_commands.append(asked)
 
     def release(self) -> None:
-        self.obeyed.append(LowCmd(np.zeros(12), np.zeros(12), np.zeros(12)))
+        self.applied_commands.append(LowCmd(np.zeros(12), np.zeros(12), np.zeros(12)))
 
     def step(self) -> None:
-        self.clock += wire.PERIOD
+        self.clock += fields.PERIOD
 
     def sense(self) -> tuple[LowState, np.ndarray]:
         return state(), np.zeros(13)
 
-    def in_force(self) -> np.ndarray:
+    def applied(self) -> np.ndarray:
         return np.zeros(13)
 
 
@@ -369,10 +369,10 @@ def meet_command(end: End, packet: bytes, whole: bool) -> None:
     """Send a packet to the robot; what it obeys is within every bound, and of what is not whole it obeys nothing."""
     server, client, to = end
     client.sendto(packet, to)
-    before, server.robot.obeyed[:] = server.counts.foreign, []
+    before, server.robot.applied_commands[:] = server.counts.foreign, []
     with np.errstate(all="raise"):
         server.tick()
-    obeyed = server.robot.obeyed
+    obeyed = server.robot.applied_commands
     assert len(obeyed) + server.counts.foreign - before == 1  # obeyed, or refused and counted
     assert whole or not obeyed
     most = {"joint_target": wire.FARTHEST, "kp": 2048.0, "kd": 4096.0, "feedforward": 128.0 + 4096.0 * wire.FASTEST}
@@ -416,9 +416,7 @@ MANY = settings(max_examples=10_000, deadline=None, suppress_health_check=[Healt
 FEW = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-@pytest.mark.slow(
-    "go1exp/deploy/runtime/go1_wire.py", "go1exp/deploy/sim_robot/protocols.py", "go1exp/deploy/sim_robot/server.py"
-)
+@pytest.mark.slow("go1exp/deploy/runtime/go1_wire.py", "go1exp/deploy/sim_robot/server.py")
 @MANY
 @given(mutated(VENDOR_COMMAND))
 def test_of_ten_thousand_mutated_commands_none_is_obeyed(listening: End, packet: tuple[bytes, bool]) -> None:
@@ -447,7 +445,7 @@ def test_a_mutated_state_raises_nothing_and_is_not_believed(looking: End, packet
 def test_what_is_not_mutated_is_obeyed_and_believed(listening: End, looking: End) -> None:
     """The ways that the mutated ones take do let the good ones through."""
     meet_command(listening, VENDOR_COMMAND, True)
-    assert [one.kp[0] for one in listening[0].robot.obeyed] == [20.0]
+    assert [one.kp[0] for one in listening[0].robot.applied_commands] == [20.0]
     received = looking[0].traffic.received
     meet_state(looking, GOOD, True)
     assert looking[0].traffic.received == received + 1
@@ -504,6 +502,30 @@ def test_a_link_leaves_out_what_is_old_doubled_or_damaged_and_counts_it(
     assert link.traffic.foreign == 4
 
 
+def test_a_link_reports_when_a_state_arrived_not_when_it_was_read(
+    pair: tuple[Go1Link, socket.socket, tuple[str, int]],
+) -> None:
+    link, other, address = pair
+    other.sendto(sent(2), address)
+    time.sleep(0.05)
+    before = time.perf_counter()
+    (one,) = link.receive()
+    assert before - one.t >= 0.045 or before <= one.t  # or the kernel gives no stamps
+    assert one.t <= time.perf_counter()
+
+
+def test_a_robot_that_is_gone_is_no_error_of_the_link() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(("127.0.0.1", 0))
+        port = gone.getsockname()[1]
+    link = Go1Link("127.0.0.1", port)
+    for _ in range(5):
+        link.send(command())
+        assert link.receive() == []
+    assert link.traffic.sent == 5
+    link.close()
+
+
 def test_a_tick_wraps_around(pair: tuple[Go1Link, socket.socket, tuple[str, int]]) -> None:
     link, other, address = pair
     for tick in (2**32 - 4, 0, 2**32 - 2, 2):
@@ -551,14 +573,12 @@ def test_without_the_ticks_unit_a_state_has_no_clock() -> None:
 def test_a_damping_motor_and_a_wanted_speed_reach_the_drives() -> None:
     packet = resealed(VENDOR_COMMAND, 22, b"\0")  # the first motor brakes by itself
     packet = resealed(packet, 22 + 27 + 5, struct.pack("<f", 2.0))  # the second is to turn at 2 rad/s
-    heard = LISTENER.read(packet)
-    assert not isinstance(heard, str)
-    told = heard.command
-    assert told is not None
+    told = LISTENER.read(packet)
+    assert isinstance(told, LowCmd)
     assert told.feedforward is not None
     assert (told.kp[0], told.kd[0], told.feedforward[0], told.damping) == (0.0, 2.0, 0.0, False)
     assert told.feedforward[1] == pytest.approx(-1.62890625 + 2.0 * 0.5625)
-    assert LISTENER.read(VENDOR_IDLE).command is None  # type: ignore[union-attr]
+    assert LISTENER.read(VENDOR_IDLE) is None
 
 
 def test_roll_pitch_and_yaw_are_those_of_scipy() -> None:

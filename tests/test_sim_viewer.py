@@ -151,7 +151,7 @@ def test_a_robot_takes_over_pose_speed_and_command_of_another(here: Here) -> Non
     new.take_over(old)
     np.testing.assert_array_equal(new.backend.qpos, old.backend.qpos)
     np.testing.assert_array_equal(new.backend.qvel, old.backend.qvel)
-    np.testing.assert_array_equal(new.in_force(), old.in_force())
+    np.testing.assert_array_equal(new.applied(), old.applied())
     np.testing.assert_array_equal(new.sense_truth(), old.sense_truth())
     assert (new.clock, new.commanded, new.braking) == (old.clock, True, False)
     new.step()

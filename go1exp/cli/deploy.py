@@ -79,7 +79,7 @@ def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled:
     if real and other:
         raise ConfigError([f"{', '.join(other)}: the real robot has its own; they are for robot=sim"])
     if not real and settings.address is not None:
-        raise ConfigError([f"address = {settings.address}: is for robot=go1 and robot=go1_sdk"])
+        raise ConfigError([f"address = {settings.address}: is for robot=go1"])
     if real and controlled:
         raise ConfigError(
             ["controller=mpc: is for robot=sim; it has never moved a real robot, nor has a person tried it"]

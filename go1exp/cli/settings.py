@@ -219,8 +219,8 @@ class DeploySettings(Stages):
     Attributes:
         controller: what moves the robot: policy, that of the bundle, or mpc (robot=sim only).
         bundle: file that go1exp export wrote; check=true needs none.
-        robot: sim, a simulated robot in another process, go1, the real one, or go1_sdk, the same by the vendor's SDK.
-        address: HOST:PORT of robot=go1 and go1_sdk; null takes 192.168.123.10:8007.
+        robot: sim, a simulated robot in another process, or go1, the real one.
+        address: HOST:PORT of robot=go1; null takes 192.168.123.10:8007.
         check: with robot=go1, only look at the robot and calibrate its foot sensors; no torque is ever asked for.
         feet: calibration of foot sensors that count, a real robot's or those of sim.feet=raw, which check=true writes;
             null takes contact from torques alone, and lets check=true write feet.json in out.
@@ -241,7 +241,7 @@ class DeploySettings(Stages):
 
     controller: Any = None
     bundle: Annotated[str, Field(min_length=1)] | None
-    robot: Literal["sim", "go1", "go1_sdk"]
+    robot: Literal["sim", "go1"]
     address: str | None
     check: bool
     feet: str | None

@@ -16,7 +16,7 @@ def _task(container: dict[str, Any]) -> int:
     from go1exp import robot
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.play_web import address
-    from go1exp.deploy.runtime.address import parsed_address
+    from go1exp.deploy.runtime.udp import parsed_address
     from go1exp.deploy.sim_robot.machine import Body, Robot
     from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
     from go1exp.sim.effects.rules import actuator_problems

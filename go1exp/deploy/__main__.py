@@ -31,8 +31,8 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
 
     parser = argparse.ArgumentParser("python -m go1exp.deploy", description="Run a bundle's policy on a robot.")
     parser.add_argument("bundle", help="file that go1exp export wrote")
-    parser.add_argument("--robot", default="sim", help="sim, go1, go1_sdk, or the port where a simulated robot listens")
-    parser.add_argument("--address", help="HOST:PORT of go1 and go1_sdk; 192.168.123.10:8007 if left out")
+    parser.add_argument("--robot", default="sim", help="sim, go1, or the port where a simulated robot listens")
+    parser.add_argument("--address", help="HOST:PORT of go1; 192.168.123.10:8007 if left out")
     parser.add_argument("--check", action="store_true", help="with go1: look at the robot; no torque is ever asked for")
     parser.add_argument("--feet", help="calibration of foot sensors that count, by --check (OUT/feet.json)")
     parser.add_argument("--rate", type=positive, help="Hz of policy and commands; that of training if left out")
@@ -70,7 +70,6 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     sim.add_argument("--loss", type=float, default=0.0, help="share of datagrams that get lost, each way")
     sim.add_argument("--foot-sensors", choices=("newton", "raw"), default="newton", help="raw: counts, as a robot's")
     sim.add_argument("--seed", type=int, default=0)
-    sim.add_argument("--protocol", choices=("go1", "exact"), default="go1", help="also with --robot PORT")
     sim.add_argument("--truth", action="store_true", help="also write the true motion into the recording")
     return parser.parse_args(given)
 
@@ -105,7 +104,7 @@ def _walk(options: argparse.Namespace) -> int:
             spin=options.spin,
         )
         sim = {name: getattr(options, name) for name in ("start", "noise", "delay", "jitter", "loss", "seed")}
-        sim |= {"protocol": options.protocol, "feet": options.foot_sensors}
+        sim |= {"feet": options.foot_sensors}
         if options.check:
             return _check(options)
         where = options.bundle, options.robot, plan, options.out, sim

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from go1exp.config.schema.registry import ConfigError
-from go1exp.deploy.estimation.many import Filters
+from go1exp.deploy.estimation import Filters
 from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.observed import columns
 from go1exp.logs.record.tape import sample

@@ -27,8 +27,6 @@ class LowState:
         imu_acc: (3,) specific force, m/s2, trunk frame.
         foot_force: (4,) in the sensor's own unit, not calibrated.
         clock: the robot's clock at the measurement, s; NaN if the robot does not report it.
-        in_force: number of the command in force at the measurement, counted from 1 by the link as it sends; 0 for none
-            yet, -1 if the robot does not report it.
     """
 
     t: float
@@ -40,7 +38,6 @@ class LowState:
     imu_acc: np.ndarray
     foot_force: np.ndarray
     clock: float = math.nan
-    in_force: int = -1
 
 
 @dataclass(frozen=True)

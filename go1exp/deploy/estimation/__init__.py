@@ -7,12 +7,14 @@ package, so it imports nothing but NumPy and pydantic.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from go1exp.config.schema.registry import Expected
+from go1exp.deploy.estimation import readings
 from go1exp.deploy.estimation.config import ChainLeg, FilterConfig, from_json, go1, load, scaler, to_json
 from go1exp.deploy.estimation.readings import WIDTH, Status, sample
 from go1exp.robot import GRAVITY
@@ -27,6 +29,7 @@ __all__ = [
     "WIDTH",
     "EstimatorError",
     "FilterConfig",
+    "Filters",
     "Status",
     "from_json",
     "go1",
@@ -85,7 +88,9 @@ def make_filter(config: FilterConfig) -> _kalman.Filter:
 
 
 def compiled_legs(config: FilterConfig) -> list[_kalman.Leg]:
-    """Return the compiled legs; ``foot(q)`` of one gives what ``go1exp.deploy.estimation.legs.foot`` does.
+    """Return the compiled legs; ``foot(q)`` returns position (3,), m, Jacobian (3, 3), m/rad, and ``turning`` (3, 3).
+
+    ``turning`` maps joint velocities to the angular velocity of the foot's link relative to the trunk.
 
     Raises:
         EstimatorError: if the extension is missing.
@@ -106,3 +111,44 @@ def _plain(module: ModuleType, name: str, value: object) -> object:
             for leg in value
         ]
     return SOURCES.index(str(value)) if name == "contact_source" else value
+
+
+COLUMNS = {
+    "quat": readings.QUAT,
+    "gyro": readings.GYRO,
+    "acc": readings.ACC,
+    "q": readings.Q,
+    "qd": readings.QD,
+    "foot_force": readings.FOOT_FORCE,
+}
+"""Names of readings and their columns in a sample."""
+
+
+class Filters:
+    """Filters with the settings of the Go1, updated together."""
+
+    def __init__(self, count: int) -> None:
+        """Make ``count`` filters.
+
+        Raises:
+            EstimatorError: if the filter is not built.
+        """
+        self._filters = [make_filter(go1()) for _ in range(count)]
+
+    def update(self, t: float, measured: Mapping[str, np.ndarray]) -> None:
+        """Update with one sample of every robot: time, s, and readings (N, ...) by the names of ``COLUMNS``."""
+        rows = np.full((len(self._filters), WIDTH), np.nan)
+        rows[:, readings.T] = t
+        for name, columns in COLUMNS.items():
+            rows[:, columns] = measured[name]
+        for one, row in zip(self._filters, rows, strict=True):
+            one.update(row)
+
+    def restart(self, robot: int) -> None:
+        """Initialise one robot's filter with its next sample."""
+        self._filters[robot].reset()
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """(N, 3) velocities of the trunks in their own frames, m/s; zero before the first sample."""
+        return np.array([one.velocity_b if one.running else np.zeros(3) for one in self._filters])

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -19,28 +18,9 @@ from go1exp.deploy.estimation.feet import FootCalibration, calibrated, forces_by
 from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.runtime.packet_delay import delays, spread
 from go1exp.deploy.runtime.safety import SafetyConfig, lean
-from go1exp.deploy.runtime.udp import Traffic
+from go1exp.deploy.runtime.udp import Go1Link
+from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import LowState
-
-
-class Looked(Protocol):
-    """A link to a Go1 before the first command, through which only packets go that ask for no torque."""
-
-    @property
-    def traffic(self) -> Traffic:
-        """Counts of its datagrams."""
-
-    @property
-    def tick(self) -> int | None:
-        """The tick of the newest state; None before the first."""
-
-    @property
-    def health(self) -> go1_wire.Health | None:
-        """What the newest state has beside the readings; None before the first."""
-
-    def receive(self) -> Sequence[LowState]:
-        """Return the states that have arrived since the last call, oldest first."""
-
 
 SECONDS = 2.0
 """How long to listen, s."""
@@ -117,7 +97,7 @@ class Heard:
 
 
 def listen(
-    link: Looked,
+    link: Go1Link,
     seconds: float,
     now: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
@@ -129,7 +109,7 @@ def listen(
         if states:
             heard.states.extend(states)
             heard.ticks.append((link.tick or 0, states[-1].t))
-        sleep(go1_wire.PERIOD)
+        sleep(PERIOD)
     heard.seconds = now() - begin
     heard.health = link.health
     return heard
@@ -155,7 +135,7 @@ class Report:
 
 
 def judged(
-    heard: Heard, link: Looked, joints: Sequence[str], stops: np.ndarray, config: FilterConfig, bounds: Bounds
+    heard: Heard, link: Go1Link, joints: Sequence[str], stops: np.ndarray, config: FilterConfig, bounds: Bounds
 ) -> Report:
     """Return the findings.
 
@@ -188,7 +168,7 @@ def judged(
     return Report(tuple(lines), tuple(problems), heard.tick_s, counts, force)
 
 
-def _packets(heard: Heard, link: Looked) -> list[str]:
+def _packets(heard: Heard, link: Go1Link) -> list[str]:
     gaps, traffic = 1e3 * heard.intervals, link.traffic
     p50, p99 = np.percentile(gaps, [50, 99])
     unit = f"{heard.tick_s:g} s" if math.isfinite(heard.tick_s) else "not known; times of arrival are used"
@@ -198,7 +178,7 @@ def _packets(heard: Heard, link: Looked) -> list[str]:
     beyond = "not known" if late is None else ", ".join(f"{name} {1e3 * value:.2f}" for name, value in late.items())
     return [
         f"packets: {_rate(heard):.0f} a second; between two p50 {p50:.2f}, p99 {p99:.2f}, worst {gaps.max():.2f} ms",
-        f"  {counted if traffic.complete else 'the SDK does not tell what it refuses'}; unit of the tick: {unit}",
+        f"  {counted}; unit of the tick: {unit}",
         f"  delay beyond the fastest packet's: {beyond}{'' if late is None else ' ms'}",
     ]
 
@@ -207,7 +187,7 @@ def _rate(heard: Heard) -> float:
     return (len(heard.states) - 1) / max(heard.states[-1].t - heard.states[0].t, 1e-9)
 
 
-def _packet_problems(heard: Heard, link: Looked, bounds: Bounds) -> list[str]:
+def _packet_problems(heard: Heard, link: Go1Link, bounds: Bounds) -> list[str]:
     problems = []
     if _rate(heard) < bounds.rate:
         problems.append(f"packets: {_rate(heard):.0f} a second; at least {bounds.rate:.0f} are needed")
@@ -275,7 +255,7 @@ def _trunk(heard: Heard, joints: Sequence[str], stops: np.ndarray, bounds: Bound
 
 
 def check(
-    link: Looked,
+    link: Go1Link,
     joints: Sequence[str],
     stops: np.ndarray,
     config: FilterConfig,

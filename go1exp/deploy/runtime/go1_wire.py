@@ -17,32 +17,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from go1exp.robot.go1_fields import ACCELERATION_STEP as ACCELERATION_STEP
-from go1exp.robot.go1_fields import BATTERY as BATTERY
-from go1exp.robot.go1_fields import COMMAND as COMMAND
-from go1exp.robot.go1_fields import COMMAND_SIZE as COMMAND_SIZE
-from go1exp.robot.go1_fields import COMMAND_TYPE as COMMAND_TYPE
-from go1exp.robot.go1_fields import DAMPING as DAMPING
-from go1exp.robot.go1_fields import HEAD as HEAD
-from go1exp.robot.go1_fields import IMU as IMU
-from go1exp.robot.go1_fields import JOINTS as JOINTS
-from go1exp.robot.go1_fields import KD_STEP as KD_STEP
-from go1exp.robot.go1_fields import KP_STEP as KP_STEP
-from go1exp.robot.go1_fields import LEGS as LEGS
-from go1exp.robot.go1_fields import LOW_LEVEL as LOW_LEVEL
-from go1exp.robot.go1_fields import MOTOR_COMMAND as MOTOR_COMMAND
-from go1exp.robot.go1_fields import MOTOR_STATE as MOTOR_STATE
-from go1exp.robot.go1_fields import PERIOD as PERIOD
-from go1exp.robot.go1_fields import POSITION_STOP as POSITION_STOP
-from go1exp.robot.go1_fields import ROBOT as ROBOT
-from go1exp.robot.go1_fields import ROBOT_PORT as ROBOT_PORT
-from go1exp.robot.go1_fields import SERVO as SERVO
-from go1exp.robot.go1_fields import STATE as STATE
-from go1exp.robot.go1_fields import STATE_SIZE as STATE_SIZE
-from go1exp.robot.go1_fields import STATE_TYPE as STATE_TYPE
-from go1exp.robot.go1_fields import TORQUE_STEP as TORQUE_STEP
-from go1exp.robot.go1_fields import VELOCITY_STOP as VELOCITY_STOP
-from go1exp.robot.go1_fields import dtype_of as dtype_of
+from go1exp.robot.go1_fields import (
+    ACCELERATION_STEP,
+    COMMAND_SIZE,
+    COMMAND_TYPE,
+    DAMPING,
+    HEAD,
+    JOINTS,
+    KD_STEP,
+    KP_STEP,
+    LOW_LEVEL,
+    POSITION_STOP,
+    SERVO,
+    STATE_SIZE,
+    STATE_TYPE,
+    TORQUE_STEP,
+    VELOCITY_STOP,
+)
 from go1exp.robot.messages import LowCmd, LowState
 
 # ---------------------------------------------------------------------- checksum and refusals
@@ -306,7 +297,7 @@ def pack_state(state: LowState, tick: int, health: Health, rpy: np.ndarray) -> b
     """Return the packet of a state, as the robot would send it.
 
     Args:
-        state: readings; ``t``, ``clock`` and ``in_force`` are not carried.
+        state: readings; ``t`` and ``clock`` are not carried.
         tick: time, ms; wraps around at 2**32.
         health: everything else.
         rpy: (3,) roll, pitch and yaw, rad.
@@ -355,7 +346,6 @@ def unpack_state(packet: bytes, t: float, clock: float) -> LowState:
         imu_acc=floats[31:],
         foot_force=whole[JOINTS:].astype(float),
         clock=clock,
-        in_force=-1,
     )
 
 

@@ -15,20 +15,18 @@ import numpy as np
 
 from go1exp.deploy.estimation.feet import LEGS, FootCalibration
 from go1exp.deploy.runtime import bundle as bundles
-from go1exp.deploy.runtime.address import parsed_address
 from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.commands import KEYS, make, range_array
 from go1exp.deploy.runtime.controller import Mover
 from go1exp.deploy.runtime.estimate import settings as estimator_settings
-from go1exp.deploy.runtime.go1_check import Looked, Report, calibrate, check
+from go1exp.deploy.runtime.go1_check import Report, calibrate, check
 from go1exp.deploy.runtime.go1_wire import gains_on_wire
 from go1exp.deploy.runtime.launch import RefusedError, RobotError, SimulatedRobot
 from go1exp.deploy.runtime.log import About
 from go1exp.deploy.runtime.packet_delay import MOST_SLIP
-from go1exp.deploy.runtime.udp import HOST, SIMULATED_TICK_S, Go1Link, UdpLink
+from go1exp.deploy.runtime.udp import HOST, SIMULATED_TICK_S, Go1Link, parsed_address
 from go1exp.deploy.runtime.walk import STATUS, Outcome, Plan, account, interruptible, save, velocity_errors, walk
 from go1exp.robot.go1_fields import MOTOR_NAMES, TORQUE_NOTE
-from go1exp.robot.messages import Link
 
 Say = Callable[[str], None]
 
@@ -42,7 +40,7 @@ class Job:
 
     Attributes:
         bundle: the file.
-        robot: ``sim``, ``go1``, ``go1_sdk``, or the port of this machine at which a simulated robot already listens.
+        robot: ``sim``, ``go1``, or the port of this machine at which a simulated robot already listens.
         plan: how to walk.
         out: folder of the logs.
         sim: settings of the simulated robot (``go1exp.deploy.sim_robot.machine.SimConfig``).
@@ -51,7 +49,7 @@ class Job:
         mover: walks in place of the bundle's policy.
         motion: what the mover does to a robot that hangs; None if it walks.
         gains: kp and kd (J,) in place of the bundle's.
-        address: HOST:PORT of ``go1`` and ``go1_sdk``; that of every Go1 if None.
+        address: HOST:PORT of ``go1``; that of every Go1 if None.
         feet: file of the calibration of foot sensors that count (``counting``); contact from torques alone if None.
     """
 
@@ -69,18 +67,10 @@ class Job:
     feet: str | None = None
 
     @property
-    def on_wire(self) -> bool:
-        """Whether robot and runtime speak by the Go1's own packets."""
-        return self.robot in REAL or self.sim.get("protocol", "go1") == "go1"
-
-    @property
     def counting(self) -> bool:
-        """Whether the feet's sensors count, each with its own zero and scale, instead of saying newtons."""
-        return self.robot in REAL or (self.on_wire and self.sim.get("feet") == "raw")
+        """Whether the foot sensors report counts, each with its own zero and scale, instead of newtons."""
+        return self.robot == "go1" or self.sim.get("feet") == "raw"
 
-
-REAL = ("go1", "go1_sdk")
-"""Names of the robots that are not simulated."""
 
 NOTICE = "note: robot=go1 has never been run on a robot; hang it up first, and keep a hand on its switch"
 
@@ -89,7 +79,7 @@ NOTICE = "note: robot=go1 has never been run on a robot; hang it up first, and k
 class _Robot:
     """The connected robot, and the process to close with it."""
 
-    link: Link
+    link: Go1Link
     simulated: bool
     process: SimulatedRobot | None = None
 
@@ -98,47 +88,27 @@ class _Robot:
 def _reached(job: Job, bundle: Bundle, say: Say) -> Iterator[_Robot]:
     """Open the link to the robot; close it at the end."""
     with contextlib.ExitStack() as stack:
-        if job.robot in REAL:
+        if job.robot == "go1":
             say(NOTICE)
-            link: Link = _real(job, bundle, say, stack)
+            link = stack.enter_context(closing(Go1Link(*parsed_address(job.address))))
+            link.tick_s = _checked(link, bundle, say).tick_s
             yield _Robot(link, simulated=False)
         elif job.robot == "sim":
             say("starting the simulated robot")
             process = stack.enter_context(SimulatedRobot(job.bundle, job.sim, job.other, keep=job.plan.keep))
-            yield _Robot(stack.enter_context(closing(simulated(job, process.port))), True, process)
+            yield _Robot(stack.enter_context(closing(simulated(process.port))), True, process)
         else:
             if not (job.robot.isascii() and job.robot.isdigit() and 0 < int(job.robot) < 2**16):
-                raise RobotError(
-                    f"robot={job.robot}: must be sim, go1, go1_sdk, or the port where a simulated robot listens"
-                )
-            yield _Robot(stack.enter_context(closing(simulated(job, int(job.robot)))), simulated=True)
+                raise RobotError(f"robot={job.robot}: must be sim, go1, or the port where a simulated robot listens")
+            yield _Robot(stack.enter_context(closing(simulated(int(job.robot)))), simulated=True)
 
 
-def simulated(job: Job, port: int) -> Link:
+def simulated(port: int) -> Go1Link:
     """Return a link to the simulated robot that listens at a port of this machine."""
-    if job.sim.get("protocol") == "exact":
-        return UdpLink(port)
     return Go1Link(HOST, port, SIMULATED_TICK_S)
 
 
-def _real(job: Job, bundle: Bundle, say: Say, stack: contextlib.ExitStack) -> Link:
-    """Return a link to a real robot, which has passed its check.
-
-    Raises:
-        RobotError: if it has not.
-    """
-    if job.robot == "go1_sdk":
-        from go1exp.deploy.runtime.go1_sdk import SdkLink
-
-        by_sdk = stack.enter_context(closing(SdkLink(address=parsed_address(job.address))))
-        _checked(by_sdk, bundle, say)
-        return by_sdk
-    link = stack.enter_context(closing(Go1Link(*parsed_address(job.address))))
-    link.tick_s = _checked(link, bundle, say).tick_s
-    return link
-
-
-def _checked(link: Looked, bundle: Bundle, say: Say) -> Report:
+def _checked(link: Go1Link, bundle: Bundle, say: Say) -> Report:
     """Return the findings about a robot that may walk.
 
     Raises:
@@ -224,21 +194,21 @@ def run_job(job: Job, say: Say) -> int:
             contact = "torque" if job.counting else None
             means: dict[str, Any] = {"contact": contact, "feet": feet, "mover": job.mover, "gains": job.gains}
             outcome = walk(bundle, robot.link, plan, on_second=say, **means)
-            traffic = getattr(robot.link, "traffic", None)
+            traffic = robot.link.traffic
     except KeyboardInterrupt:
         if outcome is not None:
             raise
         say("stopped before the walk began: nothing was commanded")
         return STATUS["operator_stop"]
-    extra: dict[str, Any] = {"robot": job.robot, "link": None if traffic is None else traffic.counts()}
+    extra: dict[str, Any] = {"robot": job.robot, "link": traffic.counts()}
     truth: Mapping[str, np.ndarray] = {}
     if robot.process is not None:
         truth, extra["simulated_robot"] = robot.process.truth, robot.process.report
         extra["velocity"] = velocity_errors(outcome.log, truth)
     content = account(bundle, plan, outcome, extra)
     where = _about(job, bundle, robot.simulated)
-    obeyed = None if robot.process is None else robot.process.obeyed
-    files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None, obeyed)
+    applied = None if robot.process is None else robot.process.applied
+    files = save(Path(job.out), where, outcome, content, truth if job.truth and truth else None, applied)
     say(str(outcome.timing))
     for line in summary_lines(content):
         say(line)
@@ -291,7 +261,7 @@ def _calibration(job: Job) -> FootCalibration | None:
         return None
     if not job.counting:
         problem = f"feet = {job.feet}: calibrates sensors that count; those of robot={job.robot} say newtons"
-        raise RefusedError([f"{problem}, unless sim.feet=raw (with sim.protocol=go1)"])
+        raise RefusedError([f"{problem}, unless sim.feet=raw"])
     calibration = FootCalibration.read(Path(job.feet))
     calibration.forces(np.zeros(LEGS))  # raises without scales, before anything moves
     return calibration
@@ -301,7 +271,7 @@ def _about(job: Job, bundle: Bundle, simulated: bool) -> About:
     """Return the origin of a walk's log."""
     about = bundle.metadata
     gains = job.gains or (np.array(about.kp), np.array(about.kd))
-    gains = gains_on_wire(*gains) if job.on_wire else gains
+    gains = gains_on_wire(*gains)
     return About(
         metadata=about,
         kp=gains[0],
@@ -312,7 +282,7 @@ def _about(job: Job, bundle: Bundle, simulated: bool) -> About:
         excitation=job.motion or "policy",
         hung=job.motion is not None,
         notes="ends where the drives begin to brake"
-        + (ON_WIRE if job.on_wire else "")
+        + ON_WIRE
         + (OTHER_MOVER if job.mover and job.motion is None else ""),
         trained=bundle.config,
     )

@@ -50,7 +50,7 @@ class SimulatedRobot:
         port: where it listens.
         report: its report of the walk, after ``close``: datagrams, and how it kept real time.
         truth: the trunk's true motion by column, with ``clock``, after ``close``; empty for a robot that hangs.
-        obeyed: what was in force, after ``close``: rows of clock, s, whether a command was, and its targets, rad.
+        applied: the applied commands, after ``close``: rows of clock, s, whether one applied, and its targets, rad.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class SimulatedRobot:
         )
         self.report: dict[str, Any] = {}
         self.truth: dict[str, np.ndarray] = {}
-        self.obeyed: np.ndarray | None = None
+        self.applied: np.ndarray | None = None
         given = {"bundle": bundle, "sim": dict(sim), "robot": dict(other), "port": port, "truth": str(self._truth)}
         given["kept"] = SPARE * keep + SPARE_S
         assert self._process.stdin is not None
@@ -134,7 +134,7 @@ class SimulatedRobot:
         if self._truth.is_file():
             with np.load(self._truth) as file:
                 rows, columns = file["rows"], [str(name) for name in file["columns"]]
-                self.obeyed = file["obeyed"]
+                self.applied = file["applied"]
             if len(rows) and not np.isnan(rows).any():
                 self.truth = dict(zip(columns, rows.T, strict=True))
         self._folder.cleanup()

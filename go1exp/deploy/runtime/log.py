@@ -24,7 +24,7 @@ STATES_PER_S = 500.0
 """States that a Go1 sends in a second."""
 
 STATE = (
-    *(("t", 1), ("clock", 1), ("in_force", 1), ("q", 12), ("qd", 12), ("tau_est", 12)),
+    *(("t", 1), ("clock", 1), ("q", 12), ("qd", 12), ("tau_est", 12)),
     *(("imu_quat", 4), ("imu_gyro", 3), ("imu_acc", 3), ("foot_force", 4)),
 )
 CYCLE = (
@@ -126,9 +126,9 @@ class Log:
         for state in cycle.fresh:
             row = self.states.next()
             # in place, by the widths of STATE: nothing is allocated during the walk
-            row[0], row[1], row[2] = state.t, state.clock, state.in_force
-            row[3:15], row[15:27], row[27:39] = state.joint_pos, state.joint_vel, state.joint_torque
-            row[39:43], row[43:46], row[46:49], row[49:53] = (
+            row[0], row[1] = state.t, state.clock
+            row[2:14], row[14:26], row[26:38] = state.joint_pos, state.joint_vel, state.joint_torque
+            row[38:42], row[42:45], row[45:48], row[48:52] = (
                 *(state.imu_quat, state.imu_gyro, state.imu_acc),
                 state.foot_force,
             )
@@ -144,18 +144,18 @@ class Log:
         self.phases.setdefault(cycle.phase, cycle.t)
 
     def recording(
-        self, about: About, truth: Mapping[str, np.ndarray] | None = None, obeyed: np.ndarray | None = None
+        self, about: About, truth: Mapping[str, np.ndarray] | None = None, applied: np.ndarray | None = None
     ) -> Recording | None:
         """Return the walk from the first command in force to the first that brakes; None if there was none.
 
         Args:
             about: its origin.
             truth: columns of the format by name, with ``clock``, s; rows are joined where the clocks are the same.
-            obeyed: (T, 2 + J) what a simulated robot had in force: its clock, s, whether a command was, targets, rad.
+            applied: (T, 2 + J) commands that a simulated robot applied: clock, s, whether one applied, targets, rad.
         """
         from go1exp.logs.recording import Recording
 
-        rows = self._in_force() if obeyed is None or self._numbered() else self._as_told(obeyed)
+        rows = self._newest_sent() if applied is None else self._reported(applied)
         if rows is None:
             return None
         kept, targets = rows
@@ -169,8 +169,7 @@ class Log:
         good &= np.isfinite(np.stack(list(channels.values()))).all(axis=0)
         if good.sum() < 2:
             return None
-        known = obeyed is not None or (self.measured("in_force")[kept] >= 0).all()
-        notes = [about.notes, "" if known else UNKNOWN_DELAY]
+        notes = [about.notes, UNKNOWN_DELAY if applied is None else ""]
         notes += [] if good.all() else [f"{int((~good).sum())} rows that were not finite or not in time are left out"]
         channels = {name: np.ascontiguousarray(values[good]) for name, values in {"t": t, **channels}.items()}
         return Recording(_meta(about, channels, "; ".join(note for note in notes if note)), channels)
@@ -207,37 +206,29 @@ class Log:
         part = self.states.part_of(rows, name)[np.argsort(clock, kind="stable")]
         return np.minimum.accumulate(part[::-1])[::-1] if name == "t" else part
 
-    def _numbered(self) -> bool:
-        """Return whether the robot told in its states which command was in force."""
-        return bool((self.measured("in_force") >= 0).any())
-
-    def _as_told(self, obeyed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""
+    def _reported(self, applied: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the states (T,) bool measured under a command of standing up or walking, and their targets."""
         clock = self.measured("clock")
-        if not len(obeyed) or not len(clock) or np.isnan(clock).any():
+        if not len(applied) or not len(clock) or np.isnan(clock).any():
             return None
-        nearest = np.clip(np.searchsorted(obeyed[:, 0], clock - 1e-6), 0, len(obeyed) - 1)
-        in_force = (np.abs(obeyed[nearest, 0] - clock) < 1e-6) & (obeyed[nearest, 1] > 0)
-        return (in_force, obeyed[nearest[in_force], 2:]) if in_force.any() else None
+        nearest = np.clip(np.searchsorted(applied[:, 0], clock - 1e-6), 0, len(applied) - 1)
+        under = (np.abs(applied[nearest, 0] - clock) < 1e-6) & (applied[nearest, 1] > 0)
+        return (under, applied[nearest[under], 2:]) if under.any() else None
 
-    def _in_force(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return which states (T,) were measured under a command of standing up or walking, and its target, per row."""
+    def _newest_sent(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the same for a robot that does not report the applied command: the newest one sent by then counts."""
         sent = self.cycles.part("number") > 0
         if not sent.any() or not self.states.count:
             return None
-        number, at = self.cycles.part("number")[sent], self.cycles.part("t")[sent]
-        damping, target = self.cycles.part("damping")[sent] > 0, self.cycles.part("q_target")[sent]
-        known = self.measured("in_force")
-        # If the robot does not report the command in force, the newest one sent by then is taken.
-        by_number, by_time = np.searchsorted(number, known), np.searchsorted(at, self.measured("t"), "right") - 1
-        k = np.where(known >= 0, by_number, by_time)
-        in_force = (k >= 0) & (k < len(number)) & (known != 0) & ((known < 0) | (known >= number[0]))
-        place = np.clip(k, 0, len(number) - 1)
-        in_force &= ~damping[place]
-        return (in_force, target[place[in_force]]) if in_force.any() else None
+        at, target = self.cycles.part("t")[sent], self.cycles.part("q_target")[sent]
+        newest = np.searchsorted(at, self.measured("t"), "right") - 1
+        under = (newest >= 0) & ~(self.cycles.part("damping")[sent] > 0)[newest]
+        return (under, target[newest[under]]) if under.any() else None
 
 
-UNKNOWN_DELAY = "q_target is the newest that was sent: the robot does not tell what it obeys, and the way takes time"
+UNKNOWN_DELAY = (
+    "q_target is the newest sent target: the robot does not report the applied one, and the network delays it"
+)
 
 
 def _meta(about: About, channels: Mapping[str, np.ndarray], notes: str) -> Meta:

@@ -334,11 +334,11 @@ def save(
     outcome: Outcome,
     content: dict[str, Any],
     truth: Mapping[str, np.ndarray] | None,
-    obeyed: np.ndarray | None = None,
+    applied: np.ndarray | None = None,
 ) -> list[Path]:
     """Write NAME.json, NAME.npz and, if the robot was commanded, NAME.parquet; return the files.
 
-    ``truth`` and ``obeyed`` are those of a simulated robot (``Log.recording``).
+    ``truth`` and ``applied`` are those of a simulated robot (``Log.recording``).
 
     Raises:
         OSError: if one cannot be written.
@@ -348,7 +348,7 @@ def save(
     files = [folder / f"{about.episode}.json", folder / f"{about.episode}.npz"]
     write_json(files[0], content, indent=1, allow_nan=False)  # first: nothing else is as small
     write_cycles(files[1], outcome.log)
-    recording = outcome.log.recording(about, truth, obeyed)
+    recording = outcome.log.recording(about, truth, applied)
     if recording is not None:
         from go1exp.logs import recording as format_
 

@@ -103,8 +103,8 @@ def main() -> int:
 
     server.serve(going)
     if given.get("truth"):
-        rows, obeyed = server.truth.rows(), server.obeyed.rows()
-        np.savez(given["truth"], rows=rows, columns=np.array(["clock", *TRUTH]), obeyed=obeyed)
+        rows, applied = server.truth.rows(), server.applied.rows()
+        np.savez(given["truth"], rows=rows, columns=np.array(["clock", *TRUTH]), applied=applied)
     _say("ended", **asdict(server.counts))
     server.close()
     return 0

@@ -98,8 +98,7 @@ class Robot:
         actuator = self._plant.actuator
         self._default_gains = tuple(getattr(actuator, name).numpy().ravel().copy() for name in ("kp", "kd"))
         self.clock, self.braking = 0.0, False
-        self._commanded, self._in_force = -np.inf, 0
-        self._measured = self.clock, self._in_force
+        self._commanded, self._measured = -np.inf, 0.0
         self._fed: torch.Tensor | None = None  # from the first feed-forward torque on
         self._place()
 
@@ -118,7 +117,7 @@ class Robot:
     def take_over(self, old: Robot) -> None:
         """Go on from where ``old`` is: its pose, speeds, clock, noise and command; drives and effects begin anew."""
         self.clock, self.braking, self._rng = old.clock, old.braking, old._rng
-        self._commanded, self._in_force, self._measured = old._commanded, old._in_force, old._measured
+        self._commanded, self._measured = old._commanded, old._measured
         self._target: torch.Tensor = old._target.clone()
         self._now: dict[str, np.ndarray] = old._now
         self._true: np.ndarray = old._true
@@ -161,10 +160,9 @@ class Robot:
         rows = (torch.as_tensor(values).unsqueeze(0) for values in self._gains)
         self._plant.set_gains(*(row.to(self._plant.q.dtype) for row in rows))
 
-    def obey(self, command: LowCmd, number: int) -> None:
-        """Put a command into force; ``number`` is the sender's count."""
-        self._commanded, self._in_force = self.clock, number
-        self.braking = command.damping
+    def apply(self, command: LowCmd) -> None:
+        """Apply a command from the next step on."""
+        self._commanded, self.braking = self.clock, command.damping
         self._target = torch.tensor(command.joint_target, dtype=self._plant.q.dtype).unsqueeze(0)
         if self._fed is not None or (command.feedforward is not None and command.feedforward.any()):
             fed = np.zeros(robot.NUM_JOINTS) if command.feedforward is None else command.feedforward
@@ -175,12 +173,11 @@ class Robot:
         """Do as a command says that asks for nothing: the joints are free, once a command has moved them."""
         if self.commanded:
             nothing = np.zeros(robot.NUM_JOINTS)
-            self.obey(LowCmd(self._target[0].numpy().astype(float), nothing, nothing), self._in_force)
+            self.apply(LowCmd(self._target[0].numpy().astype(float), nothing, nothing))
 
-    def in_force(self) -> np.ndarray:
-        """Return whether a command was in force in the last step, 1 or 0, and its targets, rad: (13,)."""
-        obeying = self.commanded and not self.braking
-        return np.concatenate([[obeying], self._target[0].numpy()])
+    def applied(self) -> np.ndarray:
+        """Return whether a command applied in the last step, 1 or 0, and its targets, rad: (13,)."""
+        return np.concatenate([[self.commanded and not self.braking], self._target[0].numpy()])
 
     def step(self) -> None:
         """Advance by a tick; drives without a command for ``SILENCE`` brake."""
@@ -189,7 +186,7 @@ class Robot:
             self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
             if self._fed is not None:
                 self._fed = torch.zeros_like(self._fed)
-        self._measured = self.clock, self._in_force
+        self._measured = self.clock
         self._advance()
         self.clock = round(self.clock / TICK + 1) * TICK  # a whole number of ticks: no rounding adds up
 
@@ -245,11 +242,9 @@ class Robot:
         hangs.
         """
         readings = noisy(self._now, self._config.noise, self._rng)
-        clock, in_force = self._measured
         state = LowState(
-            t=clock,
-            clock=clock,
-            in_force=in_force,
+            t=self._measured,
+            clock=self._measured,
             joint_pos=readings["q"],
             joint_vel=readings["qd"],
             joint_torque=self._now["tau_est"],

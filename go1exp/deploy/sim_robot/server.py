@@ -1,4 +1,8 @@
-"""The simulated robot behind a UDP socket, in real time, over a network that can delay and lose datagrams."""
+"""The simulated robot behind a UDP socket: the Go1's packets in real time, over a simulated network.
+
+Packets are rounded and cut as the robot does (``go1_wire``). Battery and temperatures are constants. Commands carry no
+number: they apply in the order of arrival, as far as is known also on the robot.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +11,22 @@ import math
 import socket
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from go1exp.deploy.runtime import go1_wire
 from go1exp.deploy.runtime.loop import MonotonicClock, Timing, run
-from go1exp.deploy.runtime.udp import HOST, arrival, ask_for_stamps
+from go1exp.deploy.runtime.safety import DEFAULT_KD
+from go1exp.deploy.runtime.udp import HOST, arrival, enable_timestamps
 from go1exp.deploy.sim_robot.machine import TICK, Robot
-from go1exp.deploy.sim_robot.protocols import OLD, language
 from go1exp.deploy.sim_robot.settings import SimConfig
+from go1exp.robot.go1_fields import COMMAND_SIZE, LEGS
+from go1exp.robot.messages import LowCmd, LowState
+
+TICK_MS = 2
+"""Increment per 2 ms of the tick that the simulated robot reports: the unit of SDK 3.8.6's comment."""
 
 MOST_AT_ONCE = 10
 """Most ticks that are simulated at once after a delay; for a longer one the robot's clock falls behind for good."""
@@ -33,8 +43,8 @@ GONE_S = 1.0
 
 STRANGER = "another sender"
 
-OBEYED = ("obeying", *(f"q_target_{k}" for k in range(12)))
-"""Columns of what was in force: whether a command was, and its targets."""
+APPLIED = ("commanded", *(f"q_target_{k}" for k in range(12)))
+"""Columns of the applied commands: whether one applied, and its targets."""
 
 CHUNK = 5000
 """Rows of a block: 10 s."""
@@ -97,6 +107,75 @@ class Truth:
         return np.concatenate([*whole, last[: self._rows]])
 
 
+ZERO, SCALE = (100.0, 130.0), (0.5, 1.5)
+"""Ranges from which ``sim.feet=raw`` draws zeros (counts; 114 to 125 on one robot) and scales (chosen)."""
+
+
+class FootSensors:
+    """The foot sensors: newtons, or counts, of which each sensor has its own zero and scale.
+
+    Attributes:
+        zero: (4,) counts without load.
+        scale: (4,) counts per newton.
+    """
+
+    def __init__(self, config: SimConfig) -> None:
+        rng = np.random.default_rng([config.seed, 2])
+        raw = config.feet == "raw"
+        self.zero = rng.uniform(*ZERO, LEGS) if raw else np.zeros(LEGS)
+        self.scale = rng.uniform(*SCALE, LEGS) if raw else np.ones(LEGS)
+
+    def counts(self, force: np.ndarray) -> np.ndarray:
+        """Return the readings under forces (4,), N."""
+        return self.zero + self.scale * force
+
+
+def roll_pitch_yaw(quat: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw, rad, of an attitude w-x-y-z of unit length."""
+    w, x, y, z = map(float, quat)
+    pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    return np.array([roll, pitch, math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))])
+
+
+class Packets:
+    """Packs states and unpacks commands as the robot does.
+
+    Attributes:
+        feet: the foot sensors.
+        health: battery and temperatures of the states.
+    """
+
+    def __init__(self, config: SimConfig) -> None:
+        """Draw the zeros and scales of the foot sensors."""
+        self.feet, self.health = FootSensors(config), go1_wire.Health()
+        self._last_velocity: np.ndarray | None = None
+
+    def read(self, packet: bytes) -> LowCmd | str | None:
+        """Return the command of a packet, None if it commands nothing, or the reason of its rejection.
+
+        A commanded joint velocity dq* becomes a torque, kd dq*, that is fed forward.
+        """
+        command = go1_wire.unpack_command(packet)
+        if isinstance(command, go1_wire.Refusal):
+            return command.value
+        if command.idle:
+            return None
+        brakes = command.damping
+        kp, kd = np.where(brakes, 0.0, command.kp), np.where(brakes, DEFAULT_KD, command.kd)
+        torque = np.where(brakes, 0.0, command.tau + command.kd * command.dq)
+        only_brakes = not (kp.any() or torque.any())
+        return LowCmd(command.q, kp, kd, damping=only_brakes, feedforward=torque if torque.any() else None)
+
+    def written(self, state: LowState, ticks: int) -> bytes:
+        """Return the packet of a state, ``ticks`` of 2 ms after the start of the robot."""
+        before = state.joint_vel if self._last_velocity is None else self._last_velocity
+        self._last_velocity = state.joint_vel
+        health = replace(self.health, acceleration=tuple((state.joint_vel - before) / TICK))
+        state = replace(state, foot_force=self.feet.counts(state.foot_force))
+        return go1_wire.pack_state(state, TICK_MS * ticks, health, roll_pitch_yaw(state.imu_quat))
+
+
 @dataclass
 class Counts:
     """Counts at the robot's end: datagrams by what happened to them, and how real time was kept.
@@ -104,7 +183,6 @@ class Counts:
     Attributes:
         heard: datagrams of the one who is listened to, those that ask for nothing included.
         commands: commands put into force.
-        old: commands that came after a newer one (known with protocol=exact only).
         foreign: datagrams that were not a valid message, or came from another sender.
         refused: these by their reason.
         states: states sent.
@@ -115,7 +193,6 @@ class Counts:
 
     heard: int = 0
     commands: int = 0
-    old: int = 0
     foreign: int = 0
     refused: dict[str, int] = field(default_factory=dict)
     states: int = 0
@@ -137,7 +214,8 @@ class Server:
         counts: what has happened.
         peer: who it listens to; None before anybody has spoken.
         truth: the trunk's true motion, the newest of it.
-        obeyed: what was in force, in the columns of ``OBEYED``, the newest of it.
+        applied: the newest applied commands, in the columns of ``APPLIED``.
+        packets: packs states and unpacks commands.
         on_heard: called for each datagram of ``peer``: its time of arrival, s on ``time.perf_counter``'s clock; itself.
         on_tick: called after each tick.
     """
@@ -151,21 +229,21 @@ class Server:
         Raises:
             OSError: if the port is taken, or the host is not this machine's.
         """
-        self.robot, self._language = robot, language(config)
+        self.robot, self.packets = robot, Packets(config)
         rng = np.random.default_rng([config.seed, 1])
         self._uplink, self._downlink = (Network(config.delay, config.loss, rng, config.jitter) for _ in range(2))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
             self._socket.bind((host, port))
-            ask_for_stamps(self._socket)
+            enable_timestamps(self._socket)
         except OSError:
             self._socket.close()
             raise
         self.address: tuple[str, int] = self._socket.getsockname()
         self.peer: tuple[str, int] | None = None
         self._heard = -math.inf
-        self.counts, self.truth, self.obeyed = Counts(), Truth(kept=kept), Truth(len(OBEYED), kept)
+        self.counts, self.truth, self.applied = Counts(), Truth(kept=kept), Truth(len(APPLIED), kept)
 
     @property
     def port(self) -> int:
@@ -197,17 +275,17 @@ class Server:
         return timing
 
     def tick(self) -> None:
-        """Receive, obey the newest command, simulate one tick, and send the readings of its beginning."""
+        """Receive, apply the newest command, simulate one tick, and send the readings of its beginning."""
         robot, now = self.robot, self.robot.clock
         self._listen(now)
         for data in self._uplink.take(now):
-            self._obey(data)
+            self._apply(data)
         # The newest command acts in this tick; the state that is sent is of its beginning.
         robot.step()
         state, true = robot.sense()
         self.truth.add(now, true)
-        self.obeyed.add(now, robot.in_force())
-        data = self._language.written(state, round(now / TICK))
+        self.applied.add(now, robot.applied())
+        data = self.packets.written(state, round(now / TICK))
         if self.peer is not None:
             self._downlink.put(now, data)
             for late in self._downlink.take(now):
@@ -220,13 +298,13 @@ class Server:
     def _listen(self, now: float) -> None:
         while True:
             try:
-                data, extra, _, sender = self._socket.recvmsg(self._language.size + 1, 64)
+                data, extra, _, sender = self._socket.recvmsg(COMMAND_SIZE + 1, 64)
             except BlockingIOError:
                 return
             except ConnectionRefusedError:
                 continue  # an earlier state was sent to a port that is closed
-            if why := self._language.refusal(data):
-                self._refuse(why)
+            if wrong := go1_wire.refusal(data, COMMAND_SIZE):
+                self._refuse(wrong.value)
             elif self.peer not in (None, sender) and now - self._heard < GONE_S:
                 self._refuse(STRANGER)
             else:
@@ -240,17 +318,15 @@ class Server:
         self.counts.foreign += 1
         self.counts.refused[why] = self.counts.refused.get(why, 0) + 1
 
-    def _obey(self, data: bytes) -> None:
-        heard = self._language.read(data)
-        if heard == OLD:
-            self.counts.old += 1
-        elif isinstance(heard, str):
-            self._refuse(heard)
-        elif heard.command is None:
+    def _apply(self, packet: bytes) -> None:
+        command = self.packets.read(packet)
+        if isinstance(command, str):
+            self._refuse(command)
+        elif command is None:
             self.robot.release()
         else:
             self.counts.commands += 1
-            self.robot.obey(heard.command, heard.number or self.counts.commands)
+            self.robot.apply(command)
 
     def _send(self, data: bytes) -> None:
         assert self.peer is not None

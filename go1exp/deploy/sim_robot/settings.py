@@ -12,8 +12,8 @@ from go1exp.config.schema.settings import settings
 
 
 @dataclass(frozen=True)
-class SimBasics:
-    """How the simulated robot is set up, whatever it speaks.
+class SimConfig:
+    """Setup of the simulated robot.
 
     Attributes:
         start: standing in the nominal stance, lying on its belly, or hung up so that no foot reaches the ground.
@@ -37,20 +37,8 @@ class SimBasics:
     seed: Annotated[int, Field(ge=0)] = 0
 
 
-@dataclass(frozen=True)
-class SimConfig(SimBasics):
-    """How the simulated robot of ``go1exp deploy`` is set up.
-
-    Attributes:
-        protocol: go1 for the robot's own packets, with their rounding; exact for double precision, with the number of
-            the command in force (for tests).
-    """
-
-    protocol: Literal["go1", "exact"] = "go1"
-
-
 @settings
-class SimSettings(SimBasics):
+class SimSettings(SimConfig):
     """``conf/sim.yaml`` without the groups.
 
     Attributes:

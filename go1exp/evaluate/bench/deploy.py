@@ -21,7 +21,6 @@ import numpy as np
 from go1exp.deploy.export.build import build
 from go1exp.deploy.runtime.bundle import Bundle, loads
 from go1exp.deploy.runtime.go1_wire import (
-    JOINTS,
     Health,
     pack_command,
     pack_state,
@@ -33,6 +32,7 @@ from go1exp.deploy.runtime.go1_wire import (
 from go1exp.deploy.runtime.launch import RobotError, SimulatedRobot
 from go1exp.deploy.runtime.loop import Timing
 from go1exp.deploy.runtime.loop import run as loop
+from go1exp.robot.go1_fields import JOINTS
 from go1exp.robot.messages import LowCmd, LowState
 from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer

@@ -14,7 +14,7 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.config.schema.registry import ConfigError
-from go1exp.deploy.estimation.many import Filters
+from go1exp.deploy.estimation import Filters
 from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.controller.types import Command, Controller, Drive, Savable, Sensed
 from go1exp.logs.record.tape import sample

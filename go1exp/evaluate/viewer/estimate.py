@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from go1exp.deploy.estimation.many import Filters
+from go1exp.deploy.estimation import Filters
 from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.logs.record.tape import sample
 from go1exp.sim.env.core import Go1Core

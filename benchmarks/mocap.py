@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from go1exp.deploy.estimation import FilterConfig
 from go1exp.deploy.estimation import readings as column
-from go1exp.deploy.estimation.legs import foot
+from go1exp.deploy.estimation.feet import kinematics
 from go1exp.deploy.estimation.replay import SCALER_LOG, Log, estimate, samples
 from go1exp.logs.importers import import_recordings
 from go1exp.logs.importers.scaler_walk_mocap import Mocap, motion_capture
@@ -79,7 +79,8 @@ def odometry(rows: np.ndarray, config: FilterConfig) -> np.ndarray:
         config: gives the legs.
     """
     t, q = rows[:, column.T], rows[:, column.Q].reshape(-1, 4, 3)
-    feet = np.array([[foot(leg, angles)[0] for leg, angles in zip(config.legs, row, strict=True)] for row in q])
+    legs = kinematics(config)
+    feet = np.array([[leg(angles)[0] for leg, angles in zip(legs, row, strict=True)] for row in q])
     # of each foot relative to the trunk's origin, in the trunk's axes (T, 4, 3); a standing foot moves with -v
     speed = np.gradient(feet, t, axis=0) + np.cross(rows[:, None, column.GYRO], feet)
     # Feet on the ground are taken to be the two lowest: three runs have no force sensors. (T, 2)
