@@ -24,7 +24,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import members
 from go1exp.evaluate.rollout import EvalConfig, evaluation_task
 from go1exp.mdp.derived import ASYNC_PAIRS, SYNC_PAIRS
-from go1exp.mdp.foot_timers import FootTimers
+from go1exp.mdp.feet import FootTimers
 from go1exp.mdp.measures import gait
 from go1exp.mdp.types import TermSetup
 from go1exp.sim.env.core import Go1Core

@@ -37,7 +37,7 @@ from benchmarks.gap import known
 from go1exp import robot
 from go1exp.gap.data.cutting import noise
 from go1exp.logs.recording import Recording, RecordingError, read_folder
-from go1exp.sim.physics.model import load_robot
+from go1exp.sim.physics.scene import load_robot
 
 sysid: Any = importlib.import_module("mujoco.sysid")  # empty without the extra, and mypy knows nothing of it
 

@@ -1,7 +1,7 @@
 """How deep balls are in a height field, by MuJoCo Warp and by MuJoCo: ``python -m benchmarks.height_field law=engine``.
 
 Balls of a foot's size at random places of ``terrain=rough``, up to ``depth`` m deep. ``law=engine`` is MuJoCo Warp as
-it comes, ``law=mujoco`` with ``sim/physics/warp_height_field.py``, as ``backend=warp`` runs it. On a CPU or a GPU.
+it comes, ``law=mujoco`` with ``sim/physics/warp_kernels.py``, as ``backend=warp`` runs it. On a CPU or a GPU.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def main(arguments: Sequence[str]) -> None:
     if not {"law"} <= set(given) <= {"law", "depth", "places", "seed"} or given["law"] not in ("engine", "mujoco"):
         raise SystemExit(USAGE)
     if given["law"] == "mujoco":
-        from go1exp.sim.physics.warp_height_field import use_mujocos_law
+        from go1exp.sim.physics.warp_kernels import use_mujocos_law
 
         use_mujocos_law()
     count, depth = int(given.get("places", 3000)), float(given.get("depth", 0.005))

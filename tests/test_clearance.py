@@ -9,9 +9,9 @@ import torch
 
 from go1exp import robot
 from go1exp.config.compose import compose
-from go1exp.mdp.clearance import foot_positions
+from go1exp.mdp.kinematics import foot_positions
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.physics.model import load_robot
+from go1exp.sim.physics.scene import load_robot
 from go1exp.sim.task import parse_task
 
 

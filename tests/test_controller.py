@@ -31,8 +31,8 @@ from go1exp.evaluate.controller.types import Drive, Sensed
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.robot import GRAVITY
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.physics.kinematics import Kinematics
-from go1exp.sim.physics.model import load_robot
+from go1exp.sim.physics.dynamics import Kinematics
+from go1exp.sim.physics.scene import load_robot
 from go1exp.sim.task import TaskConfig
 
 FILE = data_root() / "conf/controller/mpc.yaml"

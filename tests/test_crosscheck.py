@@ -18,7 +18,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from go1exp import robot
-from go1exp.sim.physics.model import load_robot
+from go1exp.sim.physics.scene import load_robot
 
 CONFIGURATIONS = 200
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from go1exp.base.tensors.delay_line import DelayLine
+from go1exp.base.tensors.memory import DelayLine
 
 DT, LONGEST = 0.002, 0.02
 

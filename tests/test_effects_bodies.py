@@ -178,7 +178,7 @@ def test_inertia_and_weight_are_those_of_the_links_written_down_anew(name: str) 
 
 def with_bodies(loads: Mapping[str, tuple[float, tuple[float, float, float]]]) -> mujoco.MjModel:
     """Compile a robot that carries real bodies: name of the link -> mass, kg, and place in its frame, m."""
-    from go1exp.sim.physics.model import load_robot
+    from go1exp.sim.physics.scene import load_robot
 
     spec = load_robot(task().robot.inertia)
     for link, (mass, at) in loads.items():

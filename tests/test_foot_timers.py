@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from go1exp.mdp.foot_timers import FootTimers
+from go1exp.mdp.feet import FootTimers
 
 DT = 0.002
 SUBSTEPS = 10

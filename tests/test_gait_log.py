@@ -16,7 +16,7 @@ from go1exp.extend.testing.snapshots import random_snapshot
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.types import Snapshot
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.gait_log import GaitLog
+from go1exp.sim.env.metrics import GaitLog
 from go1exp.train import checkpoint
 from go1exp.train.checkpoint import DamagedCheckpoint
 from go1exp.train.group import Group

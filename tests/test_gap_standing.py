@@ -35,7 +35,7 @@ from go1exp.logs.recording import VECTORS, Recording
 from go1exp.robot import JOINTS
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.tolerances import declared, sizes
-from go1exp.sim.physics.legs import Legs
+from go1exp.sim.physics.dynamics import Legs
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.terrain import TerrainConfig, build_terrain
 from tests import laboratory

@@ -32,7 +32,7 @@ from go1exp.logs.recording import Recording
 from go1exp.robot import LEGS
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.effects.tolerances import sizes
-from go1exp.sim.physics.legs import Legs
+from go1exp.sim.physics.dynamics import Legs
 from tests import laboratory
 
 EXACT = tuple(

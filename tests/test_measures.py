@@ -15,8 +15,7 @@ from go1exp.extend.testing.traces import random_trace, without
 from go1exp.logs.recorded import hysteresis, trace_of
 from go1exp.logs.recording import Meta, Recording, RecordingError
 from go1exp.mdp.measures import every_measure, measured
-from go1exp.mdp.measures.runs import find_runs, largest_within, settled
-from go1exp.mdp.measures.trace import NotMeasured, Trace
+from go1exp.mdp.measures.trace import NotMeasured, Trace, find_runs, largest_within, settled
 
 DT, SAMPLES = 0.002, 10
 WALK, STAND = (1.0, 0.0, 0.0), (0.0, 0.0, 0.0)

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 from go1exp import robot
 from go1exp.base.paths import data_root
-from go1exp.sim.physics.model import load_robot
+from go1exp.sim.physics.scene import load_robot
 
 IN_SDK_ORDER = list(robot.LEGS)
 POSES = {

@@ -12,7 +12,7 @@ import torch
 from go1exp.extend.testing.snapshots import random_snapshot
 from go1exp.mdp.types import Snapshot
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.task_log import KINDS, TaskLog
+from go1exp.sim.env.metrics import KINDS, TaskLog
 
 COMMANDS = [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.6, 0.8, 0.0], [2.0, 0.0, 0.0]]
 """One of each kind: stand, slow (turning), medium (1 m/s), fast."""

@@ -14,7 +14,7 @@ from benchmarks.height_field import OFF, RADIUS, Array, deepest_of_mujoco, deepe
 
 pytestmark = [
     pytest.mark.skipif(importlib.util.find_spec("mujoco_warp") is None, reason="needs the extra gpu"),
-    pytest.mark.slow("go1exp/sim/physics/warp_height_field.py", "go1exp/sim/physics/mujoco_warp.py"),
+    pytest.mark.slow("go1exp/sim/physics/warp_kernels.py", "go1exp/sim/physics/mujoco_warp.py"),
 ]
 
 
@@ -48,6 +48,6 @@ def test_contacts_on_the_paper_s_ground_are_as_deep_as_in_mujoco(depth: float) -
 
 def test_the_engine_still_needs_it() -> None:
     """If this fails the engine has a law of its own no more, and ``warp_height_field.py`` can go."""
-    code = "from go1exp.sim.physics.warp_height_field import use_mujocos_law as u; print(u())"
+    code = "from go1exp.sim.physics.warp_kernels import use_mujocos_law as u; print(u())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip().splitlines()[-1] == "('_inflate', '_epa_witness')"

@@ -24,7 +24,7 @@ def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[
     """Return the function from a recording of a hung Go1 to the torques (T, 12) at its joints, N m."""
     from go1exp.gap.actuator_net import FitError, smooth_motion
     from go1exp.gap.actuator_net.smoothing import WINDOW
-    from go1exp.sim.physics.inverse import joint_torques
+    from go1exp.sim.physics.dynamics import joint_torques
 
     def joint_torque(recording: Recording) -> np.ndarray:
         base = recording.meta.base_quat

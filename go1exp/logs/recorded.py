@@ -6,8 +6,7 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.logs.recording import FOOT_FORCE, VECTORS, Recording, RecordingError
-from go1exp.mdp.measures.runs import find_runs
-from go1exp.mdp.measures.trace import Array, Trace
+from go1exp.mdp.measures.trace import Array, Trace, find_runs
 
 
 def trace_of(

@@ -12,7 +12,6 @@ from go1exp.mdp import (
     rewards,
     rewards_literal,
     terminations,
-    trot,
 )
 
 __all__ = [
@@ -24,5 +23,4 @@ __all__ = [
     "rewards",
     "rewards_literal",
     "terminations",
-    "trot",
 ]

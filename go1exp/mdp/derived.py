@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.base.tensors.constants import constant_like
+from go1exp.base.tensors.memory import constant_like
 from go1exp.base.tensors.rotation import rotate
 from go1exp.mdp.types import Snapshot
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.base.tensors.constants import constant, constant_like
+from go1exp.base.tensors.memory import constant, constant_like
 from go1exp.config.schema.registry import Term
 
 if TYPE_CHECKING:

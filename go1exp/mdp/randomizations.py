@@ -13,7 +13,7 @@ import torch
 from pydantic import AfterValidator, Field
 
 from go1exp import robot
-from go1exp.base.tensors.constants import constant_like
+from go1exp.base.tensors.memory import constant_like
 from go1exp.base.tensors.randomness import Stream
 from go1exp.base.tensors.restitution import damping_ratio
 from go1exp.base.tensors.rotation import quat_from_rotvec, quat_multiply

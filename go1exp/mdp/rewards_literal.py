@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.base.tensors.constants import constant_like
+from go1exp.base.tensors.memory import constant_like
 from go1exp.config.schema.registry import NonNegative, Positive, reward
 from go1exp.mdp.derived import foot_speed_xy, joint_deviation
 from go1exp.mdp.types import Snapshot

@@ -24,7 +24,7 @@ NUM_LEGS = len(LEGS)
 MOUNT_SLIDES = ("mount_x", "mount_y", "mount_z")
 MOUNT_HINGES = ("mount_roll", "mount_pitch")
 MOUNT = (*MOUNT_SLIDES, *MOUNT_HINGES)
-"""Joints between the world and a trunk on a compliant mount, before those of the legs (``sim/physics/mount.py``).
+"""Joints between the world and a trunk on a compliant mount, before those of the legs (``sim/physics/scene.py``).
 
 None about z: legs that hang hardly turn a trunk that way, and a fit gets lost in what else it might explain.
 """

@@ -14,8 +14,7 @@ from go1exp.config.schema.beside import EVALUATED
 from go1exp.config.schema.registry import ConfigError, unknown_name
 from go1exp.config.schema.schedule import Ramp, Value
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.env.gait_log import GaitLog
-from go1exp.sim.env.task_log import TaskLog
+from go1exp.sim.env.metrics import GaitLog, TaskLog
 from go1exp.sim.schedule import WEIGHT
 from go1exp.sim.task import TrainConfig
 

@@ -1,8 +1,12 @@
-"""State that a term carries from one policy step to the next."""
+"""Tensors that outlive a step: state written in place, delay lines, constants of a device."""
 
 from __future__ import annotations
 
+import functools
+import math
 from typing import TYPE_CHECKING
+
+import torch
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,3 +29,83 @@ class Memory:
         """Write the tensors back, in place; raise KeyError if one is missing."""
         for name in self.memory:
             getattr(self, name).copy_(state[name])
+
+
+class DelayLine(Memory):
+    """The last samples of a signal (N, J), read back at a delay that may be a fraction of the sample period.
+
+    Between two samples it interpolates linearly. Each environment and joint may have a delay of its own. A delay of
+    zero returns the sample itself, bit for bit.
+    """
+
+    memory = ("_past", "_newest", "_age")
+
+    def __init__(
+        self, num_envs: int, joints: int, longest: float, dt: float, dtype: torch.dtype, device: torch.device
+    ) -> None:
+        """Allocate for delays up to ``longest`` s of a signal sampled every ``dt`` s."""
+        self._dt, self._longest = dt, longest
+        self._oldest = math.ceil(longest / dt - 1e-9)  # samples back
+        slots = 1 << (self._oldest + 1).bit_length()  # a power of two: places wrap around by a mask
+        self._wrap = slots - 1
+        self._past = torch.zeros(slots, num_envs, joints, dtype=dtype, device=device)
+        self._newest = torch.zeros(1, dtype=torch.int64, device=device)
+        self._age = torch.zeros(num_envs, 1, dtype=dtype, device=device)
+
+    def twin(self) -> DelayLine:
+        """Return an empty line for another signal (N, J) of the same kind."""
+        _, n, joints = self._past.shape
+        return DelayLine(n, joints, self._longest, self._dt, self._past.dtype, self._past.device)
+
+    def restored(self, state: dict[str, Tensor] | None) -> DelayLine | None:
+        """Return a twin with the state of one; None for None."""
+        if state is None:
+            return None
+        twin = self.twin()
+        twin.load_state_dict(state)
+        return twin
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Write the state back; that of an older version has as many places as the longest delay needs."""
+        past, newest = state["_past"], state["_newest"]
+        if len(past) < len(self._past):
+            oldest_first = past.roll(-int(newest) - 1, 0)
+            past, newest = torch.zeros_like(self._past), torch.full_like(newest, len(past) - 1)
+            past[: len(oldest_first)] = oldest_first
+        super().load_state_dict({**state, "_past": past, "_newest": newest})
+
+    def reset(self, mask: Tensor) -> None:
+        """Let the next sample stand for the whole past in the rows of ``mask`` (N,)."""
+        rows = mask.unsqueeze(1)
+        self._age.masked_fill_(rows, 0)
+        self._past.masked_fill_(rows, 0)  # what counts nothing must be finite
+
+    def steps(self, delay: Tensor) -> Tensor:
+        """Return delays in s as numbers of samples, as :meth:`at` takes them."""
+        return (delay / self._dt).clamp_(0.0, self._oldest)
+
+    def advance(self, sample: Tensor, delay: Tensor) -> Tensor:
+        """Take the newest ``sample`` (N, J) and return the signal ``delay`` (N, J) or (N, 1) s ago."""
+        return self.at(sample, self.steps(delay))
+
+    def at(self, sample: Tensor, steps: Tensor) -> Tensor:
+        """Take the newest ``sample`` (N, J) and return the signal ``steps`` (N, J) or (N, 1) samples ago."""
+        self._newest.add_(1).bitwise_and_(self._wrap)
+        self._past.index_copy_(0, self._newest, sample.unsqueeze(0))
+        steps = torch.minimum(steps, self._age).expand_as(sample).unsqueeze(0)
+        self._age += 1
+        index = (self._newest - steps.long()).bitwise_and_(self._wrap)
+        after = self._past.gather(0, index)
+        before = self._past.gather(0, index.sub_(1).bitwise_and_(self._wrap))
+        return torch.lerp(after, before, steps.frac()).squeeze(0)
+
+
+@functools.cache
+def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return ``values`` (K,) as a tensor, always the same one, which nobody may change."""
+    return torch.tensor(values, dtype=torch.float64).to(device=device, dtype=dtype)
+
+
+def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
+    """Return ``values`` (K,) in the dtype and on the device of ``like``; nobody may change them."""
+    return constant(values, like.dtype, like.device)

@@ -22,7 +22,7 @@ from go1exp.evaluate.controller.settings import MpcSettings
 from go1exp.evaluate.controller.smoothing import Smoothed
 from go1exp.evaluate.controller.swing import footholds, solved, way
 from go1exp.evaluate.controller.types import Command, Drive, Sensed
-from go1exp.sim.physics.kinematics import Kinematics
+from go1exp.sim.physics.dynamics import Kinematics
 
 LIMIT = robot.per_joint(robot.EFFORT_LIMIT)
 LOW, HIGH = robot.JOINT_POS_LIMITS.T

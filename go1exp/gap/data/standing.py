@@ -18,7 +18,7 @@ from go1exp.gap.data.windows import Windows
 from go1exp.gap.result import GapSettings
 from go1exp.logs.recording import VECTORS, Recording
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.physics.legs import Legs
+from go1exp.sim.physics.dynamics import Legs
 
 WINDOW_S, BURN_S, STRIDE_S = 0.2, 0.03, 0.3
 """Longest windows, what is replayed before them, and from one to the next, s (chosen: what is not known of the

@@ -24,7 +24,7 @@ from go1exp.gap.data.windows import PAST_S, Windows
 from go1exp.gap.result import GapSettings
 from go1exp.logs.recording import Recording, RecordingError
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.physics.legs import LegDynamics, Legs
+from go1exp.sim.physics.dynamics import LegDynamics, Legs
 
 LONGEST_S, BURN_S = 0.25, 0.02
 """Longest windows, and what is replayed before them, s: a swing of a trot takes 0.2 s."""

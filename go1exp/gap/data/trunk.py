@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from go1exp import robot
 from go1exp.gap.data.cutting import FIT_S, even_clock
 from go1exp.logs.recording import VECTORS, Recording
-from go1exp.sim.physics.legs import Legs
+from go1exp.sim.physics.dynamics import Legs
 
 LOADED = 10.0
 """Force from which a foot carries weight, N: a third of what each bears at rest, twice what is

@@ -56,7 +56,7 @@ class Machine(Protocol):
             physics_dt: step, s.
             base_quat: attitude of a held base, w-x-y-z.
             threads: of the engine.
-            mounted: a held base has the joints of ``sim/physics/mount.py``; nothing to one that is free.
+            mounted: a held base has the joints of ``sim/physics/scene.py``; nothing to one that is free.
         """
 
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.config.schema.registry import NonNegative, Positive, measure
-from go1exp.mdp.measures.runs import largest_within
-from go1exp.mdp.measures.trace import Array, Trace, mean_over, percentile_by_robot, ratio
+from go1exp.mdp.measures.trace import Array, Trace, largest_within, mean_over, percentile_by_robot, ratio
 
 HIGH = 95.0
 """Percentile of impacts that counts as high."""

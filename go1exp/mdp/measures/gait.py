@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from go1exp import robot
 from go1exp.config.schema.registry import Fraction, measure
-from go1exp.mdp.measures.runs import Runs, largest_within
-from go1exp.mdp.measures.trace import Array, Trace, mean_over, ratio
+from go1exp.mdp.measures.trace import Array, Runs, Trace, largest_within, mean_over, ratio
 
 FR = robot.LEGS.index("FR")
 

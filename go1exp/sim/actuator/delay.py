@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import torch
 from pydantic import AfterValidator, Field
 
-from go1exp.base.tensors.delay_line import DelayLine
+from go1exp.base.tensors.memory import DelayLine
 from go1exp.config.schema.registry import actuator, ordered
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.setup import Actuator, takes_feedforward

@@ -131,7 +131,7 @@ class Effect(Memory):
     joint_values: ClassVar[tuple[str, ...]] = ()
     """Parameters with a value per joint (filled in by itself)."""
     mounts: ClassVar[bool] = False
-    """Whether it acts on joints between the world and a trunk that is held (``sim/physics/mount.py``)."""
+    """Whether it acts on joints between the world and a trunk that is held (``sim/physics/scene.py``)."""
     order: ClassVar[int] = 0
     """Place among the effects of the same hook: smaller is nearer to the command."""
 

@@ -12,7 +12,7 @@ from go1exp.sim.effects.identification import Identification
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from go1exp.base.tensors.delay_line import DelayLine
+    from go1exp.base.tensors.memory import DelayLine
     from go1exp.config.schema.joint_values import JointValues
     from go1exp.robot.actuators import ActuatorSetup
 

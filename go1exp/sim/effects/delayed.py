@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from go1exp.base.tensors.delay_line import DelayLine
+from go1exp.base.tensors.memory import DelayLine
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect
 

@@ -34,7 +34,7 @@ class SoftMount(Effect):
     ``sway`` along the world's x and y, ``heave`` along z, ``roll`` and ``pitch`` about the trunk's axes. The
     weight is borne without deflection. Legs that swing push the trunk, and all legs feel it. Straps of half a metre
     let 12 kg sway by 0.004 m/N, at 0.7 Hz; stands turn by 0.001 to 0.01 rad/(N m) (a judgement). The model has joints
-    of the trunk for it (``sim/physics/mount.py``) where the effect is not null; a trunk that is free, and the simulated
+    of the trunk for it (``sim/physics/scene.py``) where the effect is not null; a trunk that is free, and the simulated
     robot of ``go1exp deploy``, feel nothing. It looks like ``base_tilt``, ``link_com`` and ``armature``.
 
     A spring that the physics step cannot resolve is given inertia until it can; with compliance 0 that is ``BOLTED``.

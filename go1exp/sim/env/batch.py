@@ -1,11 +1,12 @@
-"""The batched environment from overrides: ``go1exp.make``."""
+"""The batched environment from overrides, ``go1exp.make``, and checks of a program's arguments."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Iterable, Sequence
+from typing import Any
 
-from go1exp.config.compose import compose
-from go1exp.sim.env.arguments import listed, whole
+from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import parse_task
 
@@ -33,6 +34,37 @@ def make(
     Raises:
         go1exp.config.schema.registry.ConfigError: if an override, a number of robots or a seed is invalid.
     """
+    from go1exp.config.compose import compose
+
     num_envs, seed = whole("num_envs", num_envs, 1), whole("seed", seed, 0)
     task = parse_task(compose("train", listed(overrides)))
     return Go1Core(task, num_envs, seed, noise=noise, spread_starts=spread_starts)
+
+
+def whole(name: str, value: Any, least: int) -> int:
+    """Return a whole number of at least ``least``.
+
+    Raises:
+        ConfigError: if ``value`` is something else.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if isinstance(value, bool) or number < least:
+        raise ConfigError([f"{name} = {value!r}: must be a whole number, {least} or more"])
+    return number
+
+
+def listed(overrides: Any) -> Sequence[str]:
+    """Return overrides as a list.
+
+    Raises:
+        ConfigError: if they are one text, or one of them is no text.
+    """
+    if isinstance(overrides, str):
+        raise ConfigError([f"overrides = {overrides!r}: must be a list of texts, such as [{overrides!r}]"])
+    given = list(overrides) if isinstance(overrides, Iterable) else [overrides]
+    if not isinstance(overrides, Iterable) or not all(isinstance(text, str) for text in given):
+        raise ConfigError([f"overrides = {overrides!r}: must be a list of texts, such as ['reward=paper']"])
+    return given

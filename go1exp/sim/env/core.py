@@ -20,20 +20,17 @@ from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.base.tensors.rotation import projected_gravity, rotate_inverse
 from go1exp.config.schema.schedule import Value
 from go1exp.mdp.actions import clipped, joint_target, of_shape
-from go1exp.mdp.clearance import lift
 from go1exp.mdp.commands import UniformVelocity
 from go1exp.mdp.feet import Feet
 from go1exp.mdp.ground import GroundHeight, HeightScan
-from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.kinematics import KinematicState, lift
 from go1exp.mdp.randomizations import FEET
 from go1exp.mdp.types import Snapshot, StepResult
 from go1exp.sim.effects.rules import on_mount
-from go1exp.sim.env.engine import CapturedStep, make_backend
-from go1exp.sim.env.evidence import Evidence, accuse
-from go1exp.sim.env.gait_log import GaitLog
+from go1exp.sim.env.engine import CapturedStep, Restarts, make_backend
+from go1exp.sim.env.faults import Evidence, accuse
+from go1exp.sim.env.metrics import GaitLog, TaskLog
 from go1exp.sim.env.plant import Plant, actuator_setup
-from go1exp.sim.env.restarts import Restarts
-from go1exp.sim.env.task_log import TaskLog
 from go1exp.sim.env.terms import StepTerms
 from go1exp.sim.physics.scene import build_model
 from go1exp.sim.schedule import CONTACT_TIME, DELAY, FEET_CONTACT_FIELD

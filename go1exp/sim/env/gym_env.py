@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from go1exp.sim.env.arguments import listed, whole
+from go1exp.sim.env.batch import listed, whole
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.sb3_env import spaces
 from go1exp.sim.task import TaskConfig

@@ -12,7 +12,7 @@ from torch import Tensor
 from go1exp.config.schema.backends import WarpBackend
 from go1exp.config.schema.history import frame_width, width
 from go1exp.config.schema.registry import ConfigError, Term
-from go1exp.mdp.foot_impacts import impossible
+from go1exp.mdp.feet import impossible
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.sim.env.frames import Frames
 from go1exp.sim.schedule import WEIGHT
@@ -37,7 +37,7 @@ class StepTerms:
         sums: (R,) float64, of weighted rewards since ``core.drain_metrics``.
         failed: (N, T) bool, which terminations were true in the last step.
         left_map: (N,) bool, who was at the edge of the ground in the last step.
-        impossible: (N,) bool, whose feet met a force that physics cannot make in it (``mdp/foot_impacts.py``).
+        impossible: (N,) bool, whose feet met a force that physics cannot make in it (``mdp/feet.py``).
         distrusts: whether such a force ends an episode, or is believed.
         observed: terms of the observation, in the order of their columns; those of the critic are the last ones.
         observation_size: O.

@@ -9,8 +9,7 @@ import mujoco
 
 from go1exp.config.schema.registry import Expected
 from go1exp.robot import MOUNT
-from go1exp.sim.physics.mount import add_mount
-from go1exp.sim.physics.scene import RIGID
+from go1exp.sim.physics.scene import RIGID, add_mount
 
 BASE = "trunk"
 """Name that the base body gets, whatever the file calls it: effects on the attitude of a held robot look for it."""
@@ -41,7 +40,7 @@ def build_fixed_base(
         effort: peak torque of each, (J,) N m.
         physics_dt: timestep, s.
         base_quat: attitude of the base, w-x-y-z, base to world; it replaces the file's.
-        mounted: the base has the joints of ``sim/physics/mount.py``, before its own.
+        mounted: the base has the joints of ``sim/physics/scene.py``, before its own.
 
     Raises:
         FixedBaseError: if the file is missing or no MJCF, has no such body or hinge, has them in another order, or has

@@ -32,9 +32,7 @@ except ImportError as error:
     ) from error
 
 from go1exp.sim.physics.warp_constants import DERIVED, DerivedConstants
-from go1exp.sim.physics.warp_contacts import ContactReadings, without_contact_sensors
-from go1exp.sim.physics.warp_height_field import use_mujocos_law
-from go1exp.sim.physics.warp_random import units_kernel
+from go1exp.sim.physics.warp_kernels import ContactReadings, units_kernel, use_mujocos_law, without_contact_sensors
 
 use_mujocos_law()  # of contacts with a height field, before any kernel is built
 

@@ -6,16 +6,67 @@ Whatever the MDP needs beyond qpos and qvel is a sensor declared here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from go1exp import robot
+from go1exp.base.paths import data_root
 from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.robot import MOUNT_HINGES, MOUNT_SLIDES
 from go1exp.robot.config import RobotConfig
-from go1exp.sim.physics.model import load_robot
-from go1exp.sim.physics.mount import add_mount
 from go1exp.sim.physics.terrain_geom import FLOOR, add_to_spec
 from go1exp.sim.terrain import Terrain
+
+TRUNK_WITH_HIP_ROTORS: dict[str, Any] = {
+    "mass": 5.560,
+    "ipos": [0.020872158, 0.001871942, -0.000467986],
+    "fullinertia": [0.0180397001, 0.0678915698, 0.0773160421, -2.44537877e-4, -2.90814056e-4, -4.15398942e-5],
+}
+"""Trunk plus the four hip rotors that turn inside it, trunk frame: mass, kg; COM, m; inertia about the COM as xx, yy,
+zz, xy, xz, yz, kg m2.
+
+Computed from the vendor URDF: trunk 5.204 kg and four rotors of 0.089 kg at (+-0.11215, +-0.04675, 0), 1.11842e-4 about
+their x axis and 5.9647e-5 across it. Its IMU, camera and ultrasound links (1.08 g together) are left out.
+"""
+
+INERTIA_VARIANTS = ("merged", "rotor_complete")
+
+
+def load_robot(inertia: str = "merged") -> mujoco.MjSpec:
+    """Load ``assets/go1/go1.xml``: the robot alone, without floor, lights or sensors.
+
+    Args:
+        inertia: ``merged`` (12.743 kg) omits the hip rotors, as MuJoCo Menagerie and its descendants do;
+            ``rotor_complete`` (13.099 kg) adds them to the trunk, as the vendor URDF does.
+    """
+    if inertia not in INERTIA_VARIANTS:
+        raise ValueError(f"inertia {inertia!r} is none of {', '.join(INERTIA_VARIANTS)}")
+    spec = mujoco.MjSpec.from_file(str(data_root() / "assets/go1/go1.xml"))
+    if inertia == "rotor_complete":
+        trunk = spec.body("trunk")
+        for field, value in TRUNK_WITH_HIP_ROTORS.items():
+            setattr(trunk, field, value)
+    return spec
+
+
+def add_mount(trunk: mujoco.MjsBody) -> None:
+    """Let a held trunk move: three slides and two hinges, none of which has a spring or a damper yet.
+
+    The slides are along the axes of the world, the hinges about those of the trunk.
+
+    Args:
+        trunk: body of the trunk, a child of the world, with its attitude set and without joints.
+    """
+    back = Rotation.from_quat(trunk.quat, scalar_first=True).inv().as_matrix()
+    slides = [(name, mujoco.mjtJoint.mjJNT_SLIDE, back[:, k]) for k, name in enumerate(MOUNT_SLIDES)]
+    hinges = [(name, mujoco.mjtJoint.mjJNT_HINGE, np.eye(3)[k]) for k, name in enumerate(MOUNT_HINGES)]
+    for name, kind, axis in (*slides, *hinges):
+        joint = trunk.add_joint()
+        joint.name, joint.type, joint.axis = name, kind, list(axis)
+
 
 DECORATION_GROUP = 2
 """Geom group of the shapes that are only for the eye; they cost kinematics and are left out of training."""
@@ -81,7 +132,7 @@ def build_model(
         imu: add the IMU's sensors (they cost time and a policy does not need them).
         held: orientation w-x-y-z in which the trunk is held in the air, as on a stand; None lets it go. A held robot's
             state is its joints' alone.
-        mounted: the held trunk has the joints of ``sim/physics/mount.py``, whose state stands before that of the legs.
+        mounted: the held trunk has the joints of ``sim/physics/scene.py``, whose state stands before that of the legs.
     """
     spec = load_robot(config.inertia)
     if held is not None:

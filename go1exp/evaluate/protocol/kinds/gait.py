@@ -16,7 +16,7 @@ from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, command_text
 from go1exp.evaluate.protocol.quantities import Column, Row
 from go1exp.evaluate.protocol.report import paint
 from go1exp.mdp.measures.gait import touchdown_phase
-from go1exp.mdp.measures.runs import find_runs
+from go1exp.mdp.measures.trace import find_runs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,7 +1,7 @@
-"""Figures of gait and contact for the log of a training: sums over steps and robots, cheap enough for every step.
+"""Metrics of a training: gait, contact and task, as sums over steps and robots that are cheap enough for every step.
 
-They follow ``go1exp/mdp/measures`` where that costs nothing, and say where they do not: they show where a training is
-going, ``go1exp eval`` shows what came out.
+They follow ``go1exp/mdp/measures`` where that costs nothing; docstrings name the differences. Nothing branches on data
+or waits for the device.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ import torch
 from go1exp import robot
 from go1exp.base.tensors.memory import Memory
 from go1exp.mdp.derived import slip_speed
-from go1exp.mdp.foot_impacts import impossible
+from go1exp.mdp.feet import impossible
 from go1exp.mdp.measures.gait import GAITS
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from go1exp.mdp.types import Snapshot
+
 
 LONGEST_STRIDE = 1.0
 """Strides that take longer have no phases, s."""
@@ -33,7 +34,7 @@ OTHERS = slice(FR + 1, LEGS)  # a list of indices would be copied to the GPU at 
 TROT = GAITS["trot"][OTHERS]
 """Touchdown of FL, RR and RL after FR in a trot, cycles."""
 
-WIDTHS = {
+GAIT_SUMS = {
     **{"moving": 1, "touchdowns": LEGS, "contacts": LEGS, "forces": LEGS, "errors": 3, "phases": 3},
     **{"fast": 1, "on_ground": 1, "peaks": 1, "stances": 1, "speeds": 1, "landings": 1},
 }
@@ -41,14 +42,14 @@ WIDTHS = {
 
 
 class GaitLog(Memory):
-    """Sums since the last ``drain``, and what each robot needs of its past; nothing branches on data."""
+    """Gait and contact: sums since the last ``drain``, and the past that each robot's phases need."""
 
     memory = ("sums", "largest", "since", "period", "stance_peak")
 
     def __init__(self, num_envs: int, dt: float, device: torch.device) -> None:
         """Start with nothing; ``dt`` is the policy's period, s."""
         self._dt = dt
-        self.sums = torch.zeros(sum(WIDTHS.values()), dtype=torch.float64, device=device)
+        self.sums = torch.zeros(sum(GAIT_SUMS.values()), dtype=torch.float64, device=device)
         self.largest, self.impossible = torch.zeros(2, device=device).unbind(0)
         self.since = torch.full((num_envs,), torch.inf, device=device)  # FR's last touchdown, s ago
         self.period = torch.zeros(num_envs, device=device)  # of its last stride, s
@@ -75,7 +76,7 @@ class GaitLog(Memory):
         self.sums += torch.cat([c.float() for c in columns], -1).sum(0, dtype=torch.float64)
 
     def _phase_errors(self, s: Snapshot, landed: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3) each: distance to the trot of FL, RR and RL where they landed, in cycles, and where they did.
+        """(N, 3) each: distance to the trot of FL, RR and RL where they landed, in cycles, and a mask.
 
         The phase is the time since FR's touchdown over FR's last stride. Instants are known to the physics step:
         a foot's contact time tells how long ago it landed.
@@ -97,7 +98,9 @@ class GaitLog(Memory):
         self.stance_peak.masked_fill_(mask.unsqueeze(-1), 0.0)
 
     def drain(self) -> dict[str, float]:
-        """Return the figures since the last call; NaN where nothing happened. ``gait/`` is of robots told to move.
+        """Return the metrics since the last call; NaN where nothing happened.
+
+        ``gait/`` is of robots with a non-zero command.
 
         ``gait/stride_rate``: touchdowns of a foot per second, Hz, bounces that a policy step tells apart included.
         ``gait/trot_error``: mean circular distance of touchdowns to a trot's, cycles, of the worst foot; 0.25 for
@@ -105,9 +108,9 @@ class GaitLog(Memory):
         (largest less smallest foot), ``gait/load_share_min``: of the batch's mean force. ``contact/slip_share``,
         ``contact/peak_force``: mean over stances of the largest force, N. ``contact/touchdown_speed``: mean, m/s.
         ``contact/largest_force``: of all, N. ``contact/impossible``: steps with a force that physics cannot make
-        (``mdp/foot_impacts.py``), each the end of an episode.
+        (``mdp/feet.py``), each the end of an episode.
         """
-        sums = dict(zip(WIDTHS, self.sums.split(list(WIDTHS.values())), strict=True))
+        sums = dict(zip(GAIT_SUMS, self.sums.split(list(GAIT_SUMS.values())), strict=True))
         duty, force = sums["contacts"] / sums["moving"], sums["forces"]
         figures = {
             "gait/stride_rate": sums["touchdowns"].mean() / (sums["moving"] * self._dt),
@@ -125,4 +128,80 @@ class GaitLog(Memory):
         self.sums.zero_()
         self.largest.zero_()
         self.impossible.zero_()
+        return dict(zip(figures, values, strict=True))
+
+
+KINDS = ("stand", "slow", "medium", "fast")
+"""Commands: all zero; then by their horizontal speed. Turning on the spot is slow."""
+
+SPEEDS = (0.5, 1.25)
+"""Where medium and fast begin, m/s."""
+
+TASK_SUMS = {
+    **{"steps": 1, "errors": 3, "falls": 1, "timeouts": 1, "others": 1},
+    **dict.fromkeys(("kind_steps", "kind_errors", "kind_ends", "kind_returns", "kind_lengths"), len(KINDS)),
+}
+"""Sums and how many numbers each of them is."""
+
+
+class TaskLog(Memory):
+    """How episodes end and how commands are tracked, in all and by kind of command: sums since the last ``drain``."""
+
+    memory = ("sums",)
+
+    def __init__(self, dt: float, device: torch.device) -> None:
+        """Start with nothing; ``dt`` is the policy's period, s."""
+        self._dt = dt
+        self.sums = torch.zeros(sum(TASK_SUMS.values()), dtype=torch.float64, device=device)
+
+    def add(self, s: Snapshot, ends: tuple[Tensor, Tensor, Tensor], episode: tuple[Tensor, Tensor]) -> None:
+        """Take in a policy step, before ended episodes begin anew.
+
+        Args:
+            s: the moment.
+            ends: whether an episode ended by a fall, at its time limit, or cut short for another reason, (N,) bool.
+            episode: return and length in steps so far, (N,) each.
+        """
+        assert s.base_lin_vel_b is not None
+        assert s.base_ang_vel_b is not None
+        command = s.command
+        velocity = torch.cat([s.base_lin_vel_b[:, :2], s.base_ang_vel_b[:, 2:]], -1)
+        errors = (velocity - command).square()
+        speed, moving = command[:, :2].norm(dim=-1), (command != 0.0).any(-1)
+        medium, fast = speed >= SPEEDS[0], speed >= SPEEDS[1]
+        kinds = torch.stack([~moving, moving & ~medium, medium & ~fast, fast], -1).float()
+        ended = (ends[0] | ends[1] | ends[2]).float()
+        one = torch.ones_like(ended)
+        columns = torch.stack([one, *(each.float() for each in ends)], -1)
+        # Rows: what is summed up for each kind of command.
+        each = torch.stack([one, errors[:, :2].sum(-1), ended, ended * episode[0], ended * episode[1]])
+        totals = columns.sum(0, dtype=torch.float64)
+        by_kind = (each.double() @ kinds.double()).flatten()
+        self.sums += torch.cat([totals[:1], errors.sum(0, dtype=torch.float64), totals[1:], by_kind])
+
+    def drain(self) -> dict[str, float]:
+        """Return the figures since the last call; NaN where nothing happened.
+
+        ``task/fall_share``, ``task/timeout_share``: of the episodes that ended. ``task/falls_per_minute``: of a robot.
+        ``tracking/rmse_x``, ``rmse_y``, m/s, ``rmse_yaw``, rad/s: of all steps, exploration noise included.
+        ``command_KIND/return``, ``length`` (steps): mean of the episodes that ended under such a command;
+        ``command_KIND/rmse_xy``: horizontal error under it, m/s.
+        """
+        parts = dict(zip(TASK_SUMS, self.sums.split(list(TASK_SUMS.values())), strict=True))
+        ends = parts["falls"] + parts["timeouts"] + parts["others"]
+        figures = {
+            "task/fall_share": parts["falls"] / ends,
+            "task/timeout_share": parts["timeouts"] / ends,
+            "task/falls_per_minute": parts["falls"] / (parts["steps"] * self._dt / 60.0),
+        }
+        rmse = (parts["errors"] / parts["steps"]).sqrt()
+        figures |= {f"tracking/rmse_{axis}": rmse[k] for k, axis in enumerate(("x", "y", "yaw"))}
+        of_kinds = {
+            "return": parts["kind_returns"] / parts["kind_ends"],
+            "length": parts["kind_lengths"] / parts["kind_ends"],
+            "rmse_xy": (parts["kind_errors"] / parts["kind_steps"]).sqrt(),
+        }
+        figures |= {f"command_{kind}/{name}": v[k] for name, v in of_kinds.items() for k, kind in enumerate(KINDS)}
+        values = torch.stack([v.reshape(()) for v in figures.values()]).tolist()
+        self.sums.zero_()
         return dict(zip(figures, values, strict=True))

@@ -1,4 +1,4 @@
-"""The contact sensors of the scene, read off MuJoCo Warp's list of contacts in one pass.
+"""Kernels that MuJoCo Warp lacks: contact sensors in one pass, MuJoCo's law of height fields, random numbers.
 
 Its own contact sensors look for every sensor at every contact, and sort; here, where all contacts are with the ground,
 each contact knows its sensors. That is a fifth of a physics step. The readings are the same but for the order of sums.
@@ -6,12 +6,15 @@ each contact knows its sensors. That is a fifth of a physics step. The readings 
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from mujoco_warp._src import collision_gjk
+from mujoco_warp._src.collision_gjk import Geom, GJKResult, Polytope, _get_face_verts, _tri_affine_coord
 
 from go1exp import robot
 from go1exp.sim.physics.scene import Sensors
@@ -82,3 +85,69 @@ def without_contact_sensors(model: Any) -> None:
     """Let a ``mujoco_warp.Model`` leave its contact sensors at zero."""
     for stage in ("pos", "vel", "acc"):
         setattr(model, f"sensor_contact_{stage}_adr", wp.zeros(0, dtype=int))
+
+
+_GAMMA = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
+_MIX_1 = wp.constant(wp.uint64(0xBF58476D1CE4E5B9))
+_MIX_2 = wp.constant(wp.uint64(0x94D049BB133111EB))
+
+
+@wp.kernel(enable_backward=False)
+def units_kernel(key: wp.array2d[wp.int64], counter: wp.array[wp.int64], out: wp.array2d[float]) -> None:
+    """Write number ``counter + 1 + k`` of each environment's sequence, uniform in [0, 1), one a thread."""
+    env, k = wp.tid()
+    index = wp.uint64(counter[0]) + wp.uint64(k) + wp.uint64(1)
+    z = wp.uint64(key[env, 0]) + index * _GAMMA
+    z = (z ^ (z >> wp.uint64(30))) * _MIX_1
+    z = (z ^ (z >> wp.uint64(27))) * _MIX_2
+    z = z ^ (z >> wp.uint64(31))
+    out[env, k] = float(z >> wp.uint64(40)) * wp.float32(5.9604644775390625e-08)  # 2^-24
+
+
+_SPECIAL = "HFIELD"
+"""What the source of a function names that treats height fields by themselves."""
+
+
+@wp.func
+def _inflate(
+    result: GJKResult, geom1: Geom, geom2: Geom, geomtype1: int, geomtype2: int, margin1: float, margin2: float
+) -> tuple[float, wp.vec3, wp.vec3]:
+    """Return distance and nearest points of two rounded shapes, from those of the shapes without their roundings, m."""
+    toward = wp.normalize(result.x2 - result.x1)
+    return result.dist - margin1 - margin2, result.x1 + margin1 * toward, result.x2 - margin2 * toward
+
+
+@wp.func
+def _epa_witness(
+    pt: Polytope, geom1: Geom, geom2: Geom, geomtype1: int, geomtype2: int, face_idx: int
+) -> tuple[wp.vec3, wp.vec3, float]:
+    """Return the points of two shapes that are deepest in each other, and their distance (< 0), m.
+
+    ``face_idx`` is the face of the polytope, in differences of points, that is nearest to the origin.
+    """
+    corners = _get_face_verts(pt.face[face_idx])
+    first, second, third = 2 * corners[0], 2 * corners[1], 2 * corners[2]
+    share = _tri_affine_coord(
+        pt.vert[first] - pt.vert[first + 1],
+        pt.vert[second] - pt.vert[second + 1],
+        pt.vert[third] - pt.vert[third + 1],
+        pt.face_pr[face_idx],
+    )
+    x1 = share[0] * pt.vert[first] + share[1] * pt.vert[second] + share[2] * pt.vert[third]
+    x2 = share[0] * pt.vert[first + 1] + share[1] * pt.vert[second + 1] + share[2] * pt.vert[third + 1]
+    return x1, x2, -wp.sqrt(pt.face_norm2[face_idx])
+
+
+def use_mujocos_law() -> tuple[str, ...]:
+    """Replace what treats height fields otherwise than MuJoCo, before a kernel is built; return the names replaced.
+
+    A function that treats no height field by itself is left as it is. Names of the engine's own are private: the extra
+    ``gpu`` allows the releases that have them.
+    """
+    replaced = []
+    for function in (_inflate, _epa_witness):
+        theirs = getattr(collision_gjk, function.func.__name__, None)
+        if theirs is not None and theirs is not function and _SPECIAL in inspect.getsource(theirs.func):
+            setattr(collision_gjk, function.func.__name__, function)
+            replaced.append(function.func.__name__)
+    return tuple(replaced)

@@ -1,4 +1,4 @@
-"""What the motion asks of the actuators."""
+"""Effort of the actuators, and height, heave and pitch of the trunk."""
 
 from __future__ import annotations
 
@@ -65,3 +65,23 @@ def _torque_share(trace: Trace) -> Array:
 
 def _speed_share(trace: Trace) -> Array:
     return np.abs(trace.need("joint_vel")) / robot.per_joint(robot.VELOCITY_LIMIT)
+
+
+@measure("heave", unit="m/s")
+def heave(trace: Trace) -> Array:
+    """Root mean square of the trunk's vertical speed, world frame (N,)."""
+    vertical = -(trace.need("base_lin_vel_b") * trace.need("projected_gravity_b")).sum(-1)
+    return np.sqrt(mean_over(np.square(vertical, dtype=np.float64), trace.counts))
+
+
+@measure("trunk_height", unit="m")
+def trunk_height(trace: Trace) -> Array:
+    """Mean height of the trunk's origin over the ground (N,)."""
+    return mean_over(trace.need("base_height"), trace.counts)
+
+
+@measure("trunk_pitch", unit="rad")
+def trunk_pitch(trace: Trace) -> Array:
+    """Mean pitch of the trunk; positive is nose down (N,)."""
+    gravity = trace.need("projected_gravity_b")
+    return mean_over(np.arctan2(gravity[..., 0], -gravity[..., 2]), trace.counts)
