@@ -5,7 +5,7 @@
 Writes ``assets/policies/NAME``: the run's configuration and origin, its curves (every tenth iteration), a checkpoint
 that holds only the policy (without what only training needs), and evaluations on the CPU engine: on flat ground
 with noise, with nothing random (``rand=none``), with noise at 100 Hz, on the ground of training with all that training
-does to a robot, and as policies are judged (``go1exp/evaluate/bars.py``): stiff feet, dry friction, late targets.
+does to a robot, and as policies are judged (``go1exp/evaluate/criteria.py``): stiff feet, dry friction, late targets.
 ``first`` is the run that ``run`` started from (``start_from``): its configuration, origin and curves go to
 ``first_stage``. Without ``run`` the present policy is evaluated again.
 """
@@ -25,9 +25,8 @@ from go1exp.base.paths import data_root
 from go1exp.cli import other_robot
 from go1exp.config.compose import compose
 from go1exp.evaluate import table
-from go1exp.evaluate.bars import ROBOT
-from go1exp.evaluate.delay_margin import delay_margin
-from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
+from go1exp.evaluate.criteria import ROBOT
+from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid
 from go1exp.mdp.measures import every_measure
 from go1exp.sim.task import TaskConfig
 from go1exp.train import checkpoint, start
@@ -53,7 +52,7 @@ JUDGED_GRID = {
     "y": (0.5, -0.5),
     "yaw": (1.0, -0.6, 1.8),
 }
-"""Commands that the bars are about, m/s and rad/s."""
+"""Commands that the criteria are about, m/s and rad/s."""
 
 COMBINED = (1.0, 0.3, 0.5)
 """One command of all three kinds."""
@@ -87,7 +86,7 @@ def copy_origin(run: Path, to: Path) -> None:
 
 
 def judge(task: TaskConfig, policy: Policy, about: dict[str, Any]) -> dict[str, Any]:
-    """Return the report of a policy on ``bars.ROBOT``: 20 robots a command, 10 s, noise; and its delay margin."""
+    """Return the report of a policy on ``criteria.ROBOT``: 20 robots a command, 10 s, noise; and its delay margin."""
     other, _ = other_robot.split(compose("eval", list(ROBOT)))
     changed = other_robot.replaced(task, other)
     commands = (*grid(JUDGED_GRID["x"], JUDGED_GRID["y"], JUDGED_GRID["yaw"], cross=False), COMBINED)

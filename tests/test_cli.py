@@ -585,7 +585,7 @@ def test_a_measure_of_a_users_own_is_printed(run: Path, tmp_path: Path) -> None:
     lines = [line.split() for line in done.stdout.splitlines()]
     place = lines.index(["command", "three", "rad", "n"])
     assert lines[place + 1] == ["+0.0", "+0.0", "+0.0", "3", "1"]
-    assert "gait" not in done.stdout.split("bars for a policy")[0]
+    assert "gait" not in done.stdout.split("acceptance criteria")[0]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Gears, Measured
-from go1exp.sim.effects.two_mass import TwoMass, resonance
+from go1exp.sim.effects.gears import TwoMass, resonance
 from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model

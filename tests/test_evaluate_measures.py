@@ -12,11 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from go1exp.evaluate import delay_margin as margins
-from go1exp.evaluate import table
-from go1exp.evaluate.delay_margin import delay_margin, delayed
+from go1exp.evaluate import rollout, table
 from go1exp.evaluate.recorder import Recorder
-from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task
+from go1exp.evaluate.rollout import EvalConfig, delay_margin, delayed, evaluate, evaluation_task
 from go1exp.mdp.measures import every_measure
 from go1exp.robot import GRAVITY
 from go1exp.sim.env.core import Go1Core
@@ -178,7 +176,7 @@ def test_the_margin_is_the_largest_delay_before_the_first_fall(
         delay = 1000.0 * task.effect[-1].parameters["delay"]
         return {"distinct_falls": {"count": int(delay > falls_from - 1), "n": 5}}
 
-    monkeypatch.setattr(margins, "evaluate", fake)
+    monkeypatch.setattr(rollout, "evaluate", fake)
     result = delay_margin(task, stand, QUIET, {"count": first_falls, "n": 5})
     assert result["ms"] == margin
     assert [int(ms) for ms in result["falls"]] == [0, 10, 20, 30, 40][:run]

@@ -45,8 +45,13 @@ ORDER = {
         *("design", "certainty.py", "answer.py", "sentence.py", "report", "stages"),
     ),
     "deploy": ("estimation", "runtime", "__main__.py", "export", "sim_robot"),
+    "evaluate": (
+        *("statistics", "quantities.py", "rows.py", "observed.py", "controller", "recorder.py", "drivers.py"),
+        *("rollout.py", "footfalls.py", "video.py", "stick.py", "criteria.py", "table.py", "asynchronous.py"),
+        *("protocol", "report", "bench", "viewer"),
+    ),
 }
-"""Rooms of the package, and within three of them, from the ground up: a room imports itself and those below it."""
+"""Rooms of the package, and within four of them, from the ground up: a room imports itself and those below it."""
 
 ENGINES = ("mujoco", "mujoco_warp", "warp", "gymnasium", "stable_baselines3", "hydra", "omegaconf")
 

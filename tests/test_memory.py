@@ -24,7 +24,7 @@ from go1exp.evaluate import video
 from go1exp.evaluate.drivers import PolicyDriver
 from go1exp.evaluate.protocol.base import Chosen, chosen
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Plan
-from go1exp.evaluate.protocol.refusing import refuse
+from go1exp.evaluate.protocol.playing import refuse
 from go1exp.evaluate.protocol.stage import Setting, Stage
 from go1exp.evaluate.report import evaluating
 from go1exp.logs.record.plan import ROW_BYTES

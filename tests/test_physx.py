@@ -24,7 +24,7 @@ from go1exp.cli.runs import shipped_policies
 from go1exp.config.compose import compose
 from go1exp.config.schema.backends import CpuBackend
 from go1exp.config.schema.registry import ConfigError, Expected
-from go1exp.evaluate import engine as evaluate_engine
+from go1exp.evaluate import rollout
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import make_backend
@@ -137,7 +137,7 @@ def test_the_contract_finds_an_engine_that_is_not_the_robot(build: Build, name: 
 def test_nothing_is_judged_on_an_engine_that_is_not_the_robot(
     make_task: Callable[..., TaskConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = evaluate_engine.make_backend
+    made = rollout.make_backend
 
     def light(config: Any, *given: Any) -> Any:
         backend = made(config, *given)
@@ -145,7 +145,7 @@ def test_nothing_is_judged_on_an_engine_that_is_not_the_robot(
             _wrong("a heavier calf", backend)
         return backend
 
-    monkeypatch.setattr(evaluate_engine, "make_backend", light)
+    monkeypatch.setattr(rollout, "make_backend", light)
     config = EvalConfig(((0.0, 0.0, 0.0),), 1, 1.0, 0.0, False, False, False, False, None, 1, engine=PHYSX)
     with pytest.raises(Expected, match="nothing is judged on it: link masses"):
         evaluate(make_task(), lambda observation: torch.zeros(1, 12), config)

@@ -10,7 +10,7 @@ from scipy import stats
 
 from go1exp.evaluate.protocol.claims import Claim, judged, verdict
 from go1exp.evaluate.protocol.comparing import word
-from go1exp.evaluate.protocol.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
+from go1exp.evaluate.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
 from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,

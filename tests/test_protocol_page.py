@@ -18,12 +18,11 @@ from go1exp.config.compose import compose
 from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Played, chosen
 from go1exp.evaluate.protocol.claims import judged
-from go1exp.evaluate.protocol.playing import summarised
+from go1exp.evaluate.protocol.playing import Result, summarised
 from go1exp.evaluate.protocol.report.compare import page as comparison
 from go1exp.evaluate.protocol.report.html import page
 from go1exp.evaluate.protocol.report.tables import ACROSS, claims_table, figure_tables, meanings
 from go1exp.evaluate.protocol.report.words import condition_text, interval_text, number
-from go1exp.evaluate.protocol.result import Result
 
 PHONE = 390
 """Width, CSS pixels."""

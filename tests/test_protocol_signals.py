@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from go1exp.evaluate.protocol.disturbances import Impulses, Kicker, heading
+from go1exp.evaluate.protocol.plan import Impulses, Kicker, heading
 from go1exp.evaluate.protocol.signals import Constant, Sine, Steps, phasors, response
 
 PERIOD = 3.5

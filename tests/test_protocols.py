@@ -23,16 +23,14 @@ from go1exp.config.schema.registry import ConfigError, members
 from go1exp.evaluate.drivers import ControllerDriver, Driver, PolicyDriver
 from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Chosen, chosen
-from go1exp.evaluate.protocol.disturbances import Impulses
 from go1exp.evaluate.protocol.kinds.corners import step_answer
 from go1exp.evaluate.protocol.kinds.push_map import largest_survived
-from go1exp.evaluate.protocol.plan import Plan
-from go1exp.evaluate.protocol.playing import Rates, play
-from go1exp.evaluate.protocol.quantities import FINGERPRINT, ROBOT
+from go1exp.evaluate.protocol.plan import Impulses, Plan
+from go1exp.evaluate.protocol.playing import Rates, Result, play
 from go1exp.evaluate.protocol.report.compare import page as comparison
 from go1exp.evaluate.protocol.report.writing import write
-from go1exp.evaluate.protocol.result import Result
 from go1exp.evaluate.protocol.stage import Setting, Stage, fitting_step
+from go1exp.evaluate.quantities import FINGERPRINT, ROBOT
 from go1exp.sim.task import TaskConfig
 from tests.test_every_key_acts import unread
 

@@ -24,7 +24,6 @@ from go1exp.cli.report import _task
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.settings import parse
-from go1exp.evaluate.files import write as write_evaluation
 from go1exp.evaluate.report import curves
 from go1exp.evaluate.report.groups import baseline, groups
 from go1exp.evaluate.report.made import Report, report
@@ -33,6 +32,7 @@ from go1exp.evaluate.report.settings import ReportSettings
 from go1exp.evaluate.report.tables import plain_rows, tables
 from go1exp.evaluate.report.writing import page, write
 from go1exp.evaluate.rows import rows_of
+from go1exp.evaluate.rows import write as write_evaluation
 
 CONFIG: dict[str, Any] = {
     "seed": 0,
@@ -323,7 +323,7 @@ def test_without_anything_random_there_are_no_robots_to_pair(tmp_path: Path) -> 
 
 def kicked(folder: Path, evaluated: bool = False) -> None:
     """Write two groups of six runs that were kicked; with a larger weight they recover sooner."""
-    from go1exp.evaluate.protocol.result import write_rows
+    from go1exp.evaluate.rows import write_rows
 
     protocol = compose("eval", ["protocol=kicks"])["protocol"]["kicks"]
     for seed in range(6):

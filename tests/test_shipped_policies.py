@@ -12,7 +12,7 @@ from go1exp.cli import other_robot
 from go1exp.cli.runs import shipped_policies, trained
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
-from go1exp.evaluate.bars import ROBOT, judged
+from go1exp.evaluate.criteria import ROBOT, evaluated
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.mdp.measures import every_measure
 from go1exp.train import checkpoint
@@ -83,11 +83,11 @@ KNOWN_MISSES = {
     "paper": set(),
     "robust": set(),
 }
-"""Bars of ``go1exp/evaluate/bars.py`` that a policy is known to miss at 1 m/s and 0.5 m/s sideways; of others, none."""
+"""Criteria of ``go1exp/evaluate/criteria.py`` that a policy misses at 1 m/s and 0.5 m/s sideways; of others, none."""
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_policy_is_held_to_the_bars_and_misses_only_those_that_are_known(name: str) -> None:
+def test_a_policy_misses_only_known_criteria(name: str) -> None:
     config, policy, _ = load_run(shipped_policies()[name])
     task = other_robot.replaced(config.task, other_robot.split(compose("eval", list(ROBOT)))[0])
     commands = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0))
@@ -95,7 +95,7 @@ def test_a_policy_is_held_to_the_bars_and_misses_only_those_that_are_known(name:
         *(commands, 4, 4.0, 2.0), noise=True, randomize=True, push=False, train_ground=False, policy_dt=None, seed=5
     )
     report = evaluate(task, policy, brief, measures=every_measure())
-    verdicts = {verdict.name: verdict for verdict in judged(report)}
+    verdicts = {verdict.name: verdict for verdict in evaluated(report)}
     known = KNOWN_MISSES.get(name, set())
-    assert {n for n, v in verdicts.items() if not v.reached} == known, list(verdicts.values())
+    assert {n for n, v in verdicts.items() if not v.met} == known, list(verdicts.values())
     assert verdicts.keys() >= {"trot error", "load share", "clearance", "peak force", "RMSE xy", "RMSE yaw", "falls"}

@@ -14,7 +14,7 @@ from go1exp.config.schema.registry import ConfigError
 if TYPE_CHECKING:
     from go1exp.cli.subjects import Named, Variation
     from go1exp.evaluate.protocol.base import Chosen
-    from go1exp.evaluate.protocol.result import Result
+    from go1exp.evaluate.protocol.playing import Result
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -84,8 +84,9 @@ def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any])
     """Write page, JSON and rows, and print the verdicts."""
     from go1exp.base.files import write_json, write_text
     from go1exp.evaluate.protocol import comparing
+    from go1exp.evaluate.protocol.playing import as_json
     from go1exp.evaluate.protocol.report.compare import page
-    from go1exp.evaluate.protocol.result import as_json, finite, write_rows
+    from go1exp.evaluate.rows import finite, write_rows
 
     differences = {
         key: [d for r in results[1:] for d in comparing.compared(results[0], r)] for key, results in plays.items()

@@ -104,9 +104,8 @@ def _of_grid(settings: Any, controller: MpcSettings | None) -> tuple[Path | None
 
 def _grid(settings: Any, measures: list[Term], judged: _Judged, subject: tuple[Path | None, Path | None, Path]) -> None:
     """Play the grid of constant commands."""
-    from go1exp.evaluate import bars, files, table
-    from go1exp.evaluate.delay_margin import delay_margin
-    from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
+    from go1exp.evaluate import criteria, rows, table
+    from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid
     from go1exp.train.policy import load_run
 
     run, checkpoint, out = subject
@@ -129,8 +128,8 @@ def _grid(settings: Any, measures: list[Term], judged: _Judged, subject: tuple[P
     if settings.delay_margin:
         falls = report["distinct_falls"]
         report["delay_margin"] = delay_margin(task, policy, config, falls, spinner(1, "with a delay"), make)
-    report["bars"] = [dataclasses.asdict(verdict) for verdict in bars.judged(report)]
-    files.write(report, out)
+    report["criteria"] = [dataclasses.asdict(verdict) for verdict in criteria.evaluated(report)]
+    rows.write(report, out)
     print(table.text(report))
     print(f"\nwritten to {out}")
 

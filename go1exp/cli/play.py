@@ -57,8 +57,7 @@ def _task(container: dict[str, Any]) -> None:
         writable_file(out)
 
     from go1exp.cli.subjects import driver
-    from go1exp.evaluate.engine import require_agreement
-    from go1exp.evaluate.rollout import EvalConfig, evaluation_task
+    from go1exp.evaluate.rollout import EvalConfig, evaluation_task, require_agreement
     from go1exp.sim.env.core import Go1Core
 
     drives = driver(subject, other)

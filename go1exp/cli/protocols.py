@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from go1exp.cli.subjects import Named
     from go1exp.evaluate.drivers import Driver
     from go1exp.evaluate.protocol.base import Chosen
-    from go1exp.evaluate.protocol.playing import Rates
-    from go1exp.evaluate.protocol.result import Result
+    from go1exp.evaluate.protocol.playing import Rates, Result
 
 RATES = "rate"
 """Kind of protocol that only policies can play."""

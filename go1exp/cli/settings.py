@@ -16,7 +16,7 @@ from go1exp.config.schema.registry import Duration, FolderName, NonNegative, Pos
 from go1exp.config.schema.settings import settings
 from go1exp.deploy.runtime.controller import Stages
 from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
-from go1exp.evaluate.protocol.settings import CompareSettings
+from go1exp.evaluate.protocol.base import CompareSettings
 from go1exp.evaluate.report.settings import ReportSettings
 from go1exp.gap.actuator_net.settings import FitSettings
 from go1exp.logs.record.plan import Wishes

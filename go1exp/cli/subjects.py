@@ -152,8 +152,7 @@ def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = 
         ConfigError: if a run's configuration is not one that this version knows.
         go1exp.deploy.runtime.archive.BundleError: if a bundle is damaged or was changed.
     """
-    from go1exp.evaluate.drivers import PolicyDriver
-    from go1exp.evaluate.protocol.bundles import BundleDriver
+    from go1exp.evaluate.drivers import BundleDriver, PolicyDriver
 
     if subject.bundle is not None:
         from go1exp.deploy.runtime.bundle import load

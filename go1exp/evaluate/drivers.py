@@ -1,4 +1,4 @@
-"""What drives robots in evaluation: a trained policy or another controller (bundles: evaluate/protocol/bundles.py)."""
+"""What moves robots in evaluation: a trained policy, the policy of a bundle, or another controller."""
 
 from __future__ import annotations
 
@@ -7,15 +7,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from go1exp.config.schema.history import history_columns
-from go1exp.deploy.runtime.past import Past
+from go1exp.config.schema.registry import ConfigError
+from go1exp.deploy.estimation import Filters
+from go1exp.deploy.export.trace import readings
+from go1exp.deploy.runtime.bundle import Bundle
+from go1exp.deploy.runtime.past import Past, PolicyMemory
+from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.controller.batch import Driven
 from go1exp.evaluate.controller.types import Controller
-from go1exp.evaluate.estimated import TERM, EstimatedVelocity
 from go1exp.evaluate.observed import TrunkVelocity, columns
+from go1exp.logs.record.tape import sample
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 from go1exp.train.policy import Policy
@@ -62,6 +69,50 @@ class Driver(Protocol):
 
     def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> Pilot:
         """Take the robots of an environment, which is to be reset next."""
+
+
+TERM = "base_linear_velocity"
+
+
+class EstimatedVelocity:
+    """One filter for each robot of an environment, updated with its sensors in every physics step."""
+
+    def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
+        """Observe the plant of ``core``, which must have been built with ``imu=True``, from its next step on.
+
+        Args:
+            core: the environment.
+            noise: give the sensors the noise of the paper's Table II, and accelerometer and feet that of a logger.
+            seed: seed of the noise.
+
+        Raises:
+            ConfigError: if the policy does not observe the velocity.
+            go1exp.deploy.estimation.EstimatorError: if the filter is not built.
+        """
+        velocity_columns = columns(core.task, TERM)
+        if velocity_columns is None:
+            raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
+        self._columns = velocity_columns
+        self._filters = Filters(core.num_envs)
+        self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
+        self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])
+        core.plant.observer = self._listen
+
+    def put(self, observation: Tensor) -> Tensor:
+        """Return the observation (N, O) with the estimated velocity in place of the true one."""
+        changed = observation.clone()
+        changed[:, self._columns] = torch.as_tensor(self.velocities(), dtype=observation.dtype)
+        return changed
+
+    def velocities(self) -> NDArray[np.float64]:
+        """Return the estimated velocities of the trunks in their own frames (N, 3), m/s; zero until a filter runs."""
+        return self._filters.velocities
+
+    def _listen(self, target: Tensor) -> None:
+        """Update every filter with a sample, before a step."""
+        true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}
+        self._filters.update(self._steps * self._dt, noisy(true, self._noise, self._rng))
+        self._steps += 1
 
 
 @dataclass(frozen=True)
@@ -115,6 +166,59 @@ class _PolicyPilot:
 
     def load(self, state: Any) -> None:
         self._past, self._remembered = copy.deepcopy(state)
+
+
+@dataclass(frozen=True)
+class BundleDriver:
+    """The policy of a bundle as the robot's computer runs it: readings in, by ONNX.
+
+    Its noise is that of the robot's sensors (the simulated robot's of ``go1exp deploy``), not that of training.
+    """
+
+    label: str
+    task: TaskConfig
+    bundle: Bundle
+    about: dict[str, Any] = field(default_factory=dict)
+    senses: ClassVar[bool] = False
+
+    def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:
+        """Return why the bundle cannot be played so."""
+        names = [port.name for port in self.bundle.metadata.inputs]
+        if trunk_velocity == "estimated" and "base_lin_vel_b" not in names:
+            return [f"{key} = 'estimated': the policy of {self.label} does not see base_lin_vel_b"]
+        return []
+
+    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> Pilot:
+        """Take the robots of an environment."""
+        return _BundlePilot(self, core, trunk_velocity, seed)
+
+
+NOISY = {"joint_pos": "q", "joint_vel": "qd", "imu_quat": "quat", "imu_gyro": "gyro"}
+"""Readings and the names of their noise."""
+
+
+class _BundlePilot:
+    def __init__(self, driver: BundleDriver, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
+        self._bundle, self._core = driver.bundle, core
+        self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
+        self._memory = PolicyMemory(driver.bundle.metadata, core.task.sim.policy_dt, core.num_envs)
+        self._rng = np.random.default_rng([seed, 3])
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        now = {name: values.numpy() for name, values in readings(self._core).items()}
+        if self._core.noise:
+            zeros = {"acc": np.zeros((len(observation), 3)), "foot_force": np.zeros((len(observation), 4))}
+            read = noisy({short: now[name] for name, short in NOISY.items()} | zeros, 1.0, self._rng)
+            now |= {name: read[short].astype(np.float32) for name, short in NOISY.items()}
+        if self._filter is not None:
+            now["base_lin_vel_b"] = self._filter.velocities().astype(np.float32)
+        return torch.from_numpy(self._memory(self._bundle.policy, now)["action"])
+
+    def save(self) -> Any | None:
+        return None if self._filter else copy.deepcopy((self._memory, self._rng))
+
+    def load(self, state: Any) -> None:
+        self._memory, self._rng = copy.deepcopy(state)
 
 
 @dataclass(frozen=True)

@@ -12,20 +12,22 @@ import torch
 
 from go1exp.base import memory
 from go1exp.base.wording import counted
-from go1exp.config.schema.backends import BackendConfig
+from go1exp.config.schema.backends import BackendConfig, CpuBackend
 from go1exp.config.schema.registry import ConfigError, Term, TooLongError, members
 from go1exp.evaluate.controller.types import Controller
 from go1exp.evaluate.drivers import ControllerDriver, Driver, PolicyDriver
-from go1exp.evaluate.engine import require_agreement
-from go1exp.evaluate.measured import described, interval
 from go1exp.evaluate.observed import TrunkVelocity
+from go1exp.evaluate.quantities import described, share
 from go1exp.evaluate.recorder import Recorder, bytes_per_second
 from go1exp.evaluate.rows import drawn, rows_of
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.mdp.measures import measured
 from go1exp.sim.env.core import Go1Core
+from go1exp.sim.env.engine import make_backend
+from go1exp.sim.physics.agreement import Check, require, robots_needed
+from go1exp.sim.physics.scene import build_model
 from go1exp.sim.task import TaskConfig, time_rules
-from go1exp.sim.terrain import TerrainConfig
+from go1exp.sim.terrain import TerrainConfig, build_terrain
 from go1exp.train.policy import Policy
 
 Command = tuple[float, float, float]
@@ -103,6 +105,22 @@ def evaluation_task(task: TaskConfig, config: EvalConfig) -> TaskConfig:
     if not config.train_ground:
         changes["terrain"] = TerrainConfig(kind="flat")
     return dataclasses.replace(task, **changes)
+
+
+def require_agreement(task: TaskConfig) -> list[Check]:
+    """Compare the engine of a task with MuJoCo, in the air, and return the checks; none for MuJoCo itself.
+
+    Takes a quarter of a second on one core for PhysX.
+
+    Raises:
+        go1exp.config.schema.registry.Expected: if it differs by more than the tolerances, or is not installed.
+    """
+    if isinstance(task.backend, CpuBackend):
+        return []
+    ground = build_terrain(TerrainConfig(kind="flat"))
+    model, sensors = build_model(task.robot, ground, task.sim.physics_dt, contact=task.contact)
+    mujoco, engine = (make_backend(b, model, sensors, robots_needed()) for b in (CpuBackend("cpu", 1), task.backend))
+    return require(mujoco, engine, task.backend.name)
 
 
 def evaluate(
@@ -264,7 +282,7 @@ class _Tally:
 
     def _falls(self, robots: torch.Tensor) -> dict[str, Any]:
         """Return falls of different robots, and their share with its 95 % interval."""
-        return {"count": int(self.fell[robots].sum()), **interval(int(self.fell[robots].sum()), len(robots))}
+        return {"count": int(self.fell[robots].sum()), **share(int(self.fell[robots].sum()), len(robots))}
 
     def _row(self, k: int, command: Command, config: EvalConfig) -> dict[str, Any]:
         episodes = config.episodes
@@ -291,3 +309,53 @@ def grid(x: Sequence[float], y: Sequence[float], yaw: Sequence[float], cross: bo
 
 def _per_axis(values: torch.Tensor) -> dict[str, float]:
     return {axis: round(float(v), 5) for axis, v in zip(AXES, values, strict=True)}
+
+
+# ---------------------------------------------------------------------- the delay margin
+
+DELAYS_MS = (10, 20, 30, 40)
+"""Further delays of commands that are tried, ms."""
+
+DELAY = "command_delay"
+"""Effect that delays commands."""
+
+
+def delayed(task: TaskConfig, delay: float) -> TaskConfig:
+    """Return the task with targets that take force ``delay`` s late, in place of another such effect of its own."""
+    others = tuple(e for e in task.effect if e.entry.name != DELAY)
+    entry = members("effect")[DELAY]
+    term = Term(DELAY, entry, entry.check({"delay": delay}, DELAY)[0], {"spread": {}})
+    return dataclasses.replace(task, effect=(*others, term))
+
+
+def delay_margin(
+    task: TaskConfig,
+    policy: Policy | None,
+    config: EvalConfig,
+    falls: dict[str, Any],
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+    controller: Callable[[], Controller] | None = None,
+) -> dict[str, Any]:
+    """Run the grid with later and later targets until a robot falls.
+
+    Args:
+        task: as for ``evaluate``; a delay within its actuator stays, and the margin comes on top of it.
+        policy: as for ``evaluate``.
+        config: as for ``evaluate``.
+        falls: ``distinct_falls`` of the grid without any further delay.
+        on_step: called with the progress of each run.
+        controller: as for ``evaluate``.
+
+    Returns:
+        ``ms``, the largest delay without falls, None if robots fall without any; ``falls`` of each delay that was run.
+    """
+    runs, margin = {"0": falls}, None if falls["count"] else 0
+    for ms in DELAYS_MS:
+        if margin is None or runs[str(margin)]["count"]:
+            break
+        late = delayed(task, 1e-3 * ms)
+        runs[str(ms)] = evaluate(late, policy, config, on_step, controller=controller)["distinct_falls"]
+        if runs[str(ms)]["count"]:
+            break
+        margin = ms
+    return {"ms": margin, "falls": runs}

@@ -1,15 +1,18 @@
-"""What a grid of commands came to, robot by robot: the rows that ``go1exp report`` reads (``eval.parquet``)."""
+"""Rows of an evaluation, one for each robot, and the files that hold them (``eval.json``, ``eval.parquet``)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from go1exp import robot
-from go1exp.evaluate.protocol.quantities import FELL, MOVING, ROBOT, Column, add_measures
+from go1exp.base.files import replacing, write_json
+from go1exp.evaluate.quantities import FELL, MOVING, ROBOT, Column, Row, add_measures
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -108,3 +111,46 @@ def _columns(name: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.flo
         parts = "xyz" if count == SEPARATE else "12"
         return {f"{name}_{part}": varying[:, k] for k, part in enumerate(parts)}
     return {f"{name}_mean": varying.mean(1), f"{name}_range": np.ptp(varying, axis=1)}
+
+
+# ---------------------------------------------------------------------- files
+
+FILE = "eval.json"
+"""In a run folder; the rows are beside it."""
+
+
+def rows_file(report: Path) -> Path:
+    """Return the file of the rows that belong to a report."""
+    return report.with_suffix(".parquet")
+
+
+def write(report: dict[str, Any], out: Path) -> None:
+    """Write a report of ``evaluate`` as JSON, and its rows as Parquet beside it, unless ``out`` is no plain file."""
+    rows = report.pop("rows")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(out, report)
+    if out.is_file():
+        write_rows(rows_file(out), rows, {"protocol": "grid"})
+
+
+def write_rows(file: Path, rows: Sequence[Row], about: dict[str, str]) -> None:
+    """Write rows as Parquet, ``about`` as its metadata; a figure that is not defined is null."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    columns = {name: [finite(row.get(name)) for row in rows] for name in names}
+    table = pa.table(columns).replace_schema_metadata({f"go1exp.{k}": v for k, v in about.items()})
+    with replacing(file) as partial:
+        pq.write_table(table, partial)
+
+
+def finite(value: Any) -> Any:
+    """Return plain data for JSON: numbers that are not finite as None, NumPy's as Python's."""
+    if isinstance(value, dict):
+        return {str(k): finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

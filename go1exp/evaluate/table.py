@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from go1exp.evaluate.bars import Verdict, judged
+from go1exp.evaluate.criteria import Verdict, evaluated
 from go1exp.evaluate.rollout import AXES
 
 HEADER = ("command x, y, yaw", "mean x, y, yaw", "RMSE x, y, yaw", "falls", "mean time s")
@@ -198,10 +198,10 @@ def _delay(report: dict[str, Any]) -> str:
     return f"largest delay of the target without a fall: {held} (falls: {runs})"
 
 
-def bars(report: dict[str, Any]) -> list[str]:
-    """Say which of the bars for a policy (``evaluate/bars.py``) the report has a figure for and which it misses."""
-    verdicts = judged(report)
-    missed = [verdict for verdict in verdicts if not verdict.reached]
+def acceptance(report: dict[str, Any]) -> list[str]:
+    """Return the acceptance criteria (``evaluate/criteria.py``) that the report has a figure for, and those missed."""
+    verdicts = evaluated(report)
+    missed = [verdict for verdict in verdicts if not verdict.met]
     if not verdicts:
         return []
 
@@ -210,7 +210,8 @@ def bars(report: dict[str, Any]) -> list[str]:
         command = ", ".join(f"{v:+g}" for v in verdict.command)
         return f"  {verdict.name}: {value}" + (f" at {command}" if command else "")
 
-    head = f"bars for a policy (go1exp/evaluate/bars.py): {len(verdicts) - len(missed)} of {len(verdicts)} reached"
+    met = len(verdicts) - len(missed)
+    head = f"acceptance criteria (go1exp/evaluate/criteria.py): {met} of {len(verdicts)} met"
     return [head + ("; missed, worst command's mean:" if missed else ""), *map(worst, missed)]
 
 
@@ -227,7 +228,7 @@ def text(report: dict[str, Any]) -> str:
     lines += [""] + [
         line(report) for key, line in (("distinct_falls", _falls), ("delay_margin", _delay)) if key in report
     ]
-    return "\n".join([*lines, *(bars(report) if measured else ()), _summary(report)])
+    return "\n".join([*lines, *(acceptance(report) if measured else ()), _summary(report)])
 
 
 def markdown(report: dict[str, Any]) -> str:

@@ -1,8 +1,8 @@
 """Evaluates and films policies while training goes on: another process, on the CPU engine, of the lowest priority.
 
-The process is ``python -m go1exp.evaluate.beside RUN``; jobs and results are lines of JSON. Training never waits for
-it but at its end. What it finds goes to ``evals.csv``, to the loggers, and the best policy to ``best.pt``, whose row
-is ``best.json``: always one of ``evals.csv``.
+The process is ``python -m go1exp.evaluate.asynchronous RUN``; jobs and results are lines of JSON. Training never waits
+for it but at its end. What it finds goes to ``evals.csv``, to the loggers, and the best policy to ``best.pt``, whose
+row is ``best.json``: always one of ``evals.csv``.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ WAITING = 3
 PATIENCE = 600.0
 """Longest time to wait for results at the end of a training, s."""
 
-MODULE = "go1exp.evaluate.beside"
+MODULE = "go1exp.evaluate.asynchronous"
 
 
 class Beside:

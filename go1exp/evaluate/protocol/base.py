@@ -22,7 +22,7 @@ from go1exp.config.schema.registry import (
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.evaluate.protocol.claims import Claim
-from go1exp.evaluate.protocol.quantities import FINGERPRINT, LIFE, Column, Derived, Row
+from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -112,7 +112,7 @@ class Protocol:
     def columns(self) -> tuple[Column, ...]:
         """Return every figure of a robot."""
         from go1exp import robot
-        from go1exp.evaluate.protocol.quantities import columns_of
+        from go1exp.evaluate.quantities import columns_of
 
         return (*LIFE, *self.robot_columns, *columns_of(self.terms(), robot.LEGS))
 
@@ -151,11 +151,37 @@ class Protocol:
     def measure(self, motion: Motion, rows: Sequence[Row]) -> None:
         """Write the measures of what was recorded into the rows of its robots."""
         from go1exp import robot
-        from go1exp.evaluate.protocol.quantities import add_measures
+        from go1exp.evaluate.quantities import add_measures
         from go1exp.mdp.measures import measured
 
         if motion.trace is not None and self.terms():
             add_measures(rows, measured(motion.trace, self.terms()), robot.LEGS)
+
+
+@settings
+class CompareSettings:
+    """``conf/compare.yaml`` without the groups.
+
+    Attributes:
+        subjects: two or more, each a shipped policy, a run folder or a bundle (.zip); with @100hz at that rate, with
+            @estimated or @exact velocity. All others are compared with the first.
+        same_robot: all on the robot of the first: its drives, effects, contact, randomisation and falls; false takes
+            each one's own.
+        seed: seed of everything random, the same for all.
+        physics_dt: another physics step, s; null keeps that of training.
+        folder: for compare.html, compare.json and the rows.
+    """
+
+    subjects: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=2)]
+    same_robot: bool
+    seed: Annotated[int, Field(ge=0)]
+    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
+    folder: Annotated[str, Field(min_length=1)]
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if len(set(self.subjects)) < len(self.subjects):
+            raise ValueError(f"subjects = {list(self.subjects)}: each only once")
 
 
 def repeated(name: str, values: Sequence[Any]) -> list[str]:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.evaluate.protocol.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
-from go1exp.evaluate.protocol.result import Result
+from go1exp.evaluate.protocol.playing import Result
+from go1exp.evaluate.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
 from go1exp.evaluate.statistics.compare import Word as Word
 from go1exp.evaluate.statistics.compare import word as word
 from go1exp.evaluate.statistics.intervals import (

@@ -1,25 +1,45 @@
-"""What robots are to do, and what they did, over time."""
+"""What robots are to do, kicks included, and what they did, over time."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.evaluate.observed import TrunkVelocity
+from go1exp.mdp.kinematics import KinematicState
+from go1exp.mdp.measures.trace import Trace
 from go1exp.sim.terrain import TerrainConfig
-
-if TYPE_CHECKING:
-    from go1exp.evaluate.protocol.disturbances import Impulses
-    from go1exp.mdp.measures.trace import Trace
 
 Array = NDArray[np.float64]
 
 STEP_BYTES = 8 * (3 + 3 + 3 + 3) + 1
 """What a robot's policy step takes in a plan (``command``) and its motion, without a trace."""
+
+
+@dataclass(frozen=True)
+class Impulses:
+    """P kicks on each of N robots: F(t) = J pi / (2 T) sin(pi t / T) for T s, whose integral is J.
+
+    Attributes:
+        start: (N, P) times at which they begin, s; NaN for none.
+        size: (N, P) J, N s.
+        direction: (N, P) angle of the force from the robot's heading at that time, counter-clockwise, rad.
+        duration: T, s.
+        point: where they act, in the trunk's frame from its origin, m.
+    """
+
+    start: NDArray[np.float64]
+    size: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    duration: float
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -99,3 +119,67 @@ class Motion:
         """(N,) sums over what each robot did, which are equal to the bit only if that is."""
         did = np.abs(self.velocity).sum(-1) + self.height
         return np.asarray(np.where(self.alive, did, 0.0).sum(0), dtype=np.float64)
+
+
+# ---------------------------------------------------------------------- kicks
+
+
+def heading(quat: Tensor) -> Tensor:
+    """Return the yaw angle (N,) of attitudes (N, 4) w-x-y-z, rad."""
+    w, x, y, z = quat.unbind(-1)
+    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+class Kicker:
+    """Adds the forces to whatever else acts on the trunks, in every physics step of one environment.
+
+    It stands before the engine's ``step``, so that it needs no place in the plant, and takes its force back after it:
+    what acts on the trunk beside it stays the effects' own.
+    """
+
+    def __init__(self, backend: Any, physics_dt: float, impulses: Impulses) -> None:
+        """Begin to listen to the steps of ``backend``, whose clock starts now."""
+        self._backend, self._dt, self.time = backend, physics_dt, 0.0
+        self._inner = backend.step
+        self._state = KinematicState.view(backend.qpos, backend.qvel, None)
+        self.use(impulses)
+        backend.step = self._step
+
+    def use(self, impulses: Impulses) -> None:
+        """Take other kicks from now on."""
+        self._impulses = impulses
+        self._count = max(1, round(impulses.duration / self._dt))
+        shape = np.sin(np.pi * (np.arange(self._count) + 0.5) / self._count)
+        self._share = shape / shape.sum() / self._dt  # their sum times the step is exactly 1
+        self._angle = np.full(impulses.start.shape, np.nan)
+
+    def _step(self, torque: Tensor) -> None:
+        wrench = self._wrench()
+        if wrench is None:
+            self._inner(torque)
+        else:
+            applied = self._backend.applied()[:, :6]
+            others = applied.clone()
+            applied += wrench
+            self._inner(torque)
+            applied.copy_(others)
+        self.time += self._dt
+
+    def _wrench(self) -> Tensor | None:
+        """(N, 6) force in the world and torque in the trunk's frame of this step, None if there is none."""
+        impulses = self._impulses
+        step = np.round((self.time - impulses.start) / self._dt)
+        active = (step >= 0) & (step < self._count) & (impulses.size != 0.0)
+        if not active.any():
+            return None
+        quat = self._state.base_quat_w
+        now = heading(quat).numpy()[:, None]
+        self._angle = np.where(active & np.isnan(self._angle), now + impulses.direction, self._angle)
+        index = np.where(active, step, 0).astype(int)
+        size = np.where(active, impulses.size * self._share[index], 0.0)
+        angle = np.nan_to_num(self._angle)
+        planar = np.stack([(size * np.cos(angle)).sum(1), (size * np.sin(angle)).sum(1)], 1)
+        force = torch.zeros(len(quat), 3, dtype=quat.dtype)
+        force[:, :2] = torch.from_numpy(planar)
+        arm = torch.tensor(impulses.point, dtype=quat.dtype).expand(len(quat), 3)
+        return torch.cat([force, torch.linalg.cross(arm, rotate_inverse(quat, force))], 1)

@@ -1,22 +1,25 @@
-"""A protocol from settings to result: played, counted, judged."""
+"""A protocol from settings to result: refused if too long, played, summarised, evaluated."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from go1exp import __version__
+from go1exp.base import memory
+from go1exp.base.wording import counted
 from go1exp.config.schema.backends import BackendConfig
+from go1exp.config.schema.registry import ConfigError, TooLongError
 from go1exp.evaluate.drivers import Driver, Progress
-from go1exp.evaluate.protocol.base import Chosen, Protocol
-from go1exp.evaluate.protocol.claims import judged
-from go1exp.evaluate.protocol.quantities import Derived, Row, about, distinct, plain, resampled, summary
-from go1exp.evaluate.protocol.refusing import refuse
-from go1exp.evaluate.protocol.result import Result
+from go1exp.evaluate.protocol.base import Chosen, Played, Protocol
+from go1exp.evaluate.protocol.claims import Verdict, judged
+from go1exp.evaluate.protocol.lengths import Length
 from go1exp.evaluate.protocol.stage import Setting, Stage
+from go1exp.evaluate.quantities import Derived, Row, about, distinct, plain, resampled, summary
 from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval
 
 
@@ -35,6 +38,59 @@ class Rates:
     policy_dt: float | None = None
     physics_dt: float | None = None
     engine: BackendConfig | None = None
+
+
+@dataclass
+class Result:
+    """What came of one protocol with one driver.
+
+    Attributes:
+        chosen: the protocol.
+        label: name of the driver.
+        about: its origin, the robot, seed and rates: plain data.
+        played: rows without repeats, curves, notes.
+        repeats: rows that repeated another one and do not count.
+        summary: figures with n and interval, by condition.
+        verdicts: of its claims.
+        seconds: what it took, s.
+    """
+
+    chosen: Chosen
+    label: str
+    about: dict[str, Any]
+    played: Played
+    repeats: int
+    summary: list[dict[str, Any]]
+    verdicts: list[Verdict]
+    seconds: float
+
+
+def as_json(result: Result) -> dict[str, Any]:
+    """Return a result as plain data, without its rows."""
+    verdicts = [
+        {
+            "claim": v.name,
+            "verdict": v.word,
+            **{k: w for k, w in dataclasses.asdict(v.claim).items() if w is not None},
+            "figure": plain(v.figure, ""),
+            "condition": dict(v.condition),
+            "conditions": v.conditions,
+        }
+        for v in result.verdicts
+    ]
+    return {
+        "protocol": result.chosen.key,
+        "kind": result.chosen.kind,
+        "subject": result.label,
+        "settings": dataclasses.asdict(result.chosen.protocol),
+        **result.about,
+        "repeats": result.repeats,
+        "seconds": round(result.seconds, 1),
+        "notes": result.played.notes,
+        "claims": verdicts,
+        "summary": result.summary,
+        "curves": result.played.curves,
+    }
 
 
 def play(
@@ -97,3 +153,65 @@ def thresholds(derived: Derived, rows: Sequence[Row]) -> Interval:
     """Return a figure of all robots together with its interval."""
     n, sample = resampled(about(rows, derived.condition))
     return bootstrap_interval(lambda robots: derived.function(sample(robots)), n)
+
+
+# ---------------------------------------------------------------------- length
+
+
+def refuse(chosen: Chosen, stage: Stage) -> None:
+    """Refuse a protocol that is too long or too short to be played, before anything of its size is made.
+
+    Raises:
+        ConfigError: if no step of the policy is left that counts; names the setting.
+        TooLongError: if it does not fit into memory.
+    """
+    _refuse_too_long(chosen, stage)
+    for length in chosen.protocol.lengths():
+        dt = length.policy_dt or stage.policy_dt
+        if stage.steps(length.seconds, dt) <= stage.steps(length.settle_s, dt):
+            cause = length.causes[0]
+            left = f"of these {length.seconds:g} s no step of the policy ({dt:g} s) is left"
+            after = f" after the first {length.settle_s:g} s" if length.settle_s else ""
+            raise ConfigError([f"protocol.{chosen.key}.{cause.key} = {cause.value:g}: {left}{after}"])
+
+
+def _refuse_too_long(chosen: Chosen, stage: Stage) -> None:
+    """Refuse a protocol whose robots do not fit into memory, before anything of that size is made.
+
+    What fails for certain is refused, nothing else.
+
+    Raises:
+        TooLongError: names the setting, and the largest value of it that would fit.
+    """
+    available, lengths = memory.free(), chosen.protocol.lengths()
+    if available is None or not lengths:
+        return
+    length = max(lengths, key=lambda one: _needed(one, stage))  # what mends the largest batch mends the others
+    if (needed := _needed(length, stage)) > available:
+        plain, recorded = stage.bytes_per_second(length)
+        fitting = available / plain
+        if length.recorded and length.settle_s < fitting:
+            fitting = (available + length.settle_s * recorded) / (plain + recorded)
+        raise TooLongError([_problem(chosen, length, needed, available, fitting)])
+
+
+def _needed(length: Length, stage: Stage) -> float:
+    """Return what a batch takes at least, B."""
+    plain, recorded = stage.bytes_per_second(length)
+    listening = max(length.seconds - length.settle_s, 0.0) if length.recorded else 0.0
+    return length.seconds * plain + listening * recorded
+
+
+def _problem(chosen: Chosen, length: Length, needed: float, available: float, fitting: float) -> str:
+    """Word that a length needs too much: of the first setting that alone can mend it, or of all where none can."""
+    path, robots = f"protocol.{chosen.key}", chosen.protocol.robots
+    amounts = memory.too_much(needed, available)
+    what = f"to play {length.seconds:g} s with {counted(length.robots, 'robot')} {amounts}"
+    for cause in length.causes:
+        if limit := cause.limit(fitting):
+            return f"{path}.{cause.key} = {cause.value:g}: {what}; {limit} would fit"
+    fewer = math.floor(robots * available / needed)
+    if fewer:
+        return f"{path}.robots = {robots}: {what}; {fewer} at most would fit"
+    given = ", ".join(f"{cause.key} = {cause.value:g}" for cause in length.causes)
+    return f"{path}: {given}, robots = {robots}: {what}; {0.994 * fitting:.3g} s at most would fit"

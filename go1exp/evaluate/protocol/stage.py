@@ -15,16 +15,12 @@ from torch import Tensor
 
 from go1exp.config.schema.backends import BackendConfig
 from go1exp.config.schema.registry import Entry, Term, members
-from go1exp.evaluate.delay_margin import EFFECT as DELAY
-from go1exp.evaluate.delay_margin import delayed
 from go1exp.evaluate.drivers import Driver, Progress
-from go1exp.evaluate.engine import require_agreement
 from go1exp.evaluate.observed import TrunkVelocity
-from go1exp.evaluate.protocol.disturbances import Impulses, Kicker, heading
 from go1exp.evaluate.protocol.lengths import Length
-from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Motion, Plan
+from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Impulses, Kicker, Motion, Plan, heading
 from go1exp.evaluate.recorder import Recorder, bytes_per_step
-from go1exp.evaluate.rollout import EvalConfig, evaluation_task
+from go1exp.evaluate.rollout import DELAY, EvalConfig, delayed, evaluation_task, require_agreement
 from go1exp.mdp.commands import FixedVelocity
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from go1exp.evaluate.protocol.base import Drawing
-from go1exp.evaluate.protocol.quantities import Column
 from go1exp.evaluate.protocol.report.paint import COLOURS, WIDE, WIDTH, band, legend, panels
+from go1exp.evaluate.quantities import Column
 from go1exp.evaluate.report.curves import AXES, Curve
 from go1exp.evaluate.report.figures import Figure
 from go1exp.evaluate.report.sensitivity import Sensitivity

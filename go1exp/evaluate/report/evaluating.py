@@ -10,7 +10,6 @@ from typing import Any
 
 from go1exp.config.schema.registry import TooLongError, bind_list
 from go1exp.evaluate.drivers import PolicyDriver
-from go1exp.evaluate.files import FILE, write
 from go1exp.evaluate.protocol.base import Chosen
 from go1exp.evaluate.protocol.playing import Rates, play
 from go1exp.evaluate.protocol.report.writing import write as write_protocol
@@ -18,6 +17,7 @@ from go1exp.evaluate.report.evaluations import GRID, PROTOCOLS, names
 from go1exp.evaluate.report.runs import Run
 from go1exp.evaluate.report.settings import Evaluation
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
+from go1exp.evaluate.rows import FILE, write
 from go1exp.train.policy import load_run
 
 BEST = "best.pt"
@@ -80,7 +80,7 @@ def evaluate_run(run: Path, settings: Evaluation, on_step: Progress) -> dict[str
     shared = {f.name: getattr(settings, f.name) for f in dataclasses.fields(EvalConfig) if f.name not in unlike}
     wanted = EvalConfig(commands=commands, train_ground=False, policy_dt=None, **shared)
     measures = bind_list("measure", list(settings.measures), "evaluation.measures")
-    return {"policy": about, "robot": {}, **evaluate(config.task, policy, wanted, on_step, measures), "bars": []}
+    return {"policy": about, "robot": {}, **evaluate(config.task, policy, wanted, on_step, measures), "criteria": []}
 
 
 def evaluate_missing(

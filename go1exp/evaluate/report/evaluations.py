@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from go1exp import robot
 from go1exp.config.schema.registry import ConfigError, unknown_name
-from go1exp.evaluate.files import FILE, rows_file
-from go1exp.evaluate.protocol.quantities import FELL, MOVING, ROBOT, Column, columns_of
+from go1exp.evaluate.quantities import FELL, MOVING, ROBOT, Column, columns_of
 from go1exp.evaluate.report.runs import Run, Study
-from go1exp.evaluate.rows import COLUMNS, KEYS
+from go1exp.evaluate.rows import COLUMNS, FILE, KEYS, rows_file
 from go1exp.mdp.measures import every_measure
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from go1exp.evaluate.files import FILE, write
-from go1exp.evaluate.rows import rows_of
+from go1exp.evaluate.rows import FILE, rows_of, write
 
 SEEDS, COLUMNS = 5, 60
 """Runs of each configuration, and columns of each one's metrics."""

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.evaluate.protocol.quantities import ROBOT, Column
+from go1exp.evaluate.quantities import ROBOT, Column
 from go1exp.evaluate.report.evaluations import Judged
 from go1exp.evaluate.report.groups import Group
 from go1exp.evaluate.statistics import compare

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.evaluate.protocol.quantities import ROBOT, Column
+from go1exp.evaluate.quantities import ROBOT, Column
 from go1exp.evaluate.report.evaluations import Evaluated, Judged, draws
 from go1exp.evaluate.report.figures import means
 from go1exp.evaluate.report.groups import Group

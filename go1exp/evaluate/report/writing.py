@@ -11,10 +11,10 @@ from typing import Any
 
 from go1exp.base.files import write_json, write_text
 from go1exp.evaluate.protocol.report.html import rendered, settings_text
-from go1exp.evaluate.protocol.result import finite
 from go1exp.evaluate.report.drawings import forests, importances, learning
 from go1exp.evaluate.report.made import Report
 from go1exp.evaluate.report.tables import ORDER, PlainRow, plain_rows, tables
+from go1exp.evaluate.rows import finite
 
 NOTES = (
     "A run is one training seed, and figures are over runs: robots that one policy moved are not independent tries of a"

@@ -10,10 +10,9 @@ from typing import Literal, get_args
 
 from go1exp.config.schema.backends import BackendConfig
 from go1exp.config.schema.registry import ConfigError, Term
-from go1exp.evaluate.delay_margin import delayed
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes
 from go1exp.evaluate.protocol.stage import delay_of_effects
-from go1exp.evaluate.rollout import EvalConfig, evaluation_task
+from go1exp.evaluate.rollout import EvalConfig, delayed, evaluation_task
 from go1exp.evaluate.viewer.effects import acting
 from go1exp.sim.task import TaskConfig
 from go1exp.sim.terrain import TerrainConfig

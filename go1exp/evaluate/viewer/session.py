@@ -16,8 +16,8 @@ from go1exp.base.errors import Expected
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.deploy.estimation import EstimatorError
 from go1exp.evaluate.drivers import Driver
-from go1exp.evaluate.engine import require_agreement
-from go1exp.evaluate.protocol.disturbances import Impulses, Kicker, heading
+from go1exp.evaluate.protocol.plan import Impulses, Kicker, heading
+from go1exp.evaluate.rollout import require_agreement
 from go1exp.evaluate.viewer import requests as wish
 from go1exp.evaluate.viewer.conditions import Ground, Setup, task_under
 from go1exp.evaluate.viewer.estimate import Estimate

@@ -22,7 +22,7 @@ from go1exp.deploy.sim_robot.alone import Account
 from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
 from go1exp.deploy.sim_robot.server import GONE_S, Server
 from go1exp.deploy.sim_robot.settings import SimConfig
-from go1exp.evaluate.protocol.disturbances import Kicker, heading
+from go1exp.evaluate.protocol.plan import Kicker, heading
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.effects import acting, catalogue
 from go1exp.evaluate.viewer.session import PushMade, one_push

@@ -43,7 +43,7 @@ def felt(machine: Machine) -> tuple[str, ...]:
     free = bool(machine.base_probe)
     return tuple(
         name
-        for name in members("effect")
+        for name in sorted(members("effect"))
         if not (identification(name).needs_ground and not machine.on_ground)
         and not (identification(name).needs_stand and free)
     )

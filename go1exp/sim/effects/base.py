@@ -96,7 +96,7 @@ class Measured:
 
 @dataclass
 class Gears:
-    """How the gears between motors and joints yield (``sim/effects/two_mass.py``); zeros for gears that do not.
+    """How the gears between motors and joints yield (``sim/effects/gears.py``); zeros for gears that do not.
 
     Attributes:
         compliance: (N, J) twist per torque, rad/(N m).

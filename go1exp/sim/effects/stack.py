@@ -13,7 +13,7 @@ from go1exp.config.schema.registry import Term
 from go1exp.robot.actuators import ActuatorSetup, CompiledModel, ModelFields
 from go1exp.sim.actuator.setup import Actuator, HasGains
 from go1exp.sim.effects.base import Effect, Gears, Measured
-from go1exp.sim.effects.two_mass import TwoMass
+from go1exp.sim.effects.gears import TwoMass
 
 HOOKS = (
     *("on_target", "on_feedforward", "on_encoder", "on_error", "on_gains", "on_actuator", "on_report"),

@@ -72,7 +72,7 @@ class Tolerances:
         """Return every finite tolerance that counts, the declared ones too: effect -> parameter -> tolerance."""
         return {
             effect: {name: self.param((effect, name)).tolerance for _, name in sizes(effect)}
-            for effect in members("effect")
+            for effect in sorted(members("effect"))
         }
 
 

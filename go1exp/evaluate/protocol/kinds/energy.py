@@ -15,8 +15,8 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Drawing, Played
 from go1exp.evaluate.protocol.kinds.gait import straight
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady
-from go1exp.evaluate.protocol.quantities import Column, Row
 from go1exp.evaluate.protocol.report import paint
+from go1exp.evaluate.quantities import Column, Row
 from go1exp.mdp.measures.trace import Trace, mean_over
 
 if TYPE_CHECKING:

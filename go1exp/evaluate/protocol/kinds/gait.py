@@ -13,8 +13,8 @@ from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Drawing, Played
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, command_text
-from go1exp.evaluate.protocol.quantities import Column, Row
 from go1exp.evaluate.protocol.report import paint
+from go1exp.evaluate.quantities import Column, Row
 from go1exp.mdp.measures.gait import touchdown_phase
 from go1exp.mdp.measures.trace import find_runs
 

@@ -17,8 +17,8 @@ from go1exp.evaluate.protocol.kinds.energy import effort
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
 from go1exp.evaluate.protocol.kinds.steady import AXES, ERRORS, Steady
 from go1exp.evaluate.protocol.lengths import Length
-from go1exp.evaluate.protocol.quantities import Column, Derived, Row
 from go1exp.evaluate.protocol.report import paint
+from go1exp.evaluate.quantities import Column, Derived, Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

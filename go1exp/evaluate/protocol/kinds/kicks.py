@@ -14,9 +14,9 @@ from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Drawing, Impulse, Played, Point, Protocol, lives, repeated
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.quantities import Column, Row
 from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.protocol.signals import Signal
+from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -130,8 +130,7 @@ class Kicks(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Kick all robots, odd ones from the other side."""
-        from go1exp.evaluate.protocol.disturbances import Impulses
-        from go1exp.evaluate.protocol.plan import Plan
+        from go1exp.evaluate.protocol.plan import Impulses, Plan
 
         t = stage.times(self.duration_s)
         side = self._sides()

@@ -14,9 +14,9 @@ from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Count, Drawing, Impulse, Played, Point, Protocol, lives
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.quantities import Column, Derived, Row, values
 from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.protocol.signals import Signal
+from go1exp.evaluate.quantities import Column, Derived, Row, values
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,8 +103,7 @@ class PushMap(Protocol):
 
     def play(self, stage: Stage) -> Played:
         """Let all walk once; from where they are then, kick them again and again, each in its own phase."""
-        from go1exp.evaluate.protocol.disturbances import Impulses
-        from go1exp.evaluate.protocol.plan import Plan
+        from go1exp.evaluate.protocol.plan import Impulses, Plan
 
         t = stage.times(self.settle_s + self._look_s + self.watch_s)
         command = np.repeat(self.command.at(t)[:, None], self.count, 1)

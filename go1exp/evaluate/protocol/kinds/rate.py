@@ -14,9 +14,9 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.evaluate.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.quantities import Column, Derived, Row, values
 from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.protocol.signals import Signal
+from go1exp.evaluate.quantities import Column, Derived, Row, values
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,9 +13,9 @@ from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.quantities import Column, Row
 from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.protocol.signals import Sine, response
+from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,8 +12,8 @@ from go1exp.config.schema.registry import NonNegative, Positive
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.quantities import Column, Row
 from go1exp.evaluate.protocol.signals import Constant, Velocity
+from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.plan import Motion

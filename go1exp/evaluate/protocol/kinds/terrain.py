@@ -14,8 +14,8 @@ from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Drawing, Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes, goal
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.quantities import Column, Derived, Row, values
 from go1exp.evaluate.protocol.report import paint
+from go1exp.evaluate.quantities import Column, Derived, Row, values
 from go1exp.evaluate.statistics.intervals import Logistic, logistic_fit
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from go1exp.evaluate.protocol.comparing import Difference, Word
+from go1exp.evaluate.protocol.playing import Result
 from go1exp.evaluate.protocol.report.html import rendered, settings_text
 from go1exp.evaluate.protocol.report.tables import Meanings, Table, meanings, spread
 from go1exp.evaluate.protocol.report.words import condition_text, falls, number
-from go1exp.evaluate.protocol.result import Result
 
 ORDER: tuple[Word, ...] = ("better", "worse", "not told apart")
 

@@ -14,9 +14,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from go1exp.base.svg import draw
 from go1exp.evaluate.protocol.base import Drawing, Protocol
 from go1exp.evaluate.protocol.claims import ORDER
+from go1exp.evaluate.protocol.playing import Result
 from go1exp.evaluate.protocol.report.tables import claims_table, figure_tables, meanings
 from go1exp.evaluate.protocol.report.words import falls
-from go1exp.evaluate.protocol.result import Result
 
 INTERVALS = (
     "Figures: mean over robots with Student's 95 % interval; shares with Wilson's; falls per moving robot-minute with"

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from go1exp.evaluate.protocol.claims import limits
+from go1exp.evaluate.protocol.playing import Result
 from go1exp.evaluate.protocol.report.words import condition_text, interval_text, keys_text
-from go1exp.evaluate.protocol.result import Result
 
 Table = dict[str, Any]
 Entry = Mapping[str, Any]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from go1exp.evaluate.protocol.ground import UNITS
-from go1exp.evaluate.protocol.result import Result
+from go1exp.evaluate.protocol.playing import Result
 
 KEYS: dict[str, tuple[str, str]] = {
     "x": ("x", "m/s"),

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from go1exp.base.files import write_json, write_text
+from go1exp.evaluate.protocol.playing import Result, as_json
 from go1exp.evaluate.protocol.report.html import page
-from go1exp.evaluate.protocol.result import Result, as_json, finite, write_rows
+from go1exp.evaluate.rows import finite, write_rows
 
 
 def write(result: Result, folder: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""A motor behind gears that yield: the law of ``flexibility`` and ``backlash``, which act in series.
+"""Gears that yield: ``effect=flexibility`` and ``effect=backlash``, in series.
 
 The rotor (inertia J, reflected to the joint) turns by a twist x beyond the joint. With the gears' compliance s, their
 play b and a structural damping time t, the torque F that reaches the joint obeys::
@@ -21,21 +21,72 @@ end of the play within the step and stays there.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING
 
 import torch
 
 from go1exp.base.tensors.memory import Memory
+from go1exp.config.schema.registry import effect
+from go1exp.robot.actuators import ActuatorSetup
+from go1exp.sim.effects.base import Effect, Gears, Param
+from go1exp.sim.effects.identification import Identification
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from go1exp.robot.actuators import ActuatorSetup
-    from go1exp.sim.effects.base import Gears
-
 LIGHTEST = 1e-5
 """A rotor counts for at least this, kg m2; the Go1's have 0.004 and more."""
+
+
+@effect("backlash")
+class Backlash(Effect):
+    """The joint is free within a gap of the gears: no torque passes while |rotor angle - joint angle| < gap / 2.
+
+    Flanks meet without bouncing; the drive reads the rotor. The law is that of ``sim/effects/gears.py``, where
+    ``flexibility`` is in series. 5 to 40 mrad are likely (a judgement). It shows at reversals and as a small cycle at
+    rest; within the gap the joint has lost its rotor, which ``armature`` mimics in part.
+    """
+
+    title = "play in the gears"
+    params = (Param("gap", "rad", 0.0, 0.1, 0.0, 0.001, "joint", "free angle from flank to flank"),)
+    identification = Identification(
+        levels=({"gap": 0.002}, {"gap": 0.015}),
+        excitation="slow_ramps",
+    )
+    gap: Tensor
+
+    def on_gears(self, gears: Gears) -> Gears:
+        """Add the gap."""
+        return dataclasses.replace(gears, gap=gears.gap + self.gap)
+
+
+@effect("flexibility")
+class Flexibility(Effect):
+    """The gears twist under load: rotor angle - joint angle = compliance torque, and the drive reads the rotor.
+
+    Rotor and joint swing against each other at sqrt((1 / J_rotor + 1 / J_joint) / compliance); the law is that of
+    ``sim/effects/gears.py``. Stiffnesses of 60 to 400 N m/rad are likely at robots of this size (a judgement). Dry
+    friction stays at the joint. To a slow drive it looks like a smaller kp, below the resonance like ``lag`` or
+    ``armature``. A drive with kd > J_rotor / physics step (2.2 N m s/rad for a hip at 2 ms)
+    shakes the rotor.
+    """
+
+    title = "compliance of the gears"
+    params = (
+        Param("compliance", "rad/(N m)", 0.0, 0.02, 0.0, 5e-4, "joint", "twist per torque"),
+        Param("damping", "-", 0.02, 1.0, 0.05, math.inf, "joint", "damping ratio of the rotor on this spring"),
+    )
+    identification = Identification(
+        levels=({"compliance": 0.001}, {"compliance": 0.004}),
+    )
+    compliance: Tensor
+    damping: Tensor
+
+    def on_gears(self, gears: Gears) -> Gears:
+        """Add the compliance."""
+        return dataclasses.replace(gears, compliance=gears.compliance + self.compliance, damping=self.damping)
 
 
 class TwoMass(Memory):

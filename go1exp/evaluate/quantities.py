@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -18,7 +19,8 @@ from go1exp.evaluate.statistics.intervals import (
     rate_interval,
     share_interval,
 )
-from go1exp.mdp.measures import per_foot
+from go1exp.mdp.measures import measured, per_foot
+from go1exp.mdp.measures.trace import Trace
 
 Row = dict[str, Any]
 Condition = tuple[Any, ...]
@@ -186,3 +188,38 @@ def add_measures(rows: Sequence[Row], measures: Mapping[str, Any], legs: Sequenc
                 else {f"{name}_{leg}": v for leg, v in zip(legs, value, strict=True)}
             )
             row |= {k: float(v) if np.isfinite(v) else None for k, v in parts.items()}
+
+
+# ---------------------------------------------------------------------- measures of a command of a grid
+
+
+def described(terms: Sequence[Term], trace: Trace) -> dict[str, Any]:
+    """Return the mean over robots of each measure with its 95 % interval and n; lists of four for feet.
+
+    A measure whose unit is ``name`` gives the number of robots by name; one that needs what was not recorded, None.
+    """
+    report: dict[str, Any] = {}
+    by_name = measured(trace, list(terms))
+    for term in terms:
+        mean = phase_interval if term.entry.traits.get("circular") else mean_interval
+        each = by_name[term.key]
+        if each is None:
+            report[term.key] = None
+        elif each.dtype.kind == "U":
+            report[term.key] = dict(Counter(str(name) for name in each if name).most_common())
+        elif per_foot(term.entry):
+            feet = [_named(mean(foot), "mean") for foot in each.T]
+            report[term.key] = {name: [foot[name] for foot in feet] for name in feet[0]}
+        else:
+            report[term.key] = _named(mean(each), "mean")
+    return report
+
+
+def share(count: int, n: int) -> dict[str, Any]:
+    """Return a share of robots with Wilson's 95 % interval as plain data."""
+    return _named(share_interval(count, n), "share")
+
+
+def _named(interval: Interval, name: str) -> dict[str, Any]:
+    figure = plain(interval, "")
+    return {name: figure["estimate"], "low": figure["low"], "high": figure["high"], "n": figure["n"]}

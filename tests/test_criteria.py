@@ -1,4 +1,4 @@
-"""The bars that a policy must reach, on reports made by hand."""
+"""Acceptance criteria on reports made by hand."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from go1exp.evaluate.bars import BARS, judged, missed
-from go1exp.evaluate.table import bars
+from go1exp.evaluate.criteria import CRITERIA, evaluated, missed
+from go1exp.evaluate.table import acceptance
 
 
 def row(*command: float, mean: tuple[float, ...] | None = None, **changes: Any) -> dict[str, Any]:
@@ -29,10 +29,10 @@ def row(*command: float, mean: tuple[float, ...] | None = None, **changes: Any) 
 GOOD = [row(0, 0, 0), row(1, 0, 0), row(2, 0, 0), row(3, 0, 0), row(0, 0.5, 0), row(0, 0, 1.8), row(0.2, 0, 0)]
 
 
-def test_a_good_robot_misses_nothing_and_every_bar_is_judged() -> None:
+def test_a_good_robot_meets_every_criterion() -> None:
     report = {"commands": GOOD, "delay_margin": {"ms": 30}}
     assert missed(report) == set()
-    assert [verdict.name for verdict in judged(report)] == [*(bar.name for bar in BARS), "delay"]
+    assert [verdict.name for verdict in evaluated(report)] == [*(criterion.name for criterion in CRITERIA), "delay"]
 
 
 @pytest.mark.parametrize(
@@ -49,36 +49,44 @@ def test_a_good_robot_misses_nothing_and_every_bar_is_judged() -> None:
         ("slip", row(0, 0, 1.0, slip_share_all=0.2)),
         ("RMSE xy", {**row(1, 0, 0), "rmse": {"x": 0.02, "y": 0.09, "yaw": 0.0}}),
         ("RMSE yaw", {**row(2, 0, 0), "rmse": {"x": 0.2, "y": 0.2, "yaw": 0.11}}),
-        ("told 2.0 m/s", row(2, 0, 0, mean=(1.89, 0.0, 0.0))),
-        ("told 1.8 rad/s", row(0, 0, -1.8, mean=(0.0, 0.0, -1.6))),
-        ("told 3.0 m/s", row(3, 0, 0, mean=(2.6, 0.0, 0.0))),
-        ("told 0.1 to 0.3", row(0, -0.2, 0, mean=(0.0, -0.1, 0.0))),
+        ("commanded 2.0 m/s", row(2, 0, 0, mean=(1.89, 0.0, 0.0))),
+        ("commanded 1.8 rad/s", row(0, 0, -1.8, mean=(0.0, 0.0, -1.6))),
+        ("commanded 3.0 m/s", row(3, 0, 0, mean=(2.6, 0.0, 0.0))),
+        ("commanded 0.1 to 0.3", row(0, -0.2, 0, mean=(0.0, -0.1, 0.0))),
         ("falls", {**row(0, 0, 0), "distinct_falls": {"count": 1, "n": 20}}),
     ],
 )
-def test_a_fault_is_missed_by_its_bar_alone(name: str, bad: dict[str, Any]) -> None:
+def test_a_fault_fails_its_criterion_alone(name: str, bad: dict[str, Any]) -> None:
     assert missed({"commands": [*copy.deepcopy(GOOD), bad]}) == {name}
-    (verdict,) = [v for v in judged({"commands": [*GOOD, bad]}) if v.name == name]
+    (verdict,) = [v for v in evaluated({"commands": [*GOOD, bad]}) if v.name == name]
     assert list(verdict.command) == bad["command"]
 
 
-def test_a_fall_at_30_ms_of_delay_is_missed_and_without_a_command_nothing_is_judged() -> None:
+def test_a_fall_at_30_ms_of_delay_fails_and_without_a_command_there_is_no_verdict() -> None:
     assert missed({"commands": GOOD, "delay_margin": {"ms": 20}}) == {"delay"}
     assert missed({"commands": GOOD, "delay_margin": {"ms": None}}) == {"delay"}
-    assert judged({"commands": []}) == []
+    assert evaluated({"commands": []}) == []
     unmeasured = [{k: v for k, v in r.items() if k != "measures"} for r in GOOD]
-    assert {v.name for v in judged({"commands": unmeasured})} == {
-        *("RMSE xy", "RMSE yaw", "told 2.0 m/s", "told 1.8 rad/s", "told 3.0 m/s", "told 0.1 to 0.3", "falls")
+    assert {v.name for v in evaluated({"commands": unmeasured})} == {
+        *(
+            "RMSE xy",
+            "RMSE yaw",
+            "commanded 2.0 m/s",
+            "commanded 1.8 rad/s",
+            "commanded 3.0 m/s",
+            "commanded 0.1 to 0.3",
+            "falls",
+        )
     }
 
 
-def test_the_report_says_which_bars_are_missed_by_how_much_and_where() -> None:
-    assert bars({"commands": GOOD}) == ["bars for a policy (go1exp/evaluate/bars.py): 14 of 14 reached"]
+def test_the_report_lists_missed_criteria_by_how_much_and_where() -> None:
+    assert acceptance({"commands": GOOD}) == ["acceptance criteria (go1exp/evaluate/criteria.py): 14 of 14 met"]
     slow = row(2, 0, 0, mean=(1.5, 0.0, 0.0), stride_rate=4.5)
-    assert bars({"commands": [*GOOD, slow], "delay_margin": {"ms": None}}) == [
-        "bars for a policy (go1exp/evaluate/bars.py): 12 of 15 reached; missed, worst command's mean:",
+    assert acceptance({"commands": [*GOOD, slow], "delay_margin": {"ms": None}}) == [
+        "acceptance criteria (go1exp/evaluate/criteria.py): 12 of 15 met; missed, worst command's mean:",
         "  stride rate: 4.5 at +2, +0, +0",
-        "  told 2.0 m/s: 0.75 at +2, +0, +0",
+        "  commanded 2.0 m/s: 0.75 at +2, +0, +0",
         "  delay: -",
     ]
-    assert bars({"commands": []}) == []
+    assert acceptance({"commands": []}) == []

@@ -1,4 +1,4 @@
-"""``python -m go1exp.evaluate.beside RUN``: evaluates and films policies of a training that goes on beside it.
+"""``python -m go1exp.evaluate.asynchronous RUN``: evaluates and films policies of a training that goes on beside it.
 
 Jobs are lines of JSON on standard input, results are lines of JSON on standard output; see ``go1exp/train/beside.py``,
 which starts it. It ends with its input.
