@@ -12,7 +12,7 @@ import pytest
 
 import go1exp.logs.excitations
 import go1exp.logs.importers
-import go1exp.logs.record.policy  # noqa: F401  (registers every importer and excitation)
+import go1exp.logs.record.motions  # noqa: F401  (registers every importer and excitation)
 from go1exp.base.paths import data_root
 from go1exp.cli import SUBVERBS, VERBS
 from go1exp.cli.completion import STAGES, WORDS, _importers, _listed, completions

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 
 import go1exp.evaluate.protocol.kinds
 import go1exp.logs.importers
-import go1exp.logs.record.policy  # noqa: F401  (registers every importer and excitation)
+import go1exp.logs.record.motions  # noqa: F401  (registers every importer and excitation)
 from go1exp import cli
 from go1exp.base.paths import data_root
 from go1exp.cli import listing, settings

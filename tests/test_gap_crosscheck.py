@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import go1exp.logs.excitations
-import go1exp.logs.record.policy  # noqa: F401  (registers every excitation)
+import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
 from benchmarks.gap import cases
 from benchmarks.gap.motions import MOTIONS, RATE
 from benchmarks.gap.simulate import Episode, simulate

@@ -37,7 +37,7 @@ from go1exp.gap.stages import next as stage_next
 from go1exp.gap.stages.next import NextResult
 from go1exp.logs import recording
 from go1exp.logs.excitations import ExcitationError
-from go1exp.logs.record.playback import playback
+from go1exp.logs.record.motions import playback
 from go1exp.logs.record.simulate import held_quat
 from go1exp.logs.recording import Meta, Recording, joint_channels
 from go1exp.robot import JOINTS, NOMINAL_STANCE, soft_limits

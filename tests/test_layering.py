@@ -281,7 +281,7 @@ def test_terms_are_registered_in_the_order_of_the_source() -> None:
     import go1exp.evaluate.protocol.kinds
     import go1exp.logs.excitations
     import go1exp.logs.importers
-    import go1exp.logs.record.policy  # noqa: F401  (registers every member)
+    import go1exp.logs.record.motions  # noqa: F401  (registers every member)
 
     groups = registry.groups()
     expected = {"reward", "observation", "rand", "command", "event", "termination", "curriculum", "actuator"}

@@ -11,7 +11,7 @@ from go1exp import robot
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.runtime.log import _attitude
 from go1exp.logs.excitations import ExcitationError
-from go1exp.logs.record.played import BLEND_S, GAINS, RATE_HZ, played
+from go1exp.logs.record.motions import BLEND_S, GAINS, RATE_HZ, played
 from go1exp.logs.recording import joint_channels
 from go1exp.robot.messages import LowState
 

@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import go1exp.logs.excitations
-import go1exp.logs.record.policy  # noqa: F401  (registers every excitation)
+import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
 from go1exp import robot
 from go1exp.cli import main
 from go1exp.cli.record import RIG

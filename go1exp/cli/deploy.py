@@ -15,7 +15,7 @@ from go1exp.evaluate.controller.settings import MpcSettings
 if TYPE_CHECKING:
     from go1exp.cli.settings import DeploySettings
     from go1exp.deploy.runtime.controller import Mover
-    from go1exp.logs.record.played import PlayedMotion
+    from go1exp.logs.record.motions import PlayedMotion
 
 
 def _task(container: dict[str, Any]) -> int:
@@ -128,7 +128,7 @@ def _motion(settings: DeploySettings, controlled: bool) -> PlayedMotion | None:
         raise ConfigError(["controller=mpc: walks; motion moves a robot that hangs. Leave out one of them"])
     if settings.robot == "sim" and settings.sim.start != "hung":
         raise ConfigError([f"motion = {settings.motion!r}: is for a robot that hangs; add sim.start=hung"])
-    from go1exp.logs.record.played import played
+    from go1exp.logs.record.motions import played
 
     return played(settings.motion, settings.seconds, settings.rate, settings.gains, settings.sim.seed)
 

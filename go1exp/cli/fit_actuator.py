@@ -23,7 +23,7 @@ GO1 = "go1"
 def _inverse_dynamics(config: RobotConfig, smoothing: float | None) -> Callable[[Recording], np.ndarray]:
     """Return the function from a recording of a hung Go1 to the torques (T, 12) at its joints, N m."""
     from go1exp.gap.actuator_net import FitError, smooth_motion
-    from go1exp.gap.actuator_net.smoothing import WINDOW
+    from go1exp.gap.actuator_net.dataset import WINDOW
     from go1exp.sim.physics.dynamics import joint_torques
 
     def joint_torque(recording: Recording) -> np.ndarray:

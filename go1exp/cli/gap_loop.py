@@ -18,7 +18,7 @@ TABLE = "loop.json"
 
 def _task(container: dict[str, Any]) -> int:
     import go1exp.logs.excitations
-    import go1exp.logs.record.policy  # noqa: F401  (registers every excitation)
+    import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
     from go1exp import robot as go1
     from go1exp.cli.gap import _progress, refuse_unknown
     from go1exp.cli.parts import parse_with_groups

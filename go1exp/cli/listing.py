@@ -14,7 +14,7 @@ def _task(container: dict[str, Any]) -> None:
     import go1exp.evaluate.protocol.kinds
     import go1exp.logs.excitations
     import go1exp.logs.importers
-    import go1exp.logs.record.policy  # noqa: F401  (registers every member)
+    import go1exp.logs.record.motions  # noqa: F401  (registers every member)
     from go1exp.cli.settings import ListSettings, parse
     from go1exp.config.schema import plugins, registry
 

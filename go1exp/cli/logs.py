@@ -67,7 +67,7 @@ def long_enough(recordings: list[Recording], least: float) -> list[Recording]:
 
     Whether the unit of the times is wrong, the audit's law says (``wrong_steps``).
     """
-    from go1exp.logs.audit.log import Log
+    from go1exp.logs.audit.signals import Log
     from go1exp.logs.audit.single import wrong_steps
 
     fit = []

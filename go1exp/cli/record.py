@@ -59,7 +59,7 @@ def _unused(settings: RecordSettings) -> list[str]:
 
 def _task(container: dict[str, Any]) -> None:
     import go1exp.logs.excitations
-    import go1exp.logs.record.policy  # noqa: F401  (registers every excitation)
+    import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
     from go1exp import robot
     from go1exp.cli.parts import parse_with_groups
     from go1exp.cli.runs import trained

@@ -57,7 +57,7 @@ def _refuse_one_name(path: str, names: Sequence[str]) -> None:
 def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
     """Return what is wrong with clocks whose steps are too long or too short, one line for all of one kind."""
     from go1exp.logs.audit.limits import LEAST_STEP
-    from go1exp.logs.audit.log import Log
+    from go1exp.logs.audit.signals import Log
     from go1exp.logs.audit.single import wrong_steps
 
     flaws: dict[str, list[str]] = {}

@@ -6,7 +6,7 @@ Importing this registers every term of the package first, so that a name of your
 from __future__ import annotations
 
 import go1exp.logs.importers
-import go1exp.logs.record.policy  # noqa: F401  (registers an excitation)
+import go1exp.logs.record.motions  # noqa: F401  (registers an excitation)
 from go1exp import robot
 from go1exp.base.tensors.memory import Memory
 from go1exp.base.tensors.randomness import Stream

@@ -9,11 +9,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from go1exp.gap.actuator_net.dataset import SmoothMotion, smooth_motion
     from go1exp.gap.actuator_net.fitting import FitResult, fit
     from go1exp.gap.actuator_net.plots import plot
     from go1exp.gap.actuator_net.report import Report, text
     from go1exp.gap.actuator_net.settings import FitError, FitSettings
-    from go1exp.gap.actuator_net.smoothing import SmoothMotion, smooth_motion
 
 __all__ = [
     "FitError",
@@ -32,7 +32,7 @@ _MODULES = {
     "plot": "plots",
     **dict.fromkeys(("Report", "text"), "report"),
     **dict.fromkeys(("FitError", "FitSettings"), "settings"),
-    **dict.fromkeys(("SmoothMotion", "smooth_motion"), "smoothing"),
+    **dict.fromkeys(("SmoothMotion", "smooth_motion"), "dataset"),
 }
 """Name -> module of this package that defines it."""
 

@@ -1,4 +1,4 @@
-"""Recordings of other tools and robots, converted to the format of ``go1exp.logs.recording``; one module a source.
+"""Recordings of other tools and robots, converted to the format of ``go1exp.logs.recording``.
 
 An importer is ``f(path, *, options) -> list[Recording]``; ``path`` is a file of its source, or a folder of them. It
 converts what the source measured, writes the known flaws of the source into ``notes``, and never invents a channel.
@@ -12,29 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.config.schema.registry import ConfigError, find, members, unknown_name
-from go1exp.logs.importers import (
-    ak80_double_pendulum,
-    csv,
-    go1_walk_snippet,
-    go2_in_air,
-    mcap_joint_state,
-    scaler_walk_mocap,
-    servo_pendulum_xl330,
-    so101_arm,
-)
+from go1exp.logs.importers import arms, csv, mcap_joint_state, quadrupeds, scaler_walk_mocap
 from go1exp.logs.recording import Recording
 
-__all__ = [
-    "ak80_double_pendulum",
-    "csv",
-    "go1_walk_snippet",
-    "go2_in_air",
-    "import_recordings",
-    "mcap_joint_state",
-    "scaler_walk_mocap",
-    "servo_pendulum_xl330",
-    "so101_arm",
-]
+__all__ = ["arms", "csv", "import_recordings", "mcap_joint_state", "quadrupeds", "scaler_walk_mocap"]
 
 
 def import_recordings(name: str, path: Path, options: Mapping[str, Any]) -> list[Recording]:

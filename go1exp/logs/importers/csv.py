@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from go1exp.base.wording import counted
 from go1exp.config.schema.joint_values import JointValues, each_within, spread
 from go1exp.config.schema.registry import STRICT, ConfigError, Positive, as_json, explain, importer, nearest
-from go1exp.logs.importers.source import LEVEL, files, rate, recording
+from go1exp.logs.importers.source import LEVEL, files, recording
 from go1exp.logs.importers.table import UTF8, Layout, line_of, names, read
 from go1exp.logs.recording import FLAG, FOOT_FORCE, JOINT_QUANTITIES, VECTORS, Quaternion, Recording, RecordingError
 
@@ -191,8 +191,8 @@ def _one(
         named = ", ".join(name or "one without a name" for name in unused)
         remarks.append(f"Columns of the source that are left out: {named}.")
     remarks += [f"Column {column!r} of the source is {names}." for column, names in wanted.items() if ", " in names]
-    hz = rate_hz or rate(path, channels["t"])
-    return recording(path, "csv", channels, rate_hz=hz, episode=path.stem, notes=" ".join(remarks), **about)
+    rate = {} if rate_hz is None else {"rate_hz": rate_hz}
+    return recording(path, "csv", channels, notes=" ".join(remarks), **rate, **about)
 
 
 # ---------------------------------------------------------------------- the mapping

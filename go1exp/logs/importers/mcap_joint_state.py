@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from go1exp.config.schema.registry import NonNegative, Positive, explain, importer
-from go1exp.logs.importers.source import files, joint_columns, rate, recording
+from go1exp.logs.importers.source import files, joint_columns, recording
 from go1exp.logs.recording import Quaternion, Recording, RecordingError
 from go1exp.robot import JOINTS
 
@@ -103,14 +103,12 @@ def mcap_joint_state(
                 channels,
                 robot=robot,
                 joints=names,
-                rate_hz=rate(file, channels["t"]),
                 base=base,
                 base_quat=base_quat,
                 kp=kp,
                 kd=kd,
                 tau_limit=tau_limit,
                 excitation=excitation,
-                episode=file.stem,
                 notes=" ".join(notes),
             )
         )

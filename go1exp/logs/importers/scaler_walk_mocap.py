@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from go1exp.config.schema.registry import Positive, importer
-from go1exp.logs.importers.source import Arrays, columns, files, joint_columns, load_npz, rate, recording
+from go1exp.logs.importers.source import Arrays, columns, files, joint_columns, load_npz, recording
 from go1exp.logs.recording import FOOT_FORCE, VECTORS, Recording, RecordingError
 from go1exp.robot import GRAVITY
 
@@ -108,7 +108,6 @@ def _one(path: Path, tolerance: float, resync: bool, levelling: float | None) ->
         channels | forces | truth,
         robot="scaler",
         joints=JOINTS,
-        rate_hz=rate(path, t),
         base="floating",
         excitation="walk",
         episode=f"scaler_{path.stem}",

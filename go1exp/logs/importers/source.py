@@ -136,17 +136,20 @@ def reorder(theirs: Iterable[str], ours: Iterable[str]) -> list[int]:
 
 
 def recording(path: Path, importer: str, channels: dict[str, np.ndarray], **about: Any) -> Recording:
-    """Build a recording and check it; ``about`` are fields of ``Meta``; unknown ones are left out.
+    """Build a recording and check it; ``about`` are further fields of ``Meta``.
 
-    The notes say it where a Go1's torques have the steps of its packets, as those of ``go1exp deploy`` do.
+    By default the rate is that of the column ``t``, and the episode has the name of the file. The notes say it where
+    the torques of a Go1 have the steps of its packets, as those of ``go1exp deploy`` do.
 
     Raises:
         RecordingError: naming ``path``, if anything breaks the format.
     """
     # What a source does not state is None in the metadata, not a guess.
     known: dict[str, Any] = dict.fromkeys(("base_quat", "kp", "kd", "tau_limit", "excitation", "repeat_of"))
-    known |= {"source": "measured", "tool": f"go1exp importer {importer}"}
+    known |= {"source": "measured", "tool": f"go1exp importer {importer}", "episode": path.stem}
     known |= {"versions": {"go1exp": __version__, "numpy": np.__version__}}
+    if "rate_hz" not in about:
+        known["rate_hz"] = rate(path, channels["t"])
     try:
         meta = Meta(**(known | about))
     except ValidationError as error:
