@@ -57,8 +57,8 @@ from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.gap.robots.hung import hung
 from go1exp.logs import recording
 from go1exp.logs.audit import audit
-from go1exp.logs.record.plan import make_motion
 from go1exp.logs.record.motions import played
+from go1exp.logs.record.plan import make_motion
 from go1exp.logs.recording import VECTORS
 from go1exp.robot.go1_fields import JOINTS, MOTOR_NAMES
 from go1exp.robot.messages import Link, LowCmd, LowState

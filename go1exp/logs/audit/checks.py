@@ -14,8 +14,8 @@ import go1exp.logs.audit.related as related
 import go1exp.logs.audit.signals as signals
 import go1exp.logs.audit.single as single
 from go1exp.logs.audit.commands import Delay
-from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.audit.report import ORDER, AuditReport, Channel, Finding, worst
+from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.recording import Recording, problems, read
 
 SHORTEST = 20

@@ -13,8 +13,8 @@ from scipy.ndimage import uniform_filter1d
 
 import go1exp.logs.audit.limits as limits
 import go1exp.logs.audit.signals as signals
-from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.audit.report import Finding, Verdict
+from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.recording import joint_channel
 
 SMOOTH = 0.2

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import go1exp.logs.audit.limits as limits
 import go1exp.logs.audit.signals as signals
-from go1exp.logs.audit.signals import Log, finding, graded
 from go1exp.logs.audit.report import Finding
+from go1exp.logs.audit.signals import Log, finding, graded
 from go1exp.logs.recording import VECTORS, joint_channel
 from go1exp.robot import GRAVITY
 

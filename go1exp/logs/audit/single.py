@@ -9,8 +9,8 @@ import numpy as np
 import go1exp.logs.audit.limits as limits
 import go1exp.logs.audit.signals as signals
 from go1exp.base.wording import counted
-from go1exp.logs.audit.signals import Log, finding, graded
 from go1exp.logs.audit.report import Finding
+from go1exp.logs.audit.signals import Log, finding, graded
 from go1exp.logs.recording import joint_channel
 from go1exp.robot import EFFORT_LIMIT, JOINT_POS_LIMITS, JOINTS, VELOCITY_LIMIT
 
