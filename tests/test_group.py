@@ -115,11 +115,11 @@ def test_a_state_is_joined_and_taken_apart_by_robots() -> None:
         assert part["list"][1] == 7
 
 
-@pytest.mark.slow("go1exp/train/members.py")
+@pytest.mark.slow("go1exp/train/group.py")
 def test_a_member_that_fails_ends_the_training_with_a_line(tmp_path: Path) -> None:
     code = (
-        "from pathlib import Path; from go1exp.train import members\n"
-        f"with members.together(2, int, {{}}, Path({str(tmp_path)!r}), 'gloo') as group:\n"
+        "from pathlib import Path; from go1exp.train.group import together\n"
+        f"with together(2, int, {{}}, Path({str(tmp_path)!r}), 'gloo') as group:\n"
         "    group.agreed(1)\n"
         "    group.agreed(2)\n"
     )

@@ -12,7 +12,7 @@ from go1exp.base import memory
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.task import LoggerConfig, TrainConfig, WandbConfig, parse_train
-from go1exp.train import memory_need, metrics, preflight
+from go1exp.train import metrics, preflight
 from tests.command import run as cli
 
 CPU = torch.device("cpu")
@@ -67,19 +67,19 @@ def test_the_second_of_one_device_and_an_engine_that_is_not_installed_are_refuse
 
 
 def test_what_a_training_takes_grows_with_all_that_it_holds() -> None:
-    base = memory_need.needed_bytes(config("ppo.num_envs=4096"))
+    base = preflight.needed_bytes(config("ppo.num_envs=4096"))
     assert 25e6 < base < 1e9
     for bigger in ("ppo.num_envs=8192", "ppo.steps=1000", "ppo.hidden=[4096,4096]"):
         overrides = ["ppo.num_envs=4096", bigger] if "num_envs" not in bigger else [bigger]
-        assert memory_need.needed_bytes(config(*overrides)) > base
-    assert memory_need.needed_bytes(config("ppo.num_envs=4096", "backend=warp")) > 4096 * 4 * 18 * 64
+        assert preflight.needed_bytes(config(*overrides)) > base
+    assert preflight.needed_bytes(config("ppo.num_envs=4096", "backend=warp")) > 4096 * 4 * 18 * 64
 
 
 def test_what_does_not_fit_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory_need, "_available", lambda device: 8_000_000_000)
-    memory_need.check(config("ppo.num_envs=4096"), CPU)
+    monkeypatch.setattr(preflight, "_available", lambda device: 8_000_000_000)
+    preflight.check_memory(config("ppo.num_envs=4096"), CPU)
     with pytest.raises(ConfigError, match=r"at least \d+\.\d GB, and 8\.0 GB are free in memory") as caught:
-        memory_need.check(config("ppo.num_envs=10000000"), CPU)
+        preflight.check_memory(config("ppo.num_envs=10000000"), CPU)
     assert len(caught.value.problems) == 1
 
 

@@ -15,15 +15,15 @@ import pytest
 
 from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
-from go1exp.train import run_folder, run_lock, run_state
+from go1exp.train import run_folder, run_state
 from tests.small_run import SMALL
 
 HOLD = """
 import sys
 from pathlib import Path
-from go1exp.train import run_lock, run_state
+from go1exp.train import run_state
 run = Path(sys.argv[1])
-with run_lock.locked(run):
+with run_state.locked(run):
     run_state.write(run, "running")
     print("locked", flush=True)
     sys.stdin.read()
@@ -81,13 +81,13 @@ def test_a_killed_training_leaves_the_folder_free_and_is_known_to_be_dead(
     run = tmp_path / "run"
     (run / "checkpoints").mkdir()
     (run / "checkpoints/000003.pt.1a2b3c4d.partial").write_bytes(b"half")
-    assert run_lock.in_use(run)
+    assert run_state.in_use(run)
     holder.kill()
     holder.wait()
     assert run_state.read(run) == run_state.RunState("failed", "was killed")
-    with run_lock.locked(run):
+    with run_state.locked(run):
         assert list((run / "checkpoints").iterdir()) == []
-    assert not run_lock.in_use(run)
+    assert not run_state.in_use(run)
 
 
 def test_where_the_file_system_knows_no_locks_a_file_with_a_heartbeat_guards(
@@ -99,14 +99,14 @@ def test_where_the_file_system_knows_no_locks_a_file_with_a_heartbeat_guards(
     monkeypatch.setattr("filelock._unix.lock_fd_nonblocking", no_locks)
 
     def second() -> None:
-        with run_lock.locked(tmp_path):
+        with run_state.locked(tmp_path):
             raise AssertionError("two at a time")
 
     with (
         pytest.warns(UserWarning, match="its file system knows no locks"),
-        run_lock.locked(tmp_path),
-        pytest.raises(run_lock.RunInUse, match=f"process {os.getpid()} on "),
+        run_state.locked(tmp_path),
+        pytest.raises(run_state.RunInUse, match=f"process {os.getpid()} on "),
     ):
         second()
-    with pytest.warns(UserWarning, match="no locks"), run_lock.locked(tmp_path):
+    with pytest.warns(UserWarning, match="no locks"), run_state.locked(tmp_path):
         pass

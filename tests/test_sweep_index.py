@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from go1exp.base.paths import data_root
 from go1exp.cli.tune import _ranges
 from go1exp.config.schema.registry import ConfigError
-from go1exp.train import run_lock, run_state
+from go1exp.train import run_state
 from go1exp.train.sweep import index
 from go1exp.train.sweep.command import Command, Running, run
 from go1exp.train.sweep.launchers import LAUNCHERS, chosen
@@ -55,7 +55,7 @@ def test_a_job_is_what_its_run_folder_says(tmp_path: Path) -> None:
     for n, state in enumerate(("done", "stopped", "failed", "running")):
         (tmp_path / f"seed-{n}").mkdir()
         run_state.write(tmp_path / f"seed-{n}", state, "full disk" if state == "failed" else "")  # type: ignore[arg-type]
-    with run_lock.locked(tmp_path / "seed-3"):
+    with run_state.locked(tmp_path / "seed-3"):
         known = index.read(tmp_path)
     assert [(j.state, j.cause) for j in known.jobs] == [
         ("done", ""),

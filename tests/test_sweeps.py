@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from go1exp.train import run_lock, run_state
+from go1exp.train import run_state
 from tests.command import LIGHT
 from tests.command import run as cli
 from tests.small_run import SMALL
@@ -118,7 +118,7 @@ def test_two_sweeps_never_share_a_folder(sweep: Path) -> None:
     other = cli(sweep.parent, "train", "-m", "seed=1,2,3", *SMALL, "hydra.sweep.dir=sweep")
     assert other.returncode == 2
     assert "holds another sweep (2 jobs, the first of them 'seed=1')" in other.stderr
-    with run_lock.locked(sweep):
+    with run_state.locked(sweep):
         meanwhile = cli(sweep.parent, "train", "sweep=sweep", preload=LIGHT)
     assert meanwhile.returncode == 1
     assert "in use by process" in meanwhile.stderr

@@ -23,10 +23,9 @@ from go1exp.mdp.mirror import Mirror
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import TrainConfig, parse_train
-from go1exp.train import memory_need
-from go1exp.train.loss import ppo_loss
+from go1exp.train import preflight
+from go1exp.train.loss import mirror_of, ppo_loss
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy
-from go1exp.train.symmetry import of_policy
 from tests.test_capture import Watch
 
 TERMS = {name: entry for name, entry in members("observation").items() if entry not in foreign()}
@@ -171,7 +170,7 @@ def seen_by_a_robot_and_its_image(symmetric: bool, steps: int) -> tuple[Tensor, 
     seen = torch.stack(observed)
     ends = np.cumsum([t.entry.traits["size"] for t in task.observation])
     columns = {t.key: slice(end - t.entry.traits["size"], end) for t, end in zip(task.observation, ends, strict=True)}
-    return of_policy(task.observation).observation(seen[:, 0]), seen[:, 1], columns
+    return mirror_of(task.observation).observation(seen[:, 0]), seen[:, 1], columns
 
 
 def test_a_symmetric_robot_and_its_image_stay_mirror_images_over_half_a_second_of_contact() -> None:
@@ -303,7 +302,7 @@ def test_a_minibatch_is_joined_with_nothing_that_a_graph_cannot_hold(ppo: Adapti
 def test_the_images_count_in_the_memory_that_a_training_needs() -> None:
     config = settings()
     both = replace(config, ppo=replace(config.ppo, symmetry=True))
-    assert memory_need.needed_bytes(both) - memory_need.needed_bytes(config) == 4 * 12 * 2 * 24
+    assert preflight.needed_bytes(both) - preflight.needed_bytes(config) == 4 * 12 * 2 * 24
 
 
 # ---------------------------------------------------------------------- settings

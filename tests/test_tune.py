@@ -24,7 +24,7 @@ from go1exp.cli.tune import _ranges
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.task import parse_train
-from go1exp.train import run_lock, wandb_writer
+from go1exp.train import run_state, wandb_writer
 from go1exp.train.sweep import trials
 from go1exp.train.sweep.command import Ended
 from go1exp.train.sweep.settings import TuneSettings
@@ -145,7 +145,7 @@ def test_a_trial_whose_search_was_killed_goes_on_and_one_whose_search_lives_is_l
             trial.set_user_attr(trials.SEARCH, search)
             trial.set_user_attr(trials.FOLDER, f"trial-{trial.number:04}")
     (tmp_path / trials.SEARCHES / "killed").mkdir()
-    with run_lock.locked(tmp_path / trials.SEARCHES / "lives"):
+    with run_state.locked(tmp_path / trials.SEARCHES / "lives"):
         trials.put_back(study, tmp_path)
     states = [trial.state for trial in study.get_trials()]
     running, waiting = TrialState.RUNNING, TrialState.WAITING
@@ -279,7 +279,7 @@ def test_a_training_that_does_not_end_holds_nobody_up_and_its_trial_goes_on_when
     study = searched(tmp_path, trials=1)._study()
     with_a_killed_search(study, tmp_path)
     (tmp_path / "trial-0001").mkdir()
-    with run_lock.locked(tmp_path / "trial-0001"):
+    with run_state.locked(tmp_path / "trial-0001"):
         begin = time.monotonic()
         assert trials.put_back(study, tmp_path, patience=0.2)
         assert time.monotonic() - begin < 0.2 + 3 * trials.LOOK_S

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from go1exp.cli import main
-from go1exp.train import run_lock
+from go1exp.train import run_state
 
 PR_SET_PDEATHSIG = 1
 """``prctl(2)``: the signal to get when the parent dies."""
@@ -37,7 +37,7 @@ def end_with(parent: int) -> None:
 def wait_for_older_one(run: Path) -> None:
     """Wait until nobody trains in ``run``: a launcher that lost sight of a process may have started this one for it."""
     limit = time.monotonic() + PATIENCE_S
-    while run_lock.in_use(run) and time.monotonic() < limit:
+    while run_state.in_use(run) and time.monotonic() < limit:
         time.sleep(0.2)
 
 

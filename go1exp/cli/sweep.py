@@ -119,7 +119,7 @@ def begin(rules: Rules, folder: Path, listed: Sequence[list[str]], launcher: dic
     Raises:
         ConfigError: with every problem of every job, each with the first job that has it; then no folder is left.
     """
-    from go1exp.train import run_lock
+    from go1exp.train import run_state
     from go1exp.train.sweep import index, launchers
 
     runs = launchers.built(launchers.chosen(launcher))
@@ -135,7 +135,7 @@ def begin(rules: Rules, folder: Path, listed: Sequence[list[str]], launcher: dic
         launcher,
         os.getcwd(),
     )
-    with run_lock.locked(folder):
+    with run_state.locked(folder):
         if (folder / index.FILE).is_file():
             _refuse_another(index.read(folder), known, folder)
         show = spinner(len(jobs), "writing run folders")
@@ -158,7 +158,7 @@ def go_on(rules: Rules, folder: Path, overrides: list[str], launcher: dict[str, 
         ConfigError: if an override changes what it may not, or a job cannot run here.
         Expected: if there is no sweep in ``folder``.
     """
-    from go1exp.train import run_lock
+    from go1exp.train import run_state
     from go1exp.train.sweep import index, launchers
 
     known = index.read(folder)
@@ -173,7 +173,7 @@ def go_on(rules: Rules, folder: Path, overrides: list[str], launcher: dict[str, 
                 if not runs.remote and (job.state != "done" or _asks_for_more(overrides)):
                     rules.check(planned)
     _refuse(problems, [job.name for job in known.jobs])
-    with run_lock.locked(folder):
+    with run_state.locked(folder):
         return _launch(rules, folder, known, runs, overrides)
 
 

@@ -193,9 +193,9 @@ def plan(job: TrainJob) -> None:
 
 def _run(job: TrainJob) -> int | None:
     """Train as the only one in the run folder; return the exit status."""
-    from go1exp.train import run_lock
+    from go1exp.train import run_state
 
-    with run_lock.locked(job.run):
+    with run_state.locked(job.run):
         try:
             if not job.resumed:
                 _refuse_other(job.run, job.container)  # again: now nobody else can begin one there
@@ -204,7 +204,7 @@ def _run(job: TrainJob) -> int | None:
                 return None
         except BaseException:
             if not job.resumed:
-                discard(job.run, run_lock.FILES)
+                discard(job.run, run_state.FILES)
             raise
         return _train(job, first)
 

@@ -23,8 +23,7 @@ from go1exp.sim.env.engine import captured
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import PPOConfig
-from go1exp.train.device_buffer import DeviceRolloutBuffer
-from go1exp.train.device_update import DeviceUpdate
+from go1exp.train.device_update import DeviceRolloutBuffer, DeviceUpdate
 from go1exp.train.group import Group, SharedNoise
 from go1exp.train.ppo import AdaptivePPO, linear_rate
 

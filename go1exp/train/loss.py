@@ -1,4 +1,4 @@
-"""The law of PPO: advantages and loss, for every learner on every device.
+"""PPO's advantages, loss and mirrored samples, for every learner on every device.
 
 Both are those of Stable-Baselines3 (``RolloutBuffer.compute_returns_and_advantage`` and ``PPO.train``), to which
 tests/test_device_training.py holds them, written as pure functions of tensors: SB3's own cannot be had without its
@@ -7,19 +7,21 @@ loops, which read numbers back from the device after every minibatch.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
+from go1exp.config.schema.history import frames_of
+from go1exp.config.schema.registry import Term
+from go1exp.mdp.mirror import ACTION, Mirror, side_by_side
 from go1exp.sim.task import PPOConfig
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import ActorCriticPolicy
-    from stable_baselines3.common.type_aliases import RolloutBufferSamples
-
-    from go1exp.train.symmetry import SampleMirror
 
 
 class Loss(NamedTuple):
@@ -113,3 +115,21 @@ def write_advantages(
         delta = rewards[step] + gamma * after * continues - values[step]
         advantage = delta + gamma * gae_lambda * continues * advantage
         advantages[step].copy_(advantage)
+
+
+class SampleMirror(NamedTuple):
+    """The mirrors of a policy's input (O columns) and of its output (A)."""
+
+    observation: Mirror
+    action: Mirror = ACTION
+
+    def joined(self, batch: RolloutBufferSamples) -> RolloutBufferSamples:
+        """Return (2 B) samples: ``batch`` (B), then its image."""
+        images = batch._replace(observations=self.observation(batch.observations), actions=self.action(batch.actions))
+        pairs = zip(batch, images, strict=True)
+        return RolloutBufferSamples(*(torch.cat(pair) for pair in pairs))
+
+
+def mirror_of(observations: Iterable[Term]) -> SampleMirror:
+    """Return the mirror of a policy that sees these terms one after the other; each must declare its own."""
+    return SampleMirror(side_by_side(t.entry.traits["mirror"].repeated(frames_of(t)) for t in observations))

@@ -28,9 +28,8 @@ from torch import Tensor, nn
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import PPOConfig
-from go1exp.train import symmetry
 from go1exp.train.group import Group
-from go1exp.train.loss import ppo_loss, write_advantages
+from go1exp.train.loss import mirror_of, ppo_loss, write_advantages
 from go1exp.train.schedule import Schedule
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
@@ -213,7 +212,7 @@ class AdaptivePPO(PPO):
         self.after_iteration: Callable[[AdaptivePPO], None] = lambda ppo: None
         terms = env.core.terms if isinstance(env, Go1VecEnv) else None
         assert terms or not config.symmetry, "only a robot's observations have mirror images"
-        self.mirror = symmetry.of_policy(terms.observed) if config.symmetry and terms else None
+        self.mirror = mirror_of(terms.observed) if config.symmetry and terms else None
         policy_size = terms.policy_size if terms and terms.policy_size < terms.observation_size else None
         super().__init__(
             GaussianPolicy,

@@ -22,11 +22,11 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import TrainConfig, parse_train
-from go1exp.train import checkpoint, kept_plugins, members, metrics, preflight, start
+from go1exp.train import checkpoint, kept_plugins, metrics, preflight, start
 from go1exp.train.beside import Beside
 from go1exp.train.device import DevicePPO
 from go1exp.train.early_stop import EarlyStop
-from go1exp.train.group import Group
+from go1exp.train.group import Group, together
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
 from go1exp.train.schedule import Schedule
@@ -92,7 +92,7 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: star
         OSError: when metrics or a checkpoint cannot be written; what was saved before is untouched.
     """
     backend = "nccl" if preflight.engine_device(config).type == "cuda" else "gloo"
-    with members.together(config.process.devices, train_as_member, container, run, backend) as group:
+    with together(config.process.devices, train_as_member, container, run, backend) as group:
         ppo = _begun(config, run, first, group)
         logger = metrics.make_logger(config.logger, run, ppo.iteration, container, ppo.num_timesteps)
         size = config.ppo.num_envs * config.ppo.steps

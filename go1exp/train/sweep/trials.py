@@ -15,7 +15,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from go1exp.train import run_lock
+from go1exp.train import run_state
 
 FOLDER = "folder"
 """Attribute of a trial that was stopped, and of the one that goes on with it: its run folder."""
@@ -40,7 +40,7 @@ LOOK_S = 0.5
 def alive(folder: Path) -> Iterator[str]:
     """Be a search that others can see to be alive; give its name."""
     name = uuid.uuid4().hex
-    with run_lock.locked(folder / SEARCHES / name):
+    with run_state.locked(folder / SEARCHES / name):
         yield name
     shutil.rmtree(folder / SEARCHES / name, ignore_errors=True)  # after an exception it tells that its trials are free
 
@@ -145,9 +145,9 @@ def _is_run(trial: Any, folder: Path) -> bool:
     search, run = trial.user_attrs.get(SEARCH), trial.user_attrs.get(FOLDER)
     if search:
         place = folder / SEARCHES / search
-        return not place.is_dir() or run_lock.in_use(place)  # without it: of a machine with a folder of its own
+        return not place.is_dir() or run_state.in_use(place)  # without it: of a machine with a folder of its own
     if run:  # of a version that named no search
-        return not (folder / run).is_dir() or run_lock.in_use(folder / run)
+        return not (folder / run).is_dir() or run_state.in_use(folder / run)
     return bool(datetime.now() - trial.datetime_start < NAMELESS)
 
 
@@ -161,9 +161,9 @@ def _ended(run: Path, until: float) -> bool:
 
     It ends with a checkpoint after its iteration, if it can: one that is suspended cannot.
     """
-    if run_lock.in_use(run) and time.monotonic() < until:
+    if run_state.in_use(run) and time.monotonic() < until:
         print(f"{run}: waiting for its training to save a checkpoint", flush=True)
-    while run_lock.in_use(run):
+    while run_state.in_use(run):
         if time.monotonic() >= until:
             return False
         time.sleep(LOOK_S)
