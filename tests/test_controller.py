@@ -19,14 +19,14 @@ from scipy.spatial.transform import Rotation
 from go1exp import robot
 from go1exp.base.paths import data_root
 from go1exp.config.schema.registry import ConfigError
-from go1exp.evaluate.controller import forces, ground, swing
-from go1exp.evaluate.controller.as_targets import AsTargets
+from go1exp.evaluate.controller import forces, gait
+from go1exp.evaluate.controller.adapters import AsTargets
 from go1exp.evaluate.controller.batch import Driven
-from go1exp.evaluate.controller.feet import Feet
 from go1exp.evaluate.controller.forces import Body, ForcePlan, Problem
-from go1exp.evaluate.controller.gait import Clock
+from go1exp.evaluate.controller.gait import Clock, Feet
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
+from go1exp.evaluate.controller.state import Ground, frame
 from go1exp.evaluate.controller.types import Drive, Sensed
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.robot import GRAVITY
@@ -57,7 +57,7 @@ def settings(**changes: Any) -> MpcSettings:
 
 
 BODY = Body(12.743, np.diag([0.127, 0.394, 0.423]))
-HIPS = np.column_stack([swing.HIPS, np.zeros(4)])
+HIPS = np.column_stack([gait.HIPS, np.zeros(4)])
 
 
 def problem(seed: int | None = None, steps: int = 10, slope: tuple[float, float] = (0.0, 0.0)) -> Problem:
@@ -73,7 +73,7 @@ def problem(seed: int | None = None, steps: int = 10, slope: tuple[float, float]
         reference[:, 3, :2] = rng.uniform(-1.0, 1.0, 2)
         arms += rng.normal(0.0, 0.03, arms.shape)
     attitude = Rotation.from_euler("xyz", [*state[0, :2], 0.0]).as_matrix()
-    return Problem(state, reference, arms, stands, ground.frame(*slope), attitude)
+    return Problem(state, reference, arms, stands, frame(*slope), attitude)
 
 
 @pytest.fixture(scope="module")
@@ -222,12 +222,12 @@ def test_the_ground_is_the_plane_below_the_feet() -> None:
     a, b, high = 0.2, -0.1, 0.3
     feet = HIPS + np.random.default_rng(0).normal(0.0, 0.05, (4, 3))
     feet[:, 2] = a * feet[:, 0] + b * feet[:, 1] - high + robot.FOOT_RADIUS
-    below = ground.Ground(settings().stance, 0.05, 0.002)
+    below = Ground(settings().stance, 0.05, 0.002)
     for _ in range(2000):
         below.update(feet, np.ones(4, dtype=bool), np.zeros(3))
     np.testing.assert_allclose(below.gradient, [a, b], atol=1e-6)
     assert below.height == pytest.approx(high, abs=1e-6)
-    axes = ground.frame(a, b)
+    axes = frame(a, b)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(axes[:, 2] @ [1.0, 0.0, a], 0.0, atol=1e-12)
     np.testing.assert_allclose(axes[:, 2] @ [0.0, 1.0, b], 0.0, atol=1e-12)
@@ -240,22 +240,22 @@ def test_the_ground_is_the_plane_below_the_feet() -> None:
 def test_the_way_of_a_foot_begins_and_ends_at_rest_and_its_velocity_is_its_derivative() -> None:
     start, end = np.array([[0.1, 0.2, 0.0]]), np.array([[0.3, 0.1, 0.05]])
     for share, place in ((0.0, start), (1.0, end)):
-        at, velocity = swing.way(start, end, 0.09, np.array([share]), 0.2)
+        at, velocity = gait.way(start, end, 0.09, np.array([share]), 0.2)
         np.testing.assert_allclose(at, place, atol=1e-12)
         np.testing.assert_allclose(velocity, 0.0, atol=1e-12)
-    assert swing.way(start, end, 0.09, np.array([0.5]), 0.2)[0][0, 2] == pytest.approx(0.025 + 0.09)
+    assert gait.way(start, end, 0.09, np.array([0.5]), 0.2)[0][0, 2] == pytest.approx(0.025 + 0.09)
     for s in (0.2, 0.7):
-        early, late = (swing.way(start, end, 0.09, np.array([s + d]), 0.2)[0] for d in (-1e-6, 1e-6))
-        found = swing.way(start, end, 0.09, np.array([s]), 0.2)[1]
+        early, late = (gait.way(start, end, 0.09, np.array([s + d]), 0.2)[0] for d in (-1e-6, 1e-6))
+        found = gait.way(start, end, 0.09, np.array([s]), 0.2)[1]
         np.testing.assert_allclose(found, (late - early) / (2e-6 * 0.2), rtol=1e-6)
 
 
 def test_feet_stand_half_a_stance_behind_and_half_a_stance_ahead_of_the_hip() -> None:
     legs = np.arange(4)
-    placed = swing.footholds(settings().swing, np.array([1.0, 0.0, 0.0]), (1.0, 0.0, 0.0), np.full(4, 0.1), 0.2, legs)
-    np.testing.assert_allclose(placed, swing.HIPS + np.array([0.2, 0.0]))
-    turning = swing.footholds(settings().swing, np.zeros(3), (0.0, 0.0, 1.0), np.zeros(4), 0.2, legs)
-    np.testing.assert_allclose(turning - swing.HIPS, 0.1 * np.cross([0.0, 0.0, 1.0], HIPS)[:, :2], atol=1e-12)
+    placed = gait.footholds(settings().swing, np.array([1.0, 0.0, 0.0]), (1.0, 0.0, 0.0), np.full(4, 0.1), 0.2, legs)
+    np.testing.assert_allclose(placed, gait.HIPS + np.array([0.2, 0.0]))
+    turning = gait.footholds(settings().swing, np.zeros(3), (0.0, 0.0, 1.0), np.zeros(4), 0.2, legs)
+    np.testing.assert_allclose(turning - gait.HIPS, 0.1 * np.cross([0.0, 0.0, 1.0], HIPS)[:, :2], atol=1e-12)
 
 
 def test_kinematics_are_mujocos() -> None:

@@ -29,12 +29,10 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.history import history_columns, width
 from go1exp.config.schema.registry import Entry, Term
 from go1exp.deploy.export import graph
-from go1exp.deploy.export.build import build, command_ranges, gains
+from go1exp.deploy.export.build import build, command_ranges, gains, readings
 from go1exp.deploy.export.graph import DeployedPolicy, ExportError, required_inputs, to_onnx
-from go1exp.deploy.export.trace import readings
 from go1exp.deploy.runtime import bundle
-from go1exp.deploy.runtime.archive import BundleError, as_json, pack, seal, stored
-from go1exp.deploy.runtime.bundle import MEMBERS, Bundle, loads
+from go1exp.deploy.runtime.bundle import MEMBERS, Bundle, BundleError, as_json, loads, pack, seal, stored
 from go1exp.deploy.runtime.controller import Controller, Stages
 from go1exp.deploy.runtime.metadata import Metadata
 from go1exp.deploy.runtime.policy import OnnxPolicy

@@ -12,11 +12,10 @@ import torch
 from gymnasium.spaces import Box
 
 from go1exp.config.schema.history import columns_of, history_columns
-from go1exp.deploy.export.build import metadata
+from go1exp.deploy.export.build import metadata, readings
 from go1exp.deploy.export.graph import DeployedPolicy
-from go1exp.deploy.export.trace import readings
 from go1exp.deploy.runtime.metadata import Block, Metadata, Port
-from go1exp.deploy.runtime.past import PolicyMemory
+from go1exp.deploy.runtime.policy import PolicyMemory
 from go1exp.evaluate.drivers import PolicyDriver
 from go1exp.mdp.types import TermSetup
 from go1exp.sim.env.core import Go1Core

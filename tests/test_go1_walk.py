@@ -35,7 +35,7 @@ from go1exp.deploy.runtime.launch import RobotError
 from go1exp.deploy.runtime.udp import Go1Link
 from go1exp.deploy.runtime.walk import Plan
 from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
-from go1exp.deploy.sim_robot.alone import Account
+from go1exp.deploy.sim_robot.alone import Monitor
 from go1exp.deploy.sim_robot.machine import SILENCE, TICK, Robot
 from go1exp.deploy.sim_robot.server import GONE_S, STRANGER, TRUTH, FootSensors, Network, Server
 from go1exp.logs import recording
@@ -328,7 +328,7 @@ def test_raw_foot_sensors_have_a_zero_and_a_scale_each(file: str) -> None:
 
 def test_the_robot_alone_says_who_speaks_and_what_it_refuses(file: str) -> None:
     made, lines = server(file), list[str]()
-    account = Account(made, lines.append, _at=0.0)
+    account = Monitor(made, lines.append, _at=0.0)
     with speakers(2) as (first, second):
         to = ("127.0.0.1", made.port)
         account.look(1.1)
@@ -345,12 +345,12 @@ def test_the_robot_alone_says_who_speaks_and_what_it_refuses(file: str) -> None:
         account.look(4.3)
     made.close()
     name = "{}:{}".format(*made.peer)  # type: ignore[misc]
-    assert lines[0] == "nobody speaks"
-    assert lines[1].startswith(f"{name} speaks; others are refused")
-    assert lines[2] == f"refused for the first time: {STRANGER}"
+    assert lines[0] == "no client"
+    assert lines[1].startswith(f"client {name}; others are rejected")
+    assert lines[2] == f"rejected for the first time: {STRANGER}"
     assert lines[3].startswith(f"{name}: 100 packets/s in, 101 out; holding its pose, trunk at 0.")
-    assert lines[3].endswith(f"refused 1 x {STRANGER}; 0 ms behind real time")
-    assert lines[4:] == ["nobody speaks"]
+    assert lines[3].endswith(f"rejected 1 x {STRANGER}; 0 ms behind real time")
+    assert lines[4:] == ["no client"]
 
 
 # ---------------------------------------------------------------------- the check

@@ -198,10 +198,9 @@ STUDIO = (
     "window",
     "drive_window",
     "curve_plots",
-    "replay_show",
+    "replay",
     "replay_window",
     "sim_window",
-    "panels",
 )
 BROWSER = {f"evaluate/viewer/{name}.py" for name in STUDIO}
 """Files that build on MuJoCo Studio, or draw shapes of MuJoCo in its window."""

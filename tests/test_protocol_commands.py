@@ -21,7 +21,7 @@ from go1exp.cli.protocols import playable
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.export.build import build
-from go1exp.deploy.runtime.archive import BundleError
+from go1exp.deploy.runtime.bundle import BundleError
 from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
 from tests.small_run import SMALL

@@ -21,11 +21,10 @@ from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
 from go1exp.deploy.sim_robot.server import STRANGER, Server
 from go1exp.deploy.sim_robot.settings import SimConfig
 from go1exp.evaluate.viewer import requests as ask
-from go1exp.evaluate.viewer import sim_probe
-from go1exp.evaluate.viewer.history import SPAN
-from go1exp.evaluate.viewer.sim_probe import EVERY, HANGS, Frame, Probe
-from go1exp.evaluate.viewer.sim_process import Answering, RobotProcess
-from go1exp.evaluate.viewer.sim_show import SimShow, SimView, longest
+from go1exp.evaluate.viewer import sim_process
+from go1exp.evaluate.viewer.session import SPAN
+from go1exp.evaluate.viewer.sim_process import EVERY, SUSPENDED, Answering, Frame, Probe, RobotProcess
+from go1exp.evaluate.viewer.sim_window import SimShow, SimView, longest
 from go1exp.robot.messages import LowCmd
 from go1exp.sim.task import parse_parts
 
@@ -87,8 +86,8 @@ def test_the_page_shows_where_the_robot_is_and_its_curves(here: Here) -> None:
     largest = np.array(view.torque).max(axis=1)
     assert ((largest > 0.0) & (largest < 1.0)).all()
     assert all(runs and runs[-1][1] == 0.0 for runs in view.contacts)  # stands on all four
-    assert view.effects == ("payload",)
-    assert view.posture.startswith("following, trunk at 0.")
+    assert tuple(view.frame.sizes) == ("payload",)
+    assert view.frame.posture.startswith("following commands, trunk at 0.")
     assert here.show.view() is None  # nothing new
 
 
@@ -104,7 +103,7 @@ def test_a_push_moves_the_robot_where_it_points_and_is_marked(here: Here) -> Non
     here.show.ask(ask.Reset())
     view = here.live(0.1)
     assert np.abs(np.array(view.velocity)[:2, -3:]).max() < 0.1
-    assert view.time == pytest.approx(0.5)  # its clock goes on
+    assert view.frame.clock == pytest.approx(0.5)  # its clock goes on
 
 
 def test_a_robot_that_hangs_cannot_be_pushed_and_is_shown_in_the_air() -> None:
@@ -112,7 +111,7 @@ def test_a_robot_that_hangs_cannot_be_pushed_and_is_shown_in_the_air() -> None:
     made.show.ask(ask.Push(20.0, 0.0))
     view = made.live(0.1)
     made.close()
-    assert view.message == HANGS
+    assert view.frame.message == SUSPENDED
     assert view.pushes == []
     assert made.show.data.qpos[2] == 1.0
     assert np.isnan(view.height).all()
@@ -121,10 +120,10 @@ def test_a_robot_that_hangs_cannot_be_pushed_and_is_shown_in_the_air() -> None:
 
 def test_effects_change_while_the_robot_stands_under_its_client(here: Here) -> None:
     view = here.live(0.3)
-    assert view.sizes == {"payload": 1.0}
+    assert view.frame.sizes == {"payload": 1.0}
     assert {"payload", "coulomb", "fixed_point"} <= set(view.known)
     before = here.server.robot
-    here.show.ask(ask.Effects({"payload": 0.0, "coulomb": 2.0}))
+    here.show.ask(ask.SetEffects({"payload": 0.0, "coulomb": 2.0}))
     ends = time.monotonic() + 60.0
     while here.server.robot is before:
         view = here.live(0.02)  # the old one stands on meanwhile
@@ -132,9 +131,9 @@ def test_effects_change_while_the_robot_stands_under_its_client(here: Here) -> N
     after = here.server.robot
     assert after.clock >= before.clock
     view = here.live(0.4)
-    assert view.sizes == {"coulomb": 2.0}
-    assert view.message == ""
-    assert view.posture.startswith("following, trunk at 0.")
+    assert view.frame.sizes == {"coulomb": 2.0}
+    assert view.frame.message == ""
+    assert view.frame.posture.startswith("following commands, trunk at 0.")
     assert view.height[-1] > 0.25
     carried = [float(one.backend.field("body_mass").sum()) for one in (before, after)]
     assert carried[0] - carried[1] == pytest.approx(1.0, abs=1e-6)  # the payload is gone, kg
@@ -163,11 +162,11 @@ def test_a_robot_takes_over_pose_speed_and_command_of_another(here: Here) -> Non
 
 def test_effects_that_cannot_be_are_refused_and_the_robot_stays(here: Here) -> None:
     before = here.server.robot
-    here.show.ask(ask.Effects({"gravity": 1.0}))
+    here.show.ask(ask.SetEffects({"gravity": 1.0}))
     view = here.live(0.1)
-    assert "'gravity'" in view.message
+    assert "'gravity'" in view.frame.message
     assert here.server.robot is before
-    assert view.sizes == {"payload": 1.0}
+    assert view.frame.sizes == {"payload": 1.0}
 
 
 def test_the_timing_of_the_client_is_that_of_its_packets(here: Here) -> None:
@@ -178,7 +177,7 @@ def test_the_timing_of_the_client_is_that_of_its_packets(here: Here) -> None:
     here.show.tick()
     view = here.show.view()
     assert view is not None
-    p = view.packets
+    p = view
     assert (p.every.p50, p.every.worst) == (pytest.approx(4.0), pytest.approx(30.0))
     assert (p.new.p50, p.new.worst) == (pytest.approx(20.0), pytest.approx(46.0))
     assert len(p.new.interval) == 110 / 5 - 1
@@ -198,10 +197,10 @@ def test_intervals_rate_and_who_speaks_are_seen_as_they_happen(here: Here) -> No
     here.show.tick()
     view = here.show.view()
     assert view is not None
-    p = view.packets
-    assert p.peer == f"127.0.0.1:{here.clients[0].getsockname()[1]}"
-    assert p.speaking
-    assert p.refused == {STRANGER: 1, "wrong size": 1}
+    p = view
+    assert p.frame.peer == f"127.0.0.1:{here.clients[0].getsockname()[1]}"
+    assert p.frame.connected
+    assert p.frame.refused == {STRANGER: 1, "wrong size": 1}
     assert p.rate == here.server.counts.heard
     assert 10.0 <= p.every.p50 <= p.every.p99 <= p.every.worst
     assert len(p.every.interval) == here.server.counts.heard - 1
@@ -222,7 +221,7 @@ def test_another_speaker_begins_a_new_row_of_intervals(here: Here) -> None:
 
 
 def test_a_page_that_does_not_ask_costs_a_gap_and_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sim_probe, "KEPT_S", 0.2)
+    monkeypatch.setattr(sim_process, "KEPT_S", 0.2)
     made = Here()
     made.live(0.1)
     for _ in range(250):
@@ -278,11 +277,11 @@ def test_the_robot_lives_in_a_process_of_its_own_and_ends_with_the_page(capfd: p
         view = show.view()
         time.sleep(0.01)
     assert view is not None
-    assert view.packets.peer is None
-    assert view.packets.refused == {}
-    assert math.isnan(view.packets.every.worst)
+    assert view.frame.peer is None
+    assert view.frame.refused == {}
+    assert math.isnan(view.every.worst)
     process.close()
     assert process._process.exitcode == 0
-    assert "lived for" in capfd.readouterr().out
+    assert "ran for" in capfd.readouterr().out
     with pytest.raises(ask.Ended):
         show.tick()

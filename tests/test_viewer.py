@@ -17,11 +17,8 @@ from go1exp.cli.subjects import driver, named
 from go1exp.config.compose import compose
 from go1exp.config.schema.contact import MUJOCO_CONTACT
 from go1exp.config.schema.registry import ConfigError
-from go1exp.evaluate.viewer import requests as wish
-from go1exp.evaluate.viewer.conditions import Setup
-from go1exp.evaluate.viewer.effects import catalogue, resized
-from go1exp.evaluate.viewer.gate import Gate, listening, words
-from go1exp.evaluate.viewer.history import SPAN, History
+from go1exp.evaluate.viewer import requests as ask
+from go1exp.evaluate.viewer.page_server import Gate, listening, words
 from go1exp.evaluate.viewer.replay import (
     Choose,
     Magnify,
@@ -29,13 +26,14 @@ from go1exp.evaluate.viewer.replay import (
     Piece,
     Play,
     Player,
+    ReplayShow,
     Seek,
     Story,
     of_recording,
     of_result,
 )
-from go1exp.evaluate.viewer.replay_show import ReplayShow
-from go1exp.evaluate.viewer.session import Robots, Session
+from go1exp.evaluate.viewer.requests import Setup, catalogue, resized
+from go1exp.evaluate.viewer.session import SPAN, History, Robots, Session
 from go1exp.evaluate.viewer.walk import WalkShow
 from go1exp.gap.result import GapResult, Overlay
 from go1exp.logs.recording import Meta, Recording, RecordingError, joint_channels
@@ -67,7 +65,7 @@ def walk(session: Session, seconds: float) -> None:
 def test_the_speed_follows_the_command(session: Session) -> None:
     walk(session, 0.6)
     assert abs(session.velocity(0.2)[0]) < 0.15
-    session.ask(wish.Steer((0.8, 0.0, 0.0)))
+    session.ask(ask.Command((0.8, 0.0, 0.0)))
     walk(session, 1.6)
     assert session.velocity()[0] == pytest.approx(0.8, abs=0.2)
     estimated = session.history.last("estimated", 0.5).mean(0)
@@ -77,7 +75,7 @@ def test_the_speed_follows_the_command(session: Session) -> None:
 
 def test_a_push_moves_the_robot_where_it_points_and_is_marked(session: Session) -> None:
     walk(session, 0.4)
-    session.ask(wish.Push(15.0, math.pi / 2))
+    session.ask(ask.Push(15.0, math.pi / 2))
     walk(session, 0.3)
     sideways = session.history.last("true", 0.3)[:, 1]
     assert sideways.max() > 0.4  # 15 N s on 13 kg
@@ -93,10 +91,10 @@ def test_a_push_moves_the_robot_where_it_points_and_is_marked(session: Session) 
 def test_another_driver_takes_over_while_the_robot_walks(session: Session, other: str) -> None:
     if other not in session.robots.drivers:
         pytest.skip("the extra mpc is not installed")
-    session.ask(wish.Steer((0.4, 0.0, 0.0)))
+    session.ask(ask.Command((0.4, 0.0, 0.0)))
     walk(session, 0.8)
     before = session.qpos()
-    session.ask(wish.Hand(other))
+    session.ask(ask.SelectPolicy(other))
     assert (session.label, session.message) == (other, "")
     assert np.linalg.norm(session.qpos()[:3] - before[:3]) < 0.05
     walk(session, 1.4)  # the MPC begins its gait from standing
@@ -110,9 +108,9 @@ def test_an_effect_acts_by_its_size_and_goes(session: Session) -> None:
         return float(session.core.backend.field("body_mass")[0].sum())
 
     plain = float(session.core.backend.compiled("body_mass").sum())
-    session.ask(wish.Effects({"payload": 2.0}))
+    session.ask(ask.SetEffects({"payload": 2.0}))
     assert weight() == pytest.approx(plain + 2.0, abs=1e-6)
-    session.ask(wish.Effects({"payload": 0.0}))
+    session.ask(ask.SetEffects({"payload": 0.0}))
     assert not session.core.plant.effects.effects
     walk(session, 0.1)
     assert session.falls == 0
@@ -130,7 +128,7 @@ def test_sizes_are_multiples_of_the_distance_from_null(robots: Robots) -> None:
 
 
 def test_noise_delay_and_physics_rate_are_in_force(session: Session) -> None:
-    session.ask(wish.Conditions(noise=True, delay=0.02, physics_dt=0.001, trunk_velocity="exact"))
+    session.ask(ask.Conditions(noise=True, delay=0.02, physics_dt=0.001, trunk_velocity="exact"))
     assert session.message == ""
     assert session.core.noise
     assert session.core.task.sim.physics_dt == pytest.approx(0.001)
@@ -139,12 +137,12 @@ def test_noise_delay_and_physics_rate_are_in_force(session: Session) -> None:
 
 
 def test_grounds_and_their_levels(session: Session) -> None:
-    session.ask(wish.Walk("rough", 5.0, "bumps"))
+    session.ask(ask.SelectGround("rough", 5.0, "bumps"))
     core = session.core
     column = int(core.tile_column[0])
     assert core.terrain.tile_types[column] == "bumps"
     assert np.allclose(session.qpos()[:2], core.terrain.tile_origins[5, column, :2], atol=1e-6)
-    session.ask(wish.Walk("slope_up", 12.0))
+    session.ask(ask.SelectGround("slope_up", 12.0))
     rise = session.core.terrain.heights.max()
     assert rise == pytest.approx(5.0 * math.tan(math.radians(12.0)), rel=0.02)
     view = WalkShow(session).view()
@@ -155,13 +153,13 @@ def test_grounds_and_their_levels(session: Session) -> None:
 @pytest.mark.parametrize(
     ("request_", "why"),
     [
-        (wish.Hand("nobody"), "nobody"),
-        (wish.Effects({"wings": 1.0}), "wings"),
-        (wish.Walk("moon"), "moon"),
-        (wish.Effects({"kp_scale": 1.0, "wings": 1.0}), "wings"),
+        (ask.SelectPolicy("nobody"), "nobody"),
+        (ask.SetEffects({"wings": 1.0}), "wings"),
+        (ask.SelectGround("moon"), "moon"),
+        (ask.SetEffects({"kp_scale": 1.0, "wings": 1.0}), "wings"),
     ],
 )
-def test_what_cannot_be_is_refused_and_changes_nothing(session: Session, request_: wish.Request, why: str) -> None:
+def test_what_cannot_be_is_refused_and_changes_nothing(session: Session, request_: ask.Request, why: str) -> None:
     walk(session, 0.1)
     core, setup, history = session.core, session.setup, session.history.count
     session.ask(request_)
@@ -174,32 +172,32 @@ def test_what_cannot_be_is_refused_and_changes_nothing(session: Session, request
 
 def test_time_stands_still_and_goes_on_by_steps(session: Session) -> None:
     show = WalkShow(session)
-    session.ask(wish.Pace(True, 1.0))
+    session.ask(ask.Pace(True, 1.0))
     show.tick()
     assert session.time == 0.0
-    session.ask(wish.Step())
+    session.ask(ask.Step())
     show.tick()
     show.tick()
     assert session.time == pytest.approx(session.dt)
-    session.ask(wish.Pace(False, 0.5))
+    session.ask(ask.Pace(False, 0.5))
     assert show.tick() == pytest.approx(2.0 * session.dt)
 
 
 def test_a_reset_puts_the_robot_back_and_keeps_the_command(session: Session) -> None:
-    session.ask(wish.Steer((1.0, 0.0, 0.0)))
+    session.ask(ask.Command((1.0, 0.0, 0.0)))
     walk(session, 0.6)
     assert session.qpos()[0] > 0.1
-    session.ask(wish.Reset())
+    session.ask(ask.Reset())
     assert np.allclose(session.qpos()[:2], 0.0)
     session.advance()
     assert session.history.last("command", 0.02)[0, 0] == pytest.approx(1.0)
 
 
 def test_a_fall_is_told_and_the_robot_starts_again(session: Session) -> None:
-    session.ask(wish.Push(200.0, 0.0))
+    session.ask(ask.Push(200.0, 0.0))
     walk(session, 1.5)
     assert session.falls >= 1
-    assert "starts again" in session.message
+    assert session.message.endswith("; reset")
 
 
 def test_every_reward_term_is_shown(session: Session) -> None:
@@ -215,7 +213,7 @@ def test_every_reward_term_is_shown(session: Session) -> None:
 
 
 def test_the_curves_are_what_happened(session: Session) -> None:
-    session.ask(wish.Steer((0.5, 0.0, 0.0)))
+    session.ask(ask.Command((0.5, 0.0, 0.0)))
     walk(session, 1.0)
     view = WalkShow(session).view()
     assert view is not None

@@ -11,7 +11,7 @@ import pytest
 from websockets.datastructures import Headers
 from websockets.http11 import Response
 
-from go1exp.evaluate.viewer.gamepad import DEAD, PATH, PUSH, SILENT_S, STAND, Gamepad, steered
+from go1exp.evaluate.viewer.page_server import DEAD, PATH, PUSH, SILENT_S, STAND, Gamepad, steered
 
 LIMITS = ((-1.5, 2.0), (-0.6, 0.8), (-1.0, 1.0))
 

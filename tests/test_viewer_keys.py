@@ -18,9 +18,9 @@ from go1exp.config.compose import compose
 from go1exp.deploy.export.build import build
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer import sim_process, web
-from go1exp.evaluate.viewer.gate import FIRST_PORT, listening
-from go1exp.evaluate.viewer.replay_show import ReplayShow
-from go1exp.evaluate.viewer.sim_show import SimShow
+from go1exp.evaluate.viewer.page_server import FIRST_PORT, listening
+from go1exp.evaluate.viewer.replay import ReplayShow
+from go1exp.evaluate.viewer.sim_window import SimShow
 from go1exp.evaluate.viewer.walk import WalkShow
 from go1exp.gap import files
 from go1exp.logs.recording import write
@@ -110,6 +110,6 @@ def test_a_bundle_walks_on_the_page_and_hands_over(
     assert np.isfinite(session.qpos()).all()
     assert not np.array_equal(session.qpos(), before)
     for label in ("trot", "mine"):  # to a policy of the package and back, while it walks
-        show.ask(ask.Hand(label))
+        show.ask(ask.SelectPolicy(label))
         assert (session.label, session.message) == (label, "")
         show.tick()

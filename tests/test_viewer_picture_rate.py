@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from go1exp.evaluate.viewer.picture_rate import FRAME_S, SLOWEST_FRAME_S, PictureRate
+from go1exp.evaluate.viewer.web import FRAME_S, SLOWEST_FRAME_S, PictureRate
 
 
 def passed(rate: PictureRate, begin: float, seconds: int, lost: float) -> None:

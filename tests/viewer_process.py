@@ -19,10 +19,9 @@ import torch
 from go1exp.cli.play_web import _drivers, _grounds
 from go1exp.cli.subjects import driver, named
 from go1exp.evaluate.viewer import web
-from go1exp.evaluate.viewer.conditions import Setup
 from go1exp.evaluate.viewer.drive_window import DriveWindow
-from go1exp.evaluate.viewer.effects import catalogue
-from go1exp.evaluate.viewer.gamepad import Gamepad
+from go1exp.evaluate.viewer.page_server import Gamepad
+from go1exp.evaluate.viewer.requests import Setup, catalogue
 from go1exp.evaluate.viewer.session import Robots, Session
 from go1exp.evaluate.viewer.walk import WalkShow
 

@@ -112,7 +112,7 @@ def _mover(controller: MpcSettings | None) -> Mover | None:
     """Return what walks in place of the bundle's policy, if anything does."""
     if controller is None:
         return None
-    from go1exp.evaluate.controller.deployed import Deployed
+    from go1exp.evaluate.controller.adapters import Deployed
     from go1exp.evaluate.controller.mpc import Mpc
 
     return Deployed(Mpc(controller))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from go1exp.deploy.sim_robot.machine import Body
     from go1exp.deploy.sim_robot.settings import SimConfig
     from go1exp.evaluate.drivers import Driver
-    from go1exp.evaluate.viewer.conditions import Ground
+    from go1exp.evaluate.viewer.requests import Ground
     from go1exp.gap.robots.protocol import Robot
     from go1exp.robot.config import RobotConfig
     from go1exp.sim.terrain import TerrainConfig
@@ -84,10 +84,9 @@ def walk(
     with one_thread():
         from go1exp.cli.subjects import driver
         from go1exp.evaluate.viewer import web
-        from go1exp.evaluate.viewer.conditions import Setup
         from go1exp.evaluate.viewer.drive_window import DriveWindow
-        from go1exp.evaluate.viewer.effects import catalogue
-        from go1exp.evaluate.viewer.gamepad import Gamepad
+        from go1exp.evaluate.viewer.page_server import Gamepad
+        from go1exp.evaluate.viewer.requests import Setup, catalogue
         from go1exp.evaluate.viewer.session import Robots, Session
         from go1exp.evaluate.viewer.walk import WalkShow
 
@@ -129,7 +128,7 @@ def _drivers(subject: Named, first: Driver, other: dict[str, Any]) -> dict[str, 
 
 def _grounds(wanted: TerrainConfig | None) -> tuple[str, dict[str, Ground]]:
     """Return the name of the ground that is wanted, and every ground; those of one kind that differ get a name."""
-    from go1exp.evaluate.viewer.conditions import FLAT, grounds
+    from go1exp.evaluate.viewer.requests import FLAT, grounds
     from go1exp.sim.task import parse_parts
 
     known: dict[str, TerrainConfig] = {}
@@ -170,8 +169,7 @@ def sim(
     with one_thread():
         from go1exp.evaluate.viewer import web
         from go1exp.evaluate.viewer.sim_process import RobotProcess
-        from go1exp.evaluate.viewer.sim_show import SimShow
-        from go1exp.evaluate.viewer.sim_window import SimWindow
+        from go1exp.evaluate.viewer.sim_window import SimShow, SimWindow
 
         process = RobotProcess(groups, body.tile, config, robot_at, seconds, printed)
         try:
@@ -194,8 +192,7 @@ def log(file: Path, where: tuple[str, int]) -> None:
 
     recording = read(file)
     from go1exp.evaluate.viewer import web
-    from go1exp.evaluate.viewer.replay import of_recording
-    from go1exp.evaluate.viewer.replay_show import ReplayShow
+    from go1exp.evaluate.viewer.replay import ReplayShow, of_recording
     from go1exp.evaluate.viewer.replay_window import ReplayWindow
     from go1exp.sim.task import parse_parts
 
@@ -221,8 +218,7 @@ def gap(settings: GapVerb, robot: Robot, config: RobotConfig, where: tuple[str, 
     folder = Path(settings.out)
     result = files.load(folder)
     from go1exp.evaluate.viewer import web
-    from go1exp.evaluate.viewer.replay import of_result
-    from go1exp.evaluate.viewer.replay_show import ReplayShow, model_of
+    from go1exp.evaluate.viewer.replay import ReplayShow, model_of, of_result
     from go1exp.evaluate.viewer.replay_window import ReplayWindow
 
     story = of_result(result, str(folder / files.RESULT))

@@ -147,7 +147,7 @@ def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> 
     """Let a model predictive controller walk simulated robots by targets alone; return a recording of each."""
     from go1exp.cli import controllers
     from go1exp.config.compose import compose
-    from go1exp.evaluate.controller.as_targets import AsTargets
+    from go1exp.evaluate.controller.adapters import AsTargets
     from go1exp.evaluate.controller.batch import Driven
     from go1exp.logs.record import simulate
     from go1exp.sim.task import parse_train

@@ -150,7 +150,7 @@ def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = 
 
     Raises:
         ConfigError: if a run's configuration is not one that this version knows.
-        go1exp.deploy.runtime.archive.BundleError: if a bundle is damaged or was changed.
+        go1exp.deploy.runtime.bundle.BundleError: if a bundle is damaged or was changed.
     """
     from go1exp.evaluate.drivers import BundleDriver, PolicyDriver
 

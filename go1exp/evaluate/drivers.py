@@ -15,9 +15,9 @@ from torch import Tensor
 from go1exp.config.schema.history import history_columns
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.estimation import Filters
-from go1exp.deploy.export.trace import readings
+from go1exp.deploy.export.build import readings
 from go1exp.deploy.runtime.bundle import Bundle
-from go1exp.deploy.runtime.past import Past, PolicyMemory
+from go1exp.deploy.runtime.policy import Past, PolicyMemory
 from go1exp.deploy.sim_robot.machine import noisy
 from go1exp.evaluate.controller.batch import Driven
 from go1exp.evaluate.controller.types import Controller
@@ -74,45 +74,62 @@ class Driver(Protocol):
 TERM = "base_linear_velocity"
 
 
-class EstimatedVelocity:
-    """One filter for each robot of an environment, updated with its sensors in every physics step."""
+class VelocityFilters:
+    """One Kalman filter for each robot of an environment, updated with its sensors in every physics step."""
 
     def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
         """Observe the plant of ``core``, which must have been built with ``imu=True``, from its next step on.
 
         Args:
             core: the environment.
-            noise: give the sensors the noise of the paper's Table II, and accelerometer and feet that of a logger.
+            noise: add the sensor noise of the paper's Table II, and a logger's to accelerometer and feet.
             seed: seed of the noise.
 
         Raises:
-            ConfigError: if the policy does not observe the velocity.
             go1exp.deploy.estimation.EstimatorError: if the filter is not built.
+        """
+        self._filters = Filters(core.num_envs)
+        self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
+        self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])
+        self._observer, core.plant.observer = core.plant.observer, self._update
+
+    def velocities(self) -> NDArray[np.float64]:
+        """Return the estimated velocities of the trunks in their own frames (N, 3), m/s; zero until a filter runs."""
+        return self._filters.velocities
+
+    def restart(self, env: int) -> None:
+        """Initialise one robot's filter with its next sample."""
+        self._filters.restart(env)
+
+    def _update(self, target: Tensor) -> None:
+        """Update every filter with a sample, before a step."""
+        if self._observer is not None:
+            self._observer(target)
+        true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}
+        self._filters.update(self._steps * self._dt, noisy(true, self._noise, self._rng))
+        self._steps += 1
+
+
+class EstimatedVelocity(VelocityFilters):
+    """The filters of a policy that observes the trunk's velocity."""
+
+    def __init__(self, core: Go1Core, noise: bool, seed: int) -> None:
+        """Observe the plant of ``core``; arguments as those of ``VelocityFilters``.
+
+        Raises:
+            ConfigError: if the policy does not observe the velocity.
         """
         velocity_columns = columns(core.task, TERM)
         if velocity_columns is None:
             raise ConfigError([f"trunk_velocity = 'estimated': the policy does not see {TERM}"])
         self._columns = velocity_columns
-        self._filters = Filters(core.num_envs)
-        self._plant, self._dt, self._steps = core.plant, core.task.sim.physics_dt, 0
-        self._noise, self._rng = float(noise), np.random.default_rng([seed, 2])
-        core.plant.observer = self._listen
+        super().__init__(core, noise, seed)
 
     def put(self, observation: Tensor) -> Tensor:
         """Return the observation (N, O) with the estimated velocity in place of the true one."""
         changed = observation.clone()
         changed[:, self._columns] = torch.as_tensor(self.velocities(), dtype=observation.dtype)
         return changed
-
-    def velocities(self) -> NDArray[np.float64]:
-        """Return the estimated velocities of the trunks in their own frames (N, 3), m/s; zero until a filter runs."""
-        return self._filters.velocities
-
-    def _listen(self, target: Tensor) -> None:
-        """Update every filter with a sample, before a step."""
-        true = {name: values.cpu().numpy() for name, values in sample(self._plant, target).items()}
-        self._filters.update(self._steps * self._dt, noisy(true, self._noise, self._rng))
-        self._steps += 1
 
 
 @dataclass(frozen=True)

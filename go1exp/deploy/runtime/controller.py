@@ -14,7 +14,7 @@ import numpy as np
 
 from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.packet_delay import PacketDelay
-from go1exp.deploy.runtime.past import PolicyMemory
+from go1exp.deploy.runtime.policy import PolicyMemory
 from go1exp.deploy.runtime.safety import Safety
 from go1exp.robot.messages import Link, LowCmd, LowState
 

@@ -21,8 +21,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from go1exp.base.errors import Expected
 from go1exp.config.schema.registry import ConfigError, as_json, explain
-from go1exp.deploy.runtime.archive import unpack
-from go1exp.deploy.runtime.bundle import CONFIG, MEMBERS
+from go1exp.deploy.runtime.bundle import CONFIG, MEMBERS, unpack
 from go1exp.deploy.sim_robot.machine import Robot
 from go1exp.deploy.sim_robot.server import KEPT_S, TRUTH, Server
 from go1exp.deploy.sim_robot.settings import SimConfig

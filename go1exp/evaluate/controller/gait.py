@@ -1,8 +1,11 @@
-"""When each foot is meant to stand: a clock and four offsets."""
+"""Feet of the controller: the gait's schedule, contacts, footholds and swing trajectories."""
 
 from __future__ import annotations
 
 import numpy as np
+
+from go1exp import robot
+from go1exp.evaluate.controller.settings import SwingSettings
 
 
 class Clock:
@@ -54,3 +57,118 @@ class Clock:
         """(steps, 4) bool: meant to stand in the middle of each of the coming intervals of ``dt`` s."""
         middles = (np.arange(steps) + 0.5)[:, None] * (dt / self.period)
         return (self._phase + middles + self._offsets) % 1.0 < self.duty
+
+
+LEGS = robot.NUM_LEGS
+
+
+class Feet:
+    """Schedule and contact of the four feet.
+
+    A foot leaves the ground when the schedule says so. It stands again as soon as it feels the ground: early, in the
+    second half of its swing, or late, when its stance has begun without any ground to push on.
+
+    Attributes:
+        down: (4,) bool, which feet stand.
+        lift: (4, 3) where each foot last left the ground, m.
+        anchor: (4, 3) where each foot stands or last stood, m.
+        overdue: (4,) time since a foot should have found the ground, s; 0 for those that stand or swing.
+    """
+
+    def __init__(self, contact_force: float, dt: float) -> None:
+        """Feel the ground from ``contact_force`` N on; called every ``dt`` s."""
+        self._contact_force, self._dt = contact_force, dt
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all; the next call is the first one."""
+        self.down, self._planned = np.ones(LEGS, dtype=bool), np.ones(LEGS, dtype=bool)
+        self.lift, self.anchor = np.zeros((LEGS, 3)), np.zeros((LEGS, 3))
+        self.overdue = np.zeros(LEGS)
+        self._fresh = True
+
+    def update(self, clock: Clock, force: np.ndarray, places: np.ndarray) -> bool:
+        """Take forces (4,), N, and places (4, 3), m, of the feet; return whether other feet stand than before."""
+        planned, before = clock.stands(), self.down
+        if self._fresh:
+            self.lift[:], self.anchor[:] = places, places
+            self.down, self._planned, self._fresh = planned, planned, False
+            return True
+        touches = force > self._contact_force
+        leaves = self._planned & ~planned
+        self._planned = planned
+        may_land = planned | (clock.swing_share() > 0.5)
+        self.down = (before & ~leaves) | (touches & may_land)
+        self.overdue = np.where(planned & ~self.down, self.overdue + self._dt, 0.0)
+        self.lift[leaves] = places[leaves]
+        self.anchor[self.down] = places[self.down]
+        return bool((self.down != before).any())
+
+
+SIDES = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]])
+"""(4, 2) signs of x and y of the legs."""
+
+HIPS = SIDES * [robot.HIP_OFFSET[0], robot.HIP_OFFSET[1] + robot.LINK_LENGTHS[0]]
+"""(4, 2) points of the trunk below which feet stand: the hips' axes with the abduction offset, trunk frame, m."""
+
+ACROSS = HIPS[:, ::-1] * [-1.0, 1.0]
+"""(4, 2) how these points move where the trunk turns by 1 rad/s, m/s."""
+
+
+def footholds(
+    settings: SwingSettings,
+    velocity: np.ndarray,
+    command: tuple[float, float, float],
+    left: np.ndarray,
+    stance: float,
+    legs: np.ndarray,
+) -> np.ndarray:
+    """Return where feet are to stand (n, 2), from the trunk's origin, m; all in the axes of the robot's heading.
+
+    Below the hip, where that will be half-way through the coming stance (Raibert 1986), and further out by
+    ``velocity_gain`` times what the robot is too fast.
+
+    Args:
+        settings: ``velocity_gain``.
+        velocity: (3,) of the trunk, m/s.
+        command: commanded velocity, m/s, m/s, rad/s.
+        left: (n,) time until each foot is to stand, s.
+        stance: time that it will stand, s.
+        legs: (n,) their numbers.
+    """
+    vx, vy, _ = velocity.tolist()
+    x, y, yaw = command
+    hips = HIPS[legs]
+    moving = yaw * ACROSS[legs] + [vx, vy]
+    too_fast = settings.velocity_gain * np.array([vx - x, vy - y])
+    return np.asarray(hips + moving * (left + 0.5 * stance)[:, None] + too_fast)
+
+
+def way(
+    start: np.ndarray, end: np.ndarray, height: float, share: np.ndarray, duration: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return place (n, 3), m, and velocity (n, 3), m/s, of feet on their way.
+
+    Horizontally a cubic from rest to rest; vertically the same plus a bump 16 s^2 (1 - s)^2.
+
+    Args:
+        start: (n, 3) where each foot left the ground, m.
+        end: (n, 3) where it is to stand, m.
+        height: of the bump, m.
+        share: (n,) of the swing that has passed, 0 to 1.
+        duration: of the swing, s.
+    """
+    left = share * (1.0 - share)
+    blend, rate = share * share * (3.0 - 2.0 * share), 6.0 / duration * left
+    ahead = end - start
+    place, velocity = start + blend[:, None] * ahead, rate[:, None] * ahead
+    place[:, 2] += 16.0 * height * left * left
+    velocity[:, 2] += 32.0 * height / duration * left * (1.0 - 2.0 * share)
+    return place, velocity
+
+
+def solved(jacobians: np.ndarray, vectors: np.ndarray, damping: float = 1e-3) -> np.ndarray:
+    """Return joint changes (n, 3, k) that move feet by the columns of ``vectors`` (n, 3, k): damped least squares."""
+    transposed = jacobians.transpose(0, 2, 1)
+    square = jacobians @ transposed + damping**2 * np.eye(3)
+    return np.asarray(transposed @ np.linalg.solve(square, vectors))

@@ -13,14 +13,10 @@ from typing import Any
 import numpy as np
 
 from go1exp import robot
-from go1exp.evaluate.controller.feet import Feet
 from go1exp.evaluate.controller.forces import Body, ForcePlan, Problem
-from go1exp.evaluate.controller.gait import Clock
-from go1exp.evaluate.controller.geometry import heading, matrix, roll_pitch_yaw, skew, wrapped
-from go1exp.evaluate.controller.ground import Ground, frame
+from go1exp.evaluate.controller.gait import Clock, Feet, footholds, solved, way
 from go1exp.evaluate.controller.settings import MpcSettings
-from go1exp.evaluate.controller.smoothing import Smoothed
-from go1exp.evaluate.controller.swing import footholds, solved, way
+from go1exp.evaluate.controller.state import Ground, Smoothed, frame, heading, matrix, roll_pitch_yaw, skew, wrapped
 from go1exp.evaluate.controller.types import Command, Drive, Sensed
 from go1exp.sim.physics.dynamics import Kinematics
 

@@ -1,4 +1,4 @@
-"""The curves of a robot that walks, drawn with ImPlot."""
+"""Curves of a simulated robot, drawn with ImPlot."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
 from go1exp import robot
-from go1exp.evaluate.viewer.history import SPAN
+from go1exp.evaluate.viewer.session import SPAN
 from go1exp.evaluate.viewer.walk import Reward, Timed, WalkView
 from go1exp.evaluate.viewer.window import Vec2, section
 
@@ -40,7 +40,7 @@ class Curves:
             self.contacts(view)
         if section("Trunk height"):
             self.plot("##height", "m", view, [("height", view.height)], (0.0, 0.5))
-        if section("Torque over its limit"):
+        if section("Torque / limit"):
             lines = list(zip(robot.JOINTS, view.torque, strict=False))
             self.plot("##torque", "-", view, lines, (0.0, 1.05), TALL)
         if section(f"Rewards: {len(view.rewards)} terms, {view.total:+.2f} per s"):
@@ -77,7 +77,7 @@ class Curves:
         implot.EndPlot()
 
     def contacts(self, view: Timed) -> None:
-        """Draw a bar for each time that a foot bore force."""
+        """Draw a bar for each contact of a foot."""
         imgui.BeginGroup()
         for leg in robot.LEGS:
             imgui.TextUnformatted(leg)

@@ -1,4 +1,4 @@
-"""The window of a robot that walks: panels that send what a user asks for, beside its curves."""
+"""The window of a simulation: panels that send the user's requests, and curves."""
 
 from __future__ import annotations
 
@@ -10,14 +10,23 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from go1exp.evaluate.video import steer
 from go1exp.evaluate.viewer import curve_plots
 from go1exp.evaluate.viewer import requests as ask
-from go1exp.evaluate.viewer.gamepad import PUSH, STAND, Gamepad, steered
-from go1exp.evaluate.viewer.panels import EffectsPanel, PushPanel, ReleasedSlider
+from go1exp.evaluate.viewer.page_server import PUSH, STAND, Gamepad, steered
 from go1exp.evaluate.viewer.walk import WalkView
-from go1exp.evaluate.viewer.window import MESSAGE_LINES, Vec2, Window, arrow_shape, paragraph, section
+from go1exp.evaluate.viewer.window import (
+    MESSAGE_LINES,
+    EffectsPanel,
+    PushPanel,
+    ReleasedSlider,
+    Vec2,
+    Window,
+    arrow_shape,
+    paragraph,
+    section,
+)
 
 SLOW = imgui.Vec4(1.0, 0.7, 0.3, 1.0)
 
-TOO_SLOW = "this computer is too slow for that"
+TOO_SLOW = "cannot keep real time"
 
 KEYS = {
     imgui.Key.UpArrow: 265,
@@ -28,11 +37,11 @@ KEYS = {
     imgui.Key.RightArrow: 262,
     imgui.Key.N0: 32,
 }
-"""Key -> what it is called in ``evaluate.video.STEERING``; 0 stands still, as the space bar does in the live window."""
+"""Key -> its code in ``evaluate.video.STEERING``; 0 commands zero, as the space bar in the live window."""
 
 PUSH_KEY = imgui.Key.P
 
-AXES = ("forward m/s", "left m/s", "turn rad/s")
+AXES = ("forward m/s", "left m/s", "yaw rad/s")
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
 
@@ -40,22 +49,22 @@ RATES = (None, 0.001, 0.002, 0.004, 0.005)
 """Physics steps to choose from, s; None is that of training."""
 
 MOST_BUTTONS = 6
-"""Drivers up to which each has a button; more are a list."""
+"""Number of policies up to which each has a button; more are a list."""
 
 VELOCITIES = ("exact", "estimated")
 
-HELP = ("arrows: forward, back, turn", "comma, full stop: left, right", "0 stand, P push, space pause")
+HELP = ("arrows: forward, back, yaw", "comma, full stop: left, right", "0 zero, P push, space pause")
 
 
 class DriveWindow(Window):
-    """Panels for a robot that walks.
+    """Panels of a simulation.
 
     Attributes:
         places: where controls are on the page, left, top, right, bottom, pixels.
     """
 
     def __init__(self, pad: Gamepad) -> None:
-        """Steer by panels, keys and ``pad``."""
+        """Take commands from panels, keys and ``pad``."""
         super().__init__("Robot", "Curves")
         self._command, self._pad, self._sticks = [0.0, 0.0, 0.0], pad, False
         self._push = PushPanel(self.ask)
@@ -83,7 +92,7 @@ class DriveWindow(Window):
             self.ask(ask.Reset())
 
     def gamepad(self) -> None:
-        """Answer the gamepad: sticks ask for their share of the sliders, and for zero when they are let go."""
+        """Apply the gamepad: sticks scale to the sliders' ranges; released sticks command zero."""
         before, pushed = list(self._command), self._pad.sticks()
         if pushed is not None:
             self._command = steered(pushed, self.view.limits)
@@ -101,7 +110,7 @@ class DriveWindow(Window):
 
     def _steer(self) -> None:
         x, y, yaw = self._command
-        self.ask(ask.Steer((x, y, yaw)))
+        self.ask(ask.Command((x, y, yaw)))
 
     # ------------------------------------------------------------------ panels
 
@@ -114,7 +123,7 @@ class DriveWindow(Window):
             self._command_panel(view)
         if section("Push"):
             self._push.draw()
-        if section("Who walks"):
+        if section("Policy"):
             self._drivers_panel(view)
         if section("Ground"):
             self._ground_panel(view)
@@ -181,32 +190,32 @@ class DriveWindow(Window):
     def _drivers_panel(self, view: WalkView) -> None:
         if len(view.labels) > MOST_BUTTONS:
             imgui.SetNextItemWidth(-85.0)
-            changed, index = imgui.Combo("driver", view.labels.index(view.label), list(view.labels))
+            changed, index = imgui.Combo("policy", view.labels.index(view.label), list(view.labels))
             if changed:
-                self.ask(ask.Hand(view.labels[index]))
+                self.ask(ask.SelectPolicy(view.labels[index]))
             return
         for label in view.labels:
             if imgui.RadioButton(label, label == view.label):
-                self.ask(ask.Hand(label))
+                self.ask(ask.SelectPolicy(label))
 
     def _ground_panel(self, view: WalkView) -> None:
         setup, names = view.setup, list(view.grounds)
         imgui.SetNextItemWidth(-85.0)
         changed, index = imgui.Combo("ground", names.index(setup.ground), names)
         if changed:
-            self.ask(ask.Walk(names[index], 0.3 * view.grounds[names[index]].hardest))
+            self.ask(ask.SelectGround(names[index], 0.3 * view.grounds[names[index]].hardest))
         ground = view.grounds[setup.ground]
         if ground.tiles:
             tile = setup.tile if setup.tile in ground.tiles else ground.tiles[0]
             imgui.SetNextItemWidth(-85.0)
             changed, index = imgui.Combo("tile", ground.tiles.index(tile), list(ground.tiles))
             if changed:
-                self.ask(ask.Walk(setup.ground, setup.level, ground.tiles[index]))
+                self.ask(ask.SelectGround(setup.ground, setup.level, ground.tiles[index]))
         if ground.hardest:
             shown = "%.0f" if ground.tiles else "%.2f"
             level = self._slider.draw(f"level {ground.unit}", setup.level, ground.hardest, shown)
             if level is not None:
-                self.ask(ask.Walk(setup.ground, level, setup.tile))
+                self.ask(ask.SelectGround(setup.ground, level, setup.tile))
 
     def _conditions_panel(self, view: WalkView) -> None:
         now = ask.Conditions(view.setup.noise, view.setup.delay, view.setup.physics_dt, view.setup.trunk_velocity)

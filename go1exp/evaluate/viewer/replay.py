@@ -1,11 +1,13 @@
-"""Motions that were recorded, shown again: a log, or the windows of ``go1exp gap`` with the model before and after."""
+"""Replay of recorded motions: a log, or the windows of ``go1exp gap`` with the model before and after."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,22 +15,24 @@ from go1exp import robot
 from go1exp.gap.result import GapResult, Overlay
 from go1exp.logs.recording import JOINT_QUANTITIES, VECTORS, Recording, RecordingError
 from go1exp.robot import JOINTS
+from go1exp.robot.config import RobotConfig
+from go1exp.sim.env.camera import AZIMUTH
+from go1exp.sim.physics.scene import build_model
+from go1exp.sim.terrain import TerrainConfig, build_terrain
 
 Array = NDArray[np.float64]
 
 UNITS = {"q": "rad", "qd": "rad/s", "q_target": "rad", "tau_est": "N m", "tau_cmd": "N m"}
 
 STEP_S = 0.02
-"""Real time from picture to picture, s."""
+"""Real time between two frames, s."""
 
-SLOWEST = 0.05
-"""Smallest speed, s of the recording per s."""
+SLOWEST = 0.05  # s of the recording per s
 
 SHOWN_ERROR = 0.15
 """Largest error of an angle as it is shown at first, rad: smaller ones are magnified to that, up to ``MOST``."""
 
-MOST = 50.0
-"""Largest magnification."""
+MOST = 50.0  # largest magnification
 
 HELD_AT = 0.5
 """Height of a trunk that is held, or of which nothing is known, m."""
@@ -36,7 +40,7 @@ HELD_AT = 0.5
 
 @dataclass(frozen=True)
 class Motion:
-    """One robot through a piece.
+    """Motion of one robot over a piece.
 
     Attributes:
         name: measured, before, after, target.
@@ -51,10 +55,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of time to look at.
+    """A time span of a recording.
 
     Attributes:
-        title: where it is from.
+        title: its origin.
         t: (T,) time in the episode, s.
         motions: the first one is what was measured.
         curves: quantity -> joint -> name of a motion -> (T,), in the quantity's unit.
@@ -88,12 +92,12 @@ class Piece:
 
 @dataclass(frozen=True)
 class Story:
-    """All that there is to look at.
+    """A replay: one or more pieces.
 
     Attributes:
-        kind: what it is.
-        about: a sentence or two.
-        pieces: one after the other.
+        kind: of a log, or of a result of ``go1exp gap``.
+        about: a description.
+        pieces: in order.
     """
 
     kind: Literal["log", "gap"]
@@ -101,31 +105,23 @@ class Story:
     pieces: tuple[Piece, ...]
 
 
-# ---------------------------------------------------------------------- what is asked for
-
-
 @dataclass(frozen=True)
 class Choose:
-    """Look at another piece, by its number."""
+    """Request another piece, by its number."""
 
     piece: int
 
 
 @dataclass(frozen=True)
 class Seek:
-    """Go to another time, s from the beginning of the piece."""
+    """Request another time, s from the beginning of the piece."""
 
     time: float
 
 
 @dataclass(frozen=True)
 class Play:
-    """Let time pass or stand still.
-
-    Attributes:
-        running: whether it passes.
-        speed: s of the recording per s.
-    """
+    """Request that time passes or stands still, at ``speed`` s of the recording per s."""
 
     running: bool
     speed: float
@@ -133,7 +129,7 @@ class Play:
 
 @dataclass(frozen=True)
 class Magnify:
-    """Show errors larger than they are."""
+    """Request another magnification of errors."""
 
     times: float
 
@@ -142,30 +138,30 @@ Request = Choose | Seek | Play | Magnify
 
 
 class Player:
-    """Where one is in a story.
+    """Position in a story.
 
     Attributes:
-        story: what is told.
-        number: of the piece.
+        story: the replay.
+        number: index of the piece.
         time: s from its beginning.
         running: whether time passes.
         speed: s of the recording per s.
-        magnify: how much larger than they are errors are shown.
+        magnify: factor by which errors are magnified.
     """
 
     def __init__(self, story: Story) -> None:
-        """Begin at the beginning; windows of a gap are short, and shown slowly."""
+        """Start at the beginning; windows of a gap are short, and shown slowly."""
         self.story, self.number, self.time, self.running = story, 0, 0.0, True
         self.speed = 1.0 if story.kind == "log" else 0.1
         self.magnify = 1.0 if story.kind == "log" else magnification(story.pieces)
 
     @property
     def piece(self) -> Piece:
-        """What is looked at."""
+        """The present piece."""
         return self.story.pieces[self.number]
 
     def ask(self, request: Request) -> None:
-        """Do what is asked; times and numbers beyond the ends are the ends."""
+        """Apply a request; times and numbers are clipped to their range."""
         match request:
             case Choose(piece):
                 self.number, self.time = min(max(piece, 0), len(self.story.pieces) - 1), 0.0
@@ -177,29 +173,29 @@ class Player:
                 self.magnify = min(max(times, 1.0), MOST)
 
     def advance(self, seconds: float) -> None:
-        """Let real time pass; at its end a piece begins again."""
+        """Advance by real time; a piece repeats at its end."""
         if self.running and self.piece.duration > 0.0:
             self.time = (self.time + self.speed * seconds) % self.piece.duration
 
     @property
     def row(self) -> int:
-        """Number of the sample that is shown."""
+        """Index of the shown sample."""
         t = self.piece.t
         return int(np.clip(np.searchsorted(t, t[0] + self.time + 1e-9) - 1, 0, len(t) - 1))
 
     def pose(self, motion: Motion) -> tuple[Array, Array | None]:
-        """Return joint angles (J,) and base (7,) of a motion now; what is not measured, with its error magnified."""
+        """Return joint angles (J,) and base (7,) of a motion now; a model's with its error magnified."""
         measured = self.piece.motions[0].q[self.row]
         q = measured + self.magnify * (motion.q[self.row] - measured) if motion.name in MODELS else motion.q[self.row]
         return q, None if motion.base is None else motion.base[self.row]
 
 
 MODELS = ("before", "after")
-"""Motions that are a model's."""
+"""Names of the models' motions."""
 
 
 def magnification(pieces: Sequence[Piece]) -> float:
-    """Return by how much the errors of the models must be magnified to be seen: a round number."""
+    """Return the magnification that makes the models' errors visible: a round number."""
     largest = max(
         (float(np.abs(m.q - p.motions[0].q).max()) for p in pieces for m in p.motions[1:] if m.name in MODELS),
         default=0.0,
@@ -210,11 +206,8 @@ def magnification(pieces: Sequence[Piece]) -> float:
     return max(v for v in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0) if v <= wanted)
 
 
-# ---------------------------------------------------------------------- where it comes from
-
-
 def of_result(result: GapResult, where: str) -> Story:
-    """Return the held-out windows of an answer, whose curves it keeps.
+    """Return the held-out windows of a result that keeps their curves.
 
     Raises:
         RecordingError: if it keeps none.
@@ -271,7 +264,7 @@ def of_recording(recording: Recording) -> Story:
 
 
 def _base(recording: Recording) -> Array | None:
-    """Return where the trunk was (T, 7): as recorded, or as the IMU had it at the height of a stance."""
+    """Return the pose of the trunk (T, 7): as recorded, or the IMU's attitude at the height of a stance."""
     channels, rows = recording.channels, len(recording.t)
     known = {name for name, columns in VECTORS.items() if set(columns) <= set(channels)}
     if recording.meta.base == "fixed":
@@ -286,7 +279,122 @@ def _base(recording: Recording) -> Array | None:
     return np.concatenate([place, quat / np.linalg.norm(quat, axis=1, keepdims=True)], axis=1)
 
 
-def thinned(values: Any, most: int = 1500) -> list[float]:
-    """Return at most about ``most`` of many values, evenly, for a curve."""
-    every = -(-len(values) // most)
-    return [float(v) for v in values[::every]]
+APART = 0.9
+"""Distance to the right, as the camera sees it, of the model after from that before, in extents of the robot."""
+
+
+@dataclass(frozen=True)
+class Ghost:
+    """A robot drawn in addition to the model's own.
+
+    Attributes:
+        name: of its motion.
+        qpos: generalised coordinates.
+        shift: (3,) displacement, m.
+    """
+
+    name: str
+    qpos: Array
+    shift: Array
+
+
+@dataclass(frozen=True)
+class ReplayView:
+    """Content of the panels beside the story, which they have themselves: it is long, and this is sent often.
+
+    Attributes:
+        number: index of the piece.
+        time: s from its beginning.
+        running: whether time passes.
+        speed: s of the recording per s.
+        magnify: factor by which errors are magnified.
+        ghosts: robots drawn in addition to the model's own, which is the first motion shown.
+    """
+
+    number: int
+    time: float
+    running: bool
+    speed: float
+    magnify: float
+    ghosts: tuple[Ghost, ...]
+
+
+class ReplayShow:
+    """A story in its scene.
+
+    Attributes:
+        player: the position in it.
+        model: the scene with one robot.
+        data: its state.
+    """
+
+    def __init__(self, story: Story, config: RobotConfig, model: mujoco.MjModel | None = None) -> None:
+        """Build the scene: with the Go1, or with the model of another robot, on its base.
+
+        Raises:
+            ValueError: if the model has no such joint.
+        """
+        self.player = Player(story)
+        if model is None:
+            ground = build_terrain(TerrainConfig(kind="flat"))
+            model = build_model(config, ground, 0.002, decoration=True)[0]
+            model.vis.headlight.ambient[:] = 0.25
+        self.model, self.data = model, mujoco.MjData(model)
+        self._free = bool(model.njnt and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE)
+        names = story.pieces[0].joints
+        ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in names]
+        if min(ids) < 0:
+            raise ValueError(f"the model has no joint {names[ids.index(-1)]!r}")
+        self._at = model.jnt_qposadr[ids]
+        wide = APART * float(model.stat.extent) * (0.4 if self._free else 1.0)
+        self._apart = wide * np.array([math.sin(math.radians(AZIMUTH)), -math.cos(math.radians(AZIMUTH)), 0.0])
+        self._place()
+
+    def ask(self, request: Request) -> None:
+        """Apply a request of the user."""
+        self.player.ask(request)
+
+    def tick(self) -> float:
+        """Advance; return the time until the next call, s."""
+        self.player.advance(STEP_S)
+        self._place()
+        return STEP_S
+
+    def _qpos(self, motion: Motion) -> Array:
+        """Return the coordinates of a motion now."""
+        qpos = self.model.qpos0.copy()
+        q, base = self.player.pose(motion)
+        if self._free:
+            qpos[:7] = [0.0, 0.0, HELD_AT, 1.0, 0.0, 0.0, 0.0] if base is None else base
+        qpos[self._at] = q
+        return np.asarray(qpos)
+
+    def _place(self) -> None:
+        """Put the model's own robot into the first motion that is shown: of a gap that before."""
+        motions = {m.name: m for m in self.player.piece.motions}
+        first = motions.get("before", self.player.piece.motions[0])
+        self.data.qpos[:] = self._qpos(first)
+        self.data.qvel[:] = 0.0
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _ghosts(self) -> tuple[Ghost, ...]:
+        poses = {m.name: self._qpos(m) for m in self.player.piece.motions}
+        in_place = np.zeros(3)
+        if self.player.story.kind == "log":
+            return tuple(Ghost(name, qpos, in_place) for name, qpos in poses.items() if name != "measured")
+        measured = poses["measured"]
+        return (
+            Ghost("measured", measured, in_place),
+            Ghost("after", poses["after"], self._apart),
+            Ghost("measured", measured, self._apart),
+        )
+
+    def view(self) -> ReplayView:
+        """Return the content of the panels."""
+        p = self.player
+        return ReplayView(p.number, p.time, p.running, p.speed, p.magnify, self._ghosts())
+
+
+def model_of(robot: Any) -> mujoco.MjModel:
+    """Return the compiled model of a robot of ``go1exp gap`` on its base."""
+    return robot.build(1, 0.002, (1.0, 0.0, 0.0, 0.0), 1)[0].model

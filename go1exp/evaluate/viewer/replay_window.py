@@ -10,8 +10,19 @@ import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
-from go1exp.evaluate.viewer.replay import MODELS, MOST, UNITS, Choose, Magnify, Piece, Play, Seek, Story, thinned
-from go1exp.evaluate.viewer.replay_show import Ghost, ReplayView
+from go1exp.evaluate.viewer.replay import (
+    MODELS,
+    MOST,
+    UNITS,
+    Choose,
+    Ghost,
+    Magnify,
+    Piece,
+    Play,
+    ReplayView,
+    Seek,
+    Story,
+)
 from go1exp.evaluate.viewer.window import Vec2, Window, paragraph, section
 
 COLOURS: dict[str, tuple[float, float, float, float]] = {
@@ -213,3 +224,9 @@ def _lines(piece: Piece, joint: str) -> dict[str, Any]:
             errors += [("noise", t, [sign * level] * len(t)) for sign in (1.0, -1.0)]
         drawn[quantity] = {"values": values, "errors": errors}
     return drawn
+
+
+def thinned(values: Any, most: int = 1500) -> list[float]:
+    """Return at most about ``most`` values, evenly spaced, for a curve."""
+    every = -(-len(values) // most)
+    return [float(v) for v in values[::every]]

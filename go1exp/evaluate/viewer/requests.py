@@ -1,17 +1,35 @@
-"""What a user of the window may ask of a robot that walks: plain data from the panels to the session."""
+"""Requests of the viewer's user to a simulation: plain data, and the task that they select."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from go1exp import robot
+from go1exp.config.choices import choice_files, config_folder, load
+from go1exp.config.schema.backends import BackendConfig
+from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.joint_values import JointValues, numbers
+from go1exp.config.schema.registry import ConfigError, Term
+from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes
+from go1exp.evaluate.protocol.stage import delay_of_effects
+from go1exp.evaluate.rollout import EvalConfig, delayed, evaluation_task
+from go1exp.sim.effects.base import Param
+from go1exp.sim.effects.rules import actuator_problems
+from go1exp.sim.effects.tolerances import Tolerances
+from go1exp.sim.task import TaskConfig, parse_parts
+from go1exp.sim.terrain import TerrainConfig
 
 Velocity = tuple[float, float, float]
 """x and y, m/s, and yaw rate, rad/s, in the trunk's frame."""
 
 
 @dataclass(frozen=True)
-class Steer:
-    """Walk at another velocity from now on."""
+class Command:
+    """Command another velocity."""
 
     velocity: Velocity
 
@@ -30,15 +48,15 @@ class Push:
 
 
 @dataclass(frozen=True)
-class Hand:
-    """Give the legs to another policy, run, bundle or controller, by its label; the robot walks on."""
+class SelectPolicy:
+    """Select another policy, run, bundle or controller by its label; the robot continues from its state."""
 
     label: str
 
 
 @dataclass(frozen=True)
-class Effects:
-    """Let exactly these effects act.
+class SetEffects:
+    """Set the active effects.
 
     Attributes:
         sizes: by name; 1 is the effect as its choice or the run has it, 0 its absence.
@@ -48,12 +66,12 @@ class Effects:
 
 
 @dataclass(frozen=True)
-class Walk:
-    """Start again on another ground.
+class SelectGround:
+    """Restart on another ground.
 
     Attributes:
         ground: its name.
-        level: how hard; of graded tiles the row, of a lane its difficulty in its own unit.
+        level: difficulty: the row of graded tiles, or a lane's difficulty in its own unit.
         tile: kind of tile, of graded tiles.
     """
 
@@ -64,11 +82,11 @@ class Walk:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What stands between the controller and the robot.
+    """Set sensors, delay and physics step.
 
     Attributes:
-        noise: add sensor noise to what the controller sees.
-        delay: by which targets come later than they do anyhow, s.
+        noise: add sensor noise to the observations.
+        delay: additional command delay, s.
         physics_dt: physics step, s; None takes that of training.
         trunk_velocity: the true one, or that of the Kalman filter.
     """
@@ -81,10 +99,10 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast time passes.
+    """Set the speed of the simulation.
 
     Attributes:
-        paused: whether it stands still.
+        paused: whether the simulation is paused.
         speed: simulated seconds per second.
     """
 
@@ -94,16 +112,233 @@ class Pace:
 
 @dataclass(frozen=True)
 class Step:
-    """Pass one period of the policy while time stands still."""
+    """Simulate one period of the policy while paused."""
 
 
 @dataclass(frozen=True)
 class Reset:
-    """Put the robot back to the start."""
+    """Reset the robot to the start."""
 
 
 class Ended(Exception):
-    """What is shown is over."""
+    """The simulation or the recording has ended."""
 
 
-Request = Steer | Push | Hand | Effects | Walk | Conditions | Pace | Step | Reset
+Request = Command | Push | SelectPolicy | SetEffects | SelectGround | Conditions | Pace | Step | Reset
+
+
+LARGEST = 3.0
+"""Largest size of an effect, relative to its choice."""
+
+
+def catalogue(effects: tuple[Term, ...], randomize: bool) -> tuple[dict[str, Term], dict[str, float]]:
+    """Return every effect by name at size 1, and the sizes of those that the robot has.
+
+    An effect of the robot with nominal values of null (only randomised in training) is inactive, as its choice has it.
+
+    Args:
+        effects: of the robot.
+        randomize: keep the randomisation of its own effects.
+    """
+    known: dict[str, Term] = {}
+    for file in choice_files("effect", [config_folder()]).values():
+        parts, problems = parse_parts({"effect": load(file)}, ("effect",))
+        if not problems:
+            known |= {term.key: term for term in parts["effect"]}
+    sizes = dict.fromkeys(known, 0.0)
+    for term in effects:
+        spread = randomize and any(term.slots.get("spread", {}).values())
+        if spread or _is_active(term):
+            known[term.key] = term if spread else dataclasses.replace(term, slots={"spread": {}})
+            sizes[term.key] = 1.0
+    return dict(sorted(known.items())), sizes
+
+
+def _is_active(term: Term) -> bool:
+    nulls = {p.name: p.null for p in params_of(term)}
+    return any(v != nulls[name] for name, value in term.parameters.items() for v in numbers(value))
+
+
+def active(
+    sizes: Mapping[str, float], effects: Mapping[str, Term], actuator: Term, contact: ContactConfig
+) -> tuple[Term, ...]:
+    """Return the effects of a size above 0, at that size.
+
+    Args:
+        sizes: by name.
+        effects: by name, at size 1.
+        actuator: its term.
+        contact: of the feet.
+
+    Raises:
+        ConfigError: if a name is not known, or effects and drives do not go together.
+    """
+    if strange := [name for name in sizes if name not in effects]:
+        raise ConfigError([f"effect {strange[0]!r}: known are {', '.join(effects)}"])
+    chosen = {name: size for name, size in sizes.items() if size > 0.0}
+    terms = tuple(
+        effects[name] if size == 1.0 else resized(effects[name], size, contact) for name, size in chosen.items()
+    )
+    if problems := actuator_problems(actuator, terms, robot.JOINTS):
+        raise ConfigError(problems)
+    return terms
+
+
+def resized(term: Term, size: float, contact: ContactConfig) -> Term:
+    """Return an effect with parameters ``size`` times as far from null, clipped to their limits, without randomisation.
+
+    A parameter per joint keeps its joints; one whose values are all null stays. Null is that of a robot with this
+    contact.
+    """
+    parameters, known = dict(term.parameters), Tolerances(contact=contact)
+    for p in params_of(term):
+        left_alone = p.least is not None and parameters.get(p.name) == p.null  # what the model has stays
+        if p.name in parameters and not left_alone:
+            parameters[p.name] = _scaled(parameters[p.name], known.param((term.entry.name, p.name)), size)
+    return dataclasses.replace(term, parameters=parameters, slots={**term.slots, "spread": {}})
+
+
+def params_of(term: Term) -> tuple[Param, ...]:
+    """Return the declarations of an effect's parameters."""
+    declared: tuple[Param, ...] = vars(term.entry.target)["params"]
+    return declared
+
+
+def _scaled(value: JointValues, param: Param, size: float) -> Any:
+    def one(v: float) -> float:
+        return min(max(param.null + size * (v - param.null), param.low), param.high)
+
+    if isinstance(value, Mapping):
+        return {joint: one(v) for joint, v in value.items()}
+    if isinstance(value, tuple | list):
+        return tuple(one(v) for v in value)
+    return one(float(value))
+
+
+def lines(effects: Mapping[str, Term]) -> dict[str, str]:
+    """Return a description of each effect: its title, and its parameters at size 1."""
+    return {name: _about(term) for name, term in effects.items()}
+
+
+def _about(term: Any) -> str:
+    units = {p.name: "" if p.unit == "-" else f" {p.unit}" for p in params_of(term)}
+    values = ", ".join(f"{name} {value}{units.get(name, '')}" for name, value in term.parameters.items())
+    return f"{term.entry.target.title}; at size 1: {values}"
+
+
+HARDEST: dict[GroundName, float] = {
+    "slope_up": 30.0,
+    "slope_down": 30.0,
+    "gravel": 0.15,
+    "waves": 0.4,
+    "stairs_up": 0.25,
+    "stairs_down": 0.25,
+    "boxes": 0.3,
+}
+"""Largest difficulty of each lane, in the unit of ``protocol.ground.UNITS`` (chosen: beyond all shipped policies)."""
+
+FLAT = "flat"
+
+FOREVER = 1e7
+"""Time limit of an episode, s."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A selectable ground.
+
+    Attributes:
+        config: graded tiles or a plane; None for a lane.
+        lane: its name; None for the others.
+        hardest: largest level.
+        unit: of a level; empty for rows of tiles.
+        tiles: kinds of tile.
+    """
+
+    config: TerrainConfig | None
+    lane: GroundName | None = None
+    hardest: float = 0.0
+    unit: str = ""
+    tiles: tuple[str, ...] = ()
+
+    def built(self, level: float) -> TerrainConfig:
+        """Return the terrain at a level."""
+        if self.lane is not None:
+            return Lanes(ground=self.lane, levels=(min(max(level, 0.0), self.hardest),))
+        assert self.config is not None
+        return self.config
+
+
+def grounds(files: Mapping[str, TerrainConfig]) -> dict[str, Ground]:
+    """Return every ground by name: those of ``conf/terrain`` or of a run, and the lanes of the protocols."""
+    from go1exp.sim.terrain import build_terrain
+
+    known: dict[str, Ground] = {}
+    for name, config in files.items():
+        if config.kind == "flat":
+            known[name] = Ground(config)
+        else:
+            kinds = tuple(dict.fromkeys(build_terrain(config).tile_types))
+            known[name] = Ground(config, hardest=config.rows - 1.0, tiles=kinds)
+    lanes: tuple[GroundName, ...] = get_args(GroundName)
+    return known | {lane: Ground(None, lane, HARDEST[lane], UNITS[lane]) for lane in lanes}
+
+
+@dataclass(frozen=True)
+class Setup(Conditions):
+    """Conditions of a simulation.
+
+    Attributes:
+        ground: its name.
+        level: as in ``SelectGround``.
+        tile: as in ``SelectGround``.
+        sizes: of the active effects, by name.
+        randomize: randomise robots and starts as in training.
+        push: push as in training.
+        engine: physics engine; None for MuJoCo on the CPU.
+        seed: of everything random.
+    """
+
+    ground: str = FLAT
+    level: float = 0.0
+    tile: str | None = None
+    sizes: Mapping[str, float] = field(default_factory=dict)
+    randomize: bool = False
+    push: bool = False
+    engine: BackendConfig | None = None
+    seed: int = 1
+
+
+def task_under(task: TaskConfig, setup: Setup, known: Mapping[str, Ground], effects: Mapping[str, Term]) -> TaskConfig:
+    """Return the task of a policy under ``setup``; the physics step is rounded down to fit the policy's period.
+
+    Args:
+        task: of the policy.
+        setup: the conditions.
+        known: grounds by name.
+        effects: by name, at size 1.
+
+    Raises:
+        ConfigError: if effects and actuator are incompatible, or a name is not known.
+    """
+    if setup.ground not in known:
+        raise ConfigError([f"ground = {setup.ground!r}: known are {', '.join(known)}"])
+    period = task.sim.policy_dt
+    step = setup.physics_dt or task.sim.physics_dt
+    config = EvalConfig(
+        commands=(),
+        episodes=1,
+        duration_s=FOREVER,
+        settle_s=0.0,
+        noise=setup.noise,
+        randomize=setup.randomize,
+        push=setup.push,
+        train_ground=False,
+        policy_dt=None,
+        seed=setup.seed,
+        physics_dt=period / math.ceil(period / step - 1e-6),
+        engine=setup.engine,
+    )
+    ground, effect = known[setup.ground].built(setup.level), active(setup.sizes, effects, task.actuator, task.contact)
+    made = dataclasses.replace(evaluation_task(task, config), terrain=ground, effect=effect)
+    return delayed(made, setup.delay + delay_of_effects(made)) if setup.delay > 0.0 else made

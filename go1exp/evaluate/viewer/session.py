@@ -1,4 +1,4 @@
-"""A robot that walks while a user steers, pushes and changes it: one period of the policy at a time, no browser."""
+"""A simulated robot that a user commands, pushes and changes: one period of the policy at a time, without a browser."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -15,32 +16,89 @@ from go1exp import robot
 from go1exp.base.errors import Expected
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.deploy.estimation import EstimatorError
-from go1exp.evaluate.drivers import Driver
+from go1exp.evaluate.drivers import Driver, VelocityFilters
 from go1exp.evaluate.protocol.plan import Impulses, Kicker, heading
 from go1exp.evaluate.rollout import require_agreement
-from go1exp.evaluate.viewer import requests as wish
-from go1exp.evaluate.viewer.conditions import Ground, Setup, task_under
-from go1exp.evaluate.viewer.estimate import Estimate
-from go1exp.evaluate.viewer.history import History
+from go1exp.evaluate.viewer import requests
+from go1exp.evaluate.viewer.requests import Ground, Setup, task_under
 from go1exp.mdp.actions import clipped
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
+
+Array = NDArray[np.float64]
+
+SPAN = 10.0
+"""Duration of a curve, s."""
+
+
+class History:
+    """A ring of rows, one for each period of the policy.
+
+    Attributes:
+        widths: columns by the name of a quantity.
+        dt: time from row to row, s.
+    """
+
+    def __init__(self, widths: Mapping[str, int], dt: float) -> None:
+        """Keep the last ``SPAN`` s."""
+        self.widths, self.dt = dict(widths), dt
+        self._rows = max(2, round(SPAN / dt))
+        ends = np.cumsum([0, *self.widths.values()])
+        spans = pairwise(ends)
+        self._place = {name: slice(int(a), int(b)) for name, (a, b) in zip(self.widths, spans, strict=True)}
+        self._values = np.full((self._rows, int(ends[-1])), np.nan)
+        self.count = 0
+
+    def add(self, quantities: Mapping[str, NDArray[np.floating]]) -> None:
+        """Add a row; missing quantities are not drawn there."""
+        row = self._values[self.count % self._rows]
+        row.fill(np.nan)
+        for name, values in quantities.items():
+            row[self._place[name]] = values
+        self.count += 1
+
+    def clear(self) -> None:
+        """Remove all rows."""
+        self.count = 0
+
+    @property
+    def filled(self) -> int:
+        """Number of kept rows."""
+        return min(self.count, self._rows)
+
+    def _indices(self, every: int) -> NDArray[np.int64]:
+        """Numbers of the kept rows, oldest first: whole multiples of ``every``, so that a curve does not flicker."""
+        first = self.count - self.filled
+        return np.arange(-(-first // every) * every, self.count, every)
+
+    def times(self, every: int = 1) -> Array:
+        """Return the time of each row, oldest first: 0 for the newest, s."""
+        return np.asarray((self._indices(every) - (self.count - 1)) * self.dt, dtype=np.float64)
+
+    def series(self, name: str, every: int = 1) -> Array:
+        """Return a quantity's rows (T, W), oldest first; every n-th of them for ``every`` = n."""
+        return np.asarray(self._values[self._indices(every) % self._rows, self._place[name]])
+
+    def last(self, name: str, seconds: float) -> Array:
+        """Return the rows (T, W) of the last ``seconds`` s."""
+        return self.series(name)[-max(1, round(seconds / self.dt)) :]
+
 
 PUSH_S = 0.1
 """Duration of a push, s."""
 
 PUSH_SHOWN_S = 0.6
-"""How long its arrow is shown, s."""
+"""Time for which its arrow is shown, s."""
 
 Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Robots:
-    """What a user may choose from.
+    """Selectable policies, grounds and effects.
 
     Attributes:
-        drivers: label -> what loads the policy, bundle or controller.
+        drivers: label -> loader of the policy, bundle or controller.
         grounds: by name.
         effects: by name, at size 1.
     """
@@ -66,31 +124,30 @@ class PushMade:
 
 
 class Session:
-    """One robot.
+    """One simulated robot.
 
-    What is asked for (``ask``) is checked before anything changes: what cannot be is refused in ``message``, and the
-    robot walks on as before.
+    A request (``ask``) is checked before anything changes: an invalid one is rejected in ``message``.
 
     Attributes:
-        robots: what there is to choose from.
+        robots: what can be selected.
         core: the environment.
-        setup: what the robot walks under.
-        label: who drives.
-        command: the velocity that is asked for.
+        setup: the conditions.
+        label: of the present policy.
+        command: the commanded velocity.
         rewards: names of the reward terms.
-        paused: whether time stands still.
+        paused: whether the simulation is paused.
         speed: simulated seconds per second.
         time: simulated seconds since the session began.
-        falls: how often the robot fell.
-        message: what a user must know, a line; empty for nothing.
+        falls: number of falls.
+        message: for the user, a line; empty for none.
         push: the last one.
     """
 
-    def __init__(self, robots: Robots, label: str, setup: Setup, velocity: wish.Velocity) -> None:
-        """Build the robot and put it at the start.
+    def __init__(self, robots: Robots, label: str, setup: Setup, velocity: requests.Velocity) -> None:
+        """Build the robot and reset it to the start.
 
         Raises:
-            ConfigError: if it cannot walk under ``setup``.
+            ConfigError: if the policy is incompatible with ``setup``.
         """
         self.robots, self.command = robots, velocity
         self._loaded: dict[str, Driver] = {}
@@ -112,24 +169,24 @@ class Session:
         return self._loaded[label]
 
     def task_of(self, label: str, setup: Setup) -> TaskConfig:
-        """Return the task in which a driver walks under ``setup``; raise ConfigError if it cannot."""
+        """Return the task of a policy under ``setup``; raise ConfigError if they are incompatible."""
         driver = self._driver(label)
         if problems := driver.problems(setup.trunk_velocity, "trunk_velocity"):
             raise ConfigError(problems)
         return task_under(driver.task, setup, self.robots.grounds, self.robots.effects)
 
     def _build(self, label: str, setup: Setup) -> None:
-        """Take another driver or setup; nothing changes unless all of it can be built."""
+        """Build another policy or setup; nothing changes unless all of it can be built."""
         task, driver = self.task_of(label, setup), self._driver(label)
         require_agreement(task)
         core = Go1Core(task, 1, setup.seed, noise=setup.noise, imu=True)
-        pilot = driver.begin(core, setup.trunk_velocity, setup.seed)
+        policy = driver.begin(core, setup.trunk_velocity, setup.seed)
         self._kicker = Kicker(core.backend, task.sim.physics_dt, one_push(math.nan, 0.0, 0.0))
         try:
-            self._estimate: Estimate | None = Estimate(core, setup.seed)
+            self._estimate: VelocityFilters | None = VelocityFilters(core, core.noise, setup.seed)
         except EstimatorError:
             self._estimate = None
-        self.core, self._pilot, self.label, self.setup = core, pilot, label, setup
+        self.core, self._policy, self.label, self.setup = core, policy, label, setup
         self._limit = np.maximum(robot.per_joint(task.robot.effort_limit), 1e-9)
         names = tuple(t.key for t in core.terms.rewards)
         widths = {"command": 3, "true": 3, "estimated": 3, "height": 1, "torque": 12, "contact": 4, "push": 1}
@@ -139,7 +196,7 @@ class Session:
         self.rewards = names
 
     def _begin(self) -> None:
-        """Put the robot at the start."""
+        """Reset the robot to the start."""
         core, setup = self.core, self.setup
         ground = self.robots.grounds[setup.ground]
         self._aim()
@@ -152,19 +209,19 @@ class Session:
         self._fresh()
 
     def _aim(self) -> None:
-        """Hand the command to the environment."""
+        """Set the environment's command."""
         self.core.command.value[:] = self.core.command.value.new_tensor(self.command)
 
     def _fresh(self) -> None:
-        """Forget what is only of the episode before."""
+        """Clear the state of the last episode."""
         self._since = 0.0
         if self._estimate is not None:
-            self._estimate.restart()
+            self._estimate.restart(0)
 
     def _hand_over(self, old: Go1Core) -> None:
-        """Go on from where the robot of ``old`` is: its pose, speed and target; drives and effects begin anew.
+        """Continue from pose, velocity and target of the robot of ``old``; actuator and effects are reset.
 
-        The first period of a policy's observations comes from holding the target that was in force.
+        The first observation of the policy comes from holding the last target for one period.
         """
         core, everyone = self.core, torch.ones(1, dtype=torch.bool)
         core.level.copy_(old.level)
@@ -179,43 +236,43 @@ class Session:
         held = clipped((old.target - nominal) / action.scale, action.clip)
         self._observation = core.step(held).observation
         if self._estimate is not None:
-            self._estimate.restart()
+            self._estimate.restart(0)
 
-    # ------------------------------------------------------------------ what is asked for
+    # ------------------------------------------------------------------ requests
 
-    def ask(self, request: wish.Request) -> None:
-        """Do what is asked, or say in ``message`` why not."""
+    def ask(self, request: requests.Request) -> None:
+        """Apply a request, or give the reason of its rejection in ``message``."""
         try:
             self._fulfil(request)
         except (ConfigError, Expected) as error:
             self.message = " ".join(str(error).split())
 
-    def _fulfil(self, request: wish.Request) -> None:
+    def _fulfil(self, request: requests.Request) -> None:
         match request:
-            case wish.Steer(velocity):
+            case requests.Command(velocity):
                 self.command = velocity
-            case wish.Push(impulse, direction):
+            case requests.Push(impulse, direction):
                 self._push(impulse, direction)
-            case wish.Pace(paused, speed):
+            case requests.Pace(paused, speed):
                 self.paused, self.speed = paused, speed
-            case wish.Step():
+            case requests.Step():
                 self._single = True
-            case wish.Reset():
+            case requests.Reset():
                 self._begin()
                 self.message = ""
-            case wish.Hand(label):
+            case requests.SelectPolicy(label):
                 self._exchange(label, self.setup)
-            case wish.Effects(sizes):
+            case requests.SetEffects(sizes):
                 self._exchange(self.label, dataclasses.replace(self.setup, sizes=dict(sizes)))
-            case wish.Conditions():
+            case requests.Conditions():
                 self._exchange(self.label, dataclasses.replace(self.setup, **dataclasses.asdict(request)))
-            case wish.Walk(ground, level, tile):
+            case requests.SelectGround(ground, level, tile):
                 self._build(self.label, dataclasses.replace(self.setup, ground=ground, level=level, tile=tile))
                 self._begin()
                 self.message = ""
 
     def _exchange(self, label: str, setup: Setup) -> None:
-        """Change who drives or what the robot walks under, while it walks."""
+        """Change policy or conditions while the robot moves."""
         old = self.core
         self._build(label, setup)
         self._aim()
@@ -241,18 +298,18 @@ class Session:
         return self.core.task.sim.policy_dt
 
     def due(self) -> bool:
-        """Return whether a period shall pass now: time runs, or a single step was asked for."""
+        """Return whether a period is due: the simulation runs, or a single step was requested."""
         return not self.paused or self._single
 
     def advance(self) -> None:
-        """Let one period of the policy pass.
+        """Simulate one period of the policy.
 
         Raises:
             NumericalFault: when a value is not finite.
         """
         self._single, core = False, self.core
         self._aim()
-        result = core.step(self._pilot(self._observation))
+        result = core.step(self._policy(self._observation))
         core.check(result)
         self._observation = result.observation
         self.time += self.dt
@@ -260,7 +317,7 @@ class Session:
         why = core.episode_end(result, 0)
         if why is not None:
             self.falls += bool(result.terminated[0])
-            self.message = f"{self.time:.1f} s: {why} after {self._since:.1f} s; it starts again"
+            self.message = f"{self.time:.1f} s: {why} after {self._since:.1f} s; reset"
             self._fresh()
         self._remember()
 
@@ -282,17 +339,17 @@ class Session:
         }
         if self._estimate is not None:
             gyro = core.plant.sense(s).base_ang_vel_b if core.plant.effects.senses else s.base_ang_vel_b
-            row["estimated"] = np.array([*self._estimate.velocity()[:2], float(gyro[0, 2])])
+            row["estimated"] = np.array([*self._estimate.velocities()[0, :2], float(gyro[0, 2])])
         self.history.add(row)
 
-    # ------------------------------------------------------------------ what is seen
+    # ------------------------------------------------------------------ display
 
     def qpos(self) -> Vector:
         """Return position, attitude and joint angles (19,)."""
         return np.asarray(self.core.backend.qpos[0].cpu().double().numpy())
 
     def trained_for(self) -> dict[str, tuple[float, float]]:
-        """Return the ranges of velocity that the policy was trained for, by the names of the command's parameters."""
+        """Return the trained ranges of velocity by the names of the command's parameters."""
         parameters = self._driver(self.label).task.command.parameters
         return {name: tuple(v) for name, v in parameters.items() if isinstance(v, tuple | list) and len(v) == 2}
 
@@ -302,6 +359,6 @@ class Session:
 
 
 def one_push(start: float, impulse: float, direction: float) -> Impulses:
-    """Return one push on one robot; a start that is NaN is none."""
+    """Return one push on one robot; none for a start of NaN."""
     begins, size, angle = (np.full((1, 1), v) for v in (start, impulse, direction))
     return Impulses(begins, size, angle, duration=PUSH_S)

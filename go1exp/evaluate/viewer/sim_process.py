@@ -1,51 +1,248 @@
-"""The robot of ``go1exp sim viewer=web`` in a process of its own, so that the page takes none of its time."""
+"""The robot of ``go1exp sim viewer=web``: a process of its own, which the page observes without delaying it."""
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import signal
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from go1exp import robot
 from go1exp.base.errors import Expected
 from go1exp.base.signals import ending
 from go1exp.config.schema.registry import ConfigError
-from go1exp.deploy.sim_robot.alone import Say
-from go1exp.deploy.sim_robot.machine import Body, Robot
+from go1exp.deploy.sim_robot.alone import Say, posture
+from go1exp.deploy.sim_robot.machine import TICK, Body, Robot
+from go1exp.deploy.sim_robot.server import GONE_S, Server
 from go1exp.deploy.sim_robot.settings import SimConfig
+from go1exp.evaluate.protocol.plan import Kicker, heading
 from go1exp.evaluate.viewer import requests as ask
-from go1exp.evaluate.viewer.sim_probe import EVERY, Frame, Probe
+from go1exp.evaluate.viewer.requests import active, catalogue
+from go1exp.evaluate.viewer.session import PushMade, one_push
+
+Array = NDArray[np.float64]
+
+EVERY = 5
+"""Ticks from row to row."""
+
+ROW_S = EVERY * TICK
+
+KEPT_S = 2.0
+"""Time that is kept for a page that does not ask, s; older rows are a gap in its curves."""
+
+TRUTH, TORQUE, FORCE = slice(0, 13), slice(13, 25), slice(25, 29)
+"""Columns of a row: the trunk's truth (``server.TRUTH``), torques, N m, and forces under the feet, N."""
+
+SUSPENDED = "the robot is suspended: its trunk cannot be pushed"
 
 SWITCH_S = 1e-4
-"""Longest time for which a thread that builds another robot may hold up the ticks of 2 ms, s; Python's own is 5 ms."""
+"""Thread switch interval of the robot's process, s: building another robot must not delay its ticks of 2 ms."""
 
 ENDS_S = 5.0
-"""How long the robot may take to end, s."""
-
-
-class Link(Protocol):
-    """The page's way to a robot."""
-
-    def send(self, request: ask.Request) -> None:
-        """Ask something of it."""
-
-    def look(self) -> Frame | None:
-        """Return the next frame if it has come, without waiting; raise ``requests.Ended`` after the last one."""
+"""Time that the robot's process is given to end, s."""
 
 
 @dataclass(frozen=True)
-class Listening:
-    """From the robot, when it is there: where it listens."""
+class Frame:
+    """State of the robot, and everything that has happened since the frame before.
 
-    address: tuple[str, int]
+    Attributes:
+        now: s on the clock of ``time.perf_counter``.
+        clock: of the robot, s.
+        qpos: (19,) position, attitude and joint angles.
+        first: number of the first row, counted since the start of the robot.
+        rows: (R, 29) in the columns above, ``ROW_S`` apart.
+        packets: (P, 3) of the client's packets: arrival, s; time since the packet before, s, NaN for a client's first
+            one; time between new commands, s, NaN for a packet that repeats the one before.
+        peer: address of the client; None before the first packet.
+        connected: whether a packet of the client has arrived in the last second.
+        states: sent so far.
+        lost: datagrams that the simulated network has lost.
+        refused: number of rejected datagrams by reason.
+        slipped: time by which the robot's clock is behind real time, s.
+        posture: what the robot does.
+        push: the last one, by the robot's clock.
+        message: for the user.
+        sizes: of the active effects, by name.
+    """
+
+    now: float
+    clock: float
+    qpos: Array
+    first: int
+    rows: NDArray[np.float32]
+    packets: Array
+    peer: str | None
+    connected: bool
+    states: int
+    lost: int
+    refused: dict[str, int]
+    slipped: float
+    posture: str
+    push: PushMade
+    message: str
+    sizes: dict[str, float]
+
+
+class Probe:
+    """Collects frames of a server's robot; pushes, resets and exchanges the robot on request."""
+
+    def __init__(self, server: Server, body: Body, config: SimConfig) -> None:
+        """Observe ``server``, whose robot was built from ``body`` and ``config``."""
+        self.server, self._body, self._config = server, body, config
+        self._effects, self._sizes = catalogue(body.effect, randomize=True)
+        self._builder: _Builder | None = None
+        self._rows: deque[NDArray[np.float32]] = deque(maxlen=round(KEPT_S / ROW_S))
+        self._packets: deque[tuple[float, float, float]] = deque(maxlen=round(KEPT_S / TICK))
+        self._count, self._peer, self._heard = 0, server.peer, math.nan
+        self._newest, self._changed = b"", math.nan  # the newest packet, and its first arrival
+        self._message, self._push = "", PushMade(-math.inf, 0.0, 0.0)
+        self._kicker = _kicker(server.robot)
+        server.on_heard, server.on_tick = self._hear, self._tick
+
+    def _hear(self, arrived: float, packet: bytes) -> None:
+        since = arrived - self._heard
+        if self.server.peer != self._peer or since > GONE_S:
+            since, self._changed, self._newest = math.nan, math.nan, b""
+        cycle = math.nan
+        if packet != self._newest:
+            cycle, self._changed, self._newest = arrived - self._changed, arrived, packet
+        self._packets.append((arrived, since, cycle))
+        self._peer, self._heard = self.server.peer, arrived
+
+    def _tick(self) -> None:
+        if self._builder is not None and self._builder.ready.is_set():
+            self._exchange(self._builder)
+            self._builder = None
+        if self.server.counts.ticks % EVERY:
+            return
+        now = self.server.robot.readings
+        parts = (self.server.robot.sense_truth(), now["tau_est"], now["foot_force"])
+        self._rows.append(np.concatenate(parts).astype(np.float32))
+        self._count += 1
+
+    def frame(self) -> Frame:
+        """Return what has happened since the call before."""
+        server, counts, now = self.server, self.server.counts, time.perf_counter()
+        rows = np.array(self._rows, np.float32).reshape(-1, FORCE.stop)
+        packets = np.array(self._packets, float).reshape(-1, 3)
+        self._rows.clear()
+        self._packets.clear()
+        return Frame(
+            now=now,
+            clock=server.robot.clock,
+            qpos=server.robot.pose(),
+            first=self._count - len(rows),
+            rows=rows,
+            packets=packets,
+            peer=None if server.peer is None else "{}:{}".format(*server.peer),
+            connected=now - self._heard < GONE_S,
+            states=counts.states,
+            lost=counts.lost,
+            refused=dict(counts.refused),
+            slipped=counts.slipped,
+            posture=posture(server.robot),
+            push=self._push,
+            message=self._message,
+            sizes={name: size for name, size in self._sizes.items() if size > 0.0},
+        )
+
+    def fulfil(self, requests: Iterable[ask.Request]) -> None:
+        """Push the robot, reset it or change its effects; other requests concern the client and are ignored."""
+        for request in requests:
+            match request:
+                case ask.Push(impulse, direction):
+                    self._pushed(impulse, direction)
+                case ask.Reset():
+                    self.server.robot.restart()
+                    self._message = ""
+                case ask.SetEffects(sizes):
+                    self._begin_exchange(dict(sizes))
+
+    def _pushed(self, impulse: float, direction: float) -> None:
+        if self._kicker is None:
+            self._message = SUSPENDED
+            return
+        self._kicker.use(one_push(self._kicker.time, impulse, direction))
+        angle = float(heading(self.server.robot.backend.qpos[:, 3:7])[0]) + direction
+        self._push = PushMade(self.server.robot.clock, impulse, angle)
+
+    def _begin_exchange(self, sizes: dict[str, float]) -> None:
+        """Build a robot with other effects in a thread; it takes over when it is ready."""
+        try:
+            effect = active(sizes, self._effects, self._body.actuator, self._body.contact)
+        except ConfigError as error:
+            self._message = " ".join(str(error).split())
+            return
+        self._message = "another robot is being built ..."
+        self._builder = _Builder(replace(self._body, effect=effect), self._config, sizes)
+
+    def _exchange(self, built: _Builder) -> None:
+        """Let the new robot continue from the state of the present one, between two ticks."""
+        if built.robot is None:
+            self._message = built.problem
+            return
+        built.robot.take_over(self.server.robot)
+        self.server.robot, self._kicker = built.robot, _kicker(built.robot)
+        self._sizes, self._message = built.sizes, ""
+
+
+class _Builder:
+    """Builds a robot in a thread, since that takes tens of ticks.
+
+    Attributes:
+        robot: None if it cannot be built.
+        problem: the reason.
+        sizes: of its effects.
+        ready: set at the end.
+    """
+
+    def __init__(self, body: Body, config: SimConfig, sizes: dict[str, float]) -> None:
+        self.robot: Robot | None = None
+        self.problem, self.sizes, self.ready = "", sizes, threading.Event()
+        threading.Thread(target=self._build, args=(body, config), daemon=True).start()
+
+    def _build(self, body: Body, config: SimConfig) -> None:
+        try:
+            self.robot = Robot(body, config)
+        except (ConfigError, Expected) as error:
+            self.problem = " ".join(str(error).split())
+        finally:
+            self.ready.set()
+
+
+def _kicker(made: Robot) -> Kicker | None:
+    """Return what pushes a robot; None for a suspended one."""
+    floats = made.backend.qpos.shape[1] > robot.NUM_JOINTS
+    return Kicker(made.backend, TICK, one_push(math.nan, 0.0, 0.0)) if floats else None
+
+
+# ---------------------------------------------------------------------- the page's side
+
+
+class Link(Protocol):
+    """Connection of the page to a robot."""
+
+    def send(self, request: ask.Request) -> None:
+        """Send a request of the user."""
+
+    def look(self) -> Frame | None:
+        """Return the next frame if it has arrived, without waiting; raise ``requests.Ended`` after the last one."""
 
 
 @dataclass(frozen=True)
 class Refused:
-    """From the robot, when it cannot be: why, in lines; and whether they are problems of the settings."""
+    """The robot could not be built: the reasons, and whether they are problems of the settings."""
 
     lines: tuple[str, ...]
     settings: bool
@@ -70,12 +267,12 @@ class RobotProcess:
         """Start it and wait until it listens.
 
         Args:
-            groups: the configuration of the groups of ``machine.Body``, as plain data that another process can get.
-            tile: on which it begins.
-            config: how it is set up.
+            groups: the configuration of the groups of ``machine.Body``, as plain data that can be pickled.
+            tile: row and column of the tile on which it begins.
+            config: its setup.
             address: where to listen.
-            seconds: how long it lives, s; None until it is closed.
-            say: prints a line of it; an importable function, since it is called in the other process.
+            seconds: how long it runs, s; None until it is closed.
+            say: prints a line; an importable function, since it is called in the other process.
 
         Raises:
             ConfigError: if its settings are refused.
@@ -84,13 +281,13 @@ class RobotProcess:
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         given = (other, dict(groups), tile, config, address, seconds, say)
-        self._process = context.Process(target=_live, args=given, daemon=True)
+        self._process = context.Process(target=_run, args=given, daemon=True)
         before = {number: signal.signal(number, signal.SIG_IGN) for number in ending()}
         try:
-            self._process.start()  # it inherits that it ignores them: Ctrl-C is for the page, which then ends it
+            self._process.start()  # it inherits that it ignores them: Ctrl-C ends the page, which then ends it
         finally:
-            for number, usual in before.items():
-                signal.signal(number, usual)
+            for number, handler in before.items():
+                signal.signal(number, handler)
         other.close()
         try:
             answer = self._pipe.recv()
@@ -99,23 +296,23 @@ class RobotProcess:
         if isinstance(answer, Refused):
             self.close()
             raise ConfigError(list(answer.lines)) if answer.settings else Expected("\n".join(answer.lines))
-        self.address: tuple[str, int] = answer.address
-        self._wishes: list[ask.Request] = []
-        self._asked = False
+        self.address: tuple[str, int] = answer
+        self._requests: list[ask.Request] = []
+        self._waiting = False
 
     def send(self, request: ask.Request) -> None:
-        """Ask something of it, with the next look."""
-        self._wishes.append(request)
+        """Send a request with the next look."""
+        self._requests.append(request)
 
     def look(self) -> Frame | None:
-        """Return the next frame if it has come, and ask for another one; see ``Link``."""
+        """Return the next frame if it has arrived, and ask for another one; see ``Link``."""
         try:
             frame: Frame | None = None
-            if self._asked and self._pipe.poll():
-                frame, self._asked = self._pipe.recv(), False
-            if not self._asked:
-                self._pipe.send(tuple(self._wishes))
-                self._wishes, self._asked = [], True
+            if self._waiting and self._pipe.poll():
+                frame, self._waiting = self._pipe.recv(), False
+            if not self._waiting:
+                self._pipe.send(tuple(self._requests))
+                self._requests, self._waiting = [], True
         except (EOFError, OSError):
             raise ask.Ended from None
         return frame
@@ -129,7 +326,7 @@ class RobotProcess:
             self._process.join()
 
 
-def _live(
+def _run(
     pipe: Connection,
     groups: dict[str, Any],
     tile: tuple[int, int],
@@ -138,11 +335,10 @@ def _live(
     seconds: float | None,
     say: Say,
 ) -> None:
-    """Be the robot until the page's end of the pipe is closed."""
+    """Run the robot until the page's end of the pipe is closed."""
     import torch
 
     from go1exp.deploy.sim_robot.alone import serve
-    from go1exp.deploy.sim_robot.server import Server
     from go1exp.sim.task import parse_parts
 
     torch.set_num_threads(1)
@@ -159,7 +355,7 @@ def _live(
     except (Expected, OSError) as error:
         pipe.send(Refused((f"address = {address[0]}:{address[1]}: {error}",), settings=False))
         return
-    pipe.send(Listening(server.address))
+    pipe.send(server.address)
     answering = Answering(Probe(server, body, config), pipe)
     try:
         serve(server, lambda: answering.going, say, seconds)
@@ -168,7 +364,7 @@ def _live(
 
 
 class Answering:
-    """Answers the page between two ticks.
+    """Answers the page between two ticks; never waits.
 
     Attributes:
         going: whether the page is still there.
@@ -186,8 +382,7 @@ class Answering:
             return
         try:
             if self._pipe.poll():
-                wishes: Sequence[ask.Request] = self._pipe.recv()
-                self._probe.fulfil(wishes)
+                self._probe.fulfil(self._pipe.recv())
                 self._pipe.send(self._probe.frame())
         except (EOFError, OSError):
             self.going = False

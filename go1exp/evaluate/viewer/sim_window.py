@@ -1,22 +1,238 @@
-"""The window of ``go1exp sim viewer=web``: who drives the robot and how well in time, pushes, and curves."""
+"""The window of ``go1exp sim viewer=web``: the robot's scene and curves, its client and the client's timing."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable
-from typing import Any
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
+import torch
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
+from numpy.typing import NDArray
 
 from go1exp import robot
+from go1exp.deploy.sim_robot.machine import TICK, Body
+from go1exp.deploy.sim_robot.server import TRUTH
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.curve_plots import PLAIN, TALL, Curves
 from go1exp.evaluate.viewer.drive_window import PUSH_KEY, SLOW
-from go1exp.evaluate.viewer.history import SPAN
-from go1exp.evaluate.viewer.panels import EffectsPanel, PushPanel
-from go1exp.evaluate.viewer.sim_show import SimView
-from go1exp.evaluate.viewer.window import MESSAGE_LINES, Vec2, Window, arrow_shape, paragraph, section
+from go1exp.evaluate.viewer.requests import catalogue, lines
+from go1exp.evaluate.viewer.session import PUSH_SHOWN_S, SPAN, History, PushMade
+from go1exp.evaluate.viewer.sim_process import FORCE, ROW_S, TORQUE, Frame, Link
+from go1exp.evaluate.viewer.walk import Arrow, Series, push_arrow, runs_of
+from go1exp.evaluate.viewer.window import (
+    MESSAGE_LINES,
+    EffectsPanel,
+    PushPanel,
+    Vec2,
+    Window,
+    arrow_shape,
+    paragraph,
+    section,
+)
+from go1exp.sim.env.camera import Stage
+from go1exp.sim.env.core import Go1Core
+from go1exp.sim.terrain import build_terrain
+
+LOOK_S = 1.0 / 30.0
+"""Period at which the robot is looked at, s."""
+
+Array = NDArray[np.float64]
+
+WIDTHS = {"height": 1, "velocity": 3, "torque": 12, "contact": 4}
+"""Columns of the curves."""
+
+MOST_POINTS = 1000
+"""Most intervals that are drawn: of a faster client the longest of each group."""
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """Times between packets of the last ``history.SPAN`` s.
+
+    Attributes:
+        t: times of arrival, 0 for now, s; thinned out.
+        interval: time since the packet before, ms; of each group the longest.
+        p50: median of all intervals, ms; NaN without any.
+        p99: ms.
+        worst: ms.
+    """
+
+    t: list[float]
+    interval: list[float]
+    p50: float
+    p99: float
+    worst: float
+
+
+@dataclass(frozen=True)
+class SimView:
+    """Content of the panels.
+
+    Attributes:
+        frame: the newest one.
+        t: times of the curves, 0 for now, s.
+        height: of the trunk over the ground, m; NaN for a suspended robot.
+        velocity: true forward, left, m/s, and yaw rate, rad/s, in the trunk's frame.
+        torque: twelve, over the limit.
+        contacts: contact intervals of each leg, s.
+        pushes: times of pushes, s.
+        arrows: in the scene.
+        every: intervals of all packets of the client.
+        new: intervals of packets that differ from the one before: the cycles of a client that repeats each command.
+        rate: packets received in the last second.
+        answers: states sent per second.
+        known: description of each known effect, by name.
+    """
+
+    frame: Frame
+    t: list[float]
+    height: list[float]
+    velocity: Series
+    torque: Series
+    contacts: tuple[tuple[tuple[float, float], ...], ...]
+    pushes: list[float]
+    arrows: tuple[Arrow, ...]
+    every: Intervals
+    new: Intervals
+    rate: int
+    answers: float
+    known: dict[str, str]
+
+
+class SimShow:
+    """Scene and curves of a robot that an external client commands.
+
+    Attributes:
+        model: the scene.
+        data: its state.
+    """
+
+    def __init__(self, link: Link, body: Body) -> None:
+        """Build the scene of the robot of ``link``."""
+        self._link, self._body = link, body
+        self._terrain = build_terrain(body.terrain)
+        task = SimpleNamespace(robot=body.robot, sim=SimpleNamespace(physics_dt=TICK), contact=body.contact)
+        free = {"qpos": torch.zeros(1, 19, dtype=torch.float64), "qvel": torch.zeros(1, 18, dtype=torch.float64)}
+        free["qpos"][0, 3] = 1.0
+        self._pose = free["qpos"]
+        core = SimpleNamespace(terrain=self._terrain, task=task, backend=SimpleNamespace(**free))
+        self._stage = Stage(cast(Go1Core, core))  # reads nothing else of an environment
+        self.model, self.data = self._stage.model, self._stage.data
+        self._limit = np.maximum(robot.per_joint(body.robot.effort_limit), 1e-9)
+        self._history = History(WIDTHS, ROW_S)
+        self._packets: deque[tuple[float, float, float]] = deque()
+        self._pushes: deque[PushMade] = deque(maxlen=20)
+        self._sent: deque[tuple[float, int]] = deque(maxlen=round(1.0 / LOOK_S))
+        self._known = lines(catalogue(body.effect, randomize=True)[0])
+        self._frame: Frame | None = None
+        self._fresh = False
+
+    def ask(self, request: ask.Request) -> None:
+        """Send a request of the user."""
+        self._link.send(request)
+
+    def tick(self) -> float:
+        """Take the robot's newest frame; return the time until the next call, s."""
+        frame = self._link.look()
+        if frame is not None:
+            self._take(frame)
+        return LOOK_S
+
+    def _take(self, frame: Frame) -> None:
+        history = self._history
+        for _ in range(min(frame.first - history.count, round(SPAN / ROW_S))):
+            history.add({})  # rows that the robot did not keep: a gap
+        history.count += max(0, frame.first - history.count)
+        for row in self._rows(frame.rows.astype(float)):
+            history.add(row)
+        self._packets.extend(map(tuple, frame.packets.tolist()))
+        while self._packets and self._packets[0][0] < frame.now - SPAN:
+            self._packets.popleft()
+        if frame.push.impulse and (not self._pushes or self._pushes[-1].time != frame.push.time):
+            self._pushes.append(frame.push)
+        self._sent.append((frame.now, frame.states))
+        self._frame, self._fresh = frame, True
+        self._pose[0] = torch.from_numpy(frame.qpos)
+        if self._stage.place(0):  # other ground around the robot: a new model shows it
+            self._stage = Stage(self._stage.core)
+            self._stage.place(0)
+            self.model, self.data = self._stage.model, self._stage.data
+
+    def _rows(self, rows: Array) -> list[dict[str, Array]]:
+        """Return the curves' rows of a frame's rows (R, 29)."""
+        truth = {name: rows[:, k] for k, name in enumerate(TRUTH)}
+        place = np.stack([truth["base_pos_x_w"], truth["base_pos_y_w"]], axis=1)
+        below = self._terrain.height_at(np.nan_to_num(place))
+        true = np.column_stack([*in_trunk(truth), truth["base_ang_vel_z_b"]])
+        torque, contact = np.abs(rows[:, TORQUE]) / self._limit, (rows[:, FORCE] > 0.0).astype(float)
+        height = truth["base_pos_z_w"] - below
+        together = zip(height, true, torque, contact, strict=True)
+        return [dict(zip(WIDTHS, map(np.atleast_1d, row), strict=True)) for row in together]
+
+    def view(self) -> SimView | None:
+        """Return the content of the panels; None if nothing has changed."""
+        if self._frame is None or not self._fresh:
+            return None
+        self._fresh = False
+        frame, h = self._frame, self._history
+        t = h.times().tolist()
+        curves: dict[str, Any] = {name: h.series(name).T for name in WIDTHS}
+        pushes = [p for p in self._pushes if frame.clock - p.time < SPAN]
+        new = pushes and frame.clock - pushes[-1].time < PUSH_SHOWN_S
+        arrows = (push_arrow(self.data.qpos[:3].copy(), pushes[-1].impulse, pushes[-1].angle),) if new else ()
+        arrived, since, cycle = np.array(self._packets, float).reshape(-1, 3).T
+        (begin, before), (end, states) = self._sent[0], self._sent[-1]
+        return SimView(
+            frame=frame,
+            t=t,
+            height=curves["height"][0].tolist(),
+            velocity=curves["velocity"].tolist(),
+            torque=curves["torque"].tolist(),
+            contacts=tuple(runs_of(t, column, h.dt) for column in curves["contact"]),
+            pushes=[p.time - frame.clock for p in pushes],
+            arrows=arrows,
+            every=intervals(arrived - frame.now, since),
+            new=intervals(arrived - frame.now, cycle),
+            rate=int((arrived > frame.now - 1.0).sum()),
+            answers=(states - before) / (end - begin) if end > begin else 0.0,
+            known=self._known,
+        )
+
+
+def intervals(at: Array, since: Array) -> Intervals:
+    """Return what is drawn of packets that came at ``at`` (P,), s, ``since`` (P,) s after others; NaNs are left out."""
+    known = np.isfinite(since)
+    all_ms = 1e3 * since[known]
+    p50, p99, worst = np.percentile(all_ms, (50, 99, 100)) if len(all_ms) else (np.nan,) * 3
+    t, drawn = longest(at[known], all_ms, MOST_POINTS)
+    return Intervals(t.tolist(), drawn.tolist(), float(p50), float(p99), float(worst))
+
+
+def longest(t: Array, values: Array, most: int) -> tuple[Array, Array]:
+    """Return at most ``most`` points (T,) of a curve: of each group of neighbours the one with the largest value."""
+    every = -(-len(t) // most)
+    if every <= 1:
+        return t, values
+    starts = range(0, len(t), every)
+    chosen = np.array([k + int(np.argmax(values[k : k + every])) for k in starts])
+    return t[chosen], values[chosen]
+
+
+def in_trunk(truth: dict[str, Array]) -> tuple[Array, Array]:
+    """Return the trunk's velocity forward and to the left, (R,) each, m/s, of columns of ``server.TRUTH``."""
+    w, x, y, z = (truth[f"base_quat_{part}"] for part in "wxyz")
+    a, b, c = (truth[f"base_lin_vel_{axis}_w"] for axis in "xyz")
+    # The first two columns of the attitude's matrix, times the velocity in the world.
+    forward = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c
+    left = 2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c
+    return forward, left
+
 
 PACKETS = 150.0
 """Height of the plot of intervals, pixels."""
@@ -25,11 +241,11 @@ LEAST_MS = 5.0
 """The axis of the intervals reaches at least as far, ms."""
 
 BEHIND_S = 0.001
-"""Time behind from which the robot is said to be late, s."""
+"""Time behind real time from which the panel reports it, s."""
 
 
 class SimWindow(Window):
-    """Panels for a robot that somebody else drives.
+    """Panels of a robot that an external client commands.
 
     Attributes:
         places: where controls are on the page, left, top, right, bottom, pixels.
@@ -38,12 +254,7 @@ class SimWindow(Window):
     def __init__(self) -> None:
         super().__init__("Robot", "Curves")
         self._push, self._effects = PushPanel(self.ask), EffectsPanel(self.ask)
-        self._plots = Curves()
-
-    @property
-    def places(self) -> dict[str, tuple[float, float, float, float]]:
-        """Where controls are on the page."""
-        return self._push.places
+        self._plots, self.places = Curves(), self._push.places
 
     def keys(self) -> None:
         """Answer keys."""
@@ -59,36 +270,37 @@ class SimWindow(Window):
     def left(self) -> None:
         """Draw the panels."""
         view: SimView = self.view
-        if imgui.Button("Put back"):
+        frame = view.frame
+        if imgui.Button("Reset"):
             self.ask(ask.Reset())
-        imgui.SetItemTooltip("into its first state (Backspace); its client is not told")
+        imgui.SetItemTooltip("to its initial state (Backspace); its client is not informed")
         imgui.SameLine()
         _, self.follow = imgui.Checkbox("follow", self.follow)
         imgui.SameLine()
-        imgui.TextUnformatted(f"{view.time:.1f} s")
-        paragraph(view.posture)
-        late = f"{1e3 * view.slipped:.0f} ms behind real time since it began" if view.slipped > BEHIND_S else ""
-        imgui.TextColored(SLOW, late)
-        paragraph(view.message, MESSAGE_LINES)
-        if section("Who speaks"):
-            self._speaker(view)
+        imgui.TextUnformatted(f"{frame.clock:.1f} s")
+        paragraph(frame.posture)
+        behind = f"{1e3 * frame.slipped:.0f} ms behind real time" if frame.slipped > BEHIND_S else ""
+        imgui.TextColored(SLOW, behind)
+        paragraph(frame.message, MESSAGE_LINES)
+        if section("Client"):
+            self._client(view)
         if section("Push"):
             self._push.draw()
         if section("Effects", is_open=False):
-            self._effects.draw(view.sizes, view.known)
+            self._effects.draw(frame.sizes, view.known)
 
-    def _speaker(self, view: SimView) -> None:
-        p = view.packets
-        if p.peer is None:
-            paragraph("nobody yet")
+    def _client(self, view: SimView) -> None:
+        frame = view.frame
+        if frame.peer is None:
+            paragraph("no client yet")
         else:
-            paragraph(p.peer if p.speaking else f"nobody; {p.peer} did")
-        rows = [("packets in, last 1 s", f"{p.rate}"), ("states out, per s", f"{p.answers:.0f}")]
-        for label, times in (("interval", p.every), ("new command", p.new)):
+            paragraph(frame.peer if frame.connected else f"no client; last: {frame.peer}")
+        rows = [("packets in, last 1 s", f"{view.rate}"), ("states out, per s", f"{view.answers:.0f}")]
+        for label, times in (("interval", view.every), ("new command", view.new)):
             spread = ((name, getattr(times, name)) for name in ("p50", "p99", "worst"))
             rows += [(f"{label} {name}, ms", "-" if math.isnan(v) else f"{v:.2f}") for name, v in spread]
-        rows += [("lost by the network", f"{p.lost}"), ("refused", f"{sum(p.refused.values())}")]
-        rows += [(f"  {why}", f"{count}") for why, count in p.refused.items()]
+        rows += [("lost by the network", f"{frame.lost}"), ("rejected", f"{sum(frame.refused.values())}")]
+        rows += [(f"  {why}", f"{count}") for why, count in frame.refused.items()]
         if not imgui.BeginTable("packets", 2, int(imgui.TableFlags.SizingStretchProp)):
             return
         for row in rows:
@@ -104,28 +316,27 @@ class SimWindow(Window):
         if section("Client's timing: every packet, new commands"):
             self._intervals(view)
         if section("True velocity"):
-            lines = list(zip(("forward m/s", "left m/s", "turn rad/s"), view.velocity, strict=True))
+            lines = list(zip(("forward m/s", "left m/s", "yaw rad/s"), view.velocity, strict=True))
             self._plots.plot("##velocity", "", view, lines, (-1.5, 1.5))
         if section("Contacts"):
             self._plots.contacts(view)
         if section("Trunk height"):
             self._plots.plot("##height", "m", view, [("height", view.height)], (0.0, 0.5))
-        if section("Torque over its limit"):
+        if section("Torque / limit"):
             lines = list(zip(robot.JOINTS, view.torque, strict=True))
             self._plots.plot("##torque", "-", view, lines, (0.0, 1.05), TALL)
 
     def _intervals(self, view: SimView) -> None:
         """Draw a point for each packet of the last seconds."""
-        p = view.packets
         if not implot.BeginPlot("##intervals", Vec2(-1.0, PACKETS), PLAIN | int(implot.Flags.NoTitle)):
             return
         implot.SetupAxes("", "ms", 0, 0)
         implot.SetupAxisLimits(int(implot.Axis.X1), -SPAN, 0.0, int(implot.Cond.Always))
-        top = 1.1 * max([LEAST_MS, *p.every.interval, *p.new.interval])
+        top = 1.1 * max([LEAST_MS, *view.every.interval, *view.new.interval])
         implot.SetupAxisLimits(int(implot.Axis.Y1), 0.0, top, int(implot.Cond.Always))
         outside = int(implot.LegendFlags.Horizontal) | int(implot.LegendFlags.Outside)
         implot.SetupLegend(int(implot.Location.North), outside)
-        for name, times in (("every packet", p.every), ("new command", p.new)):
+        for name, times in (("every packet", view.every), ("new command", view.new)):
             if times.t:
                 implot.PlotScatter(name, times.t, times.interval)
         implot.EndPlot()

@@ -1,4 +1,4 @@
-"""A session as something to show: the scene in which the robot stands, its pace, and what the panels draw."""
+"""A session in its scene, and the content of its panels."""
 
 from __future__ import annotations
 
@@ -12,28 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp.evaluate.viewer import requests as ask
-from go1exp.evaluate.viewer.conditions import Ground, Setup
-from go1exp.evaluate.viewer.effects import lines
+from go1exp.evaluate.viewer.requests import Ground, Setup, lines
 from go1exp.evaluate.viewer.session import PUSH_SHOWN_S, Session
 from go1exp.sim.env.camera import ARROW_SCALE, COMMAND_RGB, LEAST_DRAWN, MEASURED_RGB, VELOCITY_TIME, Stage
 
 VIEWS_PER_S = 25.0
-"""How often the panels get new curves."""
+"""Rate at which the panels get new curves, Hz."""
 
 PAUSED_S = 0.02
-"""Time from look to look while the robot stands still, s."""
+"""Time between two calls while paused, s."""
 
 PUSH_RGB, PUSH_SCALE = (1.0, 0.35, 0.2), 0.012
 """Colour of the arrow of a push; its length per impulse, m / (N s)."""
 
 FALLBACK = ((-1.5, 2.0), (-1.0, 1.0), (-1.5, 1.5))
-"""Range of the sliders where a run does not say which velocities it was trained for."""
+"""Range of the sliders of a run without trained ranges."""
 
 RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """Parameters of a command term that are ranges of velocity."""
 
 CURVE_POINTS = 250
-"""Points of a curve: it is drawn on about as many pixels, and each point is drawn anew in every picture."""
+"""Points of a curve: about one a pixel."""
 
 SPARK_POINTS = 100
 """Points of a reward's small curve."""
@@ -58,7 +57,7 @@ class Arrow:
 
 
 class Timed(Protocol):
-    """What every plot over the last seconds needs."""
+    """Data of the plots over the last seconds."""
 
     @property
     def t(self) -> list[float]:
@@ -66,7 +65,7 @@ class Timed(Protocol):
 
     @property
     def contacts(self) -> tuple[tuple[tuple[float, float], ...], ...]:
-        """Of each leg, from when to when it bore force, s."""
+        """Contact intervals of each leg, s."""
 
     @property
     def pushes(self) -> list[float]:
@@ -90,18 +89,18 @@ class Reward:
 
 @dataclass(frozen=True)
 class WalkView:
-    """What the panels draw.
+    """Content of the panels.
 
     Attributes:
-        label: who drives.
-        labels: who could.
-        setup: what the robot walks under.
-        grounds: that there are.
-        effects: that there are, each with what it is at size 1.
-        command: the velocity that is asked for.
+        label: of the present policy.
+        labels: of all policies.
+        setup: the conditions.
+        grounds: selectable ones.
+        effects: selectable ones, each with its description.
+        command: the commanded velocity.
         limits: of each of its axes.
-        pace: how time passes.
-        achieved: simulated seconds per second that it takes indeed.
+        pace: requested speed.
+        achieved: simulated seconds per second.
         time: simulated s.
         falls: so far.
         message: for the user.
@@ -112,7 +111,7 @@ class WalkView:
         estimated: three, or none.
         height: of the trunk over the ground, m.
         torque: twelve, over the limit.
-        contacts: of each leg, from when to when it bore force, s.
+        contacts: contact intervals of each leg, s.
         pushes: times of pushes, s.
         rewards: all.
         total: of all rewards, per second.
@@ -159,7 +158,7 @@ class WalkShow:
         self._place()
 
     def _place(self) -> None:
-        """Take the robot's pose into the scene; a new ground is a new model."""
+        """Set the robot's pose in the scene; a new ground is a new model."""
         if self._core is not self.session.core:
             old, self._core = getattr(self, "_stage", None), self.session.core
             if old is None or old.core.terrain.config != self._core.terrain.config:
@@ -173,12 +172,12 @@ class WalkShow:
             self.model, self.data = self._stage.model, self._stage.data
 
     def ask(self, request: ask.Request) -> None:
-        """Do what a user asks for."""
+        """Apply a request of the user."""
         self.session.ask(request)
         self._place()
 
     def tick(self) -> float:
-        """Let one period of the policy pass, if it is due; return how long that is in real time, s."""
+        """Simulate one period of the policy, if it is due; return its duration in real time, s."""
         if not self.session.due():
             return PAUSED_S
         self.session.advance()
@@ -187,10 +186,10 @@ class WalkShow:
         self._speed += (1.0 - math.exp(-s.dt / VELOCITY_TIME)) * (self._stage.data.qvel[:2] - self._speed)
         return s.dt / s.speed
 
-    # ------------------------------------------------------------------ what the panels draw
+    # ------------------------------------------------------------------ content of the panels
 
     def view(self) -> WalkView | None:
-        """Return what is to be drawn, at most ``VIEWS_PER_S`` times a second."""
+        """Return the content of the panels, at most ``VIEWS_PER_S`` times a second."""
         now = time.perf_counter()
         if now - self._shown < 1.0 / VIEWS_PER_S:
             return None
@@ -235,7 +234,7 @@ class WalkShow:
         return tuple((min(a, 0.0), max(b, 0.0)) for a, b in pairs)
 
     def _pace(self, now: float) -> float:
-        """Return how fast time passes, over about a second."""
+        """Return the speed of the simulation over about a second."""
         if now - self._clock >= 1.0:
             self._achieved = (self.session.time - self._then) / (now - self._clock)
             self._clock, self._then = now, self.session.time
@@ -274,7 +273,7 @@ def push_arrow(at: Vector, impulse: float, angle: float) -> Arrow:
 
 
 def runs_of(t: list[float], column: Vector, dt: float) -> tuple[tuple[float, float], ...]:
-    """Return from when to when a column of zeros and ones is one, s."""
+    """Return the intervals, s, in which a column of zeros and ones is one."""
     on = np.concatenate([[0.0], np.nan_to_num(column), [0.0]]) > 0.5
     edges = np.flatnonzero(on[1:] != on[:-1]).reshape(-1, 2)
     return tuple((t[a] - dt, t[b - 1]) for a, b in edges.tolist())

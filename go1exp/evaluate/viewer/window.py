@@ -1,9 +1,10 @@
-"""What every window of ours has: places for the panels, a camera that follows, the mouse, arrows in the scene."""
+"""Base of the viewer's windows: docked panels, a camera that follows, the mouse, arrows; and shared panels."""
 
 from __future__ import annotations
 
+import math
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import mujoco
@@ -12,6 +13,8 @@ from mujoco.studio import messages, plugin, ux
 from mujoco.studio.app import inputs
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
+from go1exp.evaluate.viewer import requests as ask
+from go1exp.evaluate.viewer.requests import LARGEST
 from go1exp.evaluate.viewer.walk import Arrow
 from go1exp.evaluate.viewer.web import Ask, Shown
 from go1exp.sim.env.camera import AZIMUTH, DISTANCE, ELEVATION
@@ -40,7 +43,7 @@ class Window(plugin.ViewerPlugin):
         self._docked = self._looking = False
         self._ux = ux.UxState()
 
-    # ------------------------------------------------------------------ what a subclass draws
+    # ------------------------------------------------------------------ to be overridden
 
     def left(self) -> None:
         """Fill the left panel."""
@@ -51,20 +54,20 @@ class Window(plugin.ViewerPlugin):
         raise NotImplementedError
 
     def keys(self) -> None:
-        """Answer keys."""
+        """Handle keys."""
 
     def scene(self) -> Iterable[Any]:
         """Return shapes (``MjvGeom``) beside the model's own."""
         return ()
 
     def sight(self) -> tuple[Any, float]:
-        """Return where to look at first, from the robot, m, and from how far, in distances of a clip's camera."""
+        """Return the camera's first target relative to the robot, m, and its distance, relative to that of a clip."""
         return np.zeros(3), 1.6
 
     # ------------------------------------------------------------------ messages
 
     def ask(self, request: Any) -> None:
-        """Send what a user asks for."""
+        """Send a request of the user."""
         self.viewer.send_to_sim(Ask(request))
 
     @messages.handler
@@ -85,7 +88,7 @@ class Window(plugin.ViewerPlugin):
         self.viewer.extra_geoms[:] = list(self.scene()) if self.view is not None else []
 
     def _look(self) -> None:
-        """Look at the robot once, then follow it or not."""
+        """Point the camera at the robot once, then follow it if wanted."""
         camera = self.viewer.camera
         if not self._looking:
             self._looking = True
@@ -114,7 +117,7 @@ class Window(plugin.ViewerPlugin):
             imgui.End()
 
     def _dock(self) -> None:
-        """Give the panels their places, once; the scene shows through between them."""
+        """Dock the panels, once."""
         flags = imgui.DockNodeFlags
         root = imgui.DockSpaceOverMainViewport(0, int(flags.PassthruCentralNode))
         if self._docked:
@@ -143,9 +146,9 @@ def arrow_shape(arrow: Arrow) -> Any:
 
 
 def paragraph(text: str, lines: int = 0) -> None:
-    """Write text over several lines, broken between words (ImGui's own breaks fall within them).
+    """Write text broken between words (ImGui breaks within words), over at least ``lines`` lines.
 
-    It takes the room of ``lines`` at least: what is below text that comes and goes must not jump from under the mouse.
+    The minimum keeps the controls below in place when the text changes.
     """
     columns = int(imgui.GetContentRegionAvail().x / imgui.CalcTextSize("n").x)
     broken = textwrap.wrap(text, max(columns, 10))
@@ -154,7 +157,7 @@ def paragraph(text: str, lines: int = 0) -> None:
 
 
 MESSAGE_LINES = 2
-"""Room for what a user must know, of ``paragraph``."""
+"""Lines reserved for the message to the user."""
 
 
 def section(label: str, is_open: bool = True) -> bool:
@@ -164,3 +167,73 @@ def section(label: str, is_open: bool = True) -> bool:
 
 
 __all__ = ["MESSAGE_LINES", "Vec2", "Window", "arrow_shape", "imgui", "paragraph", "section"]
+
+
+class PushPanel:
+    """Impulse, direction and button of a push.
+
+    Attributes:
+        places: where its button is on the page, left, top, right, bottom, pixels.
+    """
+
+    def __init__(self, send: Callable[[ask.Push], None]) -> None:
+        """Send pushes by ``send``."""
+        self._send, self._impulse, self._direction = send, 20.0, 90.0
+        self.places: dict[str, tuple[float, float, float, float]] = {}
+
+    def push(self) -> None:
+        """Push by the sliders' values."""
+        self._send(ask.Push(self._impulse, math.radians(self._direction)))
+
+    def draw(self) -> None:
+        """Draw sliders and button."""
+        imgui.SetNextItemWidth(-85.0)
+        _, self._impulse = imgui.SliderFloat("N s", self._impulse, 0.0, 60.0, "%.0f")
+        imgui.SetNextItemWidth(-85.0)
+        _, self._direction = imgui.SliderFloat("deg", self._direction, -180.0, 180.0, "%.0f")
+        imgui.SetItemTooltip("direction relative to the heading: 0 forward, 90 left")
+        if imgui.Button("Push (P)", Vec2(-1.0, 0.0)):
+            self.push()
+        low, high = imgui.GetItemRectMin(), imgui.GetItemRectMax()
+        self.places["push"] = (low.x, low.y, high.x, high.y)
+
+
+class ReleasedSlider:
+    """Sliders whose value is sent when they are released: the request takes time."""
+
+    def __init__(self) -> None:
+        self._draft: dict[str, float] = {}
+
+    def draw(self, label: str, now: float, high: float, shown: str, width: float = -85.0) -> float | None:
+        """Draw a slider from 0; return its value when it is released after a change."""
+        imgui.SetNextItemWidth(width)
+        changed, value = imgui.SliderFloat(label, self._draft.get(label, now), 0.0, high, shown)
+        if changed:
+            self._draft[label] = value
+        if imgui.IsItemDeactivatedAfterEdit():
+            return self._draft.pop(label, value)
+        if not imgui.IsItemActive():
+            self._draft.pop(label, None)
+        return None
+
+
+class EffectsPanel:
+    """Each effect on or off, and its size."""
+
+    def __init__(self, send: Callable[[ask.SetEffects], None]) -> None:
+        """Send the selection by ``send``."""
+        self._send, self._slider = send, ReleasedSlider()
+
+    def draw(self, sizes: Mapping[str, float], texts: Mapping[str, str]) -> None:
+        """Draw a checkbox and a slider for each effect of ``texts``, its description."""
+        for name, text in texts.items():
+            changed, on = imgui.Checkbox(f"##{name}", sizes.get(name, 0.0) > 0.0)
+            if changed:
+                self._send(ask.SetEffects({**sizes, name: 1.0 if on else 0.0}))
+            imgui.SameLine()
+            imgui.BeginDisabled(not sizes.get(name, 0.0) > 0.0)
+            size = self._slider.draw(name, sizes.get(name, 0.0), LARGEST, "%.2f", -130.0)
+            imgui.EndDisabled()
+            imgui.SetItemTooltip(text)
+            if size is not None:
+                self._send(ask.SetEffects({**sizes, name: size}))

@@ -1,10 +1,11 @@
-"""A controller for drives that take nothing but position targets at fixed gains."""
+"""Adapters of a controller: to actuators that take position targets alone, and to the runtime's loop."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from go1exp.evaluate.controller.types import Command, Controller, Drive, Sensed
+from go1exp.robot.messages import LowCmd, LowState
 
 
 class AsTargets:
@@ -34,3 +35,28 @@ class AsTargets:
         if drive.feedforward is not None:
             torque = torque + drive.feedforward
         return Drive(q + (torque + self._kd * qd) / self._kp, self._kp, self._kd)
+
+
+class Deployed:
+    """Gives a controller what the robot reports, and the drives what the controller says.
+
+    The loop must run at the controller's own rate.
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        """Walk by ``controller``."""
+        self._controller = controller
+
+    def step(self, velocity: np.ndarray, state: LowState, base_lin_vel: np.ndarray) -> LowCmd:
+        """Return the command of a cycle; arguments as those of ``go1exp.deploy.runtime.controller.Mover``."""
+        x, y, yaw = velocity.tolist()
+        sensed = Sensed(
+            joint_pos=state.joint_pos,
+            joint_vel=state.joint_vel,
+            quat=state.imu_quat,
+            gyro=state.imu_gyro,
+            velocity_b=base_lin_vel,
+            foot_force=state.foot_force,
+        )
+        drive = self._controller.step((x, y, yaw), sensed)
+        return LowCmd(drive.target, drive.kp, drive.kd, feedforward=drive.feedforward)
