@@ -47,7 +47,7 @@ demo: setup ## train for five minutes, judge the policy, film it, find what a lo
 	@echo "demo 3/4: go1exp play (half a minute)"
 	@$(BIN)/go1exp play run=runs/demo viewer=clip physics_dt=0.002
 	@echo "demo 4/4: go1exp gap, on recordings of a robot that is not quite like its model (a minute)"
-	@$(BIN)/go1exp gap logs=assets/demo/hung_go1 out=runs/demo/gap || [ $$? -eq 10 ]
+	@$(BIN)/go1exp gap logs=assets/demo/suspended_go1 out=runs/demo/gap || [ $$? -eq 10 ]
 
 # SLOW: none, all, or a commit: then the slow tests that are about a file changed since (tests/selection.py).
 SLOW ?= none

@@ -43,7 +43,7 @@ def trajectories(overrides: list[str]) -> dict[str, np.ndarray]:
     assert not problems, problems
     names = ("q", "qd", "tau_est", "gyro", "acc", "attitude", "foot_force")
     sensors = SensorConfig(rate_hz=500.0, jitter=0.0, dropped=0.0, truth=False, **dict.fromkeys(names, PERFECT))
-    wishes = plan.Wishes(((20.0, 0.5),), 10.0, SEEDS, 0, "hung", ((0.0, 0.0),), 0, sensors)
+    wishes = plan.Wishes(((20.0, 0.5),), 10.0, SEEDS, 0, "suspended", ((0.0, 0.0),), 0, sensors)
     terms = [Term(name, members("excitation")[name], {}) for name in MOTIONS]
     rig = simulate.Rig(**parts, physics_dt=0.001)
     made = simulate.play(rig, plan.episodes(terms, wishes), sensors, 0, lambda done, total: None)
@@ -55,7 +55,7 @@ def main() -> None:
     given = dict(a.split("=", 1) for a in sys.argv[1:])
     out, run, seconds = Path(given.get("out", "runs/paper_loop")), given["run"], given.get("seconds", "15")
     common = [*HIDDEN, f"seconds={seconds}", "physics_dt=0.001", f"out={out / 'recordings'}"]
-    walk = ["excitation=[policy]", f"run={run}", "support=hung", "episodes=4"]
+    walk = ["excitation=[policy]", f"run={run}", "support=suspended", "episodes=4"]
     commands.run("record", *common, *walk)
     commands.run("record", *common, "excitation=[multisine,steps,chirp,slow_ramps]", "seeds=[1,2,3,4,5]")
     taps = ["history=8", "period=0.004", "smoothing=0.02", "epochs=40", "half_net=false", "plots=false"]

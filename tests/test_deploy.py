@@ -110,21 +110,21 @@ def make_command(**changes: Any) -> LowCmd:
 # ---------------------------------------------------------------------- the simulated robot
 
 
-@pytest.mark.parametrize("start", ["standing", "lying", "hung"])
+@pytest.mark.parametrize("start", ["standing", "lying", "suspended"])
 def test_a_robot_begins_at_rest(file: str, start: str) -> None:
     made = Robot(bundle_task(file, {}), sim_config({"start": start, "noise": 0.0}))
     state, true = made.sense()
     assert np.abs(state.joint_vel).max() < 0.3
     np.testing.assert_allclose(np.linalg.norm(state.imu_acc), 9.81, rtol=0.02)
     assert (state.foot_force > 15.0).all() == (start == "standing")
-    assert np.isnan(true).all() == (start == "hung")
+    assert np.isnan(true).all() == (start == "suspended")
     height = {"standing": (0.25, 0.33), "lying": (0.04, 0.1)}.get(start)
     if height:
         assert height[0] < true[2] < height[1]
 
 
 def test_drives_obey_and_brake_when_nobody_speaks(file: str) -> None:
-    made = Robot(bundle_task(file, {}), sim_config({"start": "hung", "noise": 0.0}))
+    made = Robot(bundle_task(file, {}), sim_config({"start": "suspended", "noise": 0.0}))
     target = robot.NOMINAL_STANCE + 0.1
     made.apply(make_command(joint_target=target, kp=np.full(12, 40.0), kd=np.full(12, 1.0)))
     for _ in range(500):
@@ -245,7 +245,7 @@ def test_a_robot_without_gains_is_refused(file: str, make_net: Callable[..., Pat
 
 
 def test_a_torque_that_is_fed_forward_moves_a_joint_until_nobody_speaks(file: str) -> None:
-    one = Robot(bundle_task(file, {}), sim_config({"start": "hung", "noise": 0.0}))
+    one = Robot(bundle_task(file, {}), sim_config({"start": "suspended", "noise": 0.0}))
     limp = make_command(kp=np.zeros(12), kd=np.zeros(12))
     one.apply(dataclasses.replace(limp, feedforward=np.tile([0.0, 0.0, 5.0], 4)))
     before = one.sense()[0].joint_pos
@@ -986,7 +986,7 @@ def test_the_bench_measures_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_motion_of_a_hung_robot_becomes_a_recording_for_gap(file: str, tmp_path: Path) -> None:
     motion = played("chirp", 1.0, 250.0, (35.0, 0.7), 3)
-    job = {"mover": motion, "motion": motion.name, "gains": motion.gains, "sim": {"start": "hung", "noise": 0.0}}
+    job = {"mover": motion, "motion": motion.name, "gains": motion.gains, "sim": {"start": "suspended", "noise": 0.0}}
     done = play(file, tmp_path, job=job, rate=motion.rate, seconds=motion.seconds)
     assert done.output[-1] == f"walked for {motion.seconds:.1f} s, to the end"
     meta = done.recording.meta

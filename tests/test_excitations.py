@@ -65,7 +65,7 @@ def test_it_stays_within_the_limits_of_any_robot(name: str, joints: int) -> None
             assert np.all((motion.target >= limits[:, 0]) & (motion.target <= limits[:, 1]))
             np.testing.assert_array_equal(motion.start, motion.target[0])
             np.testing.assert_allclose(motion.start, centre, atol=1e-12)
-            assert motion.support in ("hung", "ground", "either")
+            assert motion.support in ("suspended", "ground", "either")
             assert motion.height >= 0
 
 

@@ -49,7 +49,7 @@ def test_the_bundled_case_is_what_the_generator_makes() -> None:
     """It hides dry friction at the thighs; its README says how it was made."""
     case = cases.make("single", 2, 5, 6, 3.0, ("coulomb",))
     fresh = {r.meta.episode: r for r in generate.recordings(case)}
-    bundled = read_folder(data_root() / "assets/demo/hung_go1")
+    bundled = read_folder(data_root() / "assets/demo/suspended_go1")
     assert {r.meta.episode for r in bundled} == set(fresh)
     for recording in bundled:
         assert recording.meta == fresh[recording.meta.episode].meta

@@ -16,7 +16,7 @@ from go1exp.gap.result import EXIT_CODES, GapResult, NamedEffect
 from go1exp.logs.recording import Recording, RecordingError, write
 from tests.test_gap_report import answer
 
-DEMO = sorted(Path("assets/demo/hung_go1").glob("*.parquet"))
+DEMO = sorted(Path("assets/demo/suspended_go1").glob("*.parquet"))
 
 
 def named_so(path: Path, episode: str, repeat_of: str | None = None) -> Path:

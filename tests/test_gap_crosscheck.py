@@ -52,7 +52,7 @@ def library(names: tuple[str, ...], values: dict[str, cases.Values], episode: Ep
         assert found == []
         assert term is not None
         terms.append(term)
-    motion = Motion(episode.target, episode.on, episode.target[0].copy(), "hung")
+    motion = Motion(episode.target, episode.on, episode.target[0].copy(), "suspended")
     one = plan.Episode("e", "steps", motion, episode.kp, episode.kd, episode.hang, None, 0)
     (recording,) = play(
         dataclasses.replace(rig, effect=tuple(terms)), [one], settings.sensors, 0, lambda done, total: None

@@ -32,7 +32,7 @@ def rehearsal() -> Rehearsal:
     from go1exp.robot import NOMINAL_STANCE
 
     attitude = Attitude(0.0, 0.26, held_quat((0.0, 0.26)))
-    motion = always_on(np.tile(NOMINAL_STANCE, (100, 1)), "hung")
+    motion = always_on(np.tile(NOMINAL_STANCE, (100, 1)), "suspended")
     flat = np.zeros((100, 12))
     design = Design("gait", {}, 1.0, (1.0, 2.0), attitude, 3)
     return Rehearsal(design, motion, np.full(12, 20.0), np.full(12, 1.0), flat, flat, Used(0.1, 0.1, 0.1, 1.0))

@@ -454,7 +454,7 @@ def test_playback_holds_targets_and_sorts_joints(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion.target[:, 1:], np.tile(NOMINAL_STANCE[1:], (400, 1)))
     assert motion.torque_enable[:125].all()
     assert not motion.torque_enable[125:].any()
-    assert motion.support == "hung"
+    assert motion.support == "suspended"
 
 
 @pytest.mark.parametrize(

@@ -163,7 +163,7 @@ def test_regimes_of_the_ground_follow_the_feet() -> None:
 
 def test_hung_windows_among_standing_ones_are_replayed_as_by_themselves() -> None:
     config, recordings = recorded("excitation=[squat,gait]")
-    _, hung = recorded("excitation=[chirp]", "support=hung")
+    _, hung = recorded("excitation=[chirp]", "support=suspended")
     assert isinstance(HungGo1(config).suited((*recordings, *hung)), StandingGo1)
     assert isinstance(HungGo1(config).suited(hung), HungGo1)
     replayer, dt = ready(config, (*recordings, *hung))

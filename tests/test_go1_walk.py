@@ -312,7 +312,7 @@ def test_a_robot_holds_its_pose_until_a_command_and_brakes_when_nobody_speaks(fi
 
 def test_raw_foot_sensors_have_a_zero_and_a_scale_each(file: str) -> None:
     counts = {}
-    for start in ("hung", "standing"):
+    for start in ("suspended", "standing"):
         made = server(file, start=start, feet="raw", seed=3)
         with speakers(1) as (client,):
             client.sendto(wire.IDLE, ("127.0.0.1", made.port))
@@ -320,8 +320,8 @@ def test_raw_foot_sensors_have_a_zero_and_a_scale_each(file: str) -> None:
             counts[start] = wire.unpack_state(client.recv(1000), 0.0, 0.0).foot_force
         force = made.robot.sense()[0].foot_force
         made.close()
-    assert ((counts["hung"] >= 100) & (counts["hung"] < 130)).all()
-    scale = (counts["standing"] - counts["hung"]) / force
+    assert ((counts["suspended"] >= 100) & (counts["suspended"] < 130)).all()
+    scale = (counts["standing"] - counts["suspended"]) / force
     assert ((scale > 0.45) & (scale < 1.55)).all()
     assert np.ptp(scale) > 0.1
 

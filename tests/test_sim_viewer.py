@@ -107,7 +107,7 @@ def test_a_push_moves_the_robot_where_it_points_and_is_marked(here: Here) -> Non
 
 
 def test_a_robot_that_hangs_cannot_be_pushed_and_is_shown_in_the_air() -> None:
-    made = Here(start="hung")
+    made = Here(start="suspended")
     made.show.ask(ask.Push(20.0, 0.0))
     view = made.live(0.1)
     made.close()

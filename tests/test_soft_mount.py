@@ -277,7 +277,7 @@ def test_a_free_trunk_has_no_mount() -> None:
 @cache
 def replayer() -> Replayer:
     """Four windows of one recording of a Go1 that hangs."""
-    machine, recordings = hung(task().robot), read_folder(data_root() / "assets/demo/hung_go1")[:1]
+    machine, recordings = hung(task().robot), read_folder(data_root() / "assets/demo/suspended_go1")[:1]
     windows = machine.windows(Ready(tuple(recordings), GapSettings(stride_s=0.4)))
     return machine.replayer(windows, np.tile(LEVEL, (len(windows), 1)), 64, 1)
 

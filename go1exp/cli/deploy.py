@@ -126,8 +126,8 @@ def _motion(settings: DeploySettings, controlled: bool) -> PlayedMotion | None:
         return None
     if controlled:
         raise ConfigError(["controller=mpc: walks; motion moves a robot that hangs. Leave out one of them"])
-    if settings.robot == "sim" and settings.sim.start != "hung":
-        raise ConfigError([f"motion = {settings.motion!r}: is for a robot that hangs; add sim.start=hung"])
+    if settings.robot == "sim" and settings.sim.start != "suspended":
+        raise ConfigError([f"motion = {settings.motion!r}: is for a suspended robot; add sim.start=suspended"])
     from go1exp.logs.record.motions import played
 
     return played(settings.motion, settings.seconds, settings.rate, settings.gains, settings.sim.seed)

@@ -33,7 +33,7 @@ def _task(container: dict[str, Any]) -> int:
     problems = actuator_problems(parts["actuator"], parts["effect"], go1.JOINTS)
     if not isinstance(parts["model"], Go1Model):
         problems.append("model: the simulated robot is a Go1; only model.tolerances can be changed here")
-    if settings.support != "hung":
+    if settings.support != "suspended":
         problems.append(f"support = {settings.support!r}: designs are for a robot that is hung")
     if any(m.entry.traits.get("closed_loop") for m in parts["excitation"]):
         problems.append("excitation: motions only; a policy or a controller walks on the ground")

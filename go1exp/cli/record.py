@@ -124,7 +124,7 @@ def _record_policy(rig: Rig, run: Path, settings: RecordSettings) -> list[Record
 
     config, policy, _ = load_run(run)
     names = [f"policy_{settings.seed}_{k}" for k in range(settings.episodes)]
-    hang = settings.hang[0] if settings.support == "hung" else None
+    hang = settings.hang[0] if settings.support == "suspended" else None
     walk = simulate.Walk(config.task, policy, names, settings.seconds, hang)
     show = spinner(1, "recording a policy")
     return simulate.play_policy(rig, walk, settings.sensors, settings.seed, show)
@@ -137,8 +137,8 @@ def _misfits(settings: RecordSettings, parts: dict[str, Any]) -> list[str]:
     wrong = []
     if parts["controller"].name != MPC:
         wrong.append(f"controller.name = {parts['controller'].name!r}: excitation=[mpc] needs controller=mpc")
-    if settings.support == "hung":
-        wrong.append("support = 'hung': excitation=[mpc] walks on the ground; use support=auto")
+    if settings.support == "suspended":
+        wrong.append("support = 'suspended': excitation=[mpc] walks on the ground; use support=auto")
     solver()
     return wrong
 

@@ -63,7 +63,7 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--out", default="runs/deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
-    sim.add_argument("--start", choices=("standing", "lying", "hung"), default="standing")
+    sim.add_argument("--start", choices=("standing", "lying", "suspended"), default="standing")
     sim.add_argument("--noise", type=float, default=1.0, help="times that of the paper's Table II")
     sim.add_argument("--delay", type=float, default=0.0, help="of datagrams, each way, s")
     sim.add_argument("--jitter", type=float, default=0.0, help="largest further delay of each datagram, s")

@@ -87,7 +87,7 @@ class Robot:
                 [f"actuator = {name}: has no kp and kd, which the runtime commands with every target; use actuator=pd"]
             )
         self._config, self._rng = config, np.random.default_rng(config.seed)
-        held = (1.0, 0.0, 0.0, 0.0) if config.start == "hung" else None
+        held = (1.0, 0.0, 0.0, 0.0) if config.start == "suspended" else None
         terrain = build_terrain(task.terrain if isinstance(task, Body) else TerrainConfig())
         self._origin = _origin(terrain, task.tile if isinstance(task, Body) else (0, 0))
         model, blocks = build_model(task.robot, terrain, TICK, contact=task.contact, imu=True, held=held)
@@ -135,7 +135,7 @@ class Robot:
         joints = np.tile(LYING, robot.NUM_LEGS) if start == "lying" else robot.NOMINAL_STANCE
         qpos, qvel = torch.zeros_like(plant.backend.qpos), torch.zeros_like(plant.backend.qvel)
         qpos[:, -robot.NUM_JOINTS :] = torch.as_tensor(joints)
-        if start != "hung":
+        if start != "suspended":
             qpos[:, :3] = torch.as_tensor(self._origin)
             qpos[:, 2] += LYING_HEIGHT if start == "lying" else robot.NOMINAL_HEIGHT
             qpos[:, 3] = 1.0

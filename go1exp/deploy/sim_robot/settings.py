@@ -28,7 +28,7 @@ class SimConfig:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    start: Literal["standing", "lying", "hung"] = "standing"
+    start: Literal["standing", "lying", "suspended"] = "standing"
     noise: NonNegative = 1.0
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.0

@@ -34,7 +34,7 @@ class FitSettings:
         share: ``all``, one net for all joints (the paper's way), ``kind``, one each for hip, thigh and calf, or
             ``none``, one per joint.
         target: ``tau_est``, what the drive reports, or ``joint_torque``, by inverse dynamics (``go1exp fit-actuator``:
-            of a hung Go1).
+            of a suspended Go1).
         smoothing: window over which the inputs' angle and speed are smoothed first, s; None takes them as measured.
         epochs: passes over the training rows, at most; the learning rate falls to zero over them (cosine).
         batch: rows per step.

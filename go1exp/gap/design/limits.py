@@ -90,7 +90,9 @@ def limits_of(robot: Robot, windows: Windows, targets: Sequence[np.ndarray], saf
         DesignError: if the robot's base is not held.
     """
     if not isinstance(robot, Movable):
-        raise DesignError("gap next designs motions of a robot whose base is held; record it hung (support=hung)")
+        raise DesignError(
+            "gap next designs motions of a robot whose base is held; record it suspended (support=suspended)"
+        )
     been = windows.y[:, :, 0][windows.valid]
     sent = np.concatenate(targets)
     reach = np.stack([np.minimum(been.min(0), sent.min(0)), np.maximum(been.max(0), sent.max(0))], axis=1)

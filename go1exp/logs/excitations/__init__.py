@@ -3,7 +3,7 @@
 Importing the package registers every excitation, from this explicit list.
 """
 
-from go1exp.logs.excitations import ground, hung, switched
+from go1exp.logs.excitations import ground, suspended, switched
 from go1exp.logs.excitations.motion import ExcitationError, Motion
 
-__all__ = ["ExcitationError", "Motion", "ground", "hung", "switched"]
+__all__ = ["ExcitationError", "Motion", "ground", "suspended", "switched"]

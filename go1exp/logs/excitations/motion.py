@@ -30,7 +30,7 @@ class Motion:
         target: joint angles (T, J), rad; row i is in force from ``t[i]`` to ``t[i + 1]``.
         torque_enable: (T,) bool; false while the drives are off.
         start: joint angles (J,) at t = 0, rad.
-        support: ``hung``, on the ``ground``, or ``either``.
+        support: ``suspended``, on the ``ground``, or ``either``.
         height: height of the base above its standing height at the start, m; for drops.
         soft_start: each time the drives come back on, the player should blend from the measured angles to ``target``
             within this time, s. Without that the joints are pulled back at once. ``target`` rests at the centre
@@ -40,12 +40,12 @@ class Motion:
     target: np.ndarray
     torque_enable: np.ndarray
     start: np.ndarray
-    support: Literal["hung", "ground", "either"]
+    support: Literal["suspended", "ground", "either"]
     height: float = 0.0
     soft_start: float = 0.0
 
 
-def always_on(target: np.ndarray, support: Literal["hung", "ground", "either"], height: float = 0.0) -> Motion:
+def always_on(target: np.ndarray, support: Literal["suspended", "ground", "either"], height: float = 0.0) -> Motion:
     """Return a motion with drives on throughout that starts at its first target."""
     return Motion(target, np.ones(len(target), dtype=bool), target[0].copy(), support, height)
 

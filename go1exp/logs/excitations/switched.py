@@ -1,4 +1,4 @@
-"""Motions with sudden changes: steps of the target, and drives switched off. The robot is hung."""
+"""Motions with sudden changes: steps of the target, and drives switched off. The robot is suspended."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def steps(
             now += rng.uniform(*turn)
         edges.add_jump(now, group, centre)
         now += rng.uniform(*turn)
-    return always_on(np.clip(edges.targets(t - t[0]), limits[:, 0], limits[:, 1]), "hung")
+    return always_on(np.clip(edges.targets(t - t[0]), limits[:, 0], limits[:, 1]), "suspended")
 
 
 class _Edges:
@@ -188,4 +188,4 @@ def torque_off(
         times, poses = [0.0, 1.0], [centre, centre]
     target = glide(t - t[0], np.array(times), np.stack(poses))
     target = np.clip(target, limits[:, 0], limits[:, 1])
-    return Motion(target, enabled, target[0].copy(), "hung", soft_start=move / 2)
+    return Motion(target, enabled, target[0].copy(), "suspended", soft_start=move / 2)

@@ -65,7 +65,7 @@ def playback(
 ) -> Motion:
     """Play the targets of a file, such as the one of ``go1exp gap next``; each holds until the next.
 
-    A longer recording holds the last target, a shorter one leaves the rest out. The robot is hung.
+    A longer recording holds the last target, a shorter one leaves the rest out. The robot is suspended.
 
     Args:
         t: when commands are sent (T,), s.
@@ -92,7 +92,7 @@ def playback(
         raise ExcitationError(f"{path}: {order[j]} goes from {reach}; allowed is [{low:.3g}, {high:.3g}] rad")
     enabled = table[FLAG][rows] > 0.5 if FLAG in table else np.ones(len(t), dtype=bool)
     target = target.clip(limits[:, 0], limits[:, 1])
-    return Motion(target, enabled, target[0].copy(), "hung")
+    return Motion(target, enabled, target[0].copy(), "suspended")
 
 
 @excitation("policy", closed_loop=True)
@@ -135,13 +135,15 @@ class PlayedMotion:
     """
 
     def __init__(self, name: str, motion: Motion, rate: float, gains: Gains) -> None:
-        """Take a motion of a hung robot, whose rows are ``1 / rate`` s apart.
+        """Take a motion of a suspended robot, whose rows are ``1 / rate`` s apart.
 
         Raises:
-            ConfigError: if the motion is not for a hung robot, or has the drives off at times.
+            ConfigError: if the motion is not for a suspended robot, or has the drives off at times.
         """
         if motion.support == "ground":
-            raise ConfigError([f"motion = {name!r}: is for a robot on the ground; deploy plays what a hung one can do"])
+            raise ConfigError(
+                [f"motion = {name!r}: is for a robot on the ground; deploy plays what a suspended one can do"]
+            )
         if not motion.torque_enable.all():
             raise ConfigError([f"motion = {name!r}: has the drives off at times, which a robot here cannot be told"])
         self.name, self.rate, self.gains = name, rate, gains
@@ -173,7 +175,7 @@ def played(
         seed: of an excitation's random numbers.
 
     Raises:
-        ConfigError: if there is no such motion, it is not for a hung robot, or it does not fit into memory.
+        ConfigError: if there is no such motion, it is not for a suspended robot, or it does not fit into memory.
         go1exp.logs.excitations.ExcitationError: if the file is no table of targets, or leaves the joints' range.
     """
     table = written(Path(wish)) if wish.endswith(".csv") else None

@@ -61,8 +61,8 @@ class Wishes:
         seconds: length of a recording, s.
         seeds: seeds of the motions; one recording of each.
         repeats: times that the first recording of each pair of gains is repeated under the same commands.
-        support: hung, ground, or auto, which is what the motion asks for and otherwise hung.
-        hang: pairs of roll and pitch of a hung trunk, rad; every hung motion is recorded at each.
+        support: suspended, ground, or auto, which is what the motion asks for and otherwise suspended.
+        hang: pairs of roll and pitch of a suspended trunk, rad; every suspended motion is recorded at each.
         seed: seed of the logger's noise, of drawn effects and of a policy's commands.
         sensors: the logger.
     """
@@ -73,7 +73,7 @@ class Wishes:
     seconds: Positive
     seeds: tuple[Annotated[int, Field(ge=0)], ...]
     repeats: Annotated[int, Field(ge=0)]
-    support: Literal["auto", "hung", "ground"]
+    support: Literal["auto", "suspended", "ground"]
     hang: tuple[tuple[float, float], ...]
     seed: Annotated[int, Field(ge=0)]
     sensors: SensorConfig
@@ -130,7 +130,7 @@ def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
         ConfigError: if a motion cannot be made on the wanted base, two episodes would have one name, or so many do not
             fit into memory.
     """
-    if terms:  # as many as there are at least: where a motion is hung is not known yet
+    if terms:  # as many as there are at least: where a motion is suspended is not known yet
         sets = len(wishes.gains)
         refuse_too_long(wishes, "repeats", wishes.repeats, sets, sets * len(terms) * len(wishes.seeds))
     planned: list[Episode] = []

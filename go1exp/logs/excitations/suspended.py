@@ -1,4 +1,4 @@
-"""Smooth motions over a range of frequencies and speeds. All except the gait need a hung robot, its feet in the air.
+"""Smooth motions over a range of frequencies and speeds. All except the gait need a suspended robot.
 
 Joints differ in phase, frequency and level, so that forces between joints can be told from forces of the joint itself.
 """
@@ -58,7 +58,7 @@ def chirp(
     ]
     fastest = 2 * np.pi * first * (last / first) ** (time[:, None] / duration) * spread(amplitude, joints)
     wave_in_reach = np.stack(wave, axis=1) / np.hypot(1, fastest / speed)
-    return always_on(swing(t, wave_in_reach, amplitude, centre, limits, fade), "hung")
+    return always_on(swing(t, wave_in_reach, amplitude, centre, limits, fade), "suspended")
 
 
 SWEEP_SPREAD = 0.04
@@ -108,7 +108,7 @@ def multisine(
         # the lowest crest factor: the most energy within a given range of angles
         best = min(sums, key=lambda x: float(np.max(np.abs(x))))
         wave[:, joint] = best / np.max(np.abs(best))
-    return always_on(swing(t, wave, amplitude, centre, limits, fade), "hung")
+    return always_on(swing(t, wave, amplitude, centre, limits, fade), "suspended")
 
 
 def _spaced_lines(rng: np.random.Generator, band: tuple[float, float], lines: int) -> np.ndarray:
@@ -167,7 +167,7 @@ def slow_ramps(
             levels += [level, level]
             side = -side
         target[:, joint] = np.interp(t - t[0], times, levels)
-    return always_on(np.clip(target, limits[:, 0], limits[:, 1]), "hung")
+    return always_on(np.clip(target, limits[:, 0], limits[:, 1]), "suspended")
 
 
 @excitation("gait", smooth=True)
