@@ -295,7 +295,7 @@ def test_settings_that_do_not_fit_are_refused(capsys: pytest.CaptureFixture[str]
         ("physics_dt=0.0015",): "physics_dt = 0.0015: 1 / sensors.rate_hz = 0.002 must be a multiple of it",
         ("gains=[]",): "gains = []: at least one is needed",
         ("excitation=[policy]",): "run: required for excitation=[policy]",
-        ("support=ground",): "chirp is for a robot that is hung",
+        ("support=ground",): "chirp is for a robot that is suspended",
         ("effect=nope.yaml",): "effect=nope.yaml: no such file",
         ("sensors.q.noise=-1",): "sensors.q.noise = -1",
     }

@@ -21,7 +21,7 @@ def _task(container: dict[str, Any]) -> None:
     plugins.installed()
     settings = parse(ListSettings, container)
     choices = _choices()
-    known = [*registry.groups(), *(g for g in choices if g not in registry.groups())]
+    known = sorted({*registry.groups(), *choices})
     wanted = settings.group
     if wanted is not None and wanted not in known:
         wanted = wanted.removesuffix("s")  # effects as well as effect

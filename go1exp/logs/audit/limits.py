@@ -115,8 +115,8 @@ DELAY_POWER = 0.6
 """Share of the acceleration left unexplained by angle, speed and neighbours that the command must explain: below it
 the delay is not given."""
 DELAY_FACTOR = 2.5
-"""Factor on the jackknife error of a delay. On simulated suspended Go1s without delay, the error was up to five times
-that on chirps and slow ramps (forces of other joints), and by about one on steps and sums of sines."""
+"""Factor on the jackknife error of a delay. On simulated suspended Go1s without delay, the true error was up to five
+times that on chirps and slow ramps (forces of other joints), and about once that on steps and sums of sines."""
 DELAY_SAMPLES = 0.25
 """Samples; error of a delay because motion between samples is not known (measured: a fifth of a sample at 50 Hz)."""
 DELAY_ERROR = 4e-3
