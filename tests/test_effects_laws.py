@@ -26,7 +26,7 @@ from go1exp.config.schema.registry import Term, bind
 from go1exp.deploy.runtime import go1_wire
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.robot.messages import LowCmd
-from go1exp.sim.actuator.envelope import envelope
+from go1exp.sim.actuator.motors import envelope
 from go1exp.sim.effects.base import Effect
 from go1exp.sim.env.plant import Plant, actuator_setup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu

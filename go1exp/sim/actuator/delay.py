@@ -6,15 +6,37 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
 from go1exp.base.tensors.memory import DelayLine
-from go1exp.config.schema.registry import actuator, ordered
+from go1exp.config.schema.registry import actuator, bind, members, ordered
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.actuator.setup import Actuator, takes_feedforward
-from go1exp.sim.actuator.wrapped import InnerActuator, build
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+def _checked(settings: dict[str, Any]) -> dict[str, Any]:
+    """Check the term in ``settings`` as the registry does; return it with its defaults filled in."""
+    if "term" not in settings:
+        problems = ["drive.term: required, but not given"]
+    else:
+        term, problems = bind("actuator", str(settings["term"]), settings, "drive")
+        if term is not None:
+            return {"term": term.entry.name, **term.parameters}
+    raise PydanticCustomError("problems", "{lines}", {"lines": "\n".join(problems)})
+
+
+InnerActuator = Annotated[dict[str, Any], AfterValidator(_checked)]
+"""``{term: pd, kp: 20.0, ...}``: type of a parameter called ``drive``."""
+
+
+def build(setup: ActuatorSetup, drive: dict[str, Any]) -> Any:
+    """Return the actuator that ``drive`` describes."""
+    parameters = {k: v for k, v in drive.items() if k != "term"}
+    return members("actuator")[drive["term"]].target(setup, **parameters)
+
 
 Seconds = Annotated[float, Field(ge=0.0, le=0.2)]
 Delays = Annotated[tuple[Seconds, Seconds], AfterValidator(ordered)]

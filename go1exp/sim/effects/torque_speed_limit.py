@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp.config.schema.registry import effect
-from go1exp.sim.actuator.envelope import envelope
+from go1exp.sim.actuator.motors import envelope
 from go1exp.sim.effects.base import Effect, Param
 from go1exp.sim.effects.identification import Identification
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @effect("torque_speed_limit")
 class TorqueSpeedLimit(Effect):
-    """The motor's torque stays within its peak and below a line that falls with speed (``sim/actuator/envelope.py``).
+    """The motor's torque stays within its peak and below a line that falls with speed (``sim/actuator/motors.py``).
 
     With E the robot's peak torque and V its top speed (``robot.effort_limit``, ``robot.velocity_limit``)::
 
