@@ -24,7 +24,7 @@ from go1exp.deploy.export.graph import ExportError, required_inputs
 from go1exp.deploy.sim_robot.__main__ import bundle_task
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import parse_task, parse_train
-from go1exp.train import checkpoint, kept_plugins, run_folder, start, trainer
+from go1exp.train import checkpoint, run_folder, start, trainer
 from go1exp.train.policy import load_run
 from tests.small_run import SMALL
 
@@ -377,7 +377,7 @@ def test_an_observation_that_remembers_cannot_be_exported_and_that_is_said() -> 
 
 def train(run: Path, *overrides: str, iterations: int = 2) -> Any:
     container = compose("train", [*SMALL, *overrides, f"ppo.iterations={iterations}"])
-    config = parse_train(kept_plugins.with_copies(run, container))
+    config = parse_train(run_folder.with_kept_plugins(run, container))
     run_folder.write(run, container)
     return trainer.train(config, container, run)
 

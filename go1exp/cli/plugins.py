@@ -27,7 +27,7 @@ def begin(verb: str, container: dict[str, Any]) -> dict[str, Any]:
     plugins.begin(wanted)
     run = container.get("run")
     if isinstance(run, str) and (Path(run) / "config.yaml").is_file():
-        from go1exp.train import kept_plugins
+        from go1exp.train import run_folder
 
-        plugins.use(kept_plugins.with_copies(Path(run), {})[plugins.KEY])
+        plugins.use(run_folder.with_kept_plugins(Path(run), {})[plugins.KEY])
     return {key: value for key, value in container.items() if key != plugins.KEY}

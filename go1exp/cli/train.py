@@ -58,7 +58,7 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
 
 def _refuse_other(run: Path, container: dict[str, Any]) -> None:
     """Raise ConfigError if ``run`` holds a run with another configuration: it would be neither one nor the other."""
-    from go1exp.train import kept_plugins, run_folder
+    from go1exp.train import run_folder
 
     if not (run / "config.yaml").is_file():
         return
@@ -67,7 +67,7 @@ def _refuse_other(run: Path, container: dict[str, Any]) -> None:
         OmegaConf.update(old, key, OmegaConf.select(new, key), merge=False)
     before, after = (key_values(OmegaConf.to_container(c)) for c in (old, new))
     differ = sorted(k for k in {*before, *after} if before.get(k) != after.get(k))
-    differ += [f"plugins ({name} has changed)" for name in kept_plugins.differing(run, container)]
+    differ += [f"plugins ({name} has changed)" for name in run_folder.differing_plugins(run, container)]
     if differ:
         raise ConfigError([f"{run}: holds a run with other settings of {', '.join(differ)}; use another folder"])
 
@@ -170,11 +170,11 @@ def _planned(run: Path, overrides: list[str]) -> TrainJob:
         ConfigError: if they change what they may not.
     """
     from go1exp.sim.task import parse_train
-    from go1exp.train import kept_plugins, run_folder
+    from go1exp.train import run_folder
 
     container = _resumed(run, overrides)
     try:
-        config = parse_train(kept_plugins.with_copies(run, container))
+        config = parse_train(run_folder.with_kept_plugins(run, container))
     except ConfigError:
         run_folder.read_parsed(run)  # where the run itself is not one that this version knows, that names its file
         raise

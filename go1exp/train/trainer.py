@@ -22,7 +22,7 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import TrainConfig, parse_train
-from go1exp.train import checkpoint, kept_plugins, metrics, preflight, start
+from go1exp.train import checkpoint, metrics, preflight, run_folder, start
 from go1exp.train.beside import Beside
 from go1exp.train.device import DevicePPO
 from go1exp.train.early_stop import EarlyStop
@@ -128,7 +128,7 @@ def _close(ppo: AdaptivePPO, logger: Logger, beside: Beside, complete: bool) -> 
 
 def train_as_member(container: dict[str, Any], run: Path, group: Group) -> None:
     """Train as another member of ``group`` than its first: without files, a log, or an ear for signals."""
-    config = parse_train(kept_plugins.with_copies(run, container))
+    config = parse_train(run_folder.with_kept_plugins(run, container))
     ppo = _begun(config, run, None, group)
     logger = Logger(None, [])
     ppo.after_iteration = _Closing(config, run, logger, None, lambda: False)

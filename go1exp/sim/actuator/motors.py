@@ -1,4 +1,4 @@
-"""Proportional-derivative actuators: ideal (``pd``), DC motor (``dc_motor``), voltage-controlled motor (``voltage``)."""
+"""Proportional-derivative actuators: ``pd`` (ideal), ``dc_motor`` and ``voltage``."""
 
 from __future__ import annotations
 
