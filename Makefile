@@ -1,19 +1,20 @@
-# Two commands on a fresh machine: `make demo` and `make test`. Both set up .venv first, once.
+# On a fresh machine: `make demo`, `make test`, `make docs`. Each sets up .venv first, once.
 # Needs python3.11 with venv, and make. Another interpreter: make setup PY=/path/to/python3.11
 
 PY ?= python3.11
 TORCH := torch==2.13.0
-UV := uv==0.13.8
 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 OK := $(VENV)/.ok
 LOCK_VENV := build/lock-venv
+LOCK = $(LOCK_VENV)/bin/uv pip compile -q --python-version 3.11 --generate-hashes --no-emit-index-url \
+  --no-emit-find-links --custom-compile-command "make lock"
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo quick test test-all test-slurm test-ray test-tune check sanitise bench runtime image lock clean
+.PHONY: help setup docs demo quick test test-all test-slurm test-ray test-tune check sanitise bench runtime image lock clean
 
 help: ## list the verbs
 	@echo "usage: make VERB"
@@ -31,13 +32,25 @@ $(OK): pyproject.toml requirements/lock.txt hatch_build.py $(wildcard go1exp/dep
 	@echo "setup 2/5: $(TORCH)"
 	@$(PIP) install -qq "$(TORCH)"
 	@echo "setup 3/5: packages of requirements/lock.txt"
-	@$(PIP) install -qq --require-hashes --no-deps -r requirements/lock.txt
+	@$(call install,lock)
 	@echo "setup 4/5: go1exp itself, editable"
 	@$(PIP) install -qq --no-build-isolation --no-deps -e .
 	@$(BIN)/python -c 'from go1exp.deploy.estimation import compiled; compiled()' 2>&1 | tail -n 1
 	@echo "setup 5/5: check that the packages fit together"
 	@$(PIP) check
 	@touch $@
+
+# Packages of a lock, hash-checked: with uv, or with pip where uv cannot be installed or does not find them.
+install = $(PIP) install -qq --require-hashes --no-deps -r requirements/uv.txt 2>/dev/null && \
+  $(BIN)/uv pip install -q --python $(BIN)/python --link-mode copy --require-hashes --no-deps -r requirements/$(1).txt \
+  2>/dev/null || $(PIP) install -qq --require-hashes --no-deps -r requirements/$(1).txt
+
+docs: setup ## build the documentation in build/docs; any warning or dead link is an error
+	@echo "docs 1/2: packages of requirements/docs.txt"
+	@$(call install,docs)
+	@echo "docs 2/2: sphinx-build"
+	@$(BIN)/python -m sphinx -q -b html -n -W --keep-going -d build/doctrees docs build/docs
+	@echo "docs: build/docs/index.html"
 
 demo: setup ## train for five minutes, judge the policy, film it, find what a log hides, all in runs/demo
 	@echo "demo 1/4: go1exp train experiment=five_minutes (five minutes on two cores)"
@@ -127,15 +140,14 @@ image: ## the same as a container image, go1exp-deploy; needs Docker
 
 # An override that never applies takes torch, and with it the CUDA packages, out of the resolution.
 lock: ## resolve requirements/base.in into requirements/lock.txt, keeping the pins that still fit
-	@echo "lock 1/3: $(UV) in $(LOCK_VENV)"
+	@echo "lock 1/3: uv in $(LOCK_VENV)"
 	@$(PY) -m venv $(LOCK_VENV)
-	@$(LOCK_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input "$(UV)"
-	@echo "lock 2/3: requirements/lock.txt"
+	@$(LOCK_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes -r requirements/uv.txt
+	@echo "lock 2/3: requirements/lock.txt and requirements/docs.txt"
 	@echo "torch ; python_version < '3'" > build/no-torch.txt
-	@$(LOCK_VENV)/bin/uv pip compile -q requirements/base.in --override build/no-torch.txt --python-version 3.11 \
-	  --generate-hashes --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" \
-	  -o requirements/lock.txt
-	@! grep -n '://' requirements/lock.txt || { echo "requirements/lock.txt names an address" >&2; exit 1; }
+	@$(LOCK) requirements/base.in --override build/no-torch.txt -o requirements/lock.txt
+	@$(LOCK) requirements/docs.in -c requirements/lock.txt -o requirements/docs.txt
+	@! grep -n '://' requirements/lock.txt requirements/docs.txt || { echo "a lock names an address" >&2; exit 1; }
 	@echo "lock 3/3: requirements/deploy.txt and requirements/build.txt, parts of it"
 	@$(PY) deploy/lock.py
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 # that costs a third of the environment's speed. Read by OpenMP when torch is first imported; a user's choice stands.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def make(overrides: Sequence[str] = (), num_envs: int = 1024, seed: int = 0, **options: Any) -> Go1Core:
