@@ -53,7 +53,7 @@ from go1exp.sim.task import parse_parts
 
 FIRST_SECONDS = 3.0
 GAINS = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))
-"""Of the standard recordings (docs/gap_next.md), one set after the other; the first are those at hand."""
+"""Of the standard recordings (docs/notebook/gap_next.md), one set after the other; the first are those at hand."""
 
 KINDS = ("chirp", "steps", "slow_ramps")
 STRATEGIES = ("next", "standard", "random")

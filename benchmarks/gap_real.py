@@ -1,9 +1,9 @@
 """Real robots: ``python -m benchmarks.gap_real data=DIR out=DIR [sets=xl330,go2] [halves=true]``.
 
-Imports each set of recordings below ``data``, asks ``go1exp gap`` as docs/gap_real.md does, and counts which share of
-the angles' error is gone in the median window that no fitted value has seen. Then, with ``halves``, asks each half of
-the recordings by itself, every second one in the order of their names, and compares what they certify: an effect is
-contradicted by the other half if that names it at the same joint with an interval that does not meet. Writes
+Imports each set of recordings below ``data``, asks ``go1exp gap`` as docs/notebook/gap_real.md does, and counts which
+share of the angles' error is gone in the median window that no fitted value has seen. Then, with ``halves``, asks each
+half of the recordings by itself, every second one in the order of their names, and compares what they certify: an
+effect is contradicted by the other half if that names it at the same joint with an interval that does not meet. Writes
 ``OUT/gap.json``. What is done already is not done again.
 """
 

@@ -90,9 +90,7 @@ def _toctree(caption: str, pages: Sequence[str]) -> list[str]:
 
 def _group(group: str, title: str) -> str:
     import go1exp.evaluate.protocol.kinds
-    import go1exp.logs.excitations
-    import go1exp.logs.importers
-    import go1exp.logs.record.policy  # noqa: F401  (all of these register members)
+    import go1exp.extend  # noqa: F401  (both register members)
     from go1exp.config.schema import registry
 
     lines = [f"# {title}", ""]
@@ -250,7 +248,7 @@ def _text(target: Any) -> list[str]:
         else:
             out += [line[2:] if line.startswith("        ") and out and out[-1].startswith(("- ", "  ")) else line]
     text = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", "\n".join(out))
-    return re.sub(r"(?<!`)<(?=\w)", "&lt;", text).splitlines() + [""]
+    return [*re.sub(r"(?<!`)<(?=\w)", "&lt;", text).splitlines(), ""]
 
 
 def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:

@@ -8,7 +8,6 @@ are not concerned, since only definitions and assignments are looked at.
 from __future__ import annotations
 
 import ast
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -73,13 +72,6 @@ def test_uses_of_foreign_names_are_not_concerned(tmp_path: Path) -> None:
     file = tmp_path / "module.py"
     file.write_text("layout.of(1)\nf(go=2)\nx = parser.found\nrepeat_of = 1\nprint(do)\n")
     assert vague(file) == []
-
-
-def test_the_glossary_names_files_that_exist() -> None:
-    text = (data_root() / "docs" / "glossary.md").read_text(encoding="utf-8")
-    places = set(re.findall(r"`([a-z_0-9/]+(?:\.py|/))`", text))
-    assert len(places) > 30
-    assert sorted(place for place in places if not (PACKAGE / place).exists()) == []
 
 
 def test_the_glossary_says_each_term_once() -> None:

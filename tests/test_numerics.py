@@ -1,6 +1,6 @@
 """The size of a physics step must not show: 2 ms against 0.25 ms, the engine's own drives, and the order of the error.
 
-``python tests/test_numerics.py`` prints the tables of docs/actuators.md.
+``python tests/test_numerics.py`` prints the tables of docs/notebook/actuators.md.
 """
 
 from __future__ import annotations

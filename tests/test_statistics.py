@@ -73,7 +73,7 @@ def test_intervals_move_and_stretch_with_the_values() -> None:
 
 @pytest.mark.parametrize("n", [4, 6, 10])
 def test_the_mean_of_few_robots_has_students_interval_and_the_bootstraps_would_be_too_narrow(n: int) -> None:
-    """The figures of docs/experiments.md: 95 % at any n, and 79, 86 and 90 %."""
+    """The figures of docs/notebook/experiments.md: 95 % at any n, and 79, 86 and 90 %."""
     rng = np.random.default_rng(n)
     studies = rng.normal(size=(2000, n))
     held = [i.low <= 0.0 <= i.high for i in map(mean_interval, studies)]
@@ -295,7 +295,7 @@ def test_intervals_of_evenly_spread_runs_hold_the_truth_as_often_as_the_document
     """With 3 and 5 runs that is less than the 93 % that they should have; the document has 4,000 studies."""
     rng = np.random.default_rng(12)
     assert coverage(lambda: iqm_interval(rng.uniform(size=n)), 0.5) == pytest.approx(measured, abs=0.02)
-    assert f"{100 * measured:.1f} (" in (data_root() / "docs/studies.md").read_text()
+    assert f"{100 * measured:.1f} (" in (data_root() / "docs/notebook/studies.md").read_text()
 
 
 def test_intervals_of_falls_hold_the_truth_where_runs_differ() -> None:

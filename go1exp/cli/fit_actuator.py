@@ -76,7 +76,7 @@ def _task(container: dict[str, Any]) -> None:
         bar(done, total)
 
     if settings.target == "joint_torque" and settings.smoothing is None:
-        print("note: smoothing=0.02 usually serves target=joint_torque better (docs/actuators.md)")
+        print("note: smoothing=0.02 usually serves target=joint_torque better (docs/actuator_nets.md)")
     inverse = _inverse_dynamics(parts["robot"], settings.smoothing) if settings.target == "joint_torque" else None
     try:
         result = fit.fit(recordings, subset(fit.FitSettings, settings), progress, inverse)

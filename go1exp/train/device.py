@@ -1,8 +1,8 @@
 """PPO that never leaves the GPU: rollouts, advantages and gradient steps stay where the environment is.
 
 SB3's loop takes every step through numpy and looks at every environment's info in Python, its buffer computes
-advantages on the host, and its update waits for the device six times a minibatch (docs/benchmarks.md has what that
-costs). Policy, optimiser, saving, callbacks and logger are SB3's here too; advantages and loss are those of
+advantages on the host, and its update waits for the device six times a minibatch (docs/notebook/benchmarks.md has
+what that costs). Policy, optimiser, saving, callbacks and logger are SB3's here too; advantages and loss are those of
 ``go1exp.train.loss``, as on the CPU.
 """
 

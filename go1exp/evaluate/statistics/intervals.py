@@ -97,7 +97,7 @@ def bootstrap_interval(
     """Return ``function`` of all of n robots, with its percentile interval over robots drawn with replacement.
 
     For what has no interval of its own, such as thresholds and areas. It is too narrow for few: of the mean of normal
-    values it holds the truth in 79, 86 and 90 of 100 studies of 4, 6 and 10 robots (docs/experiments.md).
+    values it holds the truth in 79, 86 and 90 of 100 studies of 4, 6 and 10 robots (docs/notebook/experiments.md).
 
     Args:
         function: a figure of the robots with these numbers (n,), each in 0 to n - 1; NaN where it is not defined.

@@ -3,7 +3,7 @@
 A run is one training seed. Robots that one policy moved are no independent tries of a configuration, so that intervals
 here are over runs. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (NeurIPS
 2021), recommend the interquartile mean with a stratified bootstrap; with fewer than ten runs that interval holds the
-truth in 77 to 93 of 100 studies instead of 95 (docs/studies.md), so that ``iqm_interval`` is studentised.
+truth in 77 to 93 of 100 studies instead of 95 (docs/notebook/studies.md), so that ``iqm_interval`` is studentised.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def iqm_band(values: ArrayLike, level: float = LEVEL) -> tuple[Floats, Floats, F
 
     The interval is studentised: the mean plus and minus a critical value times its standard error, the critical value
     being that of normal values, simulated once for each n. The standard error is that of the winsorised values (Tukey
-    and McLaughlin 1963), with fewer than six runs that of all. Measured coverage: docs/studies.md.
+    and McLaughlin 1963), with fewer than six runs that of all. Measured coverage: docs/notebook/studies.md.
     """
     each = np.asarray(values, dtype=np.float64)
     middle = iqm(each, axis=0)

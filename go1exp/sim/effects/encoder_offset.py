@@ -29,7 +29,7 @@ class EncoderOffset(Effect):
         excitation="slow_ramps",
         confounded=("base_tilt", "link_com"),
         told_apart_by=TWO_ATTITUDES,
-        # Sealed walks: hips of 85 % were named as certified offsets of the calves (docs/gap_walks.md).
+        # Sealed walks: hips of 85 % were named as certified offsets of the calves (docs/notebook/gap_walks.md).
         doubt_on_feet="Drives that are weak at one kind of joints can look like this encoder_offset while the robot is "
         "on its feet: look at its zeros, or record it hung, before training takes it.",
     )

@@ -31,9 +31,10 @@ class JointStop(Effect):
     ``lower`` and ``upper`` shift the stops towards larger angles. ``time_constant`` is the spring's (stiffness per
     inertia 1 / time_constant^2): rubber yields where a casting does not. ``restitution`` is the share of its speed with
     which a joint comes back, by the damper alone; 0.135 is MuJoCo's. Stops of one kind of robot were seen 0.16 rad from
-    each other (docs/gap_real.md); the bounds are twice that, those of ``restitution`` what a step of 2 ms resolves. It
-    shows at the stops and nowhere else, where ``torque_speed_limit`` may act too; an ``encoder_offset`` moves a stop
-    as well, and everything else with it. A time constant below twice the physics step MuJoCo raises to that.
+    each other (docs/notebook/gap_real.md); the bounds are twice that, those of ``restitution`` what a step
+    of 2 ms resolves. It shows at the stops and nowhere else, where ``torque_speed_limit`` may act too; an
+    ``encoder_offset`` moves a stop as well, and everything else with it. A time constant below twice the physics step
+    MuJoCo raises to that.
     """
 
     title = "place, softness or rebound of the joint stops"

@@ -158,7 +158,7 @@ def build_model(
             joint.armature = config.armature[kind]
             joint.damping[0] = config.damping[kind]
             joint.frictionloss = config.friction_loss[kind]
-            # Dry friction is as rigid as a step allows: it stops a joint within one (see docs/actuators.md).
+            # Dry friction is as rigid as a step allows: it stops a joint within one (see docs/notebook/actuators.md).
             joint.solref_friction, joint.solimp_friction = [2.0 * physics_dt, 1.0], list(RIGID)
             motor = spec.actuator(f"{leg}_{name}")
             motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
