@@ -29,7 +29,8 @@ from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.plugins import begin
 from go1exp.cli.record import RIG
 from go1exp.cli.record import _motions as motions
-from go1exp.config.compose import compose, hydra_for
+from go1exp.config.compose import compose
+from go1exp.config.hydra_adapter import hydra_for
 from go1exp.config.schema import plugins, registry
 from go1exp.config.schema.registry import Term
 from go1exp.evaluate.protocol.base import chosen

@@ -38,7 +38,7 @@ from go1exp.cli.app import App
 from go1exp.cli.other_robot import CHOICES
 from go1exp.cli.record import RIG
 from go1exp.cli.simulate import BODY
-from go1exp.config.compose import compose_unresolved
+from go1exp.config import compose as composing
 from go1exp.config.schema import registry
 from go1exp.config.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
 from go1exp.config.schema.registry import ConfigError, Expected, Range
@@ -742,7 +742,7 @@ class Walk:
 
 @cache
 def _compose(program: str, overrides: tuple[str, ...]) -> str:
-    return json.dumps(OmegaConf.to_container(compose_unresolved(program, overrides)))
+    return json.dumps(composing.compose(program, overrides, resolve=False))
 
 
 def compose(program: str, overrides: tuple[str, ...] = ()) -> dict[str, Any]:

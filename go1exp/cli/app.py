@@ -4,34 +4,24 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import shutil
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import hydra
-from hydra._internal.hydra import Hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
-from hydra.types import RunMode
-from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
-
-from go1exp.cli import plugins
+from go1exp.cli import hydra_main, plugins
 from go1exp.cli.files import choices_from_files
 from go1exp.cli.quoting import protected
 from go1exp.cli.verbs import FLAGS, VALUED
 from go1exp.config.choices import CONFIG_DIR, given_folders
-from go1exp.config.compose import as_container, as_hydra_takes_them, composition_problem
+from go1exp.config.compose import as_hydra_takes_them, composition_problem
+from go1exp.config.hydra_adapter import REFUSED
 from go1exp.config.schema.registry import ConfigError, Expected
-from go1exp.config.source import seen_by
 
 BAD_CONFIG, FAILED = 2, 1
 """Exit statuses: configuration refused before anything was built; the work failed. What a signal ended has
@@ -50,25 +40,24 @@ class App:
     task: Callable[[dict[str, Any]], int | None]
     title: str = ""
     """What users call it, where that is not its name."""
+    sweep: Callable[[App, Sequence[Path], hydra_main.Sweep], int] | None = None
+    """Runs a sweep: ``(verb, the user's folders, sweep) -> exit status``; None leaves sweeps to Hydra."""
 
     def run(self, arguments: Sequence[str]) -> int:
         """Run with command-line arguments; print errors; return the exit status."""
-        # Hydra would print its own report and leave; this makes it raise to here instead.
-        before = os.environ.get("HYDRA_FULL_ERROR")
-        wants_traceback = before == "1"
-        os.environ["HYDRA_FULL_ERROR"] = "1"
+        wants_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
         defer("torch")
         warnings.filterwarnings("ignore", message="The `render_mode` attribute is not defined")
         status: list[int | None] = []
         failure: list[Exception] = []
 
-        def task(config: DictConfig) -> None:
+        def task(container: dict[str, Any]) -> None:
             try:
-                status.append(self.task(plugins.begin(self.name, as_container(config))))
+                status.append(self.task(plugins.begin(self.name, container)))
             except Exception as error:
-                if HydraConfig.get().mode == RunMode.MULTIRUN:
-                    about = HydraConfig.get()
-                    status.append(self.failed_in_sweep(error, about.job.num, list(about.overrides.task)))
+                if hydra_main.in_multirun():
+                    job = hydra_main.job()
+                    status.append(self.failed_in_sweep(error, job.number, job.overrides))
                 else:
                     failure.append(error)  # Hydra would print a report of its own
 
@@ -78,16 +67,16 @@ class App:
         try:
             _refuse_stray_words(arguments, title)
             overrides, folders = _without_config_dir(choices_from_files(arguments, self.name))
-            sys.argv = [title, *map(protected, as_hydra_takes_them(overrides))]
-            with seen_by(self.name, folders), _composed_once(overrides, folders):
-                self._under_hydra(task, status)
+            argv = [title, *map(protected, as_hydra_takes_them(overrides))]
+            sweep = self.sweep
+            on_sweep = None if sweep is None else lambda asked: sweep(self, folders, asked)
+            status.append(hydra_main.run(self.name, argv, folders, task, on_sweep))
             if failure:
                 raise failure[0]
             sys.stdout.flush()
         except BrokenPipeError:  # the command line's to answer
             raise
-        except (Exception, Refused) as caught:
-            error = caught.error if isinstance(caught, Refused) else caught
+        except Exception as error:
             if wants_traceback:
                 raise error from None
             code, message = self._explain(error, arguments)
@@ -96,17 +85,7 @@ class App:
         finally:
             stop_bars()
             warnings.formatwarning = formatwarning
-            if before is None:
-                os.environ.pop("HYDRA_FULL_ERROR", None)
         return next((s for s in status if s), 0) or 0
-
-    def _under_hydra(self, task: Callable[[DictConfig], None], status: list[int | None]) -> None:
-        """Have Hydra compose and call ``task``, and do the work for which that leaves Hydra."""
-        version = {"version_base": "1.3"} if hydra.__version__ < "1.4" else {}
-        try:
-            hydra.main(**version, config_path=None, config_name=self.name)(task)()
-        except Left as left:
-            status.append(left.work())
 
     def failed_in_sweep(self, error: Exception, number: int, overrides: Sequence[str]) -> int:
         """Print what went wrong with a job of a sweep and return its status: the other jobs do not depend on it."""
@@ -132,7 +111,7 @@ class App:
         if isinstance(error, ConfigError):
             lines = error.problems
             return BAD_CONFIG, lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems", *lines])
-        if isinstance(error, HydraException | OmegaConfBaseException | ValueError):
+        if isinstance(error, (*REFUSED, ValueError)):
             problem = composition_problem(error, self.name, arguments, given_folders(arguments)[1:])
             if problem:
                 return BAD_CONFIG, problem
@@ -143,22 +122,6 @@ class App:
         if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # the latter is torch's
             return FAILED, f"out of memory: {' '.join(str(error).split())}"
         raise error
-
-
-@contextmanager
-def _composed_once(overrides: Sequence[str], folders: Sequence[Path]) -> Iterator[None]:
-    """Spare a third of the time of starting: Hydra composes everything twice, first only to read ``hydra.mode``.
-
-    None of our files sets it, so that Hydra goes by ``--multirun``, as it does for None. Where an override or a user's
-    file may set it, Hydra looks.
-    """
-    before = Hydra.get_mode
-    if not folders and not any(re.match(r"-(?!m$|-multirun$)|[+~]*hydra(\.mode|[/=@])", o) for o in overrides):
-        Hydra.get_mode = lambda self, config_name, overrides: None  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        Hydra.get_mode = before  # type: ignore[method-assign]
 
 
 MODES = ("--run", "-r", "--multirun", "-m", "--cfg", "-c", "--info", "-i")
@@ -181,22 +144,6 @@ def _refuse_stray_words(arguments: Sequence[str], title: str) -> None:
         problems.append(f"{' and '.join(modes)} cannot be used together: --cfg and --info show one run, without -m")
     if problems:
         raise ConfigError(problems)
-
-
-class Refused(BaseException):
-    """Carries a refusal out of Hydra's callbacks, which turn every ``Exception`` into a warning."""
-
-    def __init__(self, error: ConfigError) -> None:
-        super().__init__(str(error))
-        self.error = error
-
-
-class Left(BaseException):
-    """Leaves Hydra for work that it has no part in; its callbacks would turn an ``Exception`` into a warning."""
-
-    def __init__(self, work: Callable[[], int | None]) -> None:
-        super().__init__()
-        self.work = work
 
 
 def _without_config_dir(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:
@@ -231,11 +178,6 @@ class _Deferred(ModuleType):
 def defer(name: str) -> None:
     """Make ``import name`` free: torch takes over a second, and a misspelt key should not wait for that."""
     sys.modules.setdefault(name, _Deferred(name))
-
-
-def run_dir() -> Path:
-    """Return the folder that Hydra gave to this job."""
-    return Path(HydraConfig.get().runtime.output_dir)
 
 
 def discard(run: Path, of_lock: Sequence[str] = ()) -> None:

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
 
 from go1exp.base.wording import NOT_FOR_TRAINING
 from go1exp.config.choices import choice_files, config_folder, groups_in, groups_of
+from go1exp.config.hydra_adapter import read_yaml, store_choice, stored_choices
 from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.yaml_file import UNREADABLE, why_unreadable
 
@@ -82,7 +81,7 @@ def _choice(group: str, file: str, verb: str) -> str:
     if isinstance(named, str):
         content[PATHS[group]] = str((path.parent / named).resolve())
     name = _free_name(group, path)
-    ConfigStore.instance().store(group=group, name=name, node=content, provider=str(path))
+    store_choice(group, name, content, path)
     return name
 
 
@@ -97,23 +96,25 @@ def mapping_of(given: Mapping[str, Any] | str | None, key: str) -> dict[str, Any
     if not isinstance(given, str):
         return dict(given)
     path = Path(given).expanduser()
-    content = _mapping(path, f"{key}={given}", f"without any, leave {key} out", "or a FILE.yaml that holds one")
-    return {str(k): v for k, v in OmegaConf.to_container(content, resolve=True).items()}  # type: ignore[union-attr]
+    content = _mapping(
+        path, f"{key}={given}", f"without any, leave {key} out", "or a FILE.yaml that holds one", resolve=True
+    )
+    return {str(k): v for k, v in content.items()}
 
 
-def _mapping(path: Path, key: str, when_empty: str, like: str) -> DictConfig:
+def _mapping(path: Path, key: str, when_empty: str, like: str, resolve: bool = False) -> dict[str, Any]:
     """Return what a YAML file holds; raise ConfigError, beginning with ``key``, if that is no mapping."""
     if not path.exists():
         raise ConfigError([f"{key}: no such file"])
     try:
-        content = OmegaConf.load(path)
+        content = read_yaml(path, resolve)
         lines = path.read_text(encoding="utf-8").splitlines()
     except UNREADABLE as error:
         raise ConfigError([f"{key}: {why_unreadable(error)}"]) from None
     if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
         raise ConfigError([f"{key}: is empty; {when_empty}"])
     # OmegaConf takes a file that is one text, such as XML, for a key without a value.
-    if not isinstance(content, DictConfig) or isinstance(yaml.safe_load("\n".join(lines)), str):
+    if not isinstance(content, dict) or isinstance(yaml.safe_load("\n".join(lines)), str):
         raise ConfigError([f"{key}: must be a mapping, {like}"])
     return content
 
@@ -122,7 +123,7 @@ def _free_name(group: str, path: Path) -> str:
     """Return a name for a file that no choice of the group has: Hydra would silently take that in place of the file."""
     name = re.sub(r"\W", "_", str(path.with_suffix("")), flags=re.ASCII)  # else Hydra's grammar refuses it
     shipped = choice_files(group, [config_folder()])
-    stored = ConfigStore.instance().repo.get(group, {})
-    while name in shipped or getattr(stored.get(f"{name}.yaml"), "provider", str(path)) != str(path):
+    stored = stored_choices(group)
+    while name in shipped or stored.get(name, str(path)) != str(path):
         name += "_file"
     return name

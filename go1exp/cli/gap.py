@@ -9,12 +9,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import OmegaConf
-
 from go1exp.base.files import opened, write_json
 from go1exp.cli.app import App, spinner
 from go1exp.cli.play_web import address
 from go1exp.cli.quoting import command
+from go1exp.config.hydra_adapter import read_yaml
 
 if TYPE_CHECKING:
     from go1exp.cli.settings import GapVerb
@@ -187,8 +186,8 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
 
     out = Path(settings.out)
     written = apply.write(result, out)
-    contents = {path.name: OmegaConf.to_container(OmegaConf.load(path)) for path in written}
-    proof = apply.prove(recordings, robot, settings.search, result, contents, settings.train_dt)  # type: ignore[arg-type]
+    contents = {path.name: read_yaml(path) for path in written}
+    proof = apply.prove(recordings, robot, settings.search, result, contents, settings.train_dt)
     about = {**asdict(proof), "files": [path.name for path in written]}
     write_json(out / APPLIED, about)
     print(f"\nwritten to {', '.join(str(path) for path in written)}")
@@ -201,7 +200,7 @@ def _apply(result: GapResult, recordings: list[Recording], robot: Robot, setting
         least = proof.reported if proof.after <= proof.before else proof.before
         print(f"NOT applied: the error is {1 + proof.after:.3g} with the files at this step; {better} {1 + least:.3g}")
         return
-    _print_next(contents[apply.EFFECT], robot, out / apply.EFFECT, result.contact)  # type: ignore[arg-type]
+    _print_next(contents[apply.EFFECT], robot, out / apply.EFFECT, result.contact)
 
 
 def _status(result: GapResult, out: Path) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 
 from go1exp.cli.app import App
 from go1exp.config.choices import about, choice_files, groups_in
-from go1exp.config.source import shown_folders
+from go1exp.config.hydra_adapter import shown_folders
 
 
 def _task(container: dict[str, Any]) -> None:

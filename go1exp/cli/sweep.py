@@ -15,23 +15,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
-
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from typing import TYPE_CHECKING, Any
 
 from go1exp.base.signals import STOPPED
-from go1exp.cli.app import FAILED, App, Left, Refused, spinner
+from go1exp.cli import hydra_main
+from go1exp.cli.app import FAILED, App, spinner
 from go1exp.cli.quoting import command, quoted
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.train.sweep.command import CORES, PARENT, Command, Ended
 
 if TYPE_CHECKING:
+    from go1exp.train.sweep import index
     from go1exp.train.sweep.index import Index
     from go1exp.train.sweep.task import Launcher, Task
 
@@ -39,25 +34,11 @@ LOG = "job.log"
 """In the run folder of a job that ran in a process of its own: what it printed."""
 
 
-class Job(Protocol):
-    """What a job's configuration stands for."""
-
-    @property
-    def run(self) -> Path:
-        """Its run folder."""
-
-    @property
-    def container(self) -> dict[str, Any]:
-        """Its configuration."""
-
-
 @dataclass(frozen=True)
 class Rules:
     """What a verb knows of its jobs.
 
     Attributes:
-        app: the verb.
-        folders: the user's folders of choices.
         resolve: ``(container, overrides, run folder) -> job``; raises ConfigError; touches no file.
         check: raises ConfigError, or another error that is an answer, if a job cannot run here.
         plan: makes the run folder of a job, unless it has begun.
@@ -65,8 +46,6 @@ class Rules:
         go_on: ``(run folder, overrides) -> exit status``, runs it in this process.
     """
 
-    app: App
-    folders: Sequence[Path]
     resolve: Callable[[dict[str, Any], list[str], Path], Any]
     check: Callable[[Any], None]
     plan: Callable[[Any], None]
@@ -74,47 +53,23 @@ class Rules:
     go_on: Callable[[Path, list[str]], int | None]
 
 
-_current: list[Rules] = []
-
-
-@contextmanager
-def watched(rules: Rules) -> Iterator[None]:
-    """Check and run the sweep that may begin in this block."""
-    _current.append(rules)
-    try:
-        yield
-    finally:
-        _current.pop()
-
-
-class Check(Callback):
-    """Hydra's hook before a sweep (``hydra.callbacks`` in ``conf/train.yaml``)."""
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Leave Hydra with the list of jobs, unless another sweeper than Hydra's own will say which there are."""
-        if not _current or not str(config.hydra.sweeper["_target_"]).endswith(f".{BasicSweeper.__name__}"):
-            return
-        try:
-            listed = _overrides_of_jobs(config)
-            launcher = _plain(config.hydra.launcher)
-        except Exception as error:
-            raise Refused(error) from None  # type: ignore[arg-type]
-        rules, folder = _current[-1], Path(str(config.hydra.sweep.dir)).absolute()
-        raise Left(lambda: begin(rules, folder, listed, launcher))
-
-
-def leave_to_go_on(container: dict[str, Any], overrides: Sequence[str]) -> None:
+def leave_to_go_on(rules: Rules, app: App, folder: str, overrides: Sequence[str]) -> None:
     """Leave Hydra to go on with the sweep that ``sweep=FOLDER`` names."""
-    about = HydraConfig.get()
-    given = [o for o in about.overrides.hydra if re.match(r"[+~]*hydra[./]launcher", o)]
-    launcher = _plain(about.launcher) if given else None
-    rules, folder = _current[-1], Path(str(container["sweep"])).absolute()
+    about = hydra_main.job()
+    given = any(re.match(r"[+~]*hydra[./]launcher", o) for o in about.of_hydra)
+    launcher = about.launcher if given else None
     allowed = [o for o in overrides if not o.startswith("sweep=")]
-    raise Left(lambda: go_on(rules, folder, allowed, launcher))
+    raise hydra_main.Left(lambda: go_on(rules, app, Path(folder).absolute(), allowed, launcher))
 
 
-def begin(rules: Rules, folder: Path, listed: Sequence[list[str]], launcher: dict[str, Any]) -> int:
+def begin(rules: Rules, app: App, folders: Sequence[Path], asked: hydra_main.Sweep) -> int:
     """Check every job, write the sweep's folder, run the jobs; return the exit status.
+
+    Args:
+        rules: of the verb.
+        app: the verb.
+        folders: the user's folders of choices.
+        asked: the sweep.
 
     Raises:
         ConfigError: with every problem of every job, each with the first job that has it; then no folder is left.
@@ -122,19 +77,16 @@ def begin(rules: Rules, folder: Path, listed: Sequence[list[str]], launcher: dic
     from go1exp.train import run_state
     from go1exp.train.sweep import index, launchers
 
-    runs = launchers.built(launchers.chosen(launcher))
+    folder, listed = asked.folder, asked.jobs
+    runs = launchers.built(launchers.chosen(asked.launcher))
     common = set.intersection(*map(set, listed)) if len(listed) > 1 else set()
     names = [" ".join(o for o in overrides if o not in common) for overrides in listed]
-    places = index.folder_names(names)
-    jobs = _checked(rules, folder, listed, names, places, runs)
-    known = index.Index(
-        tuple(
-            index.Job(number, name, tuple(overrides), place)
-            for number, (name, overrides, place) in enumerate(zip(names, listed, places, strict=True))
-        ),
-        launcher,
-        os.getcwd(),
-    )
+    planned = [
+        index.Job(number, name, tuple(overrides), place)
+        for number, (name, overrides, place) in enumerate(zip(names, listed, index.folder_names(names), strict=True))
+    ]
+    jobs = _checked(rules, app, folders, folder, planned, runs)
+    known = index.Index(tuple(planned), asked.launcher, os.getcwd())
     with run_state.locked(folder):
         if (folder / index.FILE).is_file():
             _refuse_another(index.read(folder), known, folder)
@@ -142,14 +94,15 @@ def begin(rules: Rules, folder: Path, listed: Sequence[list[str]], launcher: dic
         for number, job in enumerate(jobs):
             rules.plan(job)
             show(number + 1, len(jobs))
-        return _launch(rules, folder, known, runs, [])
+        return _launch(rules, app, folder, known, runs, [])
 
 
-def go_on(rules: Rules, folder: Path, overrides: list[str], launcher: dict[str, Any] | None) -> int:
+def go_on(rules: Rules, app: App, folder: Path, overrides: list[str], launcher: dict[str, Any] | None) -> int:
     """Run the jobs of a sweep that are not done; return the exit status.
 
     Args:
         rules: of the verb.
+        app: the verb.
         folder: the sweep's.
         overrides: for every job; what a resumed run may change.
         launcher: None takes the one that ran the sweep last.
@@ -168,13 +121,13 @@ def go_on(rules: Rules, folder: Path, overrides: list[str], launcher: dict[str, 
     problems: dict[str, list[int]] = {}
     with contextlib.chdir(known.cwd):
         for job in known.jobs:
-            with _noting(rules.app, problems, job.number):
+            with _noting(app, problems, job.number):
                 planned = rules.planned(folder / job.run_folder, overrides)
                 if not runs.remote and (job.state != "done" or _asks_for_more(overrides)):
                     rules.check(planned)
     _refuse(problems, [job.name for job in known.jobs])
     with run_state.locked(folder):
-        return _launch(rules, folder, known, runs, overrides)
+        return _launch(rules, app, folder, known, runs, overrides)
 
 
 def _asks_for_more(overrides: Sequence[str]) -> bool:
@@ -183,24 +136,21 @@ def _asks_for_more(overrides: Sequence[str]) -> bool:
 
 
 def _checked(
-    rules: Rules,
-    folder: Path,
-    listed: Sequence[list[str]],
-    names: Sequence[str],
-    places: Sequence[str],
-    runs: Launcher,
+    rules: Rules, app: App, folders: Sequence[Path], folder: Path, planned: Sequence[index.Job], runs: Launcher
 ) -> list[Any]:
     """Compose and check every job, and that the launcher can work."""
     jobs: list[Any] = []
     problems: dict[str, list[int]] = {}
-    show = spinner(len(listed), "checking jobs")
-    for number, (overrides, place) in enumerate(zip(listed, places, strict=True)):
-        with _noting(rules.app, problems, number):
-            container = compose(rules.app.name, [o for o in overrides if not _is_hydras(o)], rules.folders)
+    names = [job.name for job in planned]
+    show = spinner(len(planned), "checking jobs")
+    for number, job in enumerate(planned):
+        with _noting(app, problems, number):
+            ours = [o for o in job.overrides if not re.match(r"[+~]*hydra[./@]", o)]
+            container = compose(app.name, ours, folders)
             if container.get("resume") or container.get("sweep"):
                 raise ConfigError(["resume and sweep go without -m; of a sweep's jobs: sweep=FOLDER"])
-            jobs.append(rules.resolve(container, overrides, folder / place))
-        show(number + 1, len(listed))
+            jobs.append(rules.resolve(container, list(job.overrides), folder / job.run_folder))
+        show(number + 1, len(planned))
     _refuse(problems, names)
     runs.check()
     checked: list[dict[str, Any]] = []
@@ -208,7 +158,7 @@ def _checked(
         about = {key: value for key, value in job.container.items() if key != "seed"}
         if about not in checked:  # a seed changes nothing that this machine could lack
             checked.append(about)
-            with _noting(rules.app, problems, number):
+            with _noting(app, problems, number):
                 rules.check(job)
     _refuse(problems, names)
     return jobs
@@ -281,7 +231,7 @@ class _Watch:
             self._warned = True
 
 
-def _launch(rules: Rules, folder: Path, known: Index, runs: Launcher, overrides: list[str]) -> int:
+def _launch(rules: Rules, app: App, folder: Path, known: Index, runs: Launcher, overrides: list[str]) -> int:
     """Run what is not done in a folder that is locked; tell of the sweep; return the exit status."""
     from go1exp.train.sweep import index
     from go1exp.train.sweep.task import Task
@@ -296,7 +246,7 @@ def _launch(rules: Rules, folder: Path, known: Index, runs: Launcher, overrides:
         run = folder / job.run_folder
         given = [*overrides, *_share_of_cores(rules, run, known, runs)]
         tasks.append(
-            Task(job.name, job.run_folder, _command(run, given, known.cwd), _in_process(rules, watch, job, given))
+            Task(job.name, job.run_folder, _command(run, given, known.cwd), _in_process(rules, app, watch, job, given))
         )
     print(f"sweep {folder}: {len(tasks)} of {len(known.jobs)} jobs to run", flush=True)
     try:
@@ -325,7 +275,7 @@ def _command(run: Path, overrides: Sequence[str], cwd: str) -> Command:
     return Command(words, cwd, str(run / LOG), {"PYTHONPATH": path} if path else {})
 
 
-def _in_process(rules: Rules, watch: _Watch, job: Any, overrides: list[str]) -> Callable[[], None]:
+def _in_process(rules: Rules, app: App, watch: _Watch, job: Any, overrides: list[str]) -> Callable[[], None]:
     """Return what runs a job in this process and outlives its failure."""
 
     def work() -> None:
@@ -333,8 +283,8 @@ def _in_process(rules: Rules, watch: _Watch, job: Any, overrides: list[str]) -> 
             with contextlib.chdir(watch.index.cwd):
                 stopped = rules.go_on(watch.folder / job.run_folder, overrides) == STOPPED
         except Exception as error:
-            rules.app.failed_in_sweep(error, job.number, job.name.split(" "))
-            watch.causes[job.run_folder] = rules.app.cause(error)
+            app.failed_in_sweep(error, job.number, job.name.split(" "))
+            watch.causes[job.run_folder] = app.cause(error)
             return
         if stopped:
             raise KeyboardInterrupt
@@ -353,32 +303,6 @@ def _report(known: Index, folder: Path) -> int:
     if left:
         print(f"go on with: {command('train', settings={'sweep': folder})}", flush=True)
     return left
-
-
-def _overrides_of_jobs(config: DictConfig) -> list[list[str]]:
-    """Return the overrides of every job, as Hydra's own sweeper makes them.
-
-    What the command line says of a key takes the place of what ``hydra.sweeper.params`` (a study) says of it.
-    """
-    params = config.hydra.sweeper.get("params") or {}
-    given = OmegaConf.to_container(config.hydra.overrides.task)
-    assert isinstance(given, list)
-    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
-    typed = parser.parse_overrides([str(override) for override in given])
-    keys = {override.key_or_group for override in typed}
-    listed = parser.parse_overrides([f"{key}={value}" for key, value in params.items()])
-    parsed = [*(override for override in listed if override.key_or_group not in keys), *typed]
-    return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
-
-
-def _is_hydras(override: str) -> bool:
-    return re.match(r"[+~]*hydra[./@]", override) is not None
-
-
-def _plain(config: Any) -> dict[str, Any]:
-    container = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(container, dict)
-    return {str(key): value for key, value in container.items()}
 
 
 def _where(numbers: Sequence[int], names: Sequence[str]) -> str:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from omegaconf import OmegaConf
-
 from go1exp.base.signals import STOPPED
-from go1exp.cli import sweep
-from go1exp.cli.app import App, discard, run_dir
+from go1exp.cli import hydra_main, sweep
+from go1exp.cli.app import App, discard
 from go1exp.cli.quoting import command
 from go1exp.cli.runs import run_folder as existing
 from go1exp.cli.runs import shipped_policies
-from go1exp.config.choices import config_folder, given_folders
+from go1exp.config.choices import config_folder
 from go1exp.config.compose import key_values
+from go1exp.config.hydra_adapter import read_yaml, with_values
 from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
@@ -37,23 +34,26 @@ def _resumed(run: Path, overrides: list[str]) -> dict[str, Any]:
     """Return the run's own configuration with the changes that resuming allows."""
     from go1exp.train import run_folder
 
-    config = OmegaConf.create(run_folder.read_as_written(run))
+    container = run_folder.read_as_written(run)
     refused = []
     for override in overrides:
         key, _, value = override.partition("=")
         if key == "resume" or key.lstrip("+").startswith("hydra"):
             continue
         if key == "backend":
-            config.backend = OmegaConf.load(f"{config_folder()}/backend/{value}.yaml")
-        elif key in RESUMABLE or key.partition(".")[0] in RESUMABLE:
-            config.merge_with_dotlist([f"{key}={value}"])
+            container["backend"] = read_yaml(config_folder() / "backend" / f"{value}.yaml")
+        elif _may_change(key):
+            container = with_values(container, [f"{key}={value}"])
         else:
             refused.append(f"{override}: a resumed run keeps its configuration; only {', '.join(RESUMABLE)} may change")
     if refused:
         raise ConfigError(refused)
-    container = OmegaConf.to_container(config)
-    assert isinstance(container, dict)
-    return {str(k): v for k, v in container.items()}
+    return container
+
+
+def _may_change(key: str) -> bool:
+    """Return whether a resumed run may change a setting."""
+    return any(key == other or key.startswith(f"{other}.") for other in RESUMABLE)
 
 
 def _refuse_other(run: Path, container: dict[str, Any]) -> None:
@@ -62,11 +62,8 @@ def _refuse_other(run: Path, container: dict[str, Any]) -> None:
 
     if not (run / "config.yaml").is_file():
         return
-    old, new = OmegaConf.create(run_folder.read_as_written(run)), OmegaConf.create(container)
-    for key in RESUMABLE:
-        OmegaConf.update(old, key, OmegaConf.select(new, key), merge=False)
-    before, after = (key_values(OmegaConf.to_container(c)) for c in (old, new))
-    differ = sorted(k for k in {*before, *after} if before.get(k) != after.get(k))
+    before, after = key_values(run_folder.read_as_written(run)), key_values(container)
+    differ = sorted(k for k in {*before, *after} if before.get(k) != after.get(k) and not _may_change(k))
     differ += [f"plugins ({name} has changed)" for name in run_folder.differing_plugins(run, container)]
     if differ:
         raise ConfigError([f"{run}: holds a run with other settings of {', '.join(differ)}; use another folder"])
@@ -122,12 +119,12 @@ def check(job: TrainJob) -> None:
 
 
 def _task(container: dict[str, Any]) -> int | None:
-    folder = run_dir()
-    overrides = list(HydraConfig.get().overrides.task)
+    about = hydra_main.job()
+    folder, overrides = about.folder, about.overrides
     try:
         if container.get("sweep"):
-            sweep.leave_to_go_on(container, overrides)
-        _refuse_one_of_a_sweep()
+            sweep.leave_to_go_on(RULES, APP, str(container["sweep"]), overrides)
+        _refuse_one_of_a_sweep(about)
         job = resolved(container, overrides, folder)
         check(job)
     except BaseException:
@@ -138,19 +135,17 @@ def _task(container: dict[str, Any]) -> int | None:
     return _run(job)
 
 
-def _refuse_one_of_a_sweep() -> None:
+def _refuse_one_of_a_sweep(about: hydra_main.Job) -> None:
     """Raise ConfigError where a study or a launcher was chosen without ``-m``.
 
     Hydra composes one run, of none of the study's values, and would train it here, whatever the launcher.
     """
-    about = HydraConfig.get()
-    if about.mode == RunMode.MULTIRUN:
+    if about.multirun:
         return
-    study = about.runtime.choices.get("study")
-    given = [o for o in (*about.overrides.task, *about.overrides.hydra) if not o.startswith("hydra.mode=")]
+    given = [o for o in (*about.overrides, *about.of_hydra) if not o.startswith("hydra.mode=")]
     again = command("train", "-m", *given)
-    if study is not None and about.sweeper.params:
-        raise ConfigError([f"study={study}: is a sweep and needs -m: {again}"])
+    if about.study is not None:
+        raise ConfigError([f"study={about.study}: is a sweep and needs -m: {again}"])
     for launcher in given:
         if launcher.startswith("hydra/launcher=") and launcher != "hydra/launcher=basic":
             raise ConfigError([f"{launcher}: starts the jobs of a sweep and needs -m: {again}"])
@@ -248,7 +243,7 @@ def _train(job: TrainJob, first: Weights | None) -> int | None:
         trainer.train(job.config, job.container, job.run, first)
     except trainer.Stopped as stopped:
         run_state.write(job.run, "done" if stopped.finished else "stopped")
-        if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+        if hydra_main.in_multirun():
             raise KeyboardInterrupt from None  # the jobs after this one do not start
         if not stopped.finished:
             print(f"stopped; go on with: {command('train', settings={'resume': job.run})}")
@@ -266,14 +261,6 @@ def _train(job: TrainJob, first: Weights | None) -> int | None:
     return None
 
 
-class _Train(App):
-    """The verb, around which a sweep is checked before and told of after."""
+RULES = sweep.Rules(resolved, check, plan, _planned, _go_on)
 
-    def run(self, arguments: Sequence[str]) -> int:
-        """Run with command-line arguments; return the exit status."""
-        folders = given_folders(arguments)[1:]
-        with sweep.watched(sweep.Rules(self, folders, resolved, check, plan, _planned, _go_on)):
-            return super().run(arguments)
-
-
-APP = _Train("train", _task)
+APP = App("train", _task, sweep=partial(sweep.begin, RULES))

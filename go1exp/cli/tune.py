@@ -8,13 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
-from hydra.errors import HydraException
-
 from go1exp.cli.app import FAILED, App
 from go1exp.cli.quoting import command
 from go1exp.config.compose import compose_checked
+from go1exp.config.hydra_adapter import sweep_range
 from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
@@ -29,16 +26,18 @@ def _ranges(space: Sequence[str]) -> dict[str, Range]:
     Raises:
         ConfigError: with every entry that is no range of a key.
     """
+    from go1exp.train.sweep.tune import Range
+
     ranges: dict[str, Range] = {}
     problems = []
     for text in space:
         try:
-            (override,) = OverridesParser.create().parse_overrides([text])
-            drawn = _drawn(override)
+            key, bounds = sweep_range(text)
+            drawn = Range(**bounds)
             if reason := _empty(drawn):
                 problems.append(f"space: {text!r}: {reason}")
-            ranges[override.key_or_group] = drawn
-        except (HydraException, ValueError, TypeError):
+            ranges[key] = drawn
+        except (ValueError, TypeError):
             problems.append(f"space: {text!r} is none of {FORMS}")
     if problems or not ranges:
         raise ConfigError(problems or [f"space: is empty; give entries such as {FORMS}"])
@@ -52,20 +51,6 @@ def _empty(drawn: Range) -> str | None:
     if not -math.inf < drawn.low <= drawn.high < math.inf:
         return "is empty; its second number must be the larger one, and both finite"
     return "a logarithm needs numbers above 0" if drawn.log and drawn.low <= 0 else None
-
-
-def _drawn(override: Override) -> Range:
-    """Return the range that an override in Hydra's grammar for sweeps stands for; ValueError if it is none."""
-    from go1exp.train.sweep.tune import Range
-
-    value = override.value()
-    if isinstance(value, IntervalSweep) and value.start is not None and value.end is not None:
-        return Range(low=value.start, high=value.end, log="log" in value.tags)
-    if isinstance(value, RangeSweep) and isinstance(value.start, int) and isinstance(value.stop, int):
-        return Range(low=value.start, high=value.stop - 1, step=int(value.step))
-    if isinstance(value, ChoiceSweep):
-        return Range(choices=tuple(override.sweep_string_iterator()))
-    raise ValueError(override.input_line)
 
 
 def _task(container: dict[str, Any]) -> int | None:

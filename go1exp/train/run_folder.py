@@ -21,11 +21,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from go1exp import __version__
 from go1exp.base.files import write_bytes, write_json, write_text
 from go1exp.base.paths import data_root
+from go1exp.config.hydra_adapter import read_yaml, to_yaml
 from go1exp.config.schema import plugins
 from go1exp.config.schema.plugins import Plugin
 from go1exp.config.schema.registry import ConfigError
@@ -53,7 +52,7 @@ def write(run: Path, container: dict[str, Any]) -> None:
         meta = {**_meta(container), "plugins": keep_plugins(run, container)}
         if meta["git_dirty"]:
             write_text(run / DIFF, (_git("diff", "HEAD") or "")[:LONGEST_DIFF] + "\n")
-        write_text(run / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(container)))
+        write_text(run / "config.yaml", to_yaml(container))
         write_json(run / "meta.json", meta)
         for settings in _with_files(container.get("actuator")):
             source = find(settings["file"])
@@ -111,7 +110,7 @@ def read_as_written(run: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{run}: not a run folder (it has no config.yaml)")
     try:
-        container = OmegaConf.to_container(OmegaConf.load(path))
+        container = read_yaml(path)
     except UNREADABLE as error:
         raise ConfigError([f"{path}: {why_unreadable(error)}"]) from None
     if not isinstance(container, dict) or not container:

@@ -1,0 +1,400 @@
+"""Hydra and OmegaConf behind plain data; private names of them are here alone.
+
+Tested with hydra-core 1.3.8 (omegaconf 2.3) and 1.4.0rc3 (omegaconf 2.4). Private names in use: ``Hydra.get_mode``,
+``Hydra.create_main_hydra2``, ``ConfigLoaderImpl._apply_overrides_to_config``, ``FileConfigSource``, ``BasicSweeper``,
+``get_yaml_loader``.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import hydra
+import yaml
+from hydra import version
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.plugins.config_source import ConfigLoadError, ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.basecontainer import get_yaml_loader
+from omegaconf.errors import OmegaConfBaseException
+
+from go1exp.config.choices import FOLDERS, config_folder, folder_of, groups_of, hidden_from
+
+OLD = hydra.__version__ < "1.4"
+
+MAIN: dict[str, Any] = (
+    {"version_base": "1.3"} if OLD else {"execution_whitelist": ("go1exp.*", "hydra.*", "hydra_plugins.*")}
+)
+"""Arguments of ``hydra.main`` that depend on its version."""
+
+REFUSED = (HydraException, OmegaConfBaseException)
+"""What composing raises where an override or a file does not fit."""
+
+GRAMMAR = re.compile(r"See https://hydra\.cc/docs/\S+/basic for details")
+"""Link at the end of Hydra's messages on a value."""
+
+# ---------------------------------------------------------------------- YAML and containers
+
+
+def read_yaml(file: Path, resolve: bool = False) -> Any:
+    """Return the content of a YAML file as plain data, by OmegaConf's rules (``1e3`` is a number).
+
+    Raises:
+        yaml.YAMLError, UnicodeDecodeError, OSError: if the file cannot be read.
+    """
+    return OmegaConf.to_container(OmegaConf.load(file), resolve=resolve)
+
+
+def to_yaml(container: Mapping[str, Any]) -> str:
+    """Return plain data as the text of a YAML file."""
+    return OmegaConf.to_yaml(OmegaConf.create(dict(container)))
+
+
+def with_values(container: Mapping[str, Any], settings: Sequence[str]) -> dict[str, Any]:
+    """Return plain data with ``key.path=value`` settings merged into it."""
+    config = OmegaConf.create(dict(container))
+    config.merge_with_dotlist(list(settings))
+    return plain(config, resolve=False)
+
+
+def plain(config: Any, resolve: bool = True) -> dict[str, Any]:
+    """Return a mapping of OmegaConf as plain data, by default with interpolations resolved."""
+    container = OmegaConf.to_container(config, resolve=resolve)
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}
+
+
+# ---------------------------------------------------------------------- sources of configuration
+
+
+@cache
+def _fast_loader() -> Any:
+    """Return OmegaConf's YAML loader on libyaml's parser, which takes a tenth of the time, where there is libyaml."""
+    rules: Any = get_yaml_loader()
+    if not hasattr(yaml, "CSafeLoader") or issubclass(rules, yaml.CSafeLoader):
+        return rules
+
+    class Loader(yaml.cyaml.CParser, rules):
+        def __init__(self, stream: str) -> None:
+            yaml.cyaml.CParser.__init__(self, stream)
+            yaml.constructor.SafeConstructor.__init__(self)
+            yaml.resolver.Resolver.__init__(self)
+
+    return Loader
+
+
+@lru_cache(maxsize=1024)
+def _pickled(file: Path, mtime_ns: int, size: int) -> bytes:
+    """Return a file's content and header, pickled, as long as the file does not change."""
+    text = file.read_text(encoding="utf-8")
+    try:
+        content = yaml.load(text, Loader=_fast_loader())
+    except yaml.YAMLError:
+        content = 0
+    config: Any
+    if content is None or isinstance(content, dict | list | str):
+        config = OmegaConf.create({} if content is None else content)
+    else:
+        config = OmegaConf.load(file)  # whose message shows the line that is wrong
+    return pickle.dumps((config, FileConfigSource._get_header_dict(text[:512])))
+
+
+class VerbSource(FileConfigSource):
+    """Files of a folder without the groups that a verb does not have; the group ``rand`` is the folder of its files."""
+
+    hidden: ClassVar[frozenset[str]] = frozenset()
+    """Folders that sources made from now on do not show."""
+
+    def __init__(self, provider: str, path: str) -> None:
+        super().__init__(provider, path)
+        self._hidden = type(self).hidden  # of the instance: a launcher may carry it to another process
+
+    @staticmethod
+    def scheme() -> str:
+        """Return what stands before ``://`` in a search path."""
+        return "go1exp"
+
+    def _place(self, config_path: str) -> str | None:
+        """Return where a configuration lies below the folder; None if the verb does not see it."""
+        path = config_path.strip("/")
+        if path == "hydra/launcher/basic":  # Hydra's own; our file is for help and completion
+            return None
+        for group in (g for g in FOLDERS if "/" in g and (path == g or path.startswith(f"{g}/"))):
+            return None if FOLDERS[group] in self._hidden else FOLDERS[group] + path.removeprefix(group)
+        first, slash, rest = path.partition("/")
+        if first in self._hidden or first in FOLDERS.values() or FOLDERS.get(first) in self._hidden:
+            return None
+        return folder_of(first, Path(self.path)).name + slash + rest if first else ""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read one file, by its name in the group; each call returns a copy, since Hydra changes what it gets."""
+        place = self._place(config_path)
+        name = self._normalize_file_name(config_path if place is None else place)
+        file = Path(self.path, name).resolve()
+        if not file.is_file():
+            raise ConfigLoadError(f"Config not found : {file}")
+        stamp = file.stat()
+        config, header = pickle.loads(_pickled(file, stamp.st_mtime_ns, stamp.st_size))
+        return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
+
+    def is_group(self, config_path: str) -> bool:
+        """Return whether there is a folder for the verb to see."""
+        place = self._place(config_path)
+        return place is not None and super().is_group(place)
+
+    def is_config(self, config_path: str) -> bool:
+        """Return whether there is a file for the verb to see."""
+        place = self._place(config_path)
+        return place is not None and super().is_config(place)
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        """Return the names below a group."""
+        place = self._place(config_path)
+        return [] if place is None else super().list(place, results_filter)
+
+
+class _Folders(SearchPathPlugin):
+    """Puts the folders on Hydra's search path."""
+
+    folders: ClassVar[tuple[Path, ...]] = ()
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in self.folders:
+            search_path.append("main" if folder == config_folder() else "user", f"{VerbSource.scheme()}://{folder}")
+
+
+def shown_folders() -> tuple[Path, ...]:
+    """Return ``conf/`` and the user's folders that Hydra looks into now."""
+    return _Folders.folders or (config_folder(),)
+
+
+@contextmanager
+def seen_by(verb: str, folders: Sequence[Path]) -> Iterator[None]:
+    """Let Hydra find ``conf/`` and the user's ``folders`` with the groups of ``verb``."""
+    for plugin in (VerbSource, _Folders):
+        Plugins.instance().register(plugin)
+    before = VerbSource.hidden, _Folders.folders
+    VerbSource.hidden, _Folders.folders = hidden_from(verb), (config_folder(), *folders)
+    try:
+        yield
+    finally:
+        VerbSource.hidden, _Folders.folders = before
+
+
+def store_choice(group: str, name: str, content: Any, file: Path) -> None:
+    """Make the content of a user's file a choice of a group."""
+    replace: dict[str, Any] = {} if OLD else {"replace": True}
+    ConfigStore.instance().store(group=group, name=name, node=content, provider=str(file), **replace)
+
+
+def stored_choices(group: str) -> dict[str, str]:
+    """Return the choices of a group that were made of users' files, each with its file."""
+    stored = ConfigStore.instance().repo.get(group, {})
+    return {name.removesuffix(".yaml"): str(getattr(node, "provider", "")) for name, node in stored.items()}
+
+
+# ---------------------------------------------------------------------- composition
+
+
+@contextmanager
+def hydra_for(verb: str, folders: Sequence[Path] = ()) -> Iterator[None]:
+    """Set Hydra up for what ``conf/<verb>.yaml`` may choose from, with a user's ``folders`` of further choices."""
+    GlobalHydra.instance().clear()
+    with seen_by(verb, folders):
+        if OLD:
+            version.setbase("1.3")
+        # hydra.initialize would first look through the call stack for a folder
+        Hydra.create_main_hydra2("go1exp", create_config_search_path(None))
+        try:
+            yield
+        finally:
+            GlobalHydra.instance().clear()
+
+
+def composed(verb: str, overrides: Sequence[str], folders: Sequence[Path] = (), resolve: bool = True) -> dict[str, Any]:
+    """Return ``conf/<verb>.yaml`` composed with overrides, as plain data.
+
+    The chosen files are composed once and kept; other values are set on a copy, in a tenth of the time.
+    """
+    with hydra_for(verb, folders):
+        try:
+            choices, values = _parsed(overrides)
+            if not any(_needs_hydra(o) for o in (*choices, *values)):
+                config = _with_choices(verb, choices, tuple(folders))
+                ConfigLoaderImpl._apply_overrides_to_config(values, config)
+                return plain(config, resolve)
+        except REFUSED:
+            pass  # the message is that of a whole composition
+        return plain(hydra.compose(verb, list(overrides)), resolve)
+
+
+def _parsed(overrides: Sequence[str]) -> tuple[list[Override], list[Override]]:
+    """Return the overrides that choose a group's file, and those that set a value; Hydra must be set up."""
+    is_group = GlobalHydra.instance().config_loader().repository.group_exists  # type: ignore[attr-defined]
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    return [o for o in parsed if is_group(o.key_or_group)], [o for o in parsed if not is_group(o.key_or_group)]
+
+
+def _needs_hydra(o: Override) -> bool:
+    """Return whether an override is a sweep, sets a package or Hydra itself, or names a user's file."""
+    if o.is_sweep_override() or o.package or re.match(r"hydra(\.|/|$)", o.key_or_group):
+        return True
+    value, stored = o.value(), stored_choices(o.key_or_group)
+    return any(isinstance(n, str) and n in stored for n in (value if isinstance(value, list) else [value]))
+
+
+def _with_choices(verb: str, choices: Sequence[Override], folders: tuple[Path, ...]) -> DictConfig:
+    state = tuple(_stamps(folder) for folder in (config_folder(), *folders))
+    return pickle.loads(_kept(verb, tuple(str(o.input_line) for o in choices), folders, state))
+
+
+@lru_cache(maxsize=64)
+def _kept(verb: str, choices: tuple[str, ...], folders: tuple[Path, ...], state: tuple[Any, ...]) -> bytes:
+    """Return ``conf/<verb>.yaml`` with choices, pickled; ``state`` is that of the files it may be made of."""
+    return pickle.dumps(hydra.compose(verb, list(choices)))
+
+
+def _stamps(folder: str | Path) -> tuple[tuple[str, int, int], ...]:
+    """Return name, time of change and size of each file below a folder."""
+    stamps: list[tuple[str, int, int]] = []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir():
+                stamps += _stamps(entry.path)
+            else:
+                stat = entry.stat()
+                stamps.append((entry.path, stat.st_mtime_ns, stat.st_size))
+    return tuple(sorted(stamps))
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a composition was refused.
+
+    Attributes:
+        kind: choice (no such file of a group), grammar, key (no such key), present (an added key exists), type (a
+            group was given a number or mapping), or other.
+        subject: what is refused: ``group/choice``, an override, or a key path.
+        text: Hydra's message in one line.
+    """
+
+    kind: Literal["choice", "grammar", "key", "present", "type", "other"]
+    subject: str
+    text: str = ""
+
+
+def refusal(error: Exception, verb: str, overrides: Sequence[str], folders: Sequence[Path]) -> Refusal | None:
+    """Return why ``overrides`` of ``conf/<verb>.yaml`` were refused with ``error``; None if they were not."""
+    if isinstance(error, MissingConfigException):
+        return Refusal("choice", error.missing_cfg_file or "", str(error).split("\n")[0])
+    if isinstance(error, OverrideParseException):
+        return Refusal("grammar", error.override)
+    if not isinstance(error, (*REFUSED, ValueError)):
+        return None
+    with suppress(*REFUSED, ValueError), hydra_for(verb, folders):
+        if culprit := _culprit(verb, overrides, tuple(folders)):
+            return culprit
+    if isinstance(error, ValueError) and not isinstance(error, REFUSED):
+        return None
+    return Refusal("other", "", " ".join(GRAMMAR.sub("", str(error.__cause__ or error)).split()))
+
+
+def _culprit(verb: str, overrides: Sequence[str], folders: tuple[Path, ...]) -> Refusal | None:
+    """Return the override that is refused, found by applying one after the other."""
+    choices, values = _parsed(overrides)
+    for o in choices:
+        chosen = o.value()
+        named = chosen if isinstance(chosen, list) else [chosen]
+        if not o.is_delete() and not all(isinstance(name, str) for name in named):
+            return Refusal("type", str(o.input_line))
+        if o.key_or_group not in groups_of(verb) and not (o.is_add() or o.is_force_add() or o.is_sweep_override()):
+            return Refusal("key", o.key_or_group)
+    config = _with_choices(verb, [o for o in choices if not _needs_hydra(o)], folders)
+    for o in values:
+        if o.package or o.is_sweep_override():
+            continue
+        exists = OmegaConf.select(config, o.key_or_group, throw_on_missing=False) is not None
+        try:
+            ConfigLoaderImpl._apply_overrides_to_config([o], config)
+        except REFUSED as error:
+            if o.is_add() and exists:
+                return Refusal("present", o.key_or_group)
+            if not exists and (o.is_delete() or isinstance(error.__cause__, AttributeError | KeyError)):
+                return Refusal("key", o.key_or_group)
+            return None
+    return None
+
+
+# ---------------------------------------------------------------------- runs and sweeps
+
+
+@contextmanager
+def composed_once(words: Sequence[str], folders: Sequence[Path]) -> Iterator[None]:
+    """Spare a third of the time of starting: Hydra composes everything a first time only to read ``hydra.mode``.
+
+    None of our files sets it. Where an option, an override or a user's file may set it, Hydra looks.
+    """
+    before = Hydra.get_mode
+    if not folders and not any(re.match(r"-(?!m$|-multirun$)|[+~]*hydra(\.mode|[/=@])", word) for word in words):
+        Hydra.get_mode = lambda *arguments, **keywords: None  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        Hydra.get_mode = before  # type: ignore[method-assign]
+
+
+def jobs_of_sweep(config: DictConfig) -> list[list[str]] | None:
+    """Return the overrides of every job, as Hydra's own sweeper makes them; None if another sweeper decides.
+
+    A key on the command line replaces that of ``hydra.sweeper.params`` (a study).
+    """
+    if not str(config.hydra.sweeper["_target_"]).endswith(f".{BasicSweeper.__name__}"):
+        return None
+    params = config.hydra.sweeper.get("params") or {}
+    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+    typed = parser.parse_overrides([str(override) for override in config.hydra.overrides.task])
+    keys = {override.key_or_group for override in typed}
+    listed = parser.parse_overrides([f"{key}={value}" for key, value in params.items()])
+    parsed = [*(override for override in listed if override.key_or_group not in keys), *typed]
+    return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
+
+
+def sweep_range(text: str) -> tuple[str, dict[str, Any]]:
+    """Return key and range of an override in Hydra's grammar for sweeps: low, high, step, log; or choices.
+
+    Raises:
+        ValueError: if the text is no range of a key.
+    """
+    try:
+        (override,) = OverridesParser.create().parse_overrides([text])
+    except HydraException as error:
+        raise ValueError(text) from error
+    value = override.value()
+    if isinstance(value, IntervalSweep) and value.start is not None and value.end is not None:
+        return override.key_or_group, {"low": value.start, "high": value.end, "log": "log" in value.tags}
+    if isinstance(value, RangeSweep) and isinstance(value.start, int) and isinstance(value.stop, int):
+        return override.key_or_group, {"low": value.start, "high": value.stop - 1, "step": int(value.step)}
+    if isinstance(value, ChoiceSweep):
+        return override.key_or_group, {"choices": tuple(override.sweep_string_iterator())}
+    raise ValueError(text)
