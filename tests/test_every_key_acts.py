@@ -119,7 +119,7 @@ EXEMPT = {
     "deploy.yaml:feet": "of sensors that count: tests/test_go1_walk.py",
     "logger/wandb.yaml:logger.wandb.tags": "tests/test_logging.py reads them back",
     **{f"report.yaml:{key}": "tests/test_report.py shows what it does" for key in REPORT},
-    **{f"train.yaml:{key}": "tests/test_beside.py shows what it does" for key in ("eval", "video", "stop")},
+    **{f"train.yaml:{key}": "tests/test_asynchronous.py shows what it does" for key in ("eval", "video", "stop")},
     **{f"play.yaml:{key}": "tests/test_viewer_keys.py" for key in ("host", "port", "log")},
     **{f"sim.yaml:{key}": "of its page: tests/test_viewer_keys.py" for key in ("viewer", "host", "port")},
     "gap.yaml:search.phase": "of robots that walk: tests/test_gap_swings.py shows what it does",

@@ -302,14 +302,14 @@ def wait_for_the_end(file: Path) -> None:
     history(file)
 
 
-def test_an_offline_run_holds_name_group_tags_notes_config_films_evaluations_and_artifacts(
+def test_an_offline_run_holds_name_group_tags_notes_config_videos_evaluations_and_artifacts(
     tmp_path: Path, no_account: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What ``wandb sync`` sends later."""
     run = tmp_path / "sweep" / "gait-0_seed-1"
     (run / "checkpoints").mkdir(parents=True)
     (run.parent / "sweep.json").write_text("{}")
-    for name in ("checkpoints/000002.pt", "best.pt", "best.json", "config.yaml", "bundle.zip", "film.mp4"):
+    for name in ("checkpoints/000002.pt", "best.pt", "best.json", "config.yaml", "bundle.zip", "video.mp4"):
         (run / name).write_bytes(name.encode())
     (run / "evals.csv").write_text("iteration,steps,score\n1,64,0.5\n2,128,0.25\n")
     monkeypatch.setattr(wandb_writer, "_bundle", lambda folder: folder / "bundle.zip")
@@ -318,9 +318,9 @@ def test_an_offline_run_holds_name_group_tags_notes_config_films_evaluations_and
     logger = make_logger(LoggerConfig(csv=False, tensorboard=False, wandb=config), run, 0, settings)
     logger.record("iteration", 1)
     logger.dump(step=64)
-    metrics.log_film(logger, 64, run / "film.mp4")
+    metrics.log_video(logger, 64, run / "video.mp4")
     logger.record("eval/score", 0.25)
-    metrics.dump_beside(logger, 128)
+    metrics.dump_late(logger, 128)
     logger.close()
     (file,) = run.rglob("*.wandb")
     rows = history(file)
@@ -331,11 +331,11 @@ def test_an_offline_run_holds_name_group_tags_notes_config_films_evaluations_and
     assert (logged["seed"], logged["reward"]) == (7, {"gait": {"weight": 10.0}})
     columns = {key for row in rows for key in row}
     assert "eval/score" in columns
-    films = [row for row in rows if any(key.startswith("film") and "steps" not in key for key in row)]
-    assert films
+    videos = [row for row in rows if any(key.startswith("video") and "steps" not in key for key in row)]
+    assert videos
     assert any(key.startswith("evaluations") for key in columns)
     kept = {item.path for record in of_kind(file, "files") for item in record.files}
-    assert any(path.startswith("media/videos/film") for path in kept)
+    assert any(path.startswith("media/videos/video") for path in kept)
     assert any(path.startswith("media/table/evaluations") for path in kept)
     artifacts = {a.type: [e.path for e in a.manifest.contents] for a in of_kind_of_requests(file)}
     assert set(artifacts) >= {"model", "bundle"}

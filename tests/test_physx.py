@@ -147,7 +147,7 @@ def test_nothing_is_judged_on_an_engine_that_is_not_the_robot(
 
     monkeypatch.setattr(rollout, "make_backend", light)
     config = EvalConfig(((0.0, 0.0, 0.0),), 1, 1.0, 0.0, False, False, False, False, None, 1, engine=PHYSX)
-    with pytest.raises(Expected, match="nothing is judged on it: link masses"):
+    with pytest.raises(Expected, match="nothing is evaluated on it: link masses"):
         evaluate(make_task(), lambda observation: torch.zeros(1, 12), config)
 
 
@@ -447,7 +447,7 @@ def test_it_trains_nothing(make_task: Callable[..., TaskConfig]) -> None:
 
     config = parse_train(compose("train"))
     config = dataclasses.replace(config, task=dataclasses.replace(config.task, backend=PHYSX))
-    with pytest.raises(ConfigError, match="judges policies and trains none"):
+    with pytest.raises(ConfigError, match="evaluates policies and trains none"):
         preflight.check_devices(config)
 
 

@@ -103,7 +103,7 @@ def test_where_the_file_system_knows_no_locks_a_file_with_a_heartbeat_guards(
             raise AssertionError("two at a time")
 
     with (
-        pytest.warns(UserWarning, match="its file system knows no locks"),
+        pytest.warns(UserWarning, match="its file system has no locks"),
         run_state.locked(tmp_path),
         pytest.raises(run_state.RunInUse, match=f"process {os.getpid()} on "),
     ):

@@ -1,7 +1,7 @@
-"""``python -m go1exp.evaluate.asynchronous RUN``: evaluates and films policies of a training that goes on beside it.
+"""``python -m go1exp.evaluate.asynchronous RUN``: evaluates and records policies of a running training.
 
-Jobs are lines of JSON on standard input, results are lines of JSON on standard output; see ``go1exp/train/beside.py``,
-which starts it. It ends with its input.
+Jobs are lines of JSON on standard input, results are lines of JSON on standard output; see
+``go1exp/train/asynchronous.py``, which starts it. It ends with its input.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ def evaluated(run: Path, policy_file: Path, settings: dict[str, Any]) -> dict[st
     return {"score": score(rows, wanted.duration_s), **figures, "fall_share": mean("fell")}
 
 
-def film(run: Path, policy_file: Path, settings: dict[str, Any], out: Path) -> None:
-    """Film a policy file of a run on the nominal robot on flat ground; write an MP4 file."""
+def record(run: Path, policy_file: Path, settings: dict[str, Any], out: Path) -> None:
+    """Write a video of a policy file of a run, on the nominal robot on flat ground (MP4)."""
     from go1exp.evaluate import video
     from go1exp.sim.env.core import Go1Core
 
@@ -96,11 +96,11 @@ def answered(run: Path, job: dict[str, Any]) -> dict[str, Any]:
     try:
         if job["kind"] == "evaluate":
             return {**result, "figures": evaluated(run, Path(job["policy"]), job["settings"])}
-        film(run, Path(job["policy"]), job["settings"], Path(job["out"]))
+        record(run, Path(job["policy"]), job["settings"], Path(job["out"]))
         return {**result, "out": job["out"]}
     except Exception as error:  # a failure here shall not end the training
         text = " ".join(f"{type(error).__name__}: {error}".split())
-        return {**result, "problem": f"{job['kind']} beside the training failed: {text[:200]}"}
+        return {**result, "problem": f"{job['kind']} during the training failed: {text[:200]}"}
 
 
 def main(arguments: Sequence[str]) -> None:

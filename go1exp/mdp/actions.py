@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def clipped(action: Tensor, clip: float) -> Tensor:
-    """Cut a policy's output (N, 12) at +-``clip``: what acts, and what the policy is told of its last output."""
+    """Cut a policy's output (N, 12) at +-``clip``: the action in force, which the policy observes as its last one."""
     return action.clamp(-clip, clip)
 
 

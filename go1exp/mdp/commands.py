@@ -45,9 +45,9 @@ class UniformVelocity(Memory):
             hold_time: range of the time that a command is held, s.
             standing_fraction: share of the commands that are exactly zero.
             zero_fraction: probability that an axis of another command is zero, each axis by itself: without it a
-                robot is hardly ever told to do one thing alone.
+                pure command along one axis is rare.
             hard_share: share of the ranges on the hardest tiles of a height field, from 1 on flat ones; linear in
-                difficulty. Nobody runs over boxes of 20 cm (go2_rl_gym: commands by terrain).
+                difficulty. Source: go2_rl_gym.
         """
         device = stream.key.device
         ranges = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z, hold_time], device=device)

@@ -28,7 +28,7 @@ DIAGONAL_SIGNS = (1.0, -1.0, -1.0, 1.0)
 
 
 def is_moving(s: Snapshot, speed_threshold: float) -> Tensor:
-    """(N,) bool: told to move, or moving faster than ``speed_threshold`` m/s all the same (Isaac Lab, Spot task)."""
+    """(N,) bool: non-zero command, or faster than ``speed_threshold`` m/s without one (Isaac Lab, Spot task)."""
     assert s.base_lin_vel_b is not None
     return (s.command.norm(dim=-1) > 0) | (s.base_lin_vel_b[:, :2].norm(dim=-1) > speed_threshold)
 

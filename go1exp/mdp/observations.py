@@ -54,7 +54,7 @@ def joint_position(s: Snapshot) -> Tensor:
 
 @observation("joint_velocity", size=12, mirror=JOINTS)
 def joint_velocity(s: Snapshot, *, scale: Positive = 1.0) -> Tensor:
-    """Joint speeds, (N, 12) rad/s, times ``scale``."""
+    """Joint velocities, (N, 12) rad/s, times ``scale``."""
     return s.joint_vel * scale
 
 
@@ -68,7 +68,7 @@ def previous_action(s: Snapshot) -> Tensor:
 def gait_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
     """Sine and cosine of a clock of ``rate`` turns a second, (N, 2); zero while no motion is commanded.
 
-    Reward ``foot_clock`` pays for following it. Not of the paper.
+    Reward ``foot_clock`` rewards following it. Not of the paper.
     """
     angle = clock_angle(s, rate)
     moving = s.command.norm(dim=-1, keepdim=True) > 0

@@ -178,5 +178,5 @@ def joint_positions(
 
 @randomization("joint_velocities", kind="state")
 def joint_velocities(state: KinematicState, stream: Stream, *, range: Range = (-2.5, 2.5)) -> None:
-    """Initial joint speeds, rad/s. Table I: scale, (-2.5, 2.5), which of a nominal zero is zero; added here."""
+    """Initial joint velocities, rad/s. Table I: scale, (-2.5, 2.5), which of a nominal zero is zero; added here."""
     state.joint_vel.add_(stream.uniform(robot.NUM_JOINTS, low=range[0], high=range[1]))

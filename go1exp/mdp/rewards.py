@@ -44,7 +44,7 @@ def feet_air_time(s: Snapshot, *, mode_time: Positive = 0.175, speed_threshold: 
 
     Moving: sum_i T_i [T_i < m], T_i = max(air, contact time). Standing: sum_i clip(contact - air, -m, m).
     Swing and stance count alike, so that the best gait changes phase every ``mode_time``. Sum over feet, s;
-    negative for a standing robot with its feet in the air. Printed: sum_i (t_air,i - 0.175), which pays for never
+    negative for a standing robot with its feet in the air. Printed: sum_i (t_air,i - 0.175), which rewards never
     landing; source of the form: Isaac Lab, Spot `air_time`.
     """
     phase = torch.maximum(s.foot_air_time, s.foot_contact_time)
@@ -55,7 +55,7 @@ def feet_air_time(s: Snapshot, *, mode_time: Positive = 0.175, speed_threshold: 
 
 @reward("feet_air_time_touchdown")
 def feet_air_time_touchdown(s: Snapshot, *, threshold: NonNegative = 0.175) -> Tensor:
-    """Long swings, paid at touchdown: sum_i (last air time_i - threshold) [foot i touched down], s; can be negative.
+    """Long swings, rewarded at touchdown: sum_i (last air time_i - threshold) [foot i touched down], s; any sign.
 
     The other reading of the paper's first row (Isaac Lab, `feet_air_time`); zero while no motion is commanded.
     """
@@ -67,7 +67,7 @@ def feet_air_time_touchdown(s: Snapshot, *, threshold: NonNegative = 0.175) -> T
 def linear_velocity_error(s: Snapshot, *, scale: Positive = 1.0, ramp: NonNegative = 0.0) -> Tensor:
     """Tracking of the commanded planar velocity: exp(-|v*_xy - v_xy| / scale); scale in m/s. Table III.
 
-    ``ramp``, s/m, makes fast commands worth their effort: times 1 + ramp max(|v*_xy| - 1 m/s, 0), as in Isaac Lab's
+    ``ramp``, s/m, raises the reward of fast commands: times 1 + ramp max(|v*_xy| - 1 m/s, 0), as in Isaac Lab's
     Spot task.
     """
     assert s.base_lin_vel_b is not None
@@ -127,8 +127,8 @@ def load_clock(s: Snapshot, *, rate: Positive = 2.5) -> Tensor:
     """Weight on the diagonal that the clock of ``gait_clock`` puts on the ground: sum_i F_i c_i / sum_i F_i.
 
     c = -sin(p), p as in ``foot_clock``; F are the forces on the feet, N. In -1 to 1, 0 for standing feet; shifting
-    weight pays before a foot leaves the ground. 0 while no motion is commanded. Not in Table III; after Siekmann et
-    al., arXiv 2011.01387.
+    weight is rewarded before a foot leaves the ground. 0 while no motion is commanded. Not in Table III; after Siekmann
+    et al., arXiv 2011.01387.
     """
     stance = -torch.sin(clock_angle(s, rate)).unsqueeze(-1) * constant_like(DIAGONAL_SIGNS, s.foot_force)
     share = s.foot_force / s.foot_force.sum(-1, keepdim=True).clamp(min=1.0)
@@ -215,7 +215,7 @@ def foot_peak_force(s: Snapshot) -> Tensor:
 def touchdown_speed(s: Snapshot, *, free: NonNegative = 0.0) -> Tensor:
     """Feet that land fast: sum_i max(w_i - free, 0)^2 [foot i touched down], m2/s2, w the downward speed in m/s.
 
-    Paid in the step of the touchdown: weight x policy period for each. Not in Table III.
+    Counted in the step of the touchdown: weight x policy period for each. Not in Table III.
     """
     assert s.foot_touchdown_speed is not None
     return ((s.foot_touchdown_speed - free).clamp(min=0.0).square() * s.foot_touchdown).sum(-1)
@@ -289,7 +289,7 @@ def calf_contact(s: Snapshot) -> Tensor:
 def trunk_contact(s: Snapshot) -> Tensor:
     """Trunk, head or a hip touched the ground, 0 or 1. Not in Table III.
 
-    Where this ends the episode (``termination=fall``) it is what a fall costs, once: weight x policy period.
+    Where this ends the episode (``termination=fall``) it is the penalty of a fall, once: weight x policy period.
     """
     assert s.trunk_contact is not None
     return s.trunk_contact.to(s.joint_pos.dtype)

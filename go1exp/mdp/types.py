@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TermSetup:
-    """What a reward, observation or termination term that is a class is told when it is built."""
+    """Arguments from which a reward, observation or termination that is a class is built."""
 
     num_envs: int
     """N."""

@@ -1,4 +1,4 @@
-"""What actuators and effects are told about the robot and the batch when they are built."""
+"""Description of robot, batch and model from which actuators and effects are built."""
 
 from __future__ import annotations
 

@@ -54,8 +54,8 @@ class TerrainConfig:
         ramps_proportion: Share of columns with ramps, half of them up to the platform, half down to it.
         flat_proportion: Share of columns without relief.
         box_height: Largest height of a box above or below 0, m; heights are uniform in between (Isaac Lab, Go1: 0.1).
-        box_cell: Edge of a square box, m (Isaac Lab: 0.45). Edges fall on the nearest sample and a riser leans over
-            one sample, since a height field has no vertical walls.
+        box_cell: Edge of a square box, m (Isaac Lab: 0.45). Edges fall on the nearest sample and a riser is inclined
+            over one sample, since a height field has no vertical walls.
         bump_amplitude: Largest height of a bump above or below 0, m; heights are uniform in between (Isaac Lab, Go1:
             0.06).
         bump_length: Distance over which the autocorrelation of the bumps, exp(-(r / length)^2), falls to 1/e, m.

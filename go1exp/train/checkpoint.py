@@ -112,7 +112,7 @@ def restore(ppo: AdaptivePPO, state: dict[str, Any]) -> None:
     """Put ``ppo`` and its environment into the state of a checkpoint.
 
     Raises:
-        DamagedCheckpoint: if it lacks a part that this version's environment has; the learner is as it was.
+        DamagedCheckpoint: if a part of this version's environment is missing in it; the learner is as it was.
     """
     core = _core(ppo)
     try:

@@ -110,14 +110,14 @@ def _hparams(settings: dict[str, Any]) -> HParam:
     )
 
 
-def log_film(logger: Logger, steps: int, file: Path) -> None:
-    """Give a film of the policy after ``steps`` environment steps to the writers that take films."""
+def log_video(logger: Logger, steps: int, file: Path) -> None:
+    """Log a video of the policy after ``steps`` environment steps, in the writers that take videos."""
     for writer in logger.output_formats:
         if isinstance(writer, WandbWriter):
-            writer.film(steps, file)
+            writer.video(steps, file)
 
 
-def dump_beside(logger: Logger, steps: int) -> None:
+def dump_late(logger: Logger, steps: int) -> None:
     """Write what was recorded to all writers but the CSV files, which have one row for each iteration."""
     for writer in logger.output_formats:
         if not isinstance(writer, CsvWriter):

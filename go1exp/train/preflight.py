@@ -83,7 +83,7 @@ def check_devices(config: TrainConfig) -> None:
             )
         wanted.append(("backend.device", backend.device, "backend=cpu"))
     if isinstance(backend, PhysxBackend):
-        problems.append("backend = 'physx': judges policies and trains none; use backend=cpu or backend=warp")
+        problems.append("backend = 'physx': evaluates policies and trains none; use backend=cpu or backend=warp")
     for key, name, instead in wanted:
         if name.startswith("cuda") and not torch.cuda.is_available():
             problems.append(f"{key} = {name!r}: torch finds no CUDA device; use {instead}")

@@ -89,7 +89,7 @@ def _acquired(run: Path) -> BaseFileLock:
             if isinstance(error, Timeout) or error.errno not in NO_LOCKS:
                 raise
             warnings.warn(
-                f"{run}: its file system knows no locks; a file that is renewed every {LEASE_S / 3:.0f} s guards the "
+                f"{run}: its file system has no locks; a lease that is extended every {LEASE_S / 3:.0f} s guards the "
                 "folder instead, and that of a run that was killed on another computer counts for two minutes",
                 stacklevel=3,
             )

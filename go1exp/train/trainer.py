@@ -23,7 +23,7 @@ from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import TrainConfig, parse_train
 from go1exp.train import checkpoint, metrics, preflight, run_folder, start
-from go1exp.train.beside import Beside
+from go1exp.train.asynchronous import AsyncEvaluation
 from go1exp.train.device import DevicePPO
 from go1exp.train.early_stop import EarlyStop
 from go1exp.train.group import Group, together
@@ -96,10 +96,12 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: star
         ppo = _begun(config, run, first, group)
         logger = metrics.make_logger(config.logger, run, ppo.iteration, container, ppo.num_timesteps)
         size = config.ppo.num_envs * config.ppo.steps
-        beside = Beside(config, run, ppo.iteration, lambda steps, file: metrics.log_film(logger, steps, file))
+        evaluation = AsyncEvaluation(
+            config, run, ppo.iteration, lambda steps, file: metrics.log_video(logger, steps, file)
+        )
         stop = EarlyStop(config.stop, run, ppo.iteration)
         with Progress(ppo.iteration, config.ppo.iterations, size) as progress, _signals() as asked_to_stop:
-            ppo.after_iteration = _Closing(config, run, logger, progress, asked_to_stop, beside, stop)
+            ppo.after_iteration = _Closing(config, run, logger, progress, asked_to_stop, evaluation, stop)
             complete = False
             try:
                 _learn(ppo, config, logger)
@@ -108,26 +110,26 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: star
                 _keep(fault, run)
                 raise
             finally:
-                _close(ppo, logger, beside, complete)
+                _close(ppo, logger, evaluation, complete)
     return ppo
 
 
-def _close(ppo: AdaptivePPO, logger: Logger, beside: Beside, complete: bool) -> None:
-    """End what goes on beside the training, wait for it if that is complete, and close the logs."""
-    late = beside.finish(wait=complete)
-    for problem in beside.problems:
+def _close(ppo: AdaptivePPO, logger: Logger, evaluation: AsyncEvaluation, complete: bool) -> None:
+    """End the asynchronous evaluation, after its jobs if the training is complete, and close the logs."""
+    late = evaluation.finish(wait=complete)
+    for problem in evaluation.problems:
         print(problem)
-    if beside.skipped:
-        print(f"{beside.skipped} evaluations or films were left out: the process beside the training is slower")
+    if evaluation.skipped:
+        print(f"{evaluation.skipped} evaluations or videos were skipped: their process is slower than the training")
     if late:
         for key, value in late.items():
             logger.record(key, value)
-        metrics.dump_beside(logger, ppo.num_timesteps)
+        metrics.dump_late(logger, ppo.num_timesteps)
     logger.close()
 
 
 def train_as_member(container: dict[str, Any], run: Path, group: Group) -> None:
-    """Train as another member of ``group`` than its first: without files, a log, or an ear for signals."""
+    """Train as another member of ``group`` than its first: without files, log and signal handlers."""
     config = parse_train(run_folder.with_kept_plugins(run, container))
     ppo = _begun(config, run, None, group)
     logger = Logger(None, [])
@@ -168,7 +170,7 @@ def _begun(config: TrainConfig, run: Path, first: start.Weights | None, group: G
 
 
 class _Closing:
-    """What is done after each iteration: rows, progress, checkpoint, and the end if somebody asked for it."""
+    """End of an iteration: metrics, progress, schedule, checkpoint, and the end of training if requested."""
 
     def __init__(
         self,
@@ -177,11 +179,11 @@ class _Closing:
         logger: Logger,
         progress: Progress | None,
         asked_to_stop: Callable[[], bool],
-        beside: Beside | None = None,
+        evaluation: AsyncEvaluation | None = None,
         stop: EarlyStop | None = None,
     ) -> None:
         self.config, self.run, self.logger, self.progress = config, run, logger, progress
-        self.asked_to_stop, self.beside, self.stop = asked_to_stop, beside, stop
+        self.asked_to_stop, self.evaluation, self.stop = asked_to_stop, evaluation, stop
         self._clock = time.monotonic()
 
     def __call__(self, ppo: AdaptivePPO) -> None:
@@ -196,7 +198,7 @@ class _Closing:
             self.logger.record(key, value)
         for key, value in ppo.schedule.metrics().items():
             self.logger.record(key, value)
-        for key, value in (self.beside.collect() if self.beside else {}).items():
+        for key, value in (self.evaluation.collect() if self.evaluation else {}).items():
             self.logger.record(key, value)
         logged = dict(self.logger.name_to_value)
         if self.progress:
@@ -209,8 +211,8 @@ class _Closing:
         stopping = ppo.group.agreed(self.asked_to_stop())
         if last or stopping or reason or ppo.iteration % self.config.checkpoint.every == 0:
             checkpoint.save(ppo, self.run, self.config.checkpoint.keep)
-        if self.beside:
-            self.beside.offer(ppo, last=last or bool(reason))
+        if self.evaluation:
+            self.evaluation.offer(ppo, last=last or bool(reason))
         if reason:
             if self.stop:
                 self.stop.note(ppo.iteration, reason)
@@ -228,9 +230,9 @@ def _keep(fault: NumericalFault, run: Path) -> None:
 
 @contextmanager
 def _signals() -> Iterator[Callable[[], bool]]:
-    """Turn signals into a wish that can be asked for; the third Ctrl-C has the usual effect of one.
+    """Turn signals into a request to stop; the third Ctrl-C has its usual effect.
 
-    SIGTERM and SIGHUP are no more than a wish however often they come: the end of a terminal sends several.
+    SIGTERM and SIGHUP stay a request however often they arrive: the end of a terminal sends several.
     """
     received: list[int] = []
     usual = signal.getsignal(signal.SIGINT)

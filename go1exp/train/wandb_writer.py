@@ -1,4 +1,4 @@
-"""Weights & Biases: metrics, films, evaluations, checkpoints and bundle of a run; tables of a report.
+"""Weights & Biases: metrics, videos, evaluations, checkpoints and bundle of a run; tables of a report.
 
 Variables ``WANDB_*`` of the environment go before the settings, as wandb's own documentation has it. Offline runs are
 sent later by ``wandb sync RUN/wandb/offline-run-*``.
@@ -21,7 +21,7 @@ from go1exp.base.files import write_text
 from go1exp.config.schema.beside import ROWS
 from go1exp.config.schema.registry import ConfigError, Expected
 from go1exp.sim.task import LoggerConfig, WandbConfig
-from go1exp.train.beside import BEST
+from go1exp.train.asynchronous import BEST
 
 IDENTITY = "wandb_id"
 """In the run folder: the id under which a resumed run goes on."""
@@ -88,10 +88,10 @@ class WandbWriter(KVWriter):
         self._step = max(self._step, step)
         self._run.log(dict(key_values), step=step)
 
-    def film(self, steps: int, file: Path) -> None:
-        """Log a film of the policy after ``steps`` environment steps; W&B takes no rows of the past."""
+    def video(self, steps: int, file: Path) -> None:
+        """Log a video of the policy after ``steps`` environment steps; W&B takes no rows of the past."""
         video = _wandb().Video(str(file), format="mp4", caption=f"after {steps:,} steps")
-        self._run.log({"film": video, "film_steps": steps}, step=self._step)
+        self._run.log({"video": video, "video_steps": steps}, step=self._step)
 
     def close(self) -> None:
         """Log evaluations as a table, checkpoints and bundle as artifacts, and finish the run."""

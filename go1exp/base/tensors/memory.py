@@ -102,10 +102,10 @@ class DelayLine(Memory):
 
 @functools.cache
 def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return ``values`` (K,) as a tensor, always the same one, which nobody may change."""
+    """Return ``values`` (K,) as a tensor, always the same one; it must not be changed."""
     return torch.tensor(values, dtype=torch.float64).to(device=device, dtype=dtype)
 
 
 def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
-    """Return ``values`` (K,) in the dtype and on the device of ``like``; nobody may change them."""
+    """Return ``values`` (K,) in the dtype and on the device of ``like``; they must not be changed."""
     return constant(values, like.dtype, like.device)

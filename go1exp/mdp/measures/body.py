@@ -44,7 +44,7 @@ def torque_share_p99(trace: Trace) -> Array:
 
 @measure("joint_speed_share_p99", unit="-")
 def joint_speed_share_p99(trace: Trace) -> Array:
-    """Joint speed over the actuator's top speed, 99th percentile over steps and joints (N,)."""
+    """Joint velocity over the actuator's largest velocity, 99th percentile over steps and joints (N,)."""
     return percentile_over(_speed_share(trace), trace.counts, HIGH)
 
 

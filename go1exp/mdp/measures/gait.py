@@ -1,6 +1,6 @@
 """Timing of the feet: phases, duty, stride rate, clearance, and which gait that is.
 
-A stride of a foot lasts from one touchdown to the next. A robot that is told to stand has no gait: its values are NaN.
+A stride of a foot lasts from one touchdown to the next. At zero command a robot has no gait: its values are NaN.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def touchdown_phase(trace: Trace) -> Array:
 
 @measure("phase_consistency", unit="-", per="foot")
 def phase_consistency(trace: Trace) -> Array:
-    """How alike the strides are: 1 if a foot always lands at the same phase, about 0 if at any (N, 4)."""
+    """Consistency of the strides: 1 if a foot always lands at the same phase, about 0 if at any (N, 4)."""
     return np.abs(_mean_phasors(trace))
 
 
@@ -105,7 +105,8 @@ def _errors(trace: Trace) -> tuple[list[str], Array]:
 def gait(trace: Trace, *, largest_error: Fraction = 0.125, least_consistency: Fraction = 0.7) -> NDArray[np.str_]:
     """Nearest gait: trot, pace, bound, pronk, walk, amble; none if far from all; empty without strides (N,).
 
-    ``largest_error``, cycles: half of the way from a trot to a walk. ``least_consistency`` of the least alike foot.
+    ``largest_error``, cycles: half of the way from a trot to a walk. ``least_consistency`` of the least consistent
+    foot.
     """
     names, errors = _errors(trace)
     defined = np.isfinite(errors.sum(0))

@@ -100,7 +100,7 @@ class NotMeasured(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """N robots over T steps and S >= T samples of contact, S a multiple of T; a column that nobody measured is None.
+    """N robots over T steps and S >= T samples of contact, S a multiple of T; a column that was not measured is None.
 
     Joints and legs are in the order of ``robot.py``. Of a simulated robot a step is a policy step and a sample a
     physics step; of a recording both are one row. A value is that at the end of its step unless it says otherwise.
@@ -195,7 +195,7 @@ class Trace:
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:
-        """(T, N) steps that count and in which the robot was told to move; without a command, all that count."""
+        """(T, N) steps that count and with a non-zero command; without a command, all that count."""
         if self.command is None:
             return self.counts
         return self.counts & np.any(self.command != 0.0, axis=-1)

@@ -103,7 +103,7 @@ class Restarts:
     """Calls a restart of the rows of a mask; where looking at the mask is free and it is empty, only counters move.
 
     A restart draws the same number of random numbers whatever the mask, so that a robot's do not depend on the others
-    of its batch. For a few robots on a CPU a restart of nobody would cost a quarter of the step; on a GPU looking would
+    of its batch. For a few robots on a CPU an empty restart would cost a quarter of the step; on a GPU looking would
     cost more.
     """
 

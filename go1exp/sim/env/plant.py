@@ -3,11 +3,11 @@
 Training, evaluation, recording and identification all step this, so that an effect means the same to each.
 
 Numerics. MuJoCo's Euler step is a leapfrog: qpos belongs to the step's instant, qvel to half a step before it. An
-actuator that took both at face value would react half a step late to speed and half a step early to its target, which
-at 2 ms moves a 0.2 rad step by 5 mrad against 0.25 ms. So the actuator gets the speed extrapolated to the instant of
-qpos, and a target that changes counts for half of the step in which it changes: second order in the step, 0.3 mrad. Dry
-friction changes its sign within the step in which a joint turns. MuJoCo's has the sign of the speed at its end all the
-step long; the difference is given beside it.
+actuator that took both at face value would react half a step late to the velocity and half a step early to its target,
+which at 2 ms moves a 0.2 rad step by 5 mrad against 0.25 ms. So the actuator gets the velocity extrapolated to the
+instant of qpos, and a target that changes counts for half of the step in which it changes: second order in the step,
+0.3 mrad. Dry friction changes its sign within the step in which a joint turns. MuJoCo's has the sign of the speed at
+its end all the step long; the difference is given beside it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Plant:
 
     Attributes:
         q: (N, J) true joint angles, live, rad.
-        qd: (N, J) true joint speeds half a step before ``q``, live, rad/s.
+        qd: (N, J) true joint velocities half a step before ``q``, live, rad/s.
         torque: (N, J) what the actuators made in the last step, N m.
         actuator: the actuators.
         effects: what else acts.
@@ -145,7 +145,7 @@ class Plant:
         return self.effects.on_report(self.torque)
 
     def speed(self) -> Tensor:
-        """(N, J) joint speeds at the instant of ``q``, rad/s."""
+        """(N, J) joint velocities at the instant of ``q``, rad/s."""
         return torch.lerp(self._before, self.qd, 1.5)
 
     def step(self, target: Tensor, feedforward: Tensor | None = None) -> None:
@@ -240,7 +240,7 @@ class Plant:
         return torch.where(turns, torch.copysign(minus_share * twice, turn), 0.0)
 
     def joint_acceleration(self) -> Tensor:
-        """(N, J) change of joint speed over the last step, rad/s2."""
+        """(N, J) change of joint velocity over the last step, rad/s2."""
         return (self.qd - self._before) / self._dt
 
     def sense(self, s: Snapshot) -> Snapshot:

@@ -79,7 +79,7 @@ class StepTerms:
         self._terminations = task.termination
         self._termination_calls = calls("termination", task.termination)
         self.failed = torch.zeros(num_envs, len(task.termination), dtype=torch.bool, device=device)
-        # Seen with MuJoCo Warp alone; engines that judge a policy must not hide a fall behind it.
+        # Seen with MuJoCo Warp alone; an engine that evaluates a policy must not hide a fall behind it.
         self.distrusts = isinstance(task.backend, WarpBackend)
         self.left_map, self.impossible = torch.zeros(2, num_envs, dtype=torch.bool, device=device).unbind(0)
         beside = task.critic if critic else ()

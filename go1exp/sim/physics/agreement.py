@@ -94,7 +94,7 @@ def require(reference: PhysicsBackend, engine: PhysicsBackend, name: str) -> lis
     checks = compare(reference, engine)
     if failed := [str(check) for check in checks if not check.holds]:
         raise Expected(
-            f"engine = {name}: is not the robot of the model, so nothing is judged on it: {'; '.join(failed)}"
+            f"engine = {name}: is not the robot of the model, so nothing is evaluated on it: {'; '.join(failed)}"
         )
     return checks
 
@@ -187,9 +187,9 @@ def _masses_and_gravity(reference: PhysicsBackend, engine: PhysicsBackend) -> di
     """Compare mass matrix and gravity at random poses."""
     mass, gravity = [], []
     for pose in _poses(POSES, 1.0, seed=0):
-        (judged, weight), (known, known_weight) = _response(engine, pose), _response(reference, pose)
+        (tested, weight), (known, known_weight) = _response(engine, pose), _response(reference, pose)
         scale = np.sqrt(np.diag(known))
-        mass.append(_largest((judged - known) / np.outer(scale, scale)))
+        mass.append(_largest((tested - known) / np.outer(scale, scale)))
         gravity.append(_largest((weight - known_weight)[3:]))
     return {"mass matrix": float(np.max(mass)), "gravity torque": float(np.max(gravity))}
 
@@ -206,11 +206,11 @@ def _fall(reference: PhysicsBackend, engine: PhysicsBackend) -> dict[str, float]
         for _ in range(round(FALL_S / each.model.opt.timestep)):
             each.step(GAINS[0] * (stance - each.qpos[:, 7:]) - GAINS[1] * each.qvel[:, 6:])
         ends.append(_host(each.qpos))
-    judged, known = ends
+    tested, known = ends
     attitude = [Rotation.from_quat(end[:, 3:7], scalar_first=True) for end in ends]
     step = float(reference.model.opt.timestep)
     return {
-        "fall: trunk": _largest(judged[:, :3] - known[:, :3]) / step,
+        "fall: trunk": _largest(tested[:, :3] - known[:, :3]) / step,
         "fall: attitude": _largest((attitude[0] * attitude[1].inv()).magnitude()) / step,
-        "fall: joints": _largest(judged[:, 7:] - known[:, 7:]) / step,
+        "fall: joints": _largest(tested[:, 7:] - known[:, 7:]) / step,
     }

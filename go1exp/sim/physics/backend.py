@@ -27,8 +27,8 @@ class PhysicsBackend(Protocol):
     qpos: Tensor
     """(N, 19): position in the world m, quaternion w-x-y-z, joint angles rad; of a held trunk (N, 12), the last."""
     qvel: Tensor
-    """(N, 18): linear velocity in the world m/s, angular velocity in the trunk frame rad/s, joint speeds rad/s; of a
-    held trunk (N, 12), the last."""
+    """(N, 18): linear velocity in the world m/s, angular velocity in the trunk frame rad/s, joint velocities rad/s; of
+    a held trunk (N, 12), the last."""
     sensordata: Tensor
     """(N, S), addressed by ``sensors``."""
 

@@ -79,13 +79,13 @@ class LegDynamics:
 def joint_torques(
     config: RobotConfig, base_quat: tuple[float, float, float, float], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> np.ndarray:
-    """Return M(q) qdd + c(q, qd) + g(q) of a robot whose trunk is held: what actuator and friction together gave.
+    """Return M(q) qdd + c(q, qd) + g(q) of a robot with a fixed trunk: torque of actuator and friction together.
 
     Args:
         config: the robot; its damping and dry friction are the model's own, so that they are not in the result.
         base_quat: attitude of the trunk, w-x-y-z.
         q: joint angles (T, 12), rad.
-        qd: joint speeds (T, 12), rad/s.
+        qd: joint velocities (T, 12), rad/s.
         qdd: joint accelerations (T, 12), rad/s2.
 
     Returns:

@@ -28,14 +28,14 @@ def build_fixed_base(
     base_quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
     mounted: bool = False,
 ) -> mujoco.MjModel:
-    """Compile a robot that is bolted down.
+    """Compile a robot with a fixed base.
 
     Joints that are not asked for are held at zero, those of the base included; so are touching shapes and the file's
     own motors and sensors left out. Each link takes the name of its joint, so that effects on links find it.
 
     Args:
         file: MJCF, whose path names what it includes.
-        base: body that is bolted down.
+        base: body that is fixed to the world.
         joints: hinges in the order in which the model will have them, J.
         effort: peak torque of each, (J,) N m.
         physics_dt: timestep, s.

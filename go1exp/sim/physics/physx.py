@@ -66,7 +66,7 @@ class PhysxCpu(MujocoCpu):
         """Build the robots; ``settings.threads`` = 0 takes all cores.
 
         Raises:
-            go1exp.config.schema.registry.Expected: if the model is none that PhysX is told of here.
+            go1exp.config.schema.registry.Expected: if the model has a part that is not translated to PhysX.
         """
         kinematics = copy.copy(model)
         kinematics.opt.disableflags |= int(NO_DYNAMICS)

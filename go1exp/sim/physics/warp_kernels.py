@@ -1,4 +1,4 @@
-"""Kernels that MuJoCo Warp lacks: contact sensors in one pass, MuJoCo's law of height fields, random numbers.
+"""Kernels beside MuJoCo Warp's own: contact sensors in one pass, MuJoCo's law of height fields, random numbers.
 
 Its own contact sensors look for every sensor at every contact, and sort; here, where all contacts are with the ground,
 each contact knows its sensors. That is a fifth of a physics step. The readings are the same but for the order of sums.

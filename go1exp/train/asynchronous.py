@@ -1,7 +1,7 @@
-"""Evaluates and films policies while training goes on: another process, on the CPU engine, of the lowest priority.
+"""Asynchronous evaluation and videos of a training: another process, on the CPU engine, of the lowest priority.
 
 The process is ``python -m go1exp.evaluate.asynchronous RUN``; jobs and results are lines of JSON. Training never waits
-for it but at its end. What it finds goes to ``evals.csv``, to the loggers, and the best policy to ``best.pt``, whose
+for it but at its end. Its results go to ``evals.csv``, to the loggers, and the best policy to ``best.pt``, whose
 row is ``best.json``: always one of ``evals.csv``.
 """
 
@@ -29,8 +29,8 @@ from go1exp.sim.task import TrainConfig
 from go1exp.train.checkpoint import FORMAT, SUFFIX
 from go1exp.train.ppo import AdaptivePPO
 
-FOLDER, BEST, BEST_ROW, FILMS = "evals", "best.pt", "best.json", "videos"
-"""In the run folder: policies that are evaluated, the best one, its row, films."""
+FOLDER, BEST, BEST_ROW, VIDEOS = "evals", "best.pt", "best.json", "videos"
+"""In the run folder: policies that are evaluated, the best one, its row, videos."""
 
 WAITING = 3
 """Jobs that may wait; a policy that would be the next one is not evaluated."""
@@ -41,34 +41,34 @@ PATIENCE = 600.0
 MODULE = "go1exp.evaluate.asynchronous"
 
 
-class Beside:
+class AsyncEvaluation:
     """The other process, begun with the first job; with ``eval.every`` and ``video.every`` 0 there never is one.
 
     Args:
         config: of the training.
         run: its folder.
         iteration: that training continues from: rows of later ones are dropped.
-        on_film: called with the iteration's steps and the file of each film.
+        on_video: called with the iteration's steps and the file of each video.
     """
 
     def __init__(
-        self, config: TrainConfig, run: Path, iteration: int, on_film: Callable[[int, Path], None] | None = None
+        self, config: TrainConfig, run: Path, iteration: int, on_video: Callable[[int, Path], None] | None = None
     ) -> None:
-        self._config, self._run, self._on_film = config, run, on_film
+        self._config, self._run, self._on_video = config, run, on_video
         self._process: subprocess.Popen[str] | None = None
         self._results: queue.Queue[dict[str, Any] | None] = queue.Queue()
         self._waiting, self.skipped, self.problems = 0, 0, list[str]()
         self._written, self._best = set[Path](), math.inf
         self._rows = [row for row in _rows(run / ROWS) if row["iteration"] <= iteration]
         if self._rows or any((run / name).is_file() for name in (ROWS, BEST_ROW)):
-            self._settle_best(iteration)
+            self._restore_best(iteration)
             self._write_rows()
 
-    def _settle_best(self, iteration: int) -> None:
-        """Make the best policy that of a row again, after a crash or a return to an older checkpoint.
+    def _restore_best(self, iteration: int) -> None:
+        """Make best policy and rows consistent after a crash or a return to an older checkpoint.
 
-        A row that was lost comes back from its copy. A best policy of an iteration that is still to come gives way to
-        the best of the rows, and stays among those that were evaluated.
+        A lost row is restored from its copy. A best policy of a later iteration is replaced by the best of the rows,
+        and stays among those that were evaluated.
         """
         best, file, kept = _row_of_best(self._run), self._run / BEST, None
         if best and file.is_file():
@@ -102,8 +102,8 @@ class Beside:
         self._best = row["score"]
 
     def offer(self, ppo: AdaptivePPO, last: bool) -> None:
-        """Have the policy evaluated and filmed if it is its turn, or the ``last``; returns at once."""
-        turns = {"evaluate": self._config.eval.every, "film": self._config.video.every}
+        """Request an evaluation and a video of the policy if it is its turn, or the ``last``; return at once."""
+        turns = {"evaluate": self._config.eval.every, "video": self._config.video.every}
         for kind, every in turns.items():
             if every and (last or ppo.iteration % every == 0):
                 if self._waiting >= WAITING and not last:
@@ -122,8 +122,8 @@ class Beside:
         section = self._config.eval if kind == "evaluate" else self._config.video
         job: dict[str, Any] = {"kind": kind, "policy": str(file), "settings": dataclasses.asdict(section)}
         job |= {"iteration": ppo.iteration, "steps": ppo.num_timesteps}
-        if kind == "film":
-            job["out"] = str(self._run / FILMS / f"{ppo.iteration:06d}.mp4")
+        if kind == "video":
+            job["out"] = str(self._run / VIDEOS / f"{ppo.iteration:06d}.mp4")
         try:
             process = self._process or self._begin()
             assert process.stdin is not None
@@ -131,7 +131,7 @@ class Beside:
             process.stdin.flush()
             self._waiting += 1
         except OSError as error:
-            self.problems.append(f"evaluation beside the training has ended ({error.strerror})")
+            self.problems.append(f"asynchronous evaluation ended ({error.strerror})")
 
     def _begin(self) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", MODULE, str(self._run)]
@@ -153,7 +153,7 @@ class Beside:
         self._results.put(None)
 
     def collect(self) -> dict[str, float]:
-        """Return the figures of the newest evaluation that has come since the last call; does not wait."""
+        """Return the figures of the newest evaluation since the last call; do not wait."""
         figures: dict[str, float] = {}
         while True:
             try:
@@ -163,13 +163,13 @@ class Beside:
             figures = self._take(result) or figures
 
     def finish(self, wait: bool) -> dict[str, float]:
-        """End the process, after the jobs that wait if ``wait``; return the figures that came."""
+        """End the process, after the jobs that wait if ``wait``; return the figures that arrived."""
         figures: dict[str, float] = {}
         if self._process is None:
             return figures
         assert self._process.stdin is not None
         if wait and self._waiting:
-            print(f"waiting for {self._waiting} evaluations and films beside the training", flush=True)
+            print(f"waiting for {self._waiting} asynchronous evaluations and videos", flush=True)
         try:
             self._process.stdin.close()
             while wait and self._waiting:
@@ -178,7 +178,7 @@ class Beside:
                 if result is None:
                     break
         except (OSError, queue.Empty):
-            self.problems.append(f"{self._waiting} evaluations and films did not come")
+            self.problems.append(f"{self._waiting} evaluations and videos did not arrive")
         self._process.kill()
         self._process.wait()
         self._listener.join()
@@ -188,7 +188,7 @@ class Beside:
         """Keep a result; return the figures of an evaluation."""
         if result is None:
             if self._waiting:
-                self.problems.append("the process of evaluations and films has ended early")
+                self.problems.append("the process of evaluations and videos ended early")
                 self._waiting = 0
             return {}
         self._waiting -= 1
@@ -196,9 +196,9 @@ class Beside:
             if problem not in self.problems:
                 self.problems.append(problem)
             return {}
-        if result["kind"] == "film":
-            if self._on_film:
-                self._on_film(result["steps"], Path(result["out"]))
+        if result["kind"] == "video":
+            if self._on_video:
+                self._on_video(result["steps"], Path(result["out"]))
             return {}
         row = {"iteration": result["iteration"], "steps": result["steps"], **result["figures"]}
         better = row["score"] < self._best

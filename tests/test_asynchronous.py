@@ -1,4 +1,4 @@
-"""What goes on beside a training: evaluation with the best policy kept, films, and rules that end it early."""
+"""Asynchronous evaluation of a training with the best policy kept, videos, and rules that end it early."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.asynchronous import answered, score
 from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, early_stop, run_folder, trainer
-from go1exp.train.beside import Beside
+from go1exp.train.asynchronous import AsyncEvaluation
 from go1exp.train.early_stop import EarlyStop
 from tests.small_run import SMALL
 
@@ -38,7 +38,7 @@ def rows(file: Path) -> list[dict[str, float]]:
     return [{k: float(v) for k, v in r.items()} for r in csv.DictReader(file.read_text().splitlines())]
 
 
-# ---------------------------------------------------------------------- evaluation and films
+# ---------------------------------------------------------------------- evaluation and videos
 
 
 def test_a_job_gives_the_figures_of_its_policy(tmp_path: Path) -> None:
@@ -49,16 +49,16 @@ def test_a_job_gives_the_figures_of_its_policy(tmp_path: Path) -> None:
     assert set(result["figures"]) == {"score", "error_xy", "error_yaw", "fall_share"}
     assert 0.0 < result["figures"]["error_xy"] <= result["figures"]["score"] < 2.0
     lost = answered(tmp_path, {**job, "policy": "none.pt", "settings": settings})
-    assert lost["problem"].startswith("evaluate beside the training failed: FileNotFoundError")
+    assert lost["problem"].startswith("evaluate during the training failed: FileNotFoundError")
 
 
 def test_the_best_policy_is_that_of_the_lowest_score(tmp_path: Path) -> None:
-    beside = Beside(parse_train(compose("train", [*SMALL, "eval.every=1"])), tmp_path, 0)
+    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1"])), tmp_path, 0)
     for iteration, value in ((1, 0.5), (2, 0.3), (3, 0.4)):
         file = tmp_path / f"{iteration}.pt"
         file.write_bytes(bytes([iteration]))
         result = {"kind": "evaluate", "iteration": iteration, "steps": 16 * iteration, "policy": str(file)}
-        figures = beside._take({**result, "figures": {"score": value, "fall_share": 0.0}})
+        figures = evaluation._take({**result, "figures": {"score": value, "fall_share": 0.0}})
         assert figures == {"eval/iteration": iteration, "eval/score": value, "eval/fall_share": 0.0}
     assert (tmp_path / "best.pt").read_bytes() == bytes([2])
     assert json.loads((tmp_path / "best.json").read_text())["iteration"] == 2
@@ -66,9 +66,9 @@ def test_the_best_policy_is_that_of_the_lowest_score(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
-def test_policies_are_evaluated_beside_and_the_best_is_kept(tmp_path: Path) -> None:
+def test_policies_are_evaluated_and_the_best_is_kept(tmp_path: Path) -> None:
     plain = train(tmp_path / "plain", "ppo.iterations=4")
-    beside = train(tmp_path / "run", "ppo.iterations=4", "eval.every=2", *BRIEF)
+    evaluation = train(tmp_path / "run", "ppo.iterations=4", "eval.every=2", *BRIEF)
     table = rows(tmp_path / "run/evals.csv")
     assert [(r["iteration"], r["steps"]) for r in table] == [(2, 32), (4, 64)]
     best = min(table, key=lambda r: r["score"])
@@ -76,7 +76,7 @@ def test_policies_are_evaluated_beside_and_the_best_is_kept(tmp_path: Path) -> N
     kept = checkpoint.read(tmp_path / "run/best.pt")
     assert kept["iteration"] == best["iteration"]
     for name, value in plain.policy.state_dict().items():  # training knows nothing of it
-        assert torch.equal(value, beside.policy.state_dict()[name])
+        assert torch.equal(value, evaluation.policy.state_dict()[name])
     assert (tmp_path / "plain/metrics.csv").read_text() == (tmp_path / "run/metrics.csv").read_text()
     from go1exp.train.policy import load_run
 
@@ -87,20 +87,20 @@ def test_a_run_that_goes_on_drops_evaluations_of_later_iterations(tmp_path: Path
     config = parse_train(compose("train", [*SMALL, "eval.every=1"]))
     head = "iteration,steps,score,error_xy,error_yaw,fall_share\n"
     (tmp_path / "evals.csv").write_text(f"{head}1,16,0.5,0.5,0.5,0.0\n2,32,0.4,0.4,0.5,0.0\n3,48,0.3")
-    Beside(config, tmp_path, 1)
+    AsyncEvaluation(config, tmp_path, 1)
     assert [r["iteration"] for r in rows(tmp_path / "evals.csv")] == [1]
 
 
-def evaluated_run(run: Path, scores: dict[int, float]) -> Beside:
+def evaluated_run(run: Path, scores: dict[int, float]) -> AsyncEvaluation:
     """A run in which policies had these scores by iteration; a policy is a byte with its iteration."""
-    beside = Beside(parse_train(compose("train", [*SMALL, "eval.every=1"])), run, 0)
+    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1"])), run, 0)
     (run / "evals").mkdir()
     for iteration, value in scores.items():
         file = run / f"evals/{iteration:06d}.pt"
         file.write_bytes(bytes([iteration]))
         result = {"kind": "evaluate", "iteration": iteration, "steps": 16 * iteration, "policy": str(file)}
-        beside._take({**result, "figures": {"score": value, "fall_share": 0.0}})
-    return beside
+        evaluation._take({**result, "figures": {"score": value, "fall_share": 0.0}})
+    return evaluation
 
 
 def best_of(run: Path) -> tuple[int, int, float]:
@@ -119,7 +119,7 @@ def test_a_best_policy_of_later_iterations_gives_way_when_a_run_goes_on_before_i
     if not policies:  # somebody made room
         for file in (tmp_path / "evals").glob("*.pt"):
             file.unlink()
-    again = Beside(config, tmp_path, 2)
+    again = AsyncEvaluation(config, tmp_path, 2)
     assert [r["iteration"] for r in rows(tmp_path / "evals.csv")] == [1, 2]
     assert (tmp_path / "evals/000003.pt").read_bytes() == bytes([3])  # nothing is lost
     if policies:
@@ -139,19 +139,19 @@ def test_a_crash_between_row_and_best_policy_is_made_good(tmp_path: Path) -> Non
     table = (tmp_path / "evals.csv").read_text()
     head, first, second, third = table.splitlines(keepends=True)
     (tmp_path / "evals.csv").write_text(head + first + third)  # the row of the best is lost
-    Beside(config, tmp_path, 3)
+    AsyncEvaluation(config, tmp_path, 3)
     assert (tmp_path / "evals.csv").read_text() == table
     (tmp_path / "evals.csv").unlink()
-    Beside(config, tmp_path, 3)
+    AsyncEvaluation(config, tmp_path, 3)
     assert (tmp_path / "evals.csv").read_text() == head + second
     assert best_of(tmp_path) == (2, 2, 0.2)
     (tmp_path / "evals.csv").write_text(table)
     (tmp_path / "best.pt").write_bytes(bytes([1]))
     (tmp_path / "best.json").write_text(json.dumps({"iteration": 1, "steps": 16, "score": 0.5, "fall_share": 0.0}))
-    Beside(config, tmp_path, 3)  # killed after the row of the second was written
+    AsyncEvaluation(config, tmp_path, 3)  # killed after the row of the second was written
     assert best_of(tmp_path) == (2, 2, 0.2)
     (tmp_path / "best.json").write_text('{"iteration": 2, "st')
-    Beside(config, tmp_path, 3)
+    AsyncEvaluation(config, tmp_path, 3)
     assert best_of(tmp_path) == (2, 2, 0.2)
 
 
@@ -160,35 +160,35 @@ def test_a_policy_that_waited_before_a_crash_is_not_evaluated_for_the_one_of_now
 ) -> None:
     (tmp_path / "evals").mkdir()
     (tmp_path / "evals/000002.pt").write_bytes(b"of a training that went on otherwise")
-    beside = Beside(parse_train(compose("train", [*SMALL, "eval.every=1", "video.every=1"])), tmp_path, 1)
+    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1", "video.every=1"])), tmp_path, 1)
     sent = io.StringIO()
-    monkeypatch.setattr(beside, "_begin", lambda: SimpleNamespace(stdin=sent))
+    monkeypatch.setattr(evaluation, "_begin", lambda: SimpleNamespace(stdin=sent))
     policy = SimpleNamespace(state_dict=dict)
-    beside.offer(SimpleNamespace(iteration=2, num_timesteps=32, policy=policy), last=False)  # type: ignore[arg-type]
+    evaluation.offer(SimpleNamespace(iteration=2, num_timesteps=32, policy=policy), last=False)  # type: ignore[arg-type]
     assert len(sent.getvalue().splitlines()) == 2
     assert torch.load(tmp_path / "evals/000002.pt")["num_timesteps"] == 32
 
 
 @pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
 def test_a_failure_beside_is_one_line_and_training_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    beside = Beside(parse_train(compose("train", [*SMALL, "eval.every=1"])), tmp_path, 0)
+    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL, "eval.every=1"])), tmp_path, 0)
     policy = SimpleNamespace(state_dict=dict)
-    beside.offer(SimpleNamespace(iteration=1, num_timesteps=16, policy=policy), last=False)  # type: ignore[arg-type]
-    assert beside.finish(wait=True) == {}
-    (problem,) = beside.problems
-    assert problem.startswith("evaluate beside the training failed: FileNotFoundError")
+    evaluation.offer(SimpleNamespace(iteration=1, num_timesteps=16, policy=policy), last=False)  # type: ignore[arg-type]
+    assert evaluation.finish(wait=True) == {}
+    (problem,) = evaluation.problems
+    assert problem.startswith("evaluate during the training failed: FileNotFoundError")
     assert "not a run folder" in problem
 
 
 def test_nothing_is_started_where_nothing_is_asked_for(tmp_path: Path) -> None:
-    beside = Beside(parse_train(compose("train", [*SMALL])), tmp_path, 0)
-    beside.offer(SimpleNamespace(iteration=1, num_timesteps=16), last=True)  # type: ignore[arg-type]
-    assert beside.finish(wait=True) == {}
+    evaluation = AsyncEvaluation(parse_train(compose("train", [*SMALL])), tmp_path, 0)
+    evaluation.offer(SimpleNamespace(iteration=1, num_timesteps=16), last=True)  # type: ignore[arg-type]
+    assert evaluation.finish(wait=True) == {}
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow("go1exp/evaluate/", "go1exp/train/")
-def test_films_are_made_beside(tmp_path: Path) -> None:
+def test_videos_are_made(tmp_path: Path) -> None:
     train(tmp_path / "run", "ppo.iterations=2", "video.every=2", "video.seconds=0.4")
     film = tmp_path / "run/videos/000002.mp4"
     if film.is_file():  # a machine without any graphics has none, and says so
