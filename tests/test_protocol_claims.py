@@ -30,23 +30,23 @@ NAN = math.nan
 @pytest.mark.parametrize(
     ("claim", "estimate", "low", "high", "said"),
     [
-        (MOST, 0.9, 0.8, 1.0, "reached"),
+        (MOST, 0.9, 0.8, 1.0, "met"),
         (MOST, 0.9, 0.8, 1.01, "close"),
         (MOST, 1.0, 0.8, 1.2, "close"),
-        (MOST, 1.0, 0.8, 1.21, "not told"),
+        (MOST, 1.0, 0.8, 1.21, "inconclusive"),
         (MOST, 1.2, 1.01, 1.5, "close"),
-        (MOST, 1.21, 1.01, 1.5, "not reached"),
-        (MOST, 0.9, NAN, NAN, "not told"),
-        (MOST, NAN, NAN, NAN, "not told"),
-        (LEAST, 1.1, 1.0, 1.2, "reached"),
+        (MOST, 1.21, 1.01, 1.5, "not met"),
+        (MOST, 0.9, NAN, NAN, "inconclusive"),
+        (MOST, NAN, NAN, NAN, "inconclusive"),
+        (LEAST, 1.1, 1.0, 1.2, "met"),
         (LEAST, 1.0, 0.8, 1.2, "close"),
-        (LEAST, 1.0, 0.79, 1.2, "not told"),
-        (LEAST, 0.79, 0.6, 0.99, "not reached"),
-        (BETWEEN, 1.0, 0.9, 1.1, "reached"),
+        (LEAST, 1.0, 0.79, 1.2, "inconclusive"),
+        (LEAST, 0.79, 0.6, 0.99, "not met"),
+        (BETWEEN, 1.0, 0.9, 1.1, "met"),
         (BETWEEN, 1.0, 0.86, 1.14, "close"),
-        (BETWEEN, 1.0, 0.8, 1.2, "not told"),
-        (BETWEEN, 1.3, 1.2, 1.4, "not reached"),
-        (BETWEEN, 0.7, 0.6, 0.8, "not reached"),
+        (BETWEEN, 1.0, 0.8, 1.2, "inconclusive"),
+        (BETWEEN, 1.3, 1.2, 1.4, "not met"),
+        (BETWEEN, 0.7, 0.6, 0.8, "not met"),
     ],
 )
 def test_verdicts_at_their_borders(claim: Claim, estimate: float, low: float, high: float, said: str) -> None:
@@ -59,11 +59,11 @@ def test_a_claim_is_judged_by_its_worst_condition() -> None:
         row["error"] += 0.01 * (n % 5)
     entries = summary(rows, ("speed",), (Column("error", "m", "an error"),))
     everywhere = judged({"small": MOST}, entries)[0]
-    assert (everywhere.word, everywhere.condition, everywhere.conditions) == ("not reached", {"speed": 2.0}, 2)
+    assert (everywhere.word, everywhere.condition, everywhere.conditions) == ("not met", {"speed": 2.0}, 2)
     where = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here", where={"speed": 1.0})
-    assert judged({"small": where}, entries)[0].word == "reached"
+    assert judged({"small": where}, entries)[0].word == "met"
     nowhere = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here", where={"speed": 7.0})
-    assert judged({"small": nowhere}, entries)[0].word == "not told"
+    assert judged({"small": nowhere}, entries)[0].word == "inconclusive"
 
 
 def test_falls_are_counted_per_moving_minute() -> None:
@@ -134,14 +134,14 @@ def test_the_bootstrap_agrees_with_students_interval() -> None:
 @pytest.mark.parametrize("n", [2, 3, 4, 8, 40])
 def test_of_equal_pairs_one_in_twenty_is_told_apart_by_chance(n: int) -> None:
     rng = np.random.default_rng(n)
-    told = sum(word(paired_mean_interval(rng.normal(size=n)), "lower") != "not told apart" for _ in range(2000))
+    told = sum(word(paired_mean_interval(rng.normal(size=n)), "lower") != "no significant difference" for _ in range(2000))
     assert stats.binomtest(told, 2000, 0.05).pvalue > 0.001
 
 
 def test_pairs_that_all_differ_alike_tell_nothing_and_equal_pairs_are_equal() -> None:
     same = paired_mean_interval([0.41 - 0.35, 0.43 - 0.37])  # kicks are timed by the policy's period
     assert same.estimate == pytest.approx(0.06)
-    assert word(same, "lower") == "not told apart"
+    assert word(same, "lower") == "no significant difference"
     assert pairs_needed([0.41 - 0.35, 0.43 - 0.37]) is None
     none = paired_mean_interval([0.0, 0.0, 0.0])
     assert (none.estimate, none.low, none.high) == (0.0, 0.0, 0.0)
@@ -178,6 +178,6 @@ def test_words_of_differences() -> None:
     assert word(Interval(0.2, 0.1, 0.3, 9), "higher") == "better"
     assert word(Interval(0.2, 0.1, 0.3, 9), "lower") == "worse"
     assert word(Interval(-0.2, -0.3, -0.1, 9), "lower") == "better"
-    assert word(Interval(0.0, -0.1, 0.1, 9), "lower") == "not told apart"
-    assert word(Interval(0.1, NAN, NAN, 1), "lower") == "not told apart"
-    assert word(Interval(0.0, 0.0, 0.0, 9), "lower") == "not told apart"
+    assert word(Interval(0.0, -0.1, 0.1, 9), "lower") == "no significant difference"
+    assert word(Interval(0.1, NAN, NAN, 1), "lower") == "no significant difference"
+    assert word(Interval(0.0, 0.0, 0.0, 9), "lower") == "no significant difference"

@@ -161,9 +161,9 @@ def test_a_subject_is_not_told_apart_from_itself(name: str, driver: PolicyDriver
     one = result(name, driver, results)
     again = dataclasses.replace(one, label="again")
     differences = comparing.compared(one, again)
-    assert {d.word for d in differences} == {"not told apart"}
+    assert {d.word for d in differences} == {"no significant difference"}
     assert all(d.difference.estimate == 0.0 or math.isnan(d.difference.estimate) for d in differences)
-    assert "not told apart" in comparison({name: [one, again]}, {name: differences}, {})
+    assert "no significant difference" in comparison({name: [one, again]}, {name: differences}, {})
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -200,7 +200,7 @@ def test_a_better_subject_is_called_better_and_a_worse_one_worse(
     assert (d.word, d.difference.n) == ("better", 2)
     assert d.difference.estimate == pytest.approx(-0.1, abs=1e-3)
     assert found["rmse_x", (1.0, 0.0, 0.0)].difference.n == 1
-    assert found["rmse_x", (1.0, 0.0, 0.0)].word == "not told apart"
+    assert found["rmse_x", (1.0, 0.0, 0.0)].word == "no significant difference"
 
 
 # ---------------------------------------------------------------------- the stage

@@ -223,7 +223,7 @@ def test_a_worse_group_is_told_and_one_alike_is_not(two_groups: Path) -> None:
     got = made(two_groups, baseline="weight=10.0")
     (outcome,) = got.outcomes
     words = {v.column.name: v.word for v in outcome.verdicts}
-    assert words == {"error_xy": "worse", "error_yaw": "worse", "fell": "not told apart"}
+    assert words == {"error_xy": "worse", "error_yaw": "worse", "fell": "no significant difference"}
     told = next(v for v in outcome.verdicts if v.column.name == "error_yaw")
     assert told.difference.p == pytest.approx(2 / math.comb(12, 6))
     assert told.adjusted_p == pytest.approx(3 * 2 / math.comb(12, 6))
@@ -273,7 +273,7 @@ def test_few_runs_are_said_to_be_unable_to_tell(tmp_path: Path) -> None:
         run(tmp_path / f"a{seed}", seed)
         run(tmp_path / f"b{seed}", seed, 0.0, level=3.0)
     got = made(tmp_path)
-    assert all(v.hopeless and v.word == "not told apart" for v in got.outcomes[0].verdicts)
+    assert all(v.hopeless and v.word == "no significant difference" for v in got.outcomes[0].verdicts)
     assert "5 runs in each group could tell" in tables(got)[0]["note"]
     plain = made(tmp_path, correction="none", paired=True)
     assert all(v.difference.least_p == 2 / 8 for v in plain.outcomes[0].verdicts)
@@ -527,7 +527,7 @@ def test_the_command_writes_page_json_and_tables(
     assert "12 runs in 2 groups; baseline: reward.gait.weight=10.0" in out
     assert re.search(r"worse +reward.gait.weight=0.0: error_yaw", out)
     comparison = table(tmp_path / "grid_comparison.csv")
-    assert [r["verdict"] for r in comparison] == ["worse", "worse", "not told apart"]
+    assert [r["verdict"] for r in comparison] == ["worse", "worse", "no significant difference"]
     assert {p.name for p in tmp_path.iterdir()} == {
         *("report.html", "report.json", "runs.csv", "curves.csv", "grid_figures.csv", "grid_runs.csv"),
         *("grid_comparison.csv", "grid_sensitivity.csv"),

@@ -232,8 +232,8 @@ def test_the_runs_needed_are_those_of_the_normal_approximation() -> None:
 def test_words_need_both_a_small_p_and_a_direction() -> None:
     assert compare.worded(-0.1, 0.01, "lower") == "better"
     assert compare.worded(-0.1, 0.01, "higher") == "worse"
-    assert compare.worded(-0.1, 0.06, "lower") == "not told apart"
-    assert compare.worded(-0.1, math.nan, "lower") == "not told apart"
+    assert compare.worded(-0.1, 0.06, "lower") == "no significant difference"
+    assert compare.worded(-0.1, math.nan, "lower") == "no significant difference"
 
 
 # ---------------------------------------------------------------------- association

@@ -114,7 +114,7 @@ def lines(differences: dict[str, Any]) -> list[str]:
     for key, those in differences.items():
         for subject in dict.fromkeys(d.subject for d in those):
             of_subject = [d for d in those if d.subject == subject]
-            clear = [d for d in of_subject if d.word != "not told apart"]
+            clear = [d for d in of_subject if d.word != "no significant difference"]
             text_lines.append(f"{key}: {subject}: {len(clear)} figures told apart, {len(of_subject) - len(clear)} not")
             for d in clear:
                 change = interval_text(d.difference.estimate, d.difference.low, d.difference.high)

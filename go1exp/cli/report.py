@@ -86,7 +86,7 @@ def lines(made: Report) -> list[str]:
     text_lines += [f"not counted: {a.label}: {a.state} ({a.cause})" for a in made.study.absent]
     text_lines += [f"note: {note}" for note in made.study.notes]
     for outcome in made.outcomes:
-        clear = [v for v in outcome.verdicts if v.word != "not told apart"]
+        clear = [v for v in outcome.verdicts if v.word != "no significant difference"]
         if outcome.verdicts:
             words = ", ".join(f"{n} {word}" for word, n in counts(outcome.verdicts).items())
             text_lines.append(f"{outcome.judged.name}: {words}")

@@ -1,4 +1,4 @@
-"""What counts as reached: claims about figures, and the verdict on each."""
+"""Claims about quantities, and the verdict on each."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from go1exp.config.schema.registry import NonNegative
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.statistics.intervals import Interval
 
-Word = Literal["reached", "close", "not reached", "not told"]
+Word = Literal["met", "close", "not met", "inconclusive"]
 
 
 @settings
@@ -64,29 +64,29 @@ class Verdict:
 def verdict(figure: Interval, claim: Claim) -> Word:
     """Return the word for a figure with its interval.
 
-    reached: the whole interval is within the limits. not reached: all of it is beyond them and the estimate beyond the
-    tolerance. not told: the interval has both, what is within the limits and what is beyond the tolerance: n is too
-    small; or there is no interval. close: else.
+    met: the whole interval is within the limits. not met: the whole interval is beyond them and the estimate beyond the
+    tolerance. inconclusive: the interval holds values within the limits and values beyond the tolerance, or is
+    undefined. close: otherwise.
     """
     beyond = _excess(figure.estimate, claim)
     if not all(map(math.isfinite, (figure.estimate, figure.low, figure.high))):
-        return "not told"
+        return "inconclusive"
     low, high = sorted((_excess(figure.low, claim), _excess(figure.high, claim)))
     if _both_sides(figure, claim):
         low = min(low, 0.0)
     if high <= 0.0:
-        return "reached"
+        return "met"
     if low > 0.0:
-        return "close" if beyond <= claim.tolerance else "not reached"
-    return "close" if high <= claim.tolerance else "not told"
+        return "close" if beyond <= claim.tolerance else "not met"
+    return "close" if high <= claim.tolerance else "inconclusive"
 
 
-ORDER: tuple[Word, ...] = ("not reached", "not told", "close", "reached")
+ORDER: tuple[Word, ...] = ("not met", "inconclusive", "close", "met")
 """From the worst to the best."""
 
 
 def judged(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) -> list[Verdict]:
-    """Return a verdict on each claim: that of its worst condition (``quantities.summary``); not told if it has none."""
+    """Return a verdict on each claim: that of its worst condition (``quantities.summary``), inconclusive without one."""
     verdicts = []
     for name, claim in claims.items():
         candidates = []
@@ -98,7 +98,7 @@ def judged(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) ->
                 candidates.append(Verdict(name, verdict(interval, claim), claim, interval, entry["condition"], 0))
         if not candidates:
             nothing = Interval(math.nan, math.nan, math.nan, 0)
-            verdicts.append(Verdict(name, "not told", claim, nothing, claim.where, 0))
+            verdicts.append(Verdict(name, "inconclusive", claim, nothing, claim.where, 0))
             continue
         worst = min(candidates, key=lambda v: (ORDER.index(v.word), -_finite(_excess(v.figure.estimate, claim))))
         verdicts.append(Verdict(name, worst.word, claim, worst.figure, worst.condition, len(candidates)))

@@ -88,7 +88,7 @@ def _difference(
     between = paired_share_interval(a, b) if column.how == "share" else paired_mean_interval(b - a)
     assert column.better is not None
     verdict = word(between, column.better)
-    needed = pairs_needed(b - a) if verdict == "not told apart" else None
+    needed = pairs_needed(b - a) if verdict == "no significant difference" else None
     means = (float(a.mean()), float(b.mean())) if len(a) else (math.nan, math.nan)
     return Difference(subject, column.name, column.unit, condition, *means, between, verdict, needed)
 
@@ -108,7 +108,7 @@ def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: S
     assert a.better is not None
     verdict, needed = word(between, a.better), None
     half = 0.5 * (between.high - between.low)
-    if verdict == "not told apart" and math.isfinite(half) and between.estimate:
+    if verdict == "no significant difference" and math.isfinite(half) and between.estimate:
         needed = max(2, math.ceil(between.n * (half * POWER / between.estimate) ** 2))
     pair = (a.function(drawn(0, everyone)), b.function(drawn(1, everyone))) if robots else (math.nan, math.nan)
     return Difference(subject, a.name, a.unit, dict(a.condition), *pair, between, verdict, needed)

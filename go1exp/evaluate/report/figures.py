@@ -166,7 +166,7 @@ def compared(
         assert column.better is not None
         said_word = compare.worded(d.estimate.estimate, p, column.better)
         needed = None
-        if said_word == "not told apart":
+        if said_word == "no significant difference":
             level = compare.ALPHA / max(family, 1)
             needed = compare.runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=level)
         first, other = (float(iqm_interval(v).estimate) for v in (b, a))

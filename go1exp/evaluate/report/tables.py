@@ -14,7 +14,7 @@ from go1exp.evaluate.report.made import Outcome, Report
 from go1exp.evaluate.statistics.compare import RESAMPLES
 from go1exp.evaluate.statistics.intervals import Interval
 
-ORDER = ("better", "worse", "not told apart")
+ORDER = ("better", "worse", "no significant difference")
 
 PlainRow = dict[str, Any]
 

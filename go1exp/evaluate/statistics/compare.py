@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from go1exp.evaluate.statistics.intervals import LEVEL, Interval, alike
 from go1exp.evaluate.statistics.runs import TRIM, WINSORISED_FROM, iqm, iqm_interval
 
-Word = Literal["better", "worse", "not told apart"]
+Word = Literal["better", "worse", "no significant difference"]
 Direction = Literal["lower", "higher"]
 
 RESAMPLES = 20_000
@@ -218,14 +218,14 @@ def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0
 def worded(estimate: float, p: float, better: Direction, alpha: float = ALPHA) -> Word:
     """Return the word for a difference (group less baseline) with its p, which is adjusted already."""
     if not (math.isfinite(p) and p <= alpha) or estimate == 0.0:
-        return "not told apart"
+        return "no significant difference"
     return "better" if (estimate > 0.0) == (better == "higher") else "worse"
 
 
 def word(between: Interval, better: Direction) -> Word:
     """Return the word for a difference (other less first) whose interval is clear of zero or not."""
     if not (math.isfinite(between.low) and math.isfinite(between.high)):
-        return "not told apart"
+        return "no significant difference"
     if between.low > 0.0 or between.high < 0.0:
         return "better" if (between.low > 0.0) == (better == "higher") else "worse"
-    return "not told apart"
+    return "no significant difference"

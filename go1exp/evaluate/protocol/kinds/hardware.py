@@ -102,7 +102,7 @@ class Hardware(Steady):
         """Draw each item against its limit, and falls over the delay."""
         bars = (
             "Worst command's figure over its upper limit, with its 95 % interval; beyond the line the limit is missed."
-            " Green: reached; brown: close; red: not reached; grey: not told."
+            " Green: met; brown: close; red: not met; grey: inconclusive."
         )
         delay = "Share of robots of all commands that fell, with Wilson's 95 % interval."
         return [
@@ -125,7 +125,7 @@ def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
     verdicts = [v for v in judged(hardware.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
     figure, axes = paint.panels(1, height=0.5 + 0.26 * max(len(verdicts), 1))
     ax = axes[0, 0]
-    tones = {"reached": "#00705a", "close": "#8a5a00", "not reached": "#a63f00", "not told": "#59616a"}
+    tones = {"met": "#00705a", "close": "#8a5a00", "not met": "#a63f00", "inconclusive": "#59616a"}
     for k, v in enumerate(verdicts):
         limit = v.claim.at_most or 1.0
         low, high = (v.figure.estimate if np.isnan(x) else x for x in (v.figure.low, v.figure.high))

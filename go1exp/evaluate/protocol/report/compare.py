@@ -12,7 +12,7 @@ from go1exp.evaluate.protocol.report.html import rendered, settings_text
 from go1exp.evaluate.protocol.report.tables import Meanings, Table, meanings, spread
 from go1exp.evaluate.protocol.report.words import condition_text, falls, number
 
-ORDER: tuple[Word, ...] = ("better", "worse", "not told apart")
+ORDER: tuple[Word, ...] = ("better", "worse", "no significant difference")
 
 WORDS = (
     "better, worse: the whole 95 % interval of the difference, in brackets, is on that side of zero; not told apart: it"
