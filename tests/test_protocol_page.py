@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,18 +10,15 @@ from typing import Any
 import pytest
 
 import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
+from go1exp.base.report.table import Cell
 from go1exp.config.compose import compose
 from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Played, chosen
 from go1exp.evaluate.protocol.claims import judged
 from go1exp.evaluate.protocol.playing import Result, summarised
-from go1exp.evaluate.protocol.report.compare import page as comparison
-from go1exp.evaluate.protocol.report.html import page
-from go1exp.evaluate.protocol.report.tables import ACROSS, claims_table, figure_tables, meanings
-from go1exp.evaluate.protocol.report.words import condition_text, interval_text, number
-
-PHONE = 390
-"""Width, CSS pixels."""
+from go1exp.evaluate.protocol.report.pages import comparison, page
+from go1exp.evaluate.protocol.report.tables import ACROSS, claims_table, condition_text, figure_tables, meanings
+from tests.browser import PHONE, needs_chromium, on_a_phone
 
 
 def made(name: str, label: str, rows: Callable[[Any], list[dict[str, Any]]], *overrides: str) -> Result:
@@ -78,11 +71,7 @@ def compared_page() -> str:
     return comparison({"rate": [first, other]}, {"rate": comparing.compared(first, other)}, {"seed": 1})
 
 
-def test_numbers_and_conditions_in_words() -> None:
-    assert [number(v) for v in (0.12345, 5.55e-17, 2362.4, 1.5e7)] == ["0.123", "0", "2362", "1.5e+07"]
-    assert interval_text(0.5, 0.25, 1.0) == "0.5 [0.25, 1]"
-    assert interval_text(0.5, None, None) == "0.5"
-    assert interval_text(None, None, None) == "–"
+def test_conditions_in_words() -> None:
     assert condition_text({"x": 0.5, "y": 0.0, "yaw": 0.0, "delay_ms": 10.0}) == "x 0.5 m/s, delay 10 ms"
     assert condition_text({"y": 0.0, "yaw": 0.0}) == "y 0 m/s, yaw 0 rad/s"
     assert condition_text({"ground": "slope_up", "difficulty": 5.0}) == "ground slope up, difficulty 5 deg"
@@ -95,18 +84,16 @@ def test_tables_have_no_row_without_a_figure_and_one_row_for_a_condition() -> No
     one = made("hardware", "trot", hardware)
     tables = figure_tables(one.summary, meanings(one))
     conditions = len({(r["x"], r["y"], r["yaw"], r["delay_ms"]) for r in one.played.rows})
-    assert len(tables[0]["rows"]) == conditions
-    assert tables[0]["header"][1:3] == ["fell", "falls_per_minute (1/min)"]
+    assert len(tables[0].rows) == conditions
+    assert list(tables[0].header[1:3]) == ["fell", "falls_per_minute (1/min)"]
     for table in tables:
-        assert all(any(row[1:]) for row in table["rows"])
-        assert len({row[0] if isinstance(row[0], str) else row[0]["name"] for row in table["rows"]}) == len(
-            table["rows"]
-        )
-        assert all(len(row) == len(table["header"]) for row in table["rows"])
-    widths = [len(table["header"]) - 1 for table in tables if table["header"][0] == "condition"]
+        assert all(any(row[1:]) for row in table.rows)
+        assert len({str(row[0]) for row in table.rows}) == len(table.rows)
+        assert all(len(row) == len(table.header) for row in table.rows)
+    widths = [len(table.header) - 1 for table in tables if table.header[0] == "condition"]
     assert max(widths) <= ACROSS
-    assert max(widths) - min(widths) <= len(widths)  # no table for the last figure alone
-    assert not any("left_map" in table["header"] for table in tables)  # nobody did
+    assert max(widths) - min(widths) <= len(widths)  # no table for the last quantity alone
+    assert not any("left_map" in table.header for table in tables)  # nobody did
 
 
 def test_the_head_says_the_verdicts() -> None:
@@ -131,12 +118,12 @@ def test_units_are_those_of_the_ground() -> None:
     summary = [{"condition": {"ground": g, "speed": 1.0}, "figures": {"at_half": f}} for g, f in half.items()]
     verdicts = judged(one.protocol.claims, summary)
     result = Result(one, "trot", {}, Played([]), 0, summary, verdicts, 1.0)
-    claims = {row[0]: row for row in claims_table(result, meanings(result))["rows"]}
+    claims = {row[0]: row for row in claims_table(result, meanings(result)).rows}
     assert claims["incline"][3] == "at least 15 deg"
     (table,) = figure_tables(summary, meanings(result))
-    assert table["header"] == ["figure", "ground slope up, speed 1 m/s", "ground gravel, speed 1 m/s"]
-    assert [row[0]["name"] for row in table["rows"]] == ["at_half"]
-    assert [cell["value"] for cell in table["rows"][0][1:]] == ["20 deg", "0.05 m"]
+    assert list(table.header) == ["quantity", "ground slope up, speed 1 m/s", "ground gravel, speed 1 m/s"]
+    ((head, *cells),) = table.rows
+    assert [cell.text for cell in (head, *cells) if isinstance(cell, Cell)] == ["at_half", "20 deg", "0.05 m"]
 
 
 def test_meanings_are_words() -> None:
@@ -147,40 +134,10 @@ def test_meanings_are_words() -> None:
         assert unit != "-"
 
 
-# ---------------------------------------------------------------------- in a browser
-
-MEASURE = """
-<script>addEventListener("load", () => {
-  const seen = [...document.querySelectorAll("body, body *:not(svg *), svg text")];
-  const wide = seen.filter(e => { const r = e.getBoundingClientRect();
-    return r.right > innerWidth + 0.5 || r.left < -0.5 || !e.closest("svg") && e.scrollWidth > e.clientWidth + 1; });
-  const say = e => e.tagName + " " + e.textContent.trim().slice(0, 40);
-  parent.postMessage({width: innerWidth, all: seen.length, page: document.documentElement.scrollWidth,
-    wide: wide.map(say)}, "*");
-});</script>
-"""
-
-FRAME = """<!DOCTYPE html><body><script>addEventListener("message", e => {
-  const text = document.createElement("pre"); text.textContent = JSON.stringify(e.data); document.body.append(text); });
-</script><iframe src="page.html" style="width:WIDTHpx;height:2000px;border:0"></iframe></body>"""
-
-
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+@needs_chromium
 @pytest.mark.parametrize("which", ["hardware", "compare"])
 def test_no_element_is_wider_than_a_phone(which: str, tmp_path: Path) -> None:
-    """The page stands in a frame of a phone's width: a window of a browser cannot be that narrow everywhere."""
-    text = page(made("hardware", "trot", hardware)) if which == "hardware" else compared_page()
-    (tmp_path / "page.html").write_text(text.replace("</body>", f"{MEASURE}</body>"))
-    frame = tmp_path / "frame.html"
-    frame.write_text(FRAME.replace("WIDTH", str(PHONE)))
-    with tempfile.TemporaryDirectory() as profile:
-        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
-        where = [f"--user-data-dir={profile}", "--virtual-time-budget=5000", "--dump-dom", frame.as_uri()]
-        done = subprocess.run(["chromium", *flags, *where], capture_output=True, text=True, timeout=60)
-    found = re.search(r"<pre>(.*?)</pre>", done.stdout, re.DOTALL)
-    assert found, done.stderr
-    seen = json.loads(found[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
-    assert seen["width"] == PHONE
+    seen = on_a_phone(page(made("hardware", "trot", hardware)) if which == "hardware" else compared_page(), tmp_path)
+    assert seen["page"] <= seen["width"] == PHONE
     assert seen["all"] > 100
     assert seen["wide"] == []
-    assert seen["page"] <= PHONE

@@ -6,10 +6,6 @@ import csv
 import json
 import math
 import re
-import shutil
-import subprocess
-import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,14 +21,14 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.settings import parse
 from go1exp.evaluate.report import curves
-from go1exp.evaluate.report.groups import baseline, groups
 from go1exp.evaluate.report.made import Report, report
-from go1exp.evaluate.report.runs import study
 from go1exp.evaluate.report.settings import ReportSettings
+from go1exp.evaluate.report.study import baseline, groups, study
 from go1exp.evaluate.report.tables import plain_rows, tables
 from go1exp.evaluate.report.writing import page, write
 from go1exp.evaluate.rows import rows_of
 from go1exp.evaluate.rows import write as write_evaluation
+from tests.browser import PHONE, needs_chromium, on_a_phone
 
 CONFIG: dict[str, Any] = {
     "seed": 0,
@@ -117,15 +113,6 @@ def test_groups_are_configurations_without_the_seed_named_by_what_differs(two_gr
     assert "returns are of different rewards" in got.study.notes
 
 
-def test_a_term_that_a_group_lacks_is_named_once(tmp_path: Path) -> None:
-    run(tmp_path / "a", 0)
-    run(tmp_path / "b", 0)
-    config = yaml.safe_load((tmp_path / "b/config.yaml").read_text())
-    del config["reward"]["gait"]
-    (tmp_path / "b/config.yaml").write_text(yaml.safe_dump(config))
-    assert {g.name for g in made(tmp_path).groups} == {"reward.gait.weight=10.0", "no reward.gait"}
-
-
 def test_the_baseline_is_named_by_name_part_or_settings(two_groups: Path) -> None:
     those = groups(study([str(two_groups)], False))
     for wanted in ("reward.gait.weight=0.0", "weight=0.0", "reward.gait.weight=0.0, reward.gait.weight=0.0"):
@@ -155,17 +142,8 @@ def test_groups_of_a_sweep_have_the_names_of_its_jobs(tmp_path: Path) -> None:
 def test_a_sweep_names_jobs_lists_those_that_wait_and_says_why_others_failed(tmp_path: Path) -> None:
     run(tmp_path / "one", 0)
     run(tmp_path / "two", 1, state="failed", cause="No space left on device: metrics.csv", evaluated=False)
-    jobs = [
-        {
-            "number": k,
-            "name": f"seed={k}",
-            "overrides": [f"seed={k}"],
-            "state": state,
-            "run_folder": folder,
-            "cause": "",
-        }
-        for k, (folder, state) in enumerate((("one", "done"), ("two", "failed"), ("three", "waiting")))
-    ]
+    states = enumerate((("one", "done"), ("two", "failed"), ("three", "waiting")))
+    jobs = [{"name": f"seed={k}", "state": state, "run_folder": folder} for k, (folder, state) in states]
     (tmp_path / "sweep.json").write_text(json.dumps({"jobs": jobs}))
     got = study([str(tmp_path)], False)
     assert [(r.label, r.job) for r in got.runs] == [("one", "seed=0")]
@@ -196,14 +174,14 @@ def test_half_written_and_repeated_rows_are_left_out_and_said(tmp_path: Path) ->
     whole, _ = curves.read(folder, ["rollout/return"])
     file.write_text(file.read_text() + "21,21000,7")
     cut, remark = curves.read(folder, ["rollout/return"])
-    assert remark == f"{file}: has rows that are not whole; they are left out"
+    assert remark == f"{file}: has incomplete rows; they are excluded"
     assert cut.columns["rollout/return"].tolist() == whole.columns["rollout/return"].tolist()
     file.write_text(file.read_text() + "\n20,20000,9.0\n22,22000\n23,23000,8.0\n")
     again, remark = curves.read(folder, ["rollout/return"])
     assert again.columns["iteration"].tolist() == [*range(1, 22), 23]
-    assert "not whole" in remark
+    assert "incomplete" in remark
     file.write_text("")
-    assert curves.read(folder, ["rollout/return"])[1] == f"{file}: holds no whole row"
+    assert curves.read(folder, ["rollout/return"])[1] == f"{file}: holds no complete row"
 
 
 def test_a_metric_that_runs_lack_is_said(two_groups: Path) -> None:
@@ -274,19 +252,13 @@ def test_few_runs_are_said_to_be_unable_to_tell(tmp_path: Path) -> None:
         run(tmp_path / f"b{seed}", seed, 0.0, level=3.0)
     got = made(tmp_path)
     assert all(v.hopeless and v.word == "no significant difference" for v in got.outcomes[0].verdicts)
-    assert "5 runs in each group could tell" in tables(got)[0]["note"]
+    assert "at least 5 runs per group" in tables(got)[0].note
     plain = made(tmp_path, correction="none", paired=True)
     assert all(v.difference.least_p == 2 / 8 for v in plain.outcomes[0].verdicts)
-    assert "6 runs in each group could tell" in tables(plain)[0]["note"]  # 2 / 2**6 < 0.05 < 2 / 2**5
+    assert "at least 6 runs per group" in tables(plain)[0].note  # 2 / 2**6 < 0.05 < 2 / 2**5
     alone = made(tmp_path, correction="none")
     assert all(v.hopeless for v in alone.outcomes[0].verdicts)
-    assert "4 runs in each group could tell" in tables(alone)[0]["note"]  # 2 / 70 < 0.05 < 2 / 20
-
-
-def test_pairs_are_runs_of_one_seed(two_groups: Path) -> None:
-    (outcome,) = made(two_groups, paired=True, correction="none").outcomes
-    verdict = next(v for v in outcome.verdicts if v.column.name == "error_yaw")
-    assert verdict.difference.p == pytest.approx(2 / 2**6)
+    assert "at least 4 runs per group" in tables(alone)[0].note  # 2 / 70 < 0.05 < 2 / 20
 
 
 def test_policies_are_compared_on_the_same_robots_too(two_groups: Path) -> None:
@@ -342,13 +314,6 @@ def kicked(folder: Path, evaluated: bool = False) -> None:
             (place / "kicks.json").write_text(json.dumps(about))
 
 
-def test_a_protocols_rows_are_compared_by_its_claims(tmp_path: Path) -> None:
-    kicked(tmp_path)
-    (outcome,) = made(tmp_path, figures=("recovery_s",), baseline="weight=0.0").outcomes
-    assert outcome.judged.name == "kicks"
-    assert [(v.column.name, v.word) for v in outcome.verdicts] == [("recovery_s", "better")]
-
-
 # ---------------------------------------------------------------------- bad input
 
 
@@ -375,8 +340,8 @@ def test_a_run_without_evaluation_and_one_evaluated_otherwise_are_named(tmp_path
     old = run(tmp_path / "old", 5, evaluated=False)
     (old / "eval.json").write_text("{}")
     notes = made(tmp_path).study.notes
-    assert "grid: other left out, evaluated with other settings (seed) than most" in notes
-    assert "old: eval.json without eval.parquet, of an older version; eval=true makes both" in notes
+    assert "grid: other excluded, evaluated with other settings (seed) than most" in notes
+    assert "old: eval.json without eval.parquet; eval=true makes both" in notes
     assert any(n.startswith("grid: no evaluation of 2 runs (bare, old)") for n in notes)
 
 
@@ -405,7 +370,7 @@ def test_damaged_rows_are_named_and_the_others_stay(tmp_path: Path) -> None:
     (tmp_path / "a1/eval.parquet").write_bytes(b"half")
     got = made(tmp_path)
     assert any("a1/eval.json: cannot be read" in n for n in got.study.notes)
-    assert list(got.outcomes[0].judged.runs) == [(tmp_path / "a0").resolve()]
+    assert list(got.outcomes[0].evaluation.runs) == [(tmp_path / "a0").resolve()]
     (tmp_path / "a1/eval.parquet").write_bytes((tmp_path / "a0/eval.parquet").read_bytes())
     (tmp_path / "a1/eval.json").write_text("[]")  # JSON, but no report
     got = made(tmp_path)
@@ -438,7 +403,7 @@ def test_protocols_of_another_version_are_named_and_the_others_stay(
     assert len(lines) == old
     assert all(any(line.startswith(str(file)) for line in lines) for file in files)
     assert all(why in line for line in lines)
-    assert [len(o.judged.runs) for o in got.outcomes] == ([11] if old == 1 else [])
+    assert [len(o.evaluation.runs) for o in got.outcomes] == ([11] if old == 1 else [])
 
 
 def test_rows_without_a_column_that_others_have_are_left_out(tmp_path: Path) -> None:
@@ -449,11 +414,11 @@ def test_rows_without_a_column_that_others_have_are_left_out(tmp_path: Path) -> 
         file = tmp_path / "g0s0" / name
         pq.write_table(pq.read_table(file).drop_columns([lost]), file)
     got = made(tmp_path)
-    assert "kicks: g0s0 left out, evaluated with other settings (columns of the rows) than most" in got.study.notes
+    assert "kicks: g0s0 excluded, evaluated with other settings (columns of the rows) than most" in got.study.notes
     assert any(
         "g0s0/eval.json: cannot be read (ValueError: its rows have no column 'robot')" in n for n in got.study.notes
     )
-    assert [len(o.judged.runs) for o in got.outcomes] == [11, 11]
+    assert [len(o.evaluation.runs) for o in got.outcomes] == [11, 11]
 
 
 def test_two_sweeps_of_one_name_keep_their_runs_apart_and_count_each_seed_once(tmp_path: Path) -> None:
@@ -493,26 +458,24 @@ def test_figures_are_refused_before_anything_is_evaluated(tmp_path: Path, monkey
     assert len(made_of) == 1
 
 
-def test_of_one_group_a_figure_that_is_not_there_is_refused_too(tmp_path: Path) -> None:
-    run(tmp_path / "a", 0)
-    with pytest.raises(ConfigError, match="unknown figure 'nosuch'"):
-        made(tmp_path, figures=("nosuch",))
-
-
 def test_a_figure_of_one_evaluation_may_be_asked_for_where_there_is_another(tmp_path: Path) -> None:
     kicked(tmp_path, evaluated=True)
-    outcomes = {o.judged.name: o for o in made(tmp_path, figures=("recovery_s",), baseline="weight=0.0").outcomes}
-    assert [v.column.name for v in outcomes["kicks"].verdicts] == ["recovery_s"]
+    outcomes = {o.evaluation.name: o for o in made(tmp_path, figures=("recovery_s",), baseline="weight=0.0").outcomes}
+    assert [(v.column.name, v.word) for v in outcomes["kicks"].verdicts] == [("recovery_s", "better")]
     assert outcomes["grid"].verdicts == []
 
 
-def test_runs_of_other_tasks_are_said(tmp_path: Path) -> None:
+def test_runs_of_other_tasks_and_a_missing_term_are_named(tmp_path: Path) -> None:
     run(tmp_path / "a", 0)
     run(tmp_path / "b", 0)
     config = yaml.safe_load((tmp_path / "b/config.yaml").read_text())
+    del config["reward"]["gait"]
     (tmp_path / "b/config.yaml").write_text(yaml.safe_dump({**config, "command": {"term": "fixed_velocity"}}))
-    (note,) = [n for n in made(tmp_path).study.notes if "tasks" in n]
-    assert note == "training commands differ, so that returns and lengths are of different tasks"
+    got = made(tmp_path)
+    assert any("no reward.gait" in g.name for g in got.groups)
+    assert "training commands differ, so that returns and lengths are of different tasks" in got.study.notes
+    with pytest.raises(ConfigError, match="unknown figure 'nosuch'"):
+        made(tmp_path, figures=("nosuch",))
 
 
 # ---------------------------------------------------------------------- files
@@ -543,7 +506,13 @@ def test_the_page_needs_nothing_beside_it(two_groups: Path) -> None:
     text = page(made(two_groups))
     assert not re.search(r'(?:src|href)="(?!#)', text)
     assert "@import" not in text
-    for words in ("grid: against the baseline", "grid: figures", "grid: sensitivity", "rollout/return", "Groups"):
+    for words in (
+        "grid: comparison with the baseline",
+        "grid: results",
+        "grid: sensitivity",
+        "rollout/return",
+        "Groups",
+    ):
         assert words in text
 
 
@@ -578,51 +547,10 @@ def test_eval_true_evaluates_what_is_missing_with_the_runs_own_policy(tmp_path: 
     assert (tmp_path / "r/protocols/kicks.parquet").stat().st_mtime_ns == before
 
 
-# ---------------------------------------------------------------------- in a browser
-
-MEASURE = """
-<script>addEventListener("load", () => {
-  const all = [...document.querySelectorAll("body, body *:not(svg *), svg text")];
-  const wide = all.filter(e => { const r = e.getBoundingClientRect();
-    return r.right > innerWidth + 0.5 || r.left < -0.5 || !e.closest("svg") && e.scrollWidth > e.clientWidth + 1; });
-  const say = e => e.tagName + " " + e.textContent.trim().slice(0, 40);
-  parent.postMessage({width: innerWidth, all: all.length, drawings: document.querySelectorAll("figure svg").length,
-    verdicts: document.querySelectorAll("td .word").length, wide: wide.map(say)}, "*");
-});</script>
-"""
-
-FRAME = """<!DOCTYPE html><body><script>addEventListener("message", e => {
-  const text = document.createElement("pre"); text.textContent = JSON.stringify(e.data); document.body.append(text); });
-</script><iframe src="page.html" style="width:390px;height:2000px;border:0"></iframe></body>"""
-
-
-@pytest.fixture(scope="module")
-def in_a_browser(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
-    def measure(text: str) -> dict[str, Any]:
-        folder = tmp_path_factory.mktemp("page")
-        (folder / "page.html").write_text(text.replace("</body>", f"{MEASURE}</body>"))
-        (folder / "frame.html").write_text(FRAME)
-        with tempfile.TemporaryDirectory() as profile:
-            flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
-            where = [f"--user-data-dir={profile}", "--virtual-time-budget=5000", "--dump-dom"]
-            command = ["chromium", *flags, *where, (folder / "frame.html").as_uri()]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-        found = re.search(r"<pre>(.*?)</pre>", done.stdout, re.DOTALL)
-        assert found, done.stderr
-        content = found[1].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")
-        measured: dict[str, Any] = json.loads(content)
-        return measured
-
-    return measure
-
-
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
-def test_a_browser_shows_the_page_and_a_phone_all_of_it(
-    two_groups: Path, in_a_browser: Callable[[str], dict[str, Any]], tmp_path: Path
-) -> None:
-    got = made(two_groups)
-    shown = in_a_browser(write(got, tmp_path)[0].read_text())
-    assert shown["width"] == 390
-    assert shown["drawings"] == 1 + 3 + 3  # one metric, three figures, and what goes with each
+@needs_chromium
+def test_a_browser_shows_the_page_and_a_phone_all_of_it(two_groups: Path, tmp_path: Path) -> None:
+    shown = on_a_phone(write(made(two_groups), tmp_path)[0].read_text(), tmp_path)
+    assert shown["page"] <= shown["width"] == PHONE
+    assert shown["drawings"] == 1 + 3 + 3  # one metric, three quantities, and the correlates of each
     assert shown["verdicts"] == 3
     assert shown["wide"] == []

@@ -85,7 +85,7 @@ def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any])
     from go1exp.base.files import write_json, write_text
     from go1exp.evaluate.protocol import comparing
     from go1exp.evaluate.protocol.playing import as_json
-    from go1exp.evaluate.protocol.report.compare import page
+    from go1exp.evaluate.protocol.report.pages import comparison
     from go1exp.evaluate.rows import finite, write_rows
 
     differences = {
@@ -101,21 +101,22 @@ def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any])
         "results": {key: [{**as_json(r), "curves": {}} for r in results] for key, results in plays.items()},
     }
     write_json(folder / "compare.json", finite(content), indent=1, allow_nan=False)
-    write_text(folder / "compare.html", page(plays, differences, about))
+    write_text(folder / "compare.html", comparison(plays, differences, about))
     print("\n".join(lines(differences)))
     print(f"written to {folder / 'compare.html'}, {folder / 'compare.json'}, rows beside them")
 
 
 def lines(differences: dict[str, Any]) -> list[str]:
-    """Return what a terminal shows: what is told apart, and how many figures are not."""
-    from go1exp.evaluate.protocol.report.words import condition_text, interval_text
+    """Return the lines for a terminal: significant differences, and the number of the others."""
+    from go1exp.base.report.table import interval_text
+    from go1exp.evaluate.protocol.report.tables import condition_text
 
     text_lines = []
     for key, those in differences.items():
         for subject in dict.fromkeys(d.subject for d in those):
             of_subject = [d for d in those if d.subject == subject]
             clear = [d for d in of_subject if d.word != "no significant difference"]
-            text_lines.append(f"{key}: {subject}: {len(clear)} figures told apart, {len(of_subject) - len(clear)} not")
+            text_lines.append(f"{key}: {subject}: {len(clear)} of {len(of_subject)} differences are significant")
             for d in clear:
                 change = interval_text(d.difference.estimate, d.difference.low, d.difference.high)
                 where = condition_text(d.condition)

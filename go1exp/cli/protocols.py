@@ -120,7 +120,7 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
     from go1exp.cli.subjects import driver
     from go1exp.evaluate.protocol.playing import play as played
     from go1exp.evaluate.protocol.playing import refuse_lengths
-    from go1exp.evaluate.protocol.report.writing import write
+    from go1exp.evaluate.protocol.report.pages import write
 
     drives = driver(subject, other)
     refuse(protocols, drives)
@@ -138,8 +138,9 @@ def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[
 
 def lines(result: Result) -> list[str]:
     """Return what a terminal shows of a result."""
+    from go1exp.base.report.table import interval_text
     from go1exp.evaluate.protocol.claims import limits
-    from go1exp.evaluate.protocol.report.words import condition_text, falls, interval_text
+    from go1exp.evaluate.protocol.report.tables import condition_text, falls
 
     text_lines = [f"{result.chosen.key}: {result.label}, {result.seconds:.0f} s; {falls(result)}"]
     for v in result.verdicts:

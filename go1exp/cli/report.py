@@ -14,8 +14,8 @@ from go1exp.config.schema.registry import ConfigError
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.base import Chosen
     from go1exp.evaluate.report.made import Report
-    from go1exp.evaluate.report.runs import Study
     from go1exp.evaluate.report.settings import ReportSettings
+    from go1exp.evaluate.report.study import Study
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -28,7 +28,7 @@ def _task(container: dict[str, Any]) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {str(folder)!r}: is a file"])
 
-    from go1exp.evaluate.report.runs import study
+    from go1exp.evaluate.report.study import study
 
     runs = study(settings.folders, settings.unfinished)
     if settings.eval:
@@ -60,7 +60,7 @@ def _protocols(given: Any, asked: bool) -> list[Chosen | None]:
 
 
 def _evaluate(runs: Study, settings: ReportSettings, protocols: Sequence[Chosen | None]) -> None:
-    """Evaluate what is missing, and say what is being done."""
+    """Make the missing evaluations, with their progress on stderr."""
     import go1exp.mdp.measures  # noqa: F401  (registers them)
     from go1exp.evaluate.report.evaluating import evaluate_missing, missing
     from go1exp.evaluate.report.evaluations import check_figures, evaluations
@@ -76,20 +76,20 @@ def _evaluate(runs: Study, settings: ReportSettings, protocols: Sequence[Chosen 
 
 
 def lines(made: Report) -> list[str]:
-    """Return what a terminal shows: groups, what does not count, remarks, verdicts."""
-    from go1exp.evaluate.protocol.report.words import interval_text, number
+    """Return the lines for a terminal: groups, excluded runs, remarks, verdicts."""
+    from go1exp.base.report.table import interval_text, number
     from go1exp.evaluate.report.tables import counts
 
     runs = sum(len(g.runs) for g in made.groups)
     text_lines = [f"{runs} runs in {len(made.groups)} groups; baseline: {made.baseline.name}"]
     text_lines += [f"  {len(g.runs):3} runs  {g.name}" for g in made.groups]
-    text_lines += [f"not counted: {a.label}: {a.state} ({a.cause})" for a in made.study.absent]
+    text_lines += [f"excluded: {a.label}: {a.state} ({a.cause})" for a in made.study.absent]
     text_lines += [f"note: {note}" for note in made.study.notes]
     for outcome in made.outcomes:
         clear = [v for v in outcome.verdicts if v.word != "no significant difference"]
         if outcome.verdicts:
             words = ", ".join(f"{n} {word}" for word, n in counts(outcome.verdicts).items())
-            text_lines.append(f"{outcome.judged.name}: {words}")
+            text_lines.append(f"{outcome.evaluation.name}: {words}")
         for v in clear:
             d = v.difference.estimate
             change = interval_text(d.estimate, d.low, d.high)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import (
     ConfigError,
     Term,
@@ -25,8 +26,6 @@ from go1exp.evaluate.protocol.claims import Claim
 from go1exp.evaluate.quantities import FINGERPRINT, LIFE, Column, Derived, Row
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from go1exp.evaluate.protocol.lengths import Length
     from go1exp.evaluate.protocol.plan import Motion
     from go1exp.evaluate.protocol.stage import Stage
@@ -39,25 +38,6 @@ Impulse = Annotated[float, Field(gt=0), within(0.0, 500.0, "N s")]
 Coordinate = Annotated[float, within(-0.5, 0.5, "m")]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 """Where a kick acts, from the trunk's origin in its frame, m: far off it would turn the trunk without limit."""
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """One figure of a report.
-
-    Attributes:
-        name: unique in the page; letters and digits.
-        title: above it.
-        caption: what it shows, below it.
-        paint: makes it.
-        wide: takes the width of the page.
-    """
-
-    name: str
-    title: str
-    caption: str
-    paint: Callable[[], Figure]
-    wide: bool = False
 
 
 @dataclass

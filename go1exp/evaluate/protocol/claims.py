@@ -86,7 +86,7 @@ ORDER: tuple[Word, ...] = ("not met", "inconclusive", "close", "met")
 
 
 def judged(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) -> list[Verdict]:
-    """Return a verdict on each claim: that of its worst condition (``quantities.summary``), inconclusive without one."""
+    """Return the verdict on each claim in its worst condition (``quantities.summary``); inconclusive without one."""
     verdicts = []
     for name, claim in claims.items():
         candidates = []

@@ -1,4 +1,4 @@
-"""Learning curves: metrics of runs over environment steps and over time, cut where the first of a group ends."""
+"""Learning curves: metrics of runs over environment steps and over time, up to the end of the shortest run."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from go1exp.evaluate.report.groups import Group
-from go1exp.evaluate.report.runs import Run
+from go1exp.evaluate.report.study import Group
 from go1exp.evaluate.statistics.runs import iqm_band
 
 Floats = NDArray[np.float64]
@@ -18,7 +17,7 @@ Floats = NDArray[np.float64]
 RATE = "time/steps_per_s"
 STEPS, HOURS = "steps", "hours"
 AXES = {STEPS: "million environment steps", HOURS: "hours of training"}
-"""What curves are drawn over, and in which unit."""
+"""Column of the x axis -> its label."""
 
 
 @dataclass(frozen=True)
@@ -50,40 +49,34 @@ class Curve:
 
 @dataclass(frozen=True)
 class Metrics:
-    """What a run logged: (rows,) of each column that was asked for and is there; ``hours`` is training time."""
+    """Logged metrics of a run: (rows,) of each requested column; ``hours`` is training time; names of all columns."""
 
     columns: dict[str, Floats]
-    available: tuple[str, ...]
+    available: tuple[str, ...] = ()
 
 
 def read(run: Path, wanted: Sequence[str]) -> tuple[Metrics, str]:
-    """Return a run's metrics, and a remark in one line; empty if nothing is to be said.
+    """Return the metrics of a run, and a remark in one line or an empty string.
 
-    Rows that a crash left half-written are left out, and repeated iterations count once.
+    Incomplete rows are skipped, and repeated iterations count once.
     """
-    table, remark = _table(run / "metrics.csv", ("iteration", "steps", *wanted))
-    timing, _ = _table(run / "timing.csv", ("iteration", "steps", RATE))
-    columns = {name: values for name, values in table.items() if name != _NAMES}
-    available = tuple(table.get(_NAMES, ()))
+    metrics, remark = _table(run / "metrics.csv", ("iteration", "steps", *wanted))
+    columns, timing = metrics.columns, _table(run / "timing.csv", ("iteration", "steps", RATE))[0].columns
     if len(columns.get("steps", ())) and len(timing.get(RATE, ())):
         passed = np.diff(timing["steps"], prepend=0.0) / np.maximum(timing[RATE], 1e-9) / 3600.0
         columns[HOURS] = np.interp(columns["steps"], timing["steps"], np.cumsum(passed))
-    return Metrics(columns, available), remark
+    return metrics, remark
 
 
-_NAMES = ""
-"""Key under which ``_table`` gives the names of all columns."""
-
-
-def _table(file: Path, wanted: Sequence[str]) -> tuple[dict[str, Floats], str]:
-    """Return columns of a CSV file by name, rows that are whole and ascending in the first column."""
+def _table(file: Path, wanted: Sequence[str]) -> tuple[Metrics, str]:
+    """Return columns of a CSV file: its complete rows, ascending in the iteration; and a remark."""
     import pyarrow as pa
     from pyarrow import csv
 
     try:
         data = file.read_bytes()
     except OSError:
-        return {}, f"{file}: cannot be read"
+        return Metrics({}), f"{file}: cannot be read"
     whole, _, rest = data.rpartition(b"\n")
     names = whole.split(b"\n", 1)[0].decode(errors="replace").strip().split(",")
     spoilt = [bool(rest.strip())]
@@ -94,7 +87,7 @@ def _table(file: Path, wanted: Sequence[str]) -> tuple[dict[str, Floats], str]:
 
     present = [name for name in dict.fromkeys(wanted) if name in names]
     if not whole or "iteration" not in names or len(whole.split(b"\n", 2)) < 2:
-        return {}, f"{file}: holds no whole row"
+        return Metrics({}), f"{file}: holds no complete row"
     try:
         table = csv.read_csv(
             pa.BufferReader(whole + b"\n"),
@@ -107,41 +100,36 @@ def _table(file: Path, wanted: Sequence[str]) -> tuple[dict[str, Floats], str]:
             ),
         )
     except pa.ArrowInvalid as error:
-        return {}, f"{file}: is damaged ({str(error).splitlines()[0][:120]})"
+        return Metrics({}), f"{file}: is damaged ({str(error).splitlines()[0][:120]})"
     columns = {name: table[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in present}
     rising = np.isfinite(columns["iteration"])
     rising &= np.diff(np.maximum.accumulate(np.nan_to_num(columns["iteration"])), prepend=0.0) > 0.0
     kept = {name: values[rising] for name, values in columns.items()}
     if not rising.all():
         spoilt.append(True)
-    remark = f"{file}: has rows that are not whole; they are left out" if any(spoilt) else ""
-    return {**kept, _NAMES: np.array(names)}, remark
+    remark = f"{file}: has incomplete rows; they are excluded" if any(spoilt) else ""
+    return Metrics(kept, tuple(names)), remark
 
 
 def curves(
     made: Sequence[Group], metrics: dict[Path, Metrics], wanted: Sequence[str], points: int
 ) -> tuple[list[Curve], list[str]]:
-    """Return the curves of all groups, and remarks on what could not be drawn."""
-    drawn, notes = [], []
+    """Return the curves of all groups, and remarks on curves that could not be drawn."""
+    drawn: list[Curve | None] = []
+    notes = []
     for name in wanted:
         lacking = [run for group in made for run in group.runs if name not in metrics[run.folder].columns]
         if lacking:
             known = metrics[lacking[0].folder].available
             close = f"; it has {', '.join(known[:6])}, ..." if known else ""
-            notes.append(f"{name}: is not in the metrics of {_listed(lacking)}{close}")
-        for axis in AXES:
-            for group in made:
-                if (curve := _curve(group, metrics, name, axis, points)) is not None:
-                    drawn.append(curve)
-    return drawn, notes
-
-
-def _listed(runs: Sequence[Run]) -> str:
-    return runs[0].label + (f" and {len(runs) - 1} more runs" if len(runs) > 1 else "")
+            others = f" and {len(lacking) - 1} more runs" if len(lacking) > 1 else ""
+            notes.append(f"{name}: is not in the metrics of {lacking[0].label}{others}{close}")
+        drawn += [_curve(group, metrics, name, axis, points) for axis in AXES for group in made]
+    return [curve for curve in drawn if curve is not None], notes
 
 
 def _curve(group: Group, metrics: dict[Path, Metrics], name: str, axis: str, points: int) -> Curve | None:
-    """Return one curve, from where all runs have a value to where the first of them ends."""
+    """Return one curve, from where all runs have a value to the end of the shortest run; None without one."""
     lines = []
     for run in group.runs:
         columns = metrics[run.folder].columns

@@ -1,4 +1,4 @@
-"""Evaluates runs that have no evaluation yet, all alike: on the grid of commands, and by protocols."""
+"""Evaluate runs without an evaluation, with the same settings: on the grid of commands, and by protocols."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from go1exp.config.schema.registry import TooLongError, bind_list
 from go1exp.evaluate.drivers import PolicyDriver
 from go1exp.evaluate.protocol.base import Chosen
 from go1exp.evaluate.protocol.playing import Rates, play
-from go1exp.evaluate.protocol.report.writing import write as write_protocol
+from go1exp.evaluate.protocol.report.pages import write as write_protocol
 from go1exp.evaluate.report.evaluations import GRID, PROTOCOLS, names
-from go1exp.evaluate.report.runs import Run
-from go1exp.evaluate.report.settings import Evaluation
+from go1exp.evaluate.report.settings import EvaluationSettings
+from go1exp.evaluate.report.study import Run
 from go1exp.evaluate.rollout import EvalConfig, evaluate, grid
 from go1exp.evaluate.rows import FILE, write
 from go1exp.train.policy import load_run
@@ -36,12 +36,12 @@ class Wanted:
 
     @property
     def label(self) -> str:
-        """Its name in what is shown."""
+        """Name in messages."""
         return f"{self.run.label}, {self.protocol.key if self.protocol else GRID}"
 
 
 def missing(runs: Sequence[Run], protocols: Sequence[Chosen | None] = (None,)) -> list[Wanted]:
-    """Return which of these evaluations (None: the grid) the runs lack that have a checkpoint."""
+    """Return which of these evaluations (None: the grid) runs with a checkpoint lack."""
     return [
         Wanted(run, protocol)
         for run in runs
@@ -50,17 +50,17 @@ def missing(runs: Sequence[Run], protocols: Sequence[Chosen | None] = (None,)) -
     ]
 
 
-def _checkpoint(run: Path, settings: Evaluation) -> Path | None:
-    """Return the checkpoint that is judged; None for the newest."""
+def _checkpoint(run: Path, settings: EvaluationSettings) -> Path | None:
+    """Return the checkpoint to evaluate; None for the newest."""
     best = run / BEST
     return best if settings.checkpoint == "best" and best.is_file() else None
 
 
-def play_protocol(run: Run, protocol: Chosen, settings: Evaluation, on_step: Progress) -> None:
-    """Play a protocol with the policy of a run, as ``go1exp eval`` does, and write its files into the run's folder.
+def play_protocol(run: Run, protocol: Chosen, settings: EvaluationSettings, on_step: Progress) -> None:
+    """Play a protocol with the policy of a run and write its files into the run's folder.
 
     Raises:
-        ValueError: if the policy cannot be played so.
+        ValueError: if the policy cannot play the protocol.
     """
     config, policy, about = load_run(run.folder, _checkpoint(run.folder, settings))
     driver = PolicyDriver(run.label, config.task, policy, about)
@@ -72,8 +72,8 @@ def play_protocol(run: Run, protocol: Chosen, settings: Evaluation, on_step: Pro
     write_protocol(result, run.folder / PROTOCOLS)
 
 
-def evaluate_run(run: Path, settings: Evaluation, on_step: Progress) -> dict[str, Any]:
-    """Evaluate the policy of a run folder on the grid, as asked for; return the report of ``evaluate``."""
+def evaluate_run(run: Path, settings: EvaluationSettings, on_step: Progress) -> dict[str, Any]:
+    """Evaluate the policy of a run folder on the grid; return the report of ``evaluate``."""
     config, policy, about = load_run(run, _checkpoint(run, settings))
     commands = grid(settings.x, settings.y, settings.yaw, False)
     unlike = ("commands", "train_ground", "policy_dt", "physics_dt", "trunk_velocity", "engine")
@@ -84,18 +84,17 @@ def evaluate_run(run: Path, settings: Evaluation, on_step: Progress) -> dict[str
 
 
 def evaluate_missing(
-    wanted: Sequence[Wanted], settings: Evaluation, on_run: Callable[[int, int, str], Progress]
+    wanted: Sequence[Wanted], settings: EvaluationSettings, on_run: Callable[[int, int, str], Progress]
 ) -> list[str]:
-    """Evaluate runs one after the other and write what came of them into their folders; return remarks.
+    """Evaluate runs one after the other and write the results into their folders; return remarks.
 
     Args:
-        wanted: what to evaluate, and by what.
-        settings: how.
-        on_run: called with the number of the evaluation, how many there are and its label; returns what shows its
-            progress.
+        wanted: evaluations to make.
+        settings: of the evaluations on the grid.
+        on_run: called with the number of the evaluation, the number of all and its label; returns a progress callback.
 
     Raises:
-        TooLongError: if what is asked of the runs does not fit into memory.
+        TooLongError: if the evaluations do not fit into memory.
     """
     notes = []
     for number, each in enumerate(wanted, 1):

@@ -14,7 +14,7 @@ Count = Annotated[int, Field(ge=1)]
 
 
 @settings
-class Evaluation:
+class EvaluationSettings:
     """How runs without an evaluation are evaluated: on the grid of commands of ``go1exp eval``.
 
     Of these settings, seed and checkpoint are those of other protocols too.
@@ -22,10 +22,10 @@ class Evaluation:
     Attributes:
         x: forward velocities, m/s.
         y: velocities to the left, m/s.
-        yaw: turning rates, rad/s.
+        yaw: yaw rates, rad/s.
         episodes: robots of each command.
         duration_s: length of an episode, s.
-        settle_s: time at its start that does not count for tracking, s.
+        settle_s: initial time excluded from tracking errors, s.
         noise: add the observation noise of training.
         randomize: randomise robots and starts as in training.
         push: push the robots as in training.
@@ -59,17 +59,17 @@ class ReportSettings:
 
     Attributes:
         folders: run folders, sweep folders, or folders with any of them below.
-        baseline: group that all others are compared with, by its name or a part of it that no other has, or by settings
-            such as reward.gait.weight=10; null takes that with most runs, of several the first.
+        baseline: group that all others are compared with, by its name or a unique part of it, or by settings such as
+            reward.gait.weight=10; null takes the first of those with most runs.
         curves: columns of metrics.csv whose learning curves are drawn.
-        figures: figures of the evaluation that are compared; null takes error_xy, error_yaw and fell of the grid, and
-            of other protocols those of its claims.
-        correction: holm makes at most one study in twenty with any false word; none words each figure by itself.
-        paired: pair runs by their seed in comparisons; needs six pairs to tell anything.
-        unfinished: count running, stopped and failed runs as well, as far as they came.
+        figures: quantities to compare; null takes error_xy, error_yaw and fell of the grid, and the claims of other
+            protocols.
+        correction: holm bounds the chance of any false positive in a study by 5 %; none corrects nothing.
+        paired: pair runs by their seed in comparisons; at least six pairs are needed for significance.
+        unfinished: include running, stopped and failed runs.
         eval: evaluate runs that lack an evaluation, by ``protocol``: the grid as ``evaluation`` says.
         evaluation: how.
-        points: times at which a learning curve is drawn.
+        points: number of points of a learning curve.
         wandb: Weights & Biases to log the tables to, offline or online; null for none.
         project: its project.
         folder: for report.html, report.json and the CSV files; null takes report in the first of folders.
@@ -83,7 +83,7 @@ class ReportSettings:
     paired: bool
     unfinished: bool
     eval: bool
-    evaluation: Evaluation
+    evaluation: EvaluationSettings
     points: Annotated[int, Field(ge=2, le=2000)]
     wandb: Literal["offline", "online"] | None
     project: Name

@@ -10,18 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.base.files import write_json, write_text
-from go1exp.evaluate.protocol.report.html import rendered, settings_text
+from go1exp.base.report.page import Page, provenance, render, sections
+from go1exp.base.wording import counted
 from go1exp.evaluate.report.drawings import forests, importances, learning
 from go1exp.evaluate.report.made import Report
-from go1exp.evaluate.report.tables import ORDER, PlainRow, plain_rows, tables
+from go1exp.evaluate.report.tables import PlainRow, plain_rows, tables
 from go1exp.evaluate.rows import finite
+from go1exp.evaluate.statistics.compare import ORDER
 
 NOTES = (
-    "A run is one training seed, and figures are over runs: robots that one policy moved are not independent tries of a"
-    " configuration. Intervals of 95 % are studentised, their critical values simulated for each number of runs"
+    "A run is one training seed, and intervals are over runs: robots moved by one policy are no independent samples of"
+    " a configuration. Intervals of 95 % are studentised, with critical values simulated for each number of runs"
     " (docs/studies.md has their measured coverage); of shares: Wilson's with the design effect of the runs.",
-    "Comparisons: permutation test of mean ranks over runs, two-sided, Holm's correction over all comparisons of an"
-    " evaluation. Evaluations count where their settings, commands and seed are the same for all.",
+    "Comparisons: permutation test of mean ranks over runs, two-sided, with Holm's correction over all comparisons of"
+    " an evaluation. Evaluations are included if their settings, commands and seed are the same for all.",
 )
 
 
@@ -30,46 +32,45 @@ def page(made: Report) -> str:
     count = sum(len(g.runs) for g in made.groups)
     drawings = learning(made.curves, made.baseline.name)
     for outcome in made.outcomes:
-        key = outcome.judged.name
-        drawings += forests(outcome.figures, outcome.judged.main, made.baseline.name, key)
+        key = outcome.evaluation.name
+        drawings += forests(outcome.figures, outcome.evaluation.main, made.baseline.name, key)
         drawings += importances(outcome.sensitivities, key)
     names = ", ".join(dict.fromkeys(Path(f).resolve().name for f in made.settings["folders"]))
-    absent = made.study.absent
-    facts = [f"{len(absent)} runs do not count; they are listed below."] if absent else []
-    evaluated = {o.judged.name: o.judged.settings for o in made.outcomes}
-    return rendered(
-        title=f"report: {names}",
-        kind="go1exp report",
-        heading=names,
-        about=f"{count} runs in {len(made.groups)} groups; baseline: {made.baseline.name}.",
-        verdicts=_head(made),
-        facts=[*facts, *made.study.notes],
-        tables=tables(made),
-        drawings=drawings,
-        notes=NOTES,
-        settings=settings_text({**made.settings, "evaluations": evaluated}),
+    excluded = len(made.study.absent)
+    evaluated = {o.evaluation.name: o.evaluation.settings for o in made.outcomes}
+    return render(
+        Page(
+            title=f"report: {names}",
+            kind="go1exp report",
+            heading=names,
+            lead=f"{count} runs in {len(made.groups)} groups; baseline: {made.baseline.name}.",
+            verdicts=_head(made),
+            facts=[*([f"{counted(excluded, 'run')} excluded, listed below."] * bool(excluded)), *made.study.notes],
+            sections=[
+                *sections(tables(made), drawings),
+                provenance(NOTES, {**made.settings, "evaluations": evaluated}),
+            ],
+        )
     )
 
 
 def _head(made: Report) -> list[tuple[str, str]]:
-    """Return each word with the groups and figures that have it, for the page's head."""
+    """Return each word with the groups and quantities that have it, for the page's head."""
     lines = []
     for word in ORDER:
-        those = [(o.judged.name, v) for o in made.outcomes for v in o.verdicts if v.word == word]
-        text = "; ".join(f"{v.group}: {v.column.name}" for _, v in those)
+        those = [f"{v.group}: {v.column.name}" for o in made.outcomes for v in o.verdicts if v.word == word]
         if those:
-            lines.append((f"{word}: {len(those)}", text if word != ORDER[-1] else "comparisons, listed below"))
+            lines.append((f"{word}: {len(those)}", "; ".join(those) if word != ORDER[-1] else "listed below"))
     return lines
 
 
 def csv_text(rows: Sequence[PlainRow]) -> str:
-    """Return rows as CSV with a header; numbers that are not defined are empty."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    """Return rows as CSV with a header; undefined numbers are empty."""
     text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    for row in rows:
-        writer.writerow([_cell(row.get(name, "")) for name in names])
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
     return text.getvalue()
 
 
@@ -80,7 +81,7 @@ def _cell(value: Any) -> Any:
 
 
 def write(made: Report, folder: Path) -> list[Path]:
-    """Write report.html, report.json and the CSV files into ``folder``, which is made if need be; return the files."""
+    """Write report.html, report.json and the CSV files into ``folder``, created if missing; return the files."""
     folder.mkdir(parents=True, exist_ok=True)
     rows = plain_rows(made)
     content = {

@@ -17,6 +17,8 @@ from go1exp.evaluate.statistics.runs import TRIM, WINSORISED_FROM, iqm, iqm_inte
 Word = Literal["better", "worse", "no significant difference"]
 Direction = Literal["lower", "higher"]
 
+ORDER: tuple[Word, ...] = ("better", "worse", "no significant difference")
+
 RESAMPLES = 20_000
 """Permutations of a test; where there are fewer, all of them."""
 

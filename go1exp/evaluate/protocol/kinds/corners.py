@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Drawing, Played
+from go1exp.evaluate.protocol.base import Played
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, command_text
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.quantities import Column, Row
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def step_answer(along: NDArray[Any], step: int, settle: int, dt: float) -> Row:
 
 def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     first = next(iter(summaries.values()))
-    figure, axes = paint.panels(1, height=0.35 + 0.24 * len(first) * max(1, 0.6 * len(summaries)))
+    figure, axes = plots.panels(1, height=0.35 + 0.24 * len(first) * max(1, 0.6 * len(summaries)))
     ax = axes[0, 0]
     for w, (who, summary) in enumerate(summaries.items()):
         for k, entry in enumerate(summary):
@@ -109,7 +110,7 @@ def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
             if f is None or f["estimate"] is None:
                 continue
             fell = entry["figures"]["fell"]["estimate"]
-            colour = "#c1272d" if fell and len(summaries) == 1 else paint.COLOURS[w]
+            colour = "#c1272d" if fell and len(summaries) == 1 else plots.COLOURS[w]
             low, high = (f["estimate"] if v is None else v for v in (f["low"], f["high"]))
             at = k + 0.22 * w
             ax.plot([low, high], [at, at], color=colour, lw=1.4)
@@ -119,17 +120,17 @@ def _answers(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     ax.invert_yaxis()
     ax.set_xlabel("share of the command")
     if len(summaries) > 1:
-        paint.legend(figure, ax)
+        plots.legend(figure, ax)
     return figure
 
 
 def _steps(curves: Mapping[str, Any]) -> Figure:
     names = list(curves["along"])
     columns = 3
-    figure, axes = paint.panels(-(-len(names) // columns), columns, height=1.1, sharex=True, sharey=True)
+    figure, axes = plots.panels(-(-len(names) // columns), columns, height=1.1, sharex=True, sharey=True)
     for ax, name in zip(axes.flat, names, strict=False):
         ax.axhline(1.0, color="#999999", lw=0.8)
-        ax.plot(curves["t"], np.array(curves["along"][name], dtype=float), color=paint.MEASURED, lw=0.9)
+        ax.plot(curves["t"], np.array(curves["along"][name], dtype=float), color=plots.MEASURED, lw=0.9)
         ax.set_title(name, fontsize=6.8, pad=2)
         ax.set_ylim(-0.4, 1.7)
     for ax in axes.flat[len(names) :]:

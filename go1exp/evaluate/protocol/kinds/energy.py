@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from go1exp import robot
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Drawing, Played
+from go1exp.evaluate.protocol.base import Played
 from go1exp.evaluate.protocol.kinds.gait import straight
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.quantities import Column, Row
 from go1exp.mdp.measures.trace import Trace, mean_over
 
@@ -126,30 +127,30 @@ def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:
 
 
 def _cost(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    figure, axes = paint.panels(1, height=2.3)
+    figure, axes = plots.panels(1, height=2.3)
     ax = axes[0, 0]
     for k, (who, summary) in enumerate(summaries.items()):
         entries = sorted(straight(summary), key=lambda e: e["condition"]["x"])
         at = [e["condition"]["x"] for e in entries]
-        paint.intervals(ax, at, entries, "cost_of_transport", paint.COLOURS[k], who or "positive work")
+        plots.intervals(ax, at, entries, "cost_of_transport", plots.COLOURS[k], who or "positive work")
         if len(summaries) == 1:
-            paint.intervals(ax, at, entries, "cost_of_transport_abs", paint.COLOURS[1], "all work")
+            plots.intervals(ax, at, entries, "cost_of_transport_abs", plots.COLOURS[1], "all work")
     ax.set(xlabel="commanded vx (m/s)", ylabel="cost of transport")
     ax.set_ylim(bottom=0.0)
-    paint.legend(figure, ax)
+    plots.legend(figure, ax)
     return figure
 
 
 def _scatter(dots: Mapping[str, Any]) -> Figure:
-    figure, axes = paint.panels(1, 3, height=2.2)
+    figure, axes = plots.panels(1, 3, height=2.2)
     limits = zip(axes[0], dots.items(), robot.EFFORT_LIMIT, robot.VELOCITY_LIMIT, strict=True)
     for ax, (kind, points), peak, top in limits:
         both = np.array(points)
         # A picture in the figure: thousands of dots would each be a shape of the page.
-        ax.plot(both[:, 0], both[:, 1], ".", ms=1.6, color=paint.MEASURED, alpha=0.5, rasterized=True)
-        ax.plot([-top, top, top, -top, -top], [peak, peak, -peak, -peak, peak], color=paint.COMMANDED, lw=1.0)
-        ax.plot([-top, 0, top], [0, peak, 0], color=paint.ERROR, lw=1.0, ls="--")
-        ax.plot([-top, 0, top], [0, -peak, 0], color=paint.ERROR, lw=1.0, ls="--")
+        ax.plot(both[:, 0], both[:, 1], ".", ms=1.6, color=plots.MEASURED, alpha=0.5, rasterized=True)
+        ax.plot([-top, top, top, -top, -top], [peak, peak, -peak, -peak, peak], color=plots.COMMANDED, lw=1.0)
+        ax.plot([-top, 0, top], [0, peak, 0], color=plots.ERROR, lw=1.0, ls="--")
+        ax.plot([-top, 0, top], [0, -peak, 0], color=plots.ERROR, lw=1.0, ls="--")
         ax.set_title(kind)
         ax.set_xlabel("speed (rad/s)")
     axes[0, 0].set_ylabel("torque (N m)")

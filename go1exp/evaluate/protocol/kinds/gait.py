@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from go1exp import robot
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Drawing, Played
+from go1exp.evaluate.protocol.base import Played
 from go1exp.evaluate.protocol.kinds.steady import ERRORS, Steady, command_text
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.quantities import Column, Row
 from go1exp.mdp.measures.gait import touchdown_phase
 from go1exp.mdp.measures.trace import find_runs
@@ -102,10 +103,10 @@ def _asymmetry(duty: Sequence[float | None]) -> float | None:
 
 
 def _diagram(feet: Mapping[str, Any]) -> Figure:
-    figure, axes = paint.panels(len(feet), height=0.75, sharex=True)
+    figure, axes = plots.panels(len(feet), height=0.75, sharex=True)
     for ax, (name, shown) in zip(axes[:, 0], feet.items(), strict=True):
         for foot, start, stop in shown["stances"]:
-            ax.barh(foot, stop - start, left=start, height=0.72, color=paint.COLOURS[foot])
+            ax.barh(foot, stop - start, left=start, height=0.72, color=plots.COLOURS[foot])
         ax.set_yticks(range(robot.NUM_LEGS), robot.LEGS, fontsize=6.5)
         ax.set(xlim=(0.0, SHOWN), ylim=(robot.NUM_LEGS - 0.4, -0.6))
         ax.set_title(name, loc="left", pad=2)
@@ -117,7 +118,7 @@ def _diagram(feet: Mapping[str, Any]) -> Figure:
 def _circle(feet: Mapping[str, Any]) -> Figure:
     columns = 3
     rows = -(-len(feet) // columns)
-    figure, axes = paint.panels(rows, columns, height=1.75, subplot_kw={"projection": "polar"})
+    figure, axes = plots.panels(rows, columns, height=1.75, subplot_kw={"projection": "polar"})
     for ax, (name, shown) in zip(axes.flat, feet.items(), strict=False):
         for foot in range(robot.NUM_LEGS):
             turn = [2.0 * np.pi * p[foot] for p in shown["phases"] if p[foot] is not None]
@@ -126,7 +127,7 @@ def _circle(feet: Mapping[str, Any]) -> Figure:
                 np.full(len(turn), 1.0 - 0.12 * foot),
                 "o",
                 ms=3,
-                color=paint.COLOURS[foot],
+                color=plots.COLOURS[foot],
                 label=robot.LEGS[foot],
             )
         ax.set_theta_zero_location("N")
@@ -137,7 +138,7 @@ def _circle(feet: Mapping[str, Any]) -> Figure:
         ax.set_title(name, fontsize=7)
     for ax in axes.flat[len(feet) :]:
         ax.remove()
-    paint.legend(figure, axes[0, 0], columns=4)
+    plots.legend(figure, axes[0, 0], columns=4)
     return figure
 
 
@@ -152,18 +153,18 @@ SPEED = (
 
 
 def _over_speed(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    figure, axes = paint.panels(3, 2, sharex=True)
+    figure, axes = plots.panels(3, 2, sharex=True)
     for k, (who, summary) in enumerate(summaries.items()):
         entries = sorted(straight(summary), key=lambda e: e["condition"]["x"])
         at = [e["condition"]["x"] for e in entries]
         for ax, (name, _) in zip(axes.flat, SPEED, strict=True):
-            paint.intervals(ax, at, entries, name, paint.COLOURS[k], who)
+            plots.intervals(ax, at, entries, name, plots.COLOURS[k], who)
     for ax, (_, text) in zip(axes.flat, SPEED, strict=True):
         ax.set_ylabel(text)
     for ax in axes[-1]:
         ax.set_xlabel("commanded vx (m/s)")
     if len(summaries) > 1:
-        paint.legend(figure, axes[0, 0])
+        plots.legend(figure, axes[0, 0])
     return figure
 
 

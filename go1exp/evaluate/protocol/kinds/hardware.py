@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Drawing, Played, lives
+from go1exp.evaluate.protocol.base import Played, lives
 from go1exp.evaluate.protocol.claims import judged
 from go1exp.evaluate.protocol.kinds.energy import effort
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
 from go1exp.evaluate.protocol.kinds.steady import AXES, ERRORS, Steady
 from go1exp.evaluate.protocol.lengths import Length
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.quantities import Column, Derived, Row
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def _margin(rows: Sequence[Row]) -> float:
 
 def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
     verdicts = [v for v in judged(hardware.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
-    figure, axes = paint.panels(1, height=0.5 + 0.26 * max(len(verdicts), 1))
+    figure, axes = plots.panels(1, height=0.5 + 0.26 * max(len(verdicts), 1))
     ax = axes[0, 0]
     tones = {"met": "#00705a", "close": "#8a5a00", "not met": "#a63f00", "inconclusive": "#59616a"}
     for k, v in enumerate(verdicts):
@@ -141,13 +142,13 @@ def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
 def _falls(rows: Sequence[Row]) -> Figure:
     from go1exp.evaluate.statistics.intervals import share_interval
 
-    figure, axes = paint.panels(1, height=1.9)
+    figure, axes = plots.panels(1, height=1.9)
     delays = sorted({row["delay_ms"] for row in rows})
     entries = []
     for delay in delays:
         fell = [bool(row["fell"]) for row in rows if row["delay_ms"] == delay]
         i = share_interval(sum(fell), len(fell))
         entries.append({"figures": {"fell": {"estimate": i.estimate, "low": i.low, "high": i.high}}})
-    paint.intervals(axes[0, 0], delays, entries, "fell", paint.MEASURED, "")
+    plots.intervals(axes[0, 0], delays, entries, "fell", plots.MEASURED, "")
     axes[0, 0].set(xlabel="delay of the targets (ms)", ylabel="share that fell", ylim=(-0.03, 1.03))
     return figure

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Drawing, Impulse, Played, Point, Protocol, lives, repeated
+from go1exp.evaluate.protocol.base import Impulse, Played, Point, Protocol, lives, repeated
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Row
 
@@ -270,10 +271,10 @@ def _smooth(values: NDArray[Any], width: float, dt: float) -> NDArray[Any]:
 
 
 def _run(run: Mapping[str, Any], every: int) -> Figure:
-    figure, axes = paint.panels(2, height=1.6, sharex=True)
+    figure, axes = plots.panels(2, height=1.6, sharex=True)
     t, height, speed = (run[k][:: max(every, 1)] for k in ("t", "height", "speed"))
-    axes[0, 0].plot(t, height, color=paint.MEASURED, lw=1.1, label="trunk height")
-    axes[0, 0].axhline(run["nominal"], color=paint.NOMINAL, lw=1.3, label="nominal height")
+    axes[0, 0].plot(t, height, color=plots.MEASURED, lw=1.1, label="trunk height")
+    axes[0, 0].axhline(run["nominal"], color=plots.NOMINAL, lw=1.3, label="nominal height")
     axes[1, 0].plot(t, speed, color="#c1272d", lw=1.0, label="speed")
     for ax in axes[:, 0]:
         for kick in run["kicks"]:
@@ -287,29 +288,29 @@ def _run(run: Mapping[str, Any], every: int) -> Figure:
 
 
 def _around(kicks: Sequence[Mapping[str, Any]]) -> Figure:
-    figure, axes = paint.panels(2, height=1.6, sharex=True)
+    figure, axes = plots.panels(2, height=1.6, sharex=True)
     for k, kick in enumerate(kicks):
-        colour = paint.COLOURS[k % len(paint.COLOURS)]
+        colour = plots.COLOURS[k % len(plots.COLOURS)]
         for ax, name in ((axes[0, 0], "height"), (axes[1, 0], "speed")):
             middle, low, high = (np.array(b, dtype=float) for b in kick[name])
-            paint.band(ax, kick["t"], low, high, colour)
+            plots.band(ax, kick["t"], low, high, colour)
             ax.plot(kick["t"], middle, color=colour, lw=1.1, label=f"{kick['impulse']:g} N s (n {kick['n']})")
     axes[0, 0].set_ylabel("height (m)")
     axes[1, 0].set(ylabel="velocity to\nthat side (m/s)", xlabel="time since the kick (s)")
-    paint.legend(figure, axes[0, 0])
+    plots.legend(figure, axes[0, 0])
     return figure
 
 
 def _success(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    figure, axes = paint.panels(1, height=2.2)
+    figure, axes = plots.panels(1, height=2.2)
     ax = axes[0, 0]
     names = (("survived", "survived, if up before"), ("up", "still up"), ("recovered", "came back, if up before"))
     for w, (who, summary) in enumerate(summaries.items()):
         at = [e["condition"]["impulse"] * (1.0 + 0.01 * w) for e in summary]
         for k, (name, text) in enumerate(names if len(summaries) == 1 else names[1:2]):
-            paint.intervals(
-                ax, [x * 1.015**k for x in at], summary, name, paint.COLOURS[w + k], f"{who}: {text}" if who else text
+            plots.intervals(
+                ax, [x * 1.015**k for x in at], summary, name, plots.COLOURS[w + k], f"{who}: {text}" if who else text
             )
     ax.set(xlabel="impulse (N s)", ylabel="share of robots", ylim=(-0.03, 1.03))
-    paint.legend(figure, ax, columns=2)
+    plots.legend(figure, ax, columns=2)
     return figure

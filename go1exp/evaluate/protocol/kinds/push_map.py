@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Count, Drawing, Impulse, Played, Point, Protocol, lives
+from go1exp.evaluate.protocol.base import Count, Impulse, Played, Point, Protocol, lives
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 
@@ -238,7 +239,7 @@ def _weakest(rows: Sequence[Row]) -> float:
 
 
 def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    figure, axes = paint.panels(1, height=4.0, subplot_kw={"projection": "polar"})
+    figure, axes = plots.panels(1, height=4.0, subplot_kw={"projection": "polar"})
     ax = axes[0, 0]
     for k, (who, summary) in enumerate(summaries.items()):
         for name, style in (("impulse_median", "-"), ("impulse_p10", ":")):
@@ -252,20 +253,20 @@ def _map(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
                 [f["estimate"] if f[name] is None else f[name] for f in closed] for name in ("estimate", "low", "high")
             )
             text = {"impulse_median": "median", "impulse_p10": "10th percentile"}[name]
-            ax.plot(angle, middle, style, color=paint.COLOURS[k], lw=1.4, label=f"{who} {text}".strip())
+            ax.plot(angle, middle, style, color=plots.COLOURS[k], lw=1.4, label=f"{who} {text}".strip())
             if style == "-":
-                paint.band(ax, angle, low, high, paint.COLOURS[k])
+                plots.band(ax, angle, low, high, plots.COLOURS[k])
     ax.set_theta_zero_location("N")
     ax.set_ylim(bottom=0.0)
     ax.set_rlabel_position(112.5)
     ax.tick_params(labelsize=7)
     ax.set_xticks(np.arange(8) * np.pi / 4, ["forward", "45°", "left", "135°", "back", "-135°", "right", "-45°"])
-    paint.legend(figure, ax, columns=2)
+    plots.legend(figure, ax, columns=2)
     return figure
 
 
 def _phases(rows: Sequence[Row]) -> Figure:
-    figure, axes = paint.panels(1, height=2.0)
+    figure, axes = plots.panels(1, height=2.0)
     phases = sorted({row["phase"] for row in rows})
     each = [values([r for r in rows if r["phase"] == p], "impulse") for p in phases]
     each = [e[np.isfinite(e)] for e in each]
@@ -273,10 +274,10 @@ def _phases(rows: Sequence[Row]) -> Figure:
     defined = [e for e in each if len(e)]
     ax = axes[0, 0]
     if defined:
-        paint.band(
-            ax, at, [np.quantile(e, 0.1) for e in defined], [np.quantile(e, 0.9) for e in defined], paint.MEASURED
+        plots.band(
+            ax, at, [np.quantile(e, 0.1) for e in defined], [np.quantile(e, 0.9) for e in defined], plots.MEASURED
         )
-        ax.plot(at, [np.median(e) for e in defined], "-o", ms=3.5, color=paint.MEASURED)
+        ax.plot(at, [np.median(e) for e in defined], "-o", ms=3.5, color=plots.MEASURED)
     ax.set(xlabel="phase of FR (cycles)", ylabel="impulse (N s)")
     ax.set_ylim(bottom=0.0)
     return figure

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, Positive, protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.observed import TrunkVelocity
-from go1exp.evaluate.protocol.base import Drawing, Played, Protocol, lives, repeated
+from go1exp.evaluate.protocol.base import Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.protocol.signals import Signal
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 
@@ -160,7 +161,7 @@ def _over_rate(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     first = [e["condition"] for e in next(iter(summaries.values())) if "rate_hz" in e["condition"]]
     velocities = list(dict.fromkeys(c["velocity"] for c in first))
     delays = sorted({c["delay_ms"] for c in first})
-    figure, axes = paint.panels(len(SHOWN), len(velocities), sharex=True, sharey="row")
+    figure, axes = plots.panels(len(SHOWN), len(velocities), sharex=True, sharey="row")
     for w, (who, summary) in enumerate(summaries.items()):
         for d, delay in enumerate(delays if len(summaries) == 1 else delays[:1]):
             for column, velocity in enumerate(velocities):
@@ -168,8 +169,8 @@ def _over_rate(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
                 entries = [e for e in summary if wanted <= e["condition"].items() and "rate_hz" in e["condition"]]
                 at = [e["condition"]["rate_hz"] * 1.02 ** (d + w) for e in entries]
                 for row, (name, _) in enumerate(SHOWN):
-                    colour = paint.COLOURS[(d + w) % len(paint.COLOURS)]
-                    paint.intervals(axes[row, column], at, entries, name, colour, who or f"{delay:g} ms late")
+                    colour = plots.COLOURS[(d + w) % len(plots.COLOURS)]
+                    plots.intervals(axes[row, column], at, entries, name, colour, who or f"{delay:g} ms late")
     for row, (_, text) in enumerate(SHOWN):
         axes[row, 0].set_ylabel(text)
     for column, velocity in enumerate(velocities):
@@ -179,5 +180,5 @@ def _over_rate(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
         axes[-1, column].set_xticks(ticks, [f"{t:.0f}" for t in ticks], fontsize=6.5)
         axes[-1, column].minorticks_off()
         axes[-1, column].set_xlabel("rate (Hz)")
-    paint.legend(figure, axes[0, 0])
+    plots.legend(figure, axes[0, 0])
     return figure

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import Positive, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Drawing, Played, Protocol, lives, repeated
+from go1exp.evaluate.protocol.base import Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.protocol.signals import Sine, response
 from go1exp.evaluate.quantities import Column, Row
 
@@ -156,34 +157,34 @@ def _array(values: Any) -> np.ndarray:
 
 
 def _rows(curve: Mapping[str, Any]) -> Figure:
-    figure, axes = paint.panels(3, sharex=True)
+    figure, axes = plots.panels(3, sharex=True)
     t, mean, command = curve["t"], _array(curve["mean"]), _array(curve["command"])
     low, high, one = (_array(curve[name]) for name in ("low", "high", "one"))
-    for a, name in enumerate(paint.AXES):
+    for a, name in enumerate(plots.AXES):
         ax = axes[a, 0]
-        paint.band(ax, t, low[:, a], high[:, a], paint.MEASURED)
-        ax.plot(t, one[:, a], color=paint.MEASURED, lw=0.4, alpha=0.6)
-        ax.plot(t, mean[:, a], color=paint.MEASURED, lw=1.2, label="measured")
-        ax.plot(t, command[:, a], color=paint.COMMANDED, lw=1.0, ls="--", label="commanded")
-        ax.plot(t, mean[:, a] - command[:, a], color=paint.ERROR, lw=0.8, label="error")
+        plots.band(ax, t, low[:, a], high[:, a], plots.MEASURED)
+        ax.plot(t, one[:, a], color=plots.MEASURED, lw=0.4, alpha=0.6)
+        ax.plot(t, mean[:, a], color=plots.MEASURED, lw=1.2, label="measured")
+        ax.plot(t, command[:, a], color=plots.COMMANDED, lw=1.0, ls="--", label="commanded")
+        ax.plot(t, mean[:, a] - command[:, a], color=plots.ERROR, lw=0.8, label="error")
         ax.set_ylabel(name)
     axes[2, 0].set_xlabel("time (s)")
-    paint.legend(figure, axes[0, 0])
+    plots.legend(figure, axes[0, 0])
     return figure
 
 
 def _bode(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    figure, axes = paint.panels(3, 2, sharex=True)
+    figure, axes = plots.panels(3, 2, sharex=True)
     lines = [(who, a) for who, s in summaries.items() for a in dict.fromkeys(e["condition"]["amplitude"] for e in s)]
     for k, (who, amplitude) in enumerate(lines):
         entries = [e for e in summaries[who] if e["condition"]["amplitude"] == amplitude]
         entries.sort(key=lambda e: -e["condition"]["period"])
-        colour = paint.COLOURS[(list(summaries).index(who) if len(summaries) > 1 else k) % len(paint.COLOURS)]
+        colour = plots.COLOURS[(list(summaries).index(who) if len(summaries) > 1 else k) % len(plots.COLOURS)]
         frequency = [(1.0 + 0.012 * k) / e["condition"]["period"] for e in entries]
         for a, axis in enumerate(AXES):
             text = f"{who} {amplitude}".strip() if a == 0 else ""
-            paint.intervals(axes[a, 0], frequency, entries, f"gain_{axis}", colour, text)
-            paint.intervals(axes[a, 1], frequency, entries, f"lag_{axis}", colour, "")
+            plots.intervals(axes[a, 0], frequency, entries, f"gain_{axis}", colour, text)
+            plots.intervals(axes[a, 1], frequency, entries, f"lag_{axis}", colour, "")
     for a, axis in enumerate(AXES):
         axes[a, 0].set_ylabel(f"{axis}: gain")
         axes[a, 1].set_ylabel("lag (s)")
@@ -191,5 +192,5 @@ def _bode(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
         axes[a, 1].axhline(0.0, color="#999999", lw=0.7)
     for ax in axes[2]:
         ax.set_xlabel("frequency (Hz)")
-    paint.legend(figure, axes[0, 0], columns=2)
+    plots.legend(figure, axes[0, 0], columns=2)
     return figure

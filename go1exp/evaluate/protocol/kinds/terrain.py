@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from go1exp.base.report import plots
+from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import NonNegative, PositiveRange, Speed, protocol
 from go1exp.config.schema.settings import settings
-from go1exp.evaluate.protocol.base import Drawing, Played, Protocol, lives, repeated
+from go1exp.evaluate.protocol.base import Played, Protocol, lives, repeated
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes, goal
 from go1exp.evaluate.protocol.lengths import Cause, Length
-from go1exp.evaluate.protocol.report import paint
 from go1exp.evaluate.quantities import Column, Derived, Row, values
 from go1exp.evaluate.statistics.intervals import Logistic, logistic_fit
 
@@ -192,7 +193,7 @@ def _success(subjects: Subjects) -> Figure:
     first = next(iter(subjects.values()))[1]
     grounds = list(dict.fromkeys(e["condition"]["ground"] for e in first))
     columns = 2 if len(grounds) > 1 else 1
-    figure, axes = paint.panels(-(-len(grounds) // columns), columns, height=1.6, sharey=True)
+    figure, axes = plots.panels(-(-len(grounds) // columns), columns, height=1.6, sharey=True)
     for w, (who, (rows, summary)) in enumerate(subjects.items()):
         for ax, ground in zip(axes.flat, grounds, strict=False):
             _curve(ax, [r for r in rows if r["ground"] == ground], summary, ground, who, w)
@@ -203,7 +204,7 @@ def _success(subjects: Subjects) -> Figure:
         ax.remove()
     for ax in axes[:, 0]:
         ax.set_ylabel("share")
-    paint.legend(figure, axes[0, 0])
+    plots.legend(figure, axes[0, 0])
     return figure
 
 
@@ -215,9 +216,9 @@ def _curve(
         condition = {"ground": ground, "speed": speed}
         entries = [e for e in summary if "passed" in e["figures"] and condition.items() <= e["condition"].items()]
         at = [e["condition"]["difficulty"] for e in entries]
-        colour = paint.COLOURS[(colour_from + k) % len(paint.COLOURS)]
+        colour = plots.COLOURS[(colour_from + k) % len(plots.COLOURS)]
         text = f"{who} {speed:g} m/s".strip()
-        paint.intervals(ax, at, entries, "passed", colour, text, ls="none")
+        plots.intervals(ax, at, entries, "passed", colour, text, ls="none")
         fit = _fit([r for r in rows if r["speed"] == speed])
         if fit is not None:
             x = np.linspace(min(at), max(at), 60)

@@ -1,0 +1,303 @@
+"""Quantities of groups with intervals over runs, comparisons with the baseline, and correlates of error and falls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from go1exp.evaluate.quantities import ROBOT, Column
+from go1exp.evaluate.report.evaluations import Evaluation, RunRows, draws
+from go1exp.evaluate.report.study import Group
+from go1exp.evaluate.statistics import compare
+from go1exp.evaluate.statistics.association import Association, associations
+from go1exp.evaluate.statistics.intervals import Interval, stratified_mean_interval
+from go1exp.evaluate.statistics.runs import clustered_share, iqm_interval, pooled_share, share_bootstrap
+
+Floats = NDArray[np.float64]
+Rows = Mapping[Path, NDArray[np.bool_]]
+"""Selected rows of each run."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One quantity of one group.
+
+    Attributes:
+        group: name of the group.
+        column: the quantity.
+        runs: estimate with its interval over runs; n is the number of runs.
+        robots: of a share, Wilson's interval over all robots of these runs; else None.
+        bootstrap: of a share, the percentile interval over runs; else None.
+        values: of each run, NaN where undefined.
+        condition: empty for all conditions together.
+    """
+
+    group: str
+    column: Column
+    runs: Interval
+    robots: Interval | None
+    bootstrap: Interval | None
+    values: Floats
+    condition: tuple[tuple[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One quantity of one group compared with the baseline.
+
+    Attributes:
+        group: name of the group.
+        column: the quantity.
+        first: interquartile mean of the baseline.
+        other: interquartile mean of the group.
+        difference: with its p and effect sizes.
+        adjusted_p: after Holm's correction; the p itself without a correction.
+        word: better, worse or no significant difference.
+        needed: runs per group needed for 80 % power; None if significant, or without a difference.
+        hopeless: whether no difference could be significant with so few runs among so many comparisons.
+        robots: difference of these policies robot by robot; None where no two robots of a condition differ.
+    """
+
+    group: str
+    column: Column
+    first: float
+    other: float
+    difference: compare.Difference
+    adjusted_p: float
+    word: compare.Word
+    needed: int | None
+    hopeless: bool
+    robots: Interval | None
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Correlation of one quantity with one result.
+
+    Attributes:
+        source: a swept setting (over runs), or a randomised quantity (over robots).
+        column: the result.
+        association: correlation and importance.
+        adjusted_p: after Holm's correction over the quantities of the same source and result.
+    """
+
+    source: Literal["setting", "drawn"]
+    column: Column
+    association: Association
+    adjusted_p: float
+
+
+# ---------------------------------------------------------------------- quantities
+
+
+def figures(evaluation: Evaluation, made: Sequence[Group]) -> list[Figure]:
+    """Return every quantity of every group, over all conditions."""
+    return [_figure(evaluation, group, column) for column in evaluation.columns for group in made]
+
+
+def by_condition(evaluation: Evaluation, made: Sequence[Group]) -> list[Figure]:
+    """Return the quantities with a better direction, of every group in every condition."""
+    columns = [c for c in evaluation.columns if c.better]
+    first = next(iter(evaluation.runs.values())).table
+    keys = [key for key in evaluation.keys if key in first]
+    entries = []
+    for condition in dict.fromkeys(zip(*(first[key].tolist() for key in keys), strict=True)):
+        named = tuple(zip(keys, condition, strict=True))
+        rows = {f: np.all([e.table[k] == v for k, v in named], axis=0) for f, e in evaluation.runs.items()}
+        entries += [_figure(evaluation, group, column, rows, named) for column in columns for group in made]
+    return entries
+
+
+def _figure(
+    evaluation: Evaluation,
+    group: Group,
+    column: Column,
+    rows: Rows | None = None,
+    condition: tuple[tuple[str, Any], ...] = (),
+) -> Figure:
+    of_runs = _values(evaluation, group, column, rows)
+    means = _means(of_runs)
+    if column.how != "share":
+        return Figure(group.name, column, iqm_interval(means), None, None, means, condition)
+    counts, totals = [int(v.sum()) for v in of_runs], [len(v) for v in of_runs]
+    over_runs, robots = clustered_share(counts, totals), pooled_share(counts, totals)
+    return Figure(group.name, column, over_runs, robots, share_bootstrap(counts, totals), means, condition)
+
+
+def _values(evaluation: Evaluation, group: Group, column: Column, rows: Rows | None = None) -> list[Floats]:
+    """Return the defined values of each run of a group."""
+    values = []
+    for folder in (run.folder for run in group.runs):
+        each = evaluation.runs[folder].table.get(column.name) if folder in evaluation.runs else None
+        each = np.empty(0) if each is None else each if rows is None else each[rows[folder]]
+        values.append(each[np.isfinite(each)])
+    return values
+
+
+def _means(values: Sequence[Floats]) -> Floats:
+    """Return the mean of each array, NaN of an empty one."""
+    return np.array([float(each.mean()) if len(each) else math.nan for each in values])
+
+
+# ---------------------------------------------------------------------- comparisons
+
+
+def compared(
+    evaluation: Evaluation,
+    made: Sequence[Group],
+    baseline: Group,
+    wanted: Sequence[str] | None,
+    correction: Literal["holm", "none"],
+    paired: bool,
+) -> list[Verdict]:
+    """Compare each evaluated group with the baseline, quantity by quantity.
+
+    Args:
+        evaluation: of all runs.
+        made: all groups.
+        baseline: one of the groups.
+        wanted: names of quantities, as far as the evaluation has them; None takes its main ones.
+        correction: over all quantities of all groups, or none.
+        paired: pair runs by their seed.
+    """
+    known = {c.name: c for c in evaluation.columns if c.better}
+    columns = [known[name] for name in (wanted or evaluation.main) if name in known]
+    evaluated = [g for g in made if any(run.folder in evaluation.runs for run in g.runs)]
+    if baseline not in evaluated:
+        return []
+    subjects = [(g, c) for c in columns for g in evaluated if g is not baseline]
+    samples = [_samples(evaluation, group, baseline, column, paired) for group, column in subjects]
+    differences = [compare.difference(a, b, paired) for a, b in samples]
+    p_values = [d.p for d in differences]
+    adjusted = compare.holm(p_values) if correction == "holm" else p_values
+    family = sum(math.isfinite(p) for p in p_values) if correction == "holm" else 1
+    entries = []
+    for (group, column), (a, b), d, p in zip(subjects, samples, differences, adjusted, strict=True):
+        assert column.better is not None
+        word, needed = compare.worded(d.estimate.estimate, p, column.better), None
+        if word == compare.ORDER[-1]:
+            level = compare.ALPHA / max(family, 1)
+            needed = compare.runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=level)
+        first, other = (float(iqm_interval(v).estimate) for v in (b, a))
+        hopeless = not d.least_p * family <= compare.ALPHA
+        robots = _by_robot(evaluation, group, baseline, column)
+        entries.append(Verdict(group.name, column, first, other, d, p, word, needed, hopeless, robots))
+    return entries
+
+
+def _samples(
+    evaluation: Evaluation, group: Group, baseline: Group, column: Column, paired: bool
+) -> tuple[Floats, Floats]:
+    """Return one value per run of both groups; for pairs, of the seeds that both have."""
+    a, b = (_means(_values(evaluation, g, column)) for g in (group, baseline))
+    if not paired:
+        return a[np.isfinite(a)], b[np.isfinite(b)]
+    theirs = {run.seed: value for run, value in zip(baseline.runs, b, strict=True)}
+    both = [(value, theirs[run.seed]) for run, value in zip(group.runs, a, strict=True) if run.seed in theirs]
+    pairs = np.array(both, dtype=np.float64).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _by_robot(evaluation: Evaluation, group: Group, baseline: Group, column: Column) -> Interval | None:
+    """Return the difference of a group's policies to the baseline's on the same robots; None without such pairs.
+
+    All evaluations share one seed: the k-th robot of a condition is the same for every policy. The difference of a
+    robot is the mean over the group's runs minus that over the baseline's; its interval is over robots, stratified by
+    condition. It concerns these policies, not other training seeds.
+    """
+    sides = [
+        [evaluation.runs[r.folder].table for r in g.runs if r.folder in evaluation.runs] for g in (group, baseline)
+    ]
+    tables = [table for side in sides for table in side]
+    keys = [key for key in (*evaluation.keys, ROBOT) if key in tables[0]] if tables else []
+    if not all(sides) or ROBOT not in keys or any(column.name not in table for table in tables):
+        return None
+    rows = [list(zip(*(table[key].tolist() for key in keys), strict=True)) for table in tables]
+    ordered = sorted(rows[0])
+    if any(sorted(each) != ordered for each in rows) or len(set(ordered)) < len(ordered):
+        return None
+    places = [sorted(range(len(each)), key=each.__getitem__) for each in rows]
+    values = np.array([t[column.name][place] for t, place in zip(tables, places, strict=True)], dtype=np.float64)
+    of_group, of_baseline = np.split(values, [len(sides[0])])
+    conditions = {row[:-1]: k for k, row in enumerate(ordered)}
+    return stratified_mean_interval(_mean(of_group) - _mean(of_baseline), [conditions[row[:-1]] for row in ordered])
+
+
+def _mean(values: Floats) -> Floats:
+    """Return the mean over the first axis of defined values; NaN where none is defined."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    return np.asarray(np.where(known, values, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan))
+
+
+# ---------------------------------------------------------------------- sensitivity
+
+
+def sensitivities(evaluation: Evaluation, made: Sequence[Group]) -> list[Sensitivity]:
+    """Return the correlates of the main quantities of an evaluation."""
+    entries: list[Sensitivity] = []
+    for column in (c for c in evaluation.columns if c.name in evaluation.main):
+        entries += _corrected("setting", column, _of_settings(evaluation, made, column))
+        entries += _corrected("drawn", column, _of_draws(evaluation, column))
+    return entries
+
+
+def _corrected(source: Literal["setting", "drawn"], column: Column, those: Sequence[Association]) -> list[Sensitivity]:
+    adjusted = compare.holm([a.p for a in those])
+    return [Sensitivity(source, column, a, p) for a, p in zip(those, adjusted, strict=True)]
+
+
+def _of_settings(evaluation: Evaluation, made: Sequence[Group], column: Column) -> list[Association]:
+    """Return the correlation of each swept key with a quantity of runs."""
+    if len(made) < 2:
+        return []
+    values = np.concatenate([_means(_values(evaluation, group, column)) for group in made])
+    swept = {key: [group.settings[key] for group in made for _ in group.runs] for key in made[0].settings}
+    return associations({key: _numbers_or_names(each) for key, each in swept.items()}, values)
+
+
+def _numbers_or_names(values: Sequence[Any]) -> NDArray[Any]:
+    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    return np.array(values, dtype=np.float64) if numbers else np.array([str(v) for v in values])
+
+
+def _of_draws(evaluation: Evaluation, column: Column) -> list[Association]:
+    """Return the correlation of each randomised quantity with a quantity of robots.
+
+    The policies of one evaluation meet the same robots, each of which is one sample: the mean over runs of the robot's
+    deviation from the mean of its run under the same command.
+    """
+    names: list[str] = []
+    robots: dict[tuple[float, ...], list[float]] = {}
+    for rows in evaluation.runs.values():
+        drawn = draws(rows)
+        names = names or (list(drawn) if column.name in rows.table else [])
+        if column.name not in rows.table or not drawn or set(drawn) != set(names):
+            continue  # trained, and therefore evaluated, with another randomisation
+        deviation = _deviation(rows, evaluation.keys, column)
+        keys = [rows.table[k] for k in (*evaluation.keys, ROBOT) if rows.table[k].dtype.kind == "f"]
+        table = np.column_stack([*(drawn[name] for name in names), *keys])
+        for row, value in zip(table.tolist(), deviation.tolist(), strict=True):
+            robots.setdefault(tuple(row), []).append(value)
+    if not names:
+        return []
+    quantities = np.array([row[: len(names)] for row in robots])
+    values = _means([np.array([v for v in each if np.isfinite(v)]) for each in robots.values()])
+    return associations({name: quantities[:, k] for k, name in enumerate(names)}, values)
+
+
+def _deviation(rows: RunRows, keys: Sequence[str], column: Column) -> Floats:
+    """Return a column (n,) minus its mean over the robots of the same condition."""
+    values = rows.table[column.name].astype(np.float64)
+    conditions = np.stack([np.unique(rows.table[k], return_inverse=True)[1] for k in keys], axis=1)
+    which = np.unique(conditions, axis=0, return_inverse=True)[1].ravel()
+    known = np.isfinite(values)
+    counts = np.maximum(np.bincount(which[known], minlength=which.max() + 1), 1)
+    centres = np.bincount(which[known], values[known], minlength=which.max() + 1) / counts
+    return np.asarray(values - centres[which])
