@@ -76,6 +76,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     # The robot's computer has none of these; pydantic is loaded with the estimator alone.
     "deploy/estimation/": (*ENGINES, "torch"),
     "deploy/runtime/": (*ENGINES, "torch", "onnx", "scipy", "rich", "pydantic"),
+    "base/report/": (*ENGINES, "torch", "numpy", "scipy"),
     "evaluate/report/": (*ENGINES, "torch"),
     "evaluate/statistics/": (*ENGINES, "torch"),
     "evaluate/viewer/session.py": ENGINES,
