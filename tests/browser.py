@@ -1,52 +1,163 @@
-"""A page of a report in a frame of a phone's width: a window of a browser cannot be that narrow everywhere."""
+"""A real Chromium without a display, driven by its DevTools protocol."""
 
 from __future__ import annotations
 
-import html
+import base64
+import io
 import json
-import re
 import shutil
 import subprocess
 import tempfile
+import time
+import urllib.request
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
-import pytest
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from websockets.sync.client import ClientConnection, connect
 
-PHONE = 390
-"""Width, CSS pixels."""
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
-needs_chromium = pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+"""WebGL 2 without a graphics card."""
 
-MEASURE = """
-<script>addEventListener("load", () => {
-  const all = [...document.querySelectorAll("body, body *:not(svg *), svg text")];
-  const wide = all.filter(e => { const r = e.getBoundingClientRect();
-    return r.right > innerWidth + 0.5 || r.left < -0.5 || !e.closest("svg") && e.scrollWidth > e.clientWidth + 1; });
-  const say = e => e.tagName + " " + e.textContent.trim().slice(0, 40);
-  parent.postMessage({width: innerWidth, all: all.length, drawings: document.querySelectorAll("figure svg").length,
-    verdicts: document.querySelectorAll("td .word").length, page: document.documentElement.scrollWidth,
-    empty: [...document.querySelectorAll("svg")].filter(e => e.getBoundingClientRect().height < 20).length,
-    wide: wide.filter(e => !e.closest(".heat")).map(say)}, "*");
-});</script>
-"""
-
-FRAME = f"""<!DOCTYPE html><body><script>addEventListener("message", e => {{
-  const text = document.createElement("pre"); text.textContent = JSON.stringify(e.data);
-  document.body.append(text); }});
-</script><iframe src="page.html" style="width:{PHONE}px;height:2000px;border:0"></iframe></body>"""
+SLOWEST = 180.0
+"""How long a page may take to answer that draws without a graphics card beside other work, s."""
 
 
-def on_a_phone(text: str, folder: Path) -> dict[str, Any]:
-    """Return counts of elements of a page, and those that are wider than the screen."""
-    (folder / "page.html").write_text(text.replace("</body>", f"{MEASURE}</body>"))
-    (folder / "frame.html").write_text(FRAME)
-    with tempfile.TemporaryDirectory() as profile:
-        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
-        where = [f"--user-data-dir={profile}", "--virtual-time-budget=5000", "--dump-dom"]
-        command = ["chromium", *flags, *where, (folder / "frame.html").as_uri()]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    found = re.search(r"<pre>(.*?)</pre>", done.stdout, re.DOTALL)
-    assert found, done.stderr
-    measured: dict[str, Any] = json.loads(html.unescape(found[1]))
-    return measured
+class Browser:
+    """One page.
+
+    Args:
+        width: of the window, pixels.
+        height: of the window, pixels.
+        scale: pixels that are drawn for each of these, in either direction.
+    """
+
+    def __init__(self, width: int = 1280, height: int = 800, scale: float = 1.0) -> None:
+        assert CHROMIUM is not None
+        self._folder = tempfile.TemporaryDirectory(prefix="chromium_", ignore_cleanup_errors=True)
+        flags = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--remote-debugging-port=0", *SOFTWARE_GL)
+        size = (f"--window-size={width},{height}", f"--user-data-dir={self._folder.name}")
+        self._process = subprocess.Popen(
+            [CHROMIUM, *flags, *size, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        self._number, self._open = 0, ExitStack()
+        self.messages: list[str] = []
+        """What the page has written to its console."""
+        try:
+            self._page = self._connected()
+        except BaseException:
+            self.close()
+            raise
+        self.call("Page.enable")
+        self.call("Runtime.enable")
+        about = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **about)
+
+    def _connected(self) -> ClientConnection:
+        """Wait for Chromium to listen, and return a connection to its page."""
+        port_file = Path(self._folder.name) / "DevToolsActivePort"
+        wait_until(lambda: port_file.is_file() and len(port_file.read_text().splitlines()) > 1, 30.0, "Chromium")
+        port = port_file.read_text().splitlines()[0]
+
+        def pages() -> list[dict[str, Any]]:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as answer:
+                return [target for target in json.load(answer) if target["type"] == "page"]
+
+        wait_until(lambda: bool(pages()), 30.0, "a page of Chromium")
+        page = connect(pages()[0]["webSocketDebuggerUrl"], max_size=2**26, compression=None, ping_interval=None)
+        return self._open.enter_context(page)
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End Chromium."""
+        self._open.close()
+        self._process.terminate()
+        try:
+            self._process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._folder.cleanup()
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the DevTools protocol and return its answer."""
+        self._number += 1
+        self._page.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._page.recv(timeout=SLOWEST))
+            if answer.get("method") == "Runtime.consoleAPICalled":
+                self.messages.append(" ".join(str(a.get("value", "")) for a in answer["params"]["args"]))
+            if answer.get("id") == self._number:
+                if "error" in answer:
+                    raise RuntimeError(f"{method}: {answer['error']['message']}")
+                return dict(answer["result"])
+
+    def go(self, address: str) -> None:
+        """Open an address, and wait until there is a page."""
+        self.call("Page.navigate", url=address)
+        wait_until(lambda: self.evaluate("document.body !== null") is True, 60.0, f"page of {address}")
+
+    def evaluate(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression."""
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in answer:
+            raise RuntimeError(str(answer["exceptionDetails"]))
+        return answer["result"].get("value")
+
+    def screenshot(self) -> NDArray[np.uint8]:
+        """Return what is seen, (H, W, 3)."""
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+    def hold(self, point: Callable[[], tuple[float, float]], *, until: Callable[[], bool], seconds: float) -> None:
+        """Press the left mouse button at a point until something is so, and again each 20 s, as people do.
+
+        A slow page looks at the mouse now and then.
+        """
+        end = time.monotonic() + seconds
+        while True:
+            x, y = point()
+            about = {"x": x, "y": y, "button": "left", "clickCount": 1}
+            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+            time.sleep(1.0)
+            self.call("Input.dispatchMouseEvent", type="mousePressed", buttons=1, **about)
+            try:
+                wait_until(until, min(20.0, max(end - time.monotonic(), 0.0)), "answer to the mouse")
+                return
+            except AssertionError:
+                if time.monotonic() > end:
+                    raise
+            finally:
+                self.call("Input.dispatchMouseEvent", type="mouseReleased", **about)
+            time.sleep(1.0)
+
+    def hold_key(self, key: str, code: str, number: int, *, until: Callable[[], bool], seconds: float) -> None:
+        """Press a key until something is so, by the three names that browsers have for it."""
+        about = {"key": key, "code": code, "windowsVirtualKeyCode": number, "nativeVirtualKeyCode": number}
+        self.call("Input.dispatchKeyEvent", type="rawKeyDown", **about)
+        try:
+            wait_until(until, seconds, f"answer to {key}")
+        finally:
+            self.call("Input.dispatchKeyEvent", type="keyUp", **about)
+
+
+def wait_until(true: Callable[[], bool], seconds: float, what: str) -> float:
+    """Wait until something is so, and return how long that took, s; fail after ``seconds``."""
+    start = time.monotonic()
+    while not true():
+        if time.monotonic() - start > seconds:
+            raise AssertionError(f"no {what} within {seconds:g} s")
+        time.sleep(0.05)
+    return time.monotonic() - start

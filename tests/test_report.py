@@ -28,7 +28,7 @@ from go1exp.evaluate.report.tables import plain_rows, tables
 from go1exp.evaluate.report.writing import page, write
 from go1exp.evaluate.rows import rows_of
 from go1exp.evaluate.rows import write as write_evaluation
-from tests.browser import PHONE, needs_chromium, on_a_phone
+from tests.phone import PHONE, needs_chromium, on_a_phone
 
 CONFIG: dict[str, Any] = {
     "seed": 0,

@@ -33,8 +33,8 @@ class Cell:
     marked: bool = False
 
 
-Row = Sequence[Cell | str | int] | str
-"""Cells, or the heading of the rows below it."""
+Row = Sequence[object] | str
+"""Cells (``Cell``, or a value that is shown as text), or the heading of the rows below it."""
 
 
 @dataclass(frozen=True)
