@@ -43,10 +43,10 @@ def trajectories(overrides: list[str]) -> dict[str, np.ndarray]:
     assert not problems, problems
     names = ("q", "qd", "tau_est", "gyro", "acc", "attitude", "foot_force")
     sensors = SensorConfig(rate_hz=500.0, jitter=0.0, dropped=0.0, truth=False, **dict.fromkeys(names, PERFECT))
-    wishes = plan.Wishes(((20.0, 0.5),), 10.0, SEEDS, 0, "suspended", ((0.0, 0.0),), 0, sensors)
+    config = plan.RecordingConfig(((20.0, 0.5),), 10.0, SEEDS, 0, "suspended", ((0.0, 0.0),), 0, sensors)
     terms = [Term(name, members("excitation")[name], {}) for name in MOTIONS]
     rig = simulate.Rig(**parts, physics_dt=0.001)
-    made = simulate.play(rig, plan.episodes(terms, wishes), sensors, 0, lambda done, total: None)
+    made = simulate.play(rig, plan.episodes(terms, config), sensors, 0, lambda done, total: None)
     return {f"{r.meta.excitation} {r.meta.episode.split('_')[-1]}": r.joint("q") for r in made}
 
 

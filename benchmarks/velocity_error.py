@@ -16,7 +16,7 @@ import numpy as np
 
 from go1exp.base.tensors.threads import one_thread
 from go1exp.config.schema.backends import CpuBackend
-from go1exp.evaluate.drivers import EstimatedVelocity
+from go1exp.evaluate.agents import EstimatedVelocity
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import parse_train
 from go1exp.train import run_folder

@@ -233,7 +233,7 @@ def test_many_samples_at_once_are_the_same_as_one_by_one() -> None:
 # ---------------------------------------------------------------------- what it must find
 
 
-@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/drivers.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/agents.py", "assets/estimation/", "hatch_build.py")
 def test_a_swaying_robot_is_followed_exactly() -> None:
     rows, truth = stroll(exact(), seconds=4.0)
     states = make_filter(exact()).run(rows)
@@ -265,7 +265,7 @@ def test_an_offset_of_the_accelerometer_is_learnt_while_standing() -> None:
     np.testing.assert_allclose(states[-1, 3:6], 0.0, atol=2e-3)
 
 
-@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/drivers.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/agents.py", "assets/estimation/", "hatch_build.py")
 def test_one_slipping_foot_moves_the_estimate_little() -> None:
     config = exact()
     rows, truth = (values.copy() for values in stroll(config, 4.0))
@@ -313,7 +313,7 @@ def sinking_steps(config: FilterConfig, slope: float) -> np.ndarray:
     return np.array(rows)
 
 
-@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/drivers.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/agents.py", "assets/estimation/", "hatch_build.py")
 @pytest.mark.parametrize("slope", [0.0, 0.3])
 def test_ground_that_gives_way_does_not_make_the_trunk_sink(slope: float) -> None:
     config = go1(foot_radius=0.0)

@@ -80,7 +80,7 @@ def test_it_is_what_the_feet_carry() -> None:
         assert np.corrcoef(carried, felt)[0, 1] > 0.75
 
 
-@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/drivers.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/agents.py", "assets/estimation/", "hatch_build.py")
 @pytest.mark.parametrize("number", [14, 15])
 def test_motion_capture_a_stride_off_is_moved_back(number: int, tmp_path: Path) -> None:
     """Run 14 came so; run 15 is made so."""
@@ -103,7 +103,7 @@ def test_motion_capture_a_stride_off_is_moved_back(number: int, tmp_path: Path) 
 # ---------------------------------------------------------------------- runs with faults
 
 
-@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/drivers.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/agents.py", "assets/estimation/", "hatch_build.py")
 def test_broken_rows_and_missing_sensors_do_not_stop_a_run(tmp_path: Path) -> None:
     whole = judge(DATA / "run_19.npz", scaler()) if run(19) else None
     arrays = run(19)
@@ -231,7 +231,7 @@ print(*found, *sorted(set(outcome[:, -1].astype(int))))
 """
 
 
-@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/drivers.py", "assets/estimation/", "hatch_build.py")
+@pytest.mark.slow("go1exp/deploy/estimation/", "go1exp/evaluate/agents.py", "assets/estimation/", "hatch_build.py")
 def test_an_update_allocates_nothing(tmp_path: Path) -> None:
     """Every allocation of the process is counted, C++'s ``new`` too: 5000 updates of every outcome need as many
     as 5 do.

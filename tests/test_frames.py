@@ -16,7 +16,7 @@ from go1exp.deploy.export.build import metadata, readings
 from go1exp.deploy.export.graph import DeployedPolicy
 from go1exp.deploy.runtime.metadata import Block, Metadata, Port
 from go1exp.deploy.runtime.policy import PolicyMemory
-from go1exp.evaluate.drivers import PolicyDriver
+from go1exp.evaluate.agents import PolicyAgent
 from go1exp.mdp.types import TermSetup
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.frames import Frames
@@ -156,10 +156,10 @@ def test_a_policy_that_runs_faster_than_it_was_trained_sees_frames_of_its_traini
 
     faster = dataclasses.replace(task, sim=dataclasses.replace(task.sim, policy_dt=1.0 / rate))
     core = Go1Core(faster, 2, noise=False)
-    pilot = PolicyDriver("policy", task, policy).begin(core, "exact", 0)
+    running = PolicyAgent("policy", task, policy).begin(core, "exact", 0)
     observation = core.reset()
     for _ in range(7):
-        observation = core.step(pilot(observation)).observation
+        observation = core.step(running(observation)).observation
     joints, cycles = slice(15, 51), round(rate / 50.0)
     for k, now in enumerate(seen):
         frames = now[:, joints].unflatten(1, (3, 12))

@@ -48,7 +48,7 @@ class Creep(Effect):
 '''
 
 USUAL = """shapes=({"speed": 0.3}, {"speed": 2.0}), free_shapes=("speed",), simpler="coulomb", excitation="slow_ramps",
-confounded=("coulomb",), told_apart_by="record slow_ramps at two gain sets" """
+confounded=("coulomb",), separated_by="record slow_ramps at two gain sets" """
 
 
 STILL = Motion(*np.zeros((4, 12)))

@@ -21,7 +21,7 @@ from go1exp.cli.record import APP as RECORD
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError, TooLongError, members
 from go1exp.evaluate import video
-from go1exp.evaluate.drivers import PolicyDriver
+from go1exp.evaluate.agents import PolicyAgent
 from go1exp.evaluate.protocol.base import Chosen, chosen
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Plan
 from go1exp.evaluate.protocol.playing import refuse
@@ -87,8 +87,8 @@ FREE = 8_000_000_000
 def stage(make_task: Callable[..., TaskConfig]) -> Stage:
     """Robots that stand, at 50 Hz."""
     task = make_task("backend.threads=1", "sim.physics_dt=0.005", "sim.policy_dt=0.02")
-    driver = PolicyDriver("stand", task, lambda observation: torch.zeros(len(observation), 12))
-    return Stage(driver, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=0))
+    agent = PolicyAgent("stand", task, lambda observation: torch.zeros(len(observation), 12))
+    return Stage(agent, Setting(noise=False, randomize=False, trunk_velocity="exact", seed=0))
 
 
 def one(name: str, *overrides: str) -> Chosen:

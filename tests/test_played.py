@@ -68,7 +68,7 @@ def test_an_excitation_is_played_by_name() -> None:
     ("wish", "problem"),
     [
         ("squat", "squat.*is for a robot on the ground"),
-        ("torque_off", "drives off"),
+        ("torque_off", "switches actuators off"),
         ("chrip", "chrip"),
     ],
 )
@@ -84,7 +84,7 @@ def test_files_that_cannot_be_played_are_refused_by_column(tmp_path: Path) -> No
         played(str(table(tmp_path / "a.csv", kd_FL_thigh=np.arange(11.0))), None, None, None, 0)
     off = np.ones(11)
     off[5] = 0.0
-    with pytest.raises(ConfigError, match="drives off"):
+    with pytest.raises(ConfigError, match="switches actuators off"):
         played(str(table(tmp_path / "b.csv", torque_enable=off)), None, None, None, 0)
     wide = np.linspace(0.0, 5.0, 11)
     with pytest.raises(ExcitationError, match="q_target_FR_calf goes from"):

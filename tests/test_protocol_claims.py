@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from go1exp.evaluate.protocol.claims import Claim, judged, verdict
+from go1exp.evaluate.protocol.claims import Claim, evaluated, verdict
 from go1exp.evaluate.protocol.comparing import word
 from go1exp.evaluate.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
 from go1exp.evaluate.statistics.intervals import (
@@ -58,12 +58,12 @@ def test_a_claim_is_judged_by_its_worst_condition() -> None:
     for n, row in enumerate(rows):
         row["error"] += 0.01 * (n % 5)
     entries = summary(rows, ("speed",), (Column("error", "m", "an error"),))
-    everywhere = judged({"small": MOST}, entries)[0]
+    everywhere = evaluated({"small": MOST}, entries)[0]
     assert (everywhere.word, everywhere.condition, everywhere.conditions) == ("not met", {"speed": 2.0}, 2)
     where = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here", where={"speed": 1.0})
-    assert judged({"small": where}, entries)[0].word == "met"
+    assert evaluated({"small": where}, entries)[0].word == "met"
     nowhere = Claim(quantity="error", at_most=1.0, tolerance=0.2, source="here", where={"speed": 7.0})
-    assert judged({"small": nowhere}, entries)[0].word == "inconclusive"
+    assert evaluated({"small": nowhere}, entries)[0].word == "inconclusive"
 
 
 def test_falls_are_counted_per_moving_minute() -> None:

@@ -103,23 +103,23 @@ def test_a_bundle_plays_what_its_run_plays(run: Path, bundle: Path, tmp_path: Pa
     theirs, about_bundle = evaluated(tmp_path / "bundle", f"bundle={bundle}", quiet)
     for a, b in zip(ours, theirs, strict=True):
         assert a["rmse_x"] == pytest.approx(b["rmse_x"], abs=1e-3)
-    assert about_bundle["driver"]["sha256"] != about["driver"].get("sha256")
+    assert about_bundle["agent"]["sha256"] != about["agent"].get("sha256")
     noisy, _ = evaluated(tmp_path / "noisy", f"bundle={bundle}")
     assert [r["rmse_x"] for r in noisy] != [r["rmse_x"] for r in theirs]
 
 
 def test_another_controller_plays_and_is_compared(run: Path, tmp_path: Path) -> None:
     rows, about = evaluated(tmp_path / "mpc", "controller=mpc", f"run={run}", "protocol.corners.noise=false")
-    assert about["driver"]["controller"]["name"] == "mpc"
+    assert about["agent"]["controller"]["name"] == "mpc"
     assert [row["fell"] for row in rows] == [False, False]
     content = compared(tmp_path / "both", f"subjects=[mpc,{run}]")
     assert [result["subject"] for result in content["results"]["corners"]] == ["mpc", str(run)]
 
 
 def test_of_several_protocols_a_controller_leaves_out_the_rates(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    driver = subjects.driver(subjects.word("mpc", ""), {})
+    agent = subjects.agent(subjects.word("mpc", ""), {})
     protocols, _ = protocols_chosen(compose("eval", ["protocol=[rate,corners]"]), {})
-    assert [c.key for c in playable(protocols, driver)] == ["corners"]
+    assert [c.key for c in playable(protocols, agent)] == ["corners"]
     assert "rate: not played" in capsys.readouterr().out
 
 
@@ -167,7 +167,7 @@ def test_results_that_will_be_replaced_are_named(run: Path, tmp_path: Path, caps
 def test_the_help_says_what_the_keys_of_a_protocol_are(capsys: pytest.CaptureFixture[str]) -> None:
     show("eval", "go1exp eval", ["protocol", "protocol=kicks"])
     shown = capsys.readouterr().out
-    assert re.search(r"protocol\.kicks\.robots=200 +robots of each condition", shown)
+    assert re.search(r"protocol\.kicks\.robots=200 +number of robots in each condition", shown)
     assert re.search(r"protocol\.kicks\.recovery\.height=0\.015\s+largest difference", shown)
 
 

@@ -14,7 +14,7 @@ from go1exp.base.report.table import Cell
 from go1exp.config.compose import compose
 from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Played, chosen
-from go1exp.evaluate.protocol.claims import judged
+from go1exp.evaluate.protocol.claims import evaluated
 from go1exp.evaluate.protocol.playing import Result, summarised
 from go1exp.evaluate.protocol.report.pages import comparison, page
 from go1exp.evaluate.protocol.report.tables import ACROSS, claims_table, condition_text, figure_tables, meanings
@@ -26,7 +26,7 @@ def made(name: str, label: str, rows: Callable[[Any], list[dict[str, Any]]], *ov
     (one,), _ = chosen(compose("eval", [f"protocol={name}", *(f"protocol.{name}.{o}" for o in overrides)])["protocol"])
     those = rows(one.protocol)
     figures = summarised(one, those)
-    verdicts = judged(one.protocol.claims, figures)
+    verdicts = evaluated(one.protocol.claims, figures)
     return Result(one, label, {"seed": 1}, Played(those), 0, figures, verdicts, 1.0)
 
 
@@ -116,7 +116,7 @@ def test_units_are_those_of_the_ground() -> None:
         "gravel": {"estimate": 0.05, "low": 0.04, "high": 0.06, "n": 4, "unit": "m"},
     }
     summary = [{"condition": {"ground": g, "speed": 1.0}, "figures": {"at_half": f}} for g, f in half.items()]
-    verdicts = judged(one.protocol.claims, summary)
+    verdicts = evaluated(one.protocol.claims, summary)
     result = Result(one, "trot", {}, Played([]), 0, summary, verdicts, 1.0)
     claims = {row[0]: row for row in claims_table(result, meanings(result)).rows}
     assert claims["incline"][3] == "at least 15 deg"

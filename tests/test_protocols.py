@@ -20,7 +20,7 @@ from torch import Tensor
 import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError, members
-from go1exp.evaluate.drivers import ControllerDriver, Driver, PolicyDriver
+from go1exp.evaluate.agents import Agent, ControllerAgent, PolicyAgent
 from go1exp.evaluate.protocol import comparing
 from go1exp.evaluate.protocol.base import Chosen, chosen
 from go1exp.evaluate.protocol.kinds.corners import step_answer
@@ -51,7 +51,7 @@ SMALL = {
 
 
 @pytest.fixture(scope="module")
-def driver(make_task: Callable[..., TaskConfig]) -> PolicyDriver:
+def agent(make_task: Callable[..., TaskConfig]) -> PolicyAgent:
     """Robots that sway on the spot."""
     step = [0]
 
@@ -60,7 +60,7 @@ def driver(make_task: Callable[..., TaskConfig]) -> PolicyDriver:
         swing = 0.4 * math.sin(0.3 * step[0])
         return torch.tensor([0.0, swing, -swing] * 4).repeat(len(observation), 1)
 
-    return PolicyDriver("sway", make_task("backend.threads=1", "sim.physics_dt=0.005", "rand=table1"), sway)
+    return PolicyAgent("sway", make_task("backend.threads=1", "sim.physics_dt=0.005", "rand=table1"), sway)
 
 
 def small(name: str, *more: str) -> Chosen:
@@ -77,14 +77,14 @@ def small(name: str, *more: str) -> Chosen:
 
 
 @pytest.fixture(scope="module")
-def results(driver: PolicyDriver) -> dict[str, Result]:
+def results(agent: PolicyAgent) -> dict[str, Result]:
     """What came of each protocol, played once."""
     return {}
 
 
-def result(name: str, driver: PolicyDriver, results: dict[str, Result]) -> Result:
+def result(name: str, agent: PolicyAgent, results: dict[str, Result]) -> Result:
     if name not in results:
-        results[name] = play(small(name), driver, Rates(seed=1))
+        results[name] = play(small(name), agent, Rates(seed=1))
     return results[name]
 
 
@@ -128,9 +128,9 @@ def unclosed(page: str) -> list[str]:
 
 @pytest.mark.parametrize("name", EVERY)
 def test_a_protocol_makes_rows_json_and_a_page(
-    name: str, driver: PolicyDriver, results: dict[str, Result], tmp_path: Path
+    name: str, agent: PolicyAgent, results: dict[str, Result], tmp_path: Path
 ) -> None:
-    one = result(name, driver, results)
+    one = result(name, agent, results)
     rows_file, json_file, page_file = write(one, tmp_path)
     rows = pq.read_table(rows_file).to_pylist()
     keys, columns = one.chosen.protocol.keys, {c.name for c in one.chosen.protocol.columns()}
@@ -156,8 +156,8 @@ def test_a_protocol_makes_rows_json_and_a_page(
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_subject_is_not_told_apart_from_itself(name: str, driver: PolicyDriver, results: dict[str, Result]) -> None:
-    one = result(name, driver, results)
+def test_a_subject_is_not_told_apart_from_itself(name: str, agent: PolicyAgent, results: dict[str, Result]) -> None:
+    one = result(name, agent, results)
     again = dataclasses.replace(one, label="again")
     differences = comparing.compared(one, again)
     assert {d.word for d in differences} == {"no significant difference"}
@@ -166,9 +166,9 @@ def test_a_subject_is_not_told_apart_from_itself(name: str, driver: PolicyDriver
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_every_key_of_a_protocol_is_read(name: str, driver: PolicyDriver) -> None:
+def test_every_key_of_a_protocol_is_read(name: str, agent: PolicyAgent) -> None:
     def work() -> None:
-        one = play(small(name), driver, Rates(seed=1))
+        one = play(small(name), agent, Rates(seed=1))
         one.chosen.protocol.drawings(one.played, one.summary)
 
     kind: Any = members("protocol")[name].target
@@ -176,18 +176,18 @@ def test_every_key_of_a_protocol_is_read(name: str, driver: PolicyDriver) -> Non
     assert [key for key in unread([kind], work) if key not in velocity] == []
 
 
-def test_robots_of_the_nominal_protocol_count_once(driver: PolicyDriver) -> None:
-    still = play(small("corners", "noise=false", "randomize=false", "robots=3"), driver, Rates(seed=1))
+def test_robots_of_the_nominal_protocol_count_once(agent: PolicyAgent) -> None:
+    still = play(small("corners", "noise=false", "randomize=false", "robots=3"), agent, Rates(seed=1))
     assert (len(still.played.rows), still.repeats) == (1, 2)
-    random = play(small("corners", "robots=3"), driver, Rates(seed=1))
+    random = play(small("corners", "robots=3"), agent, Rates(seed=1))
     assert (len(random.played.rows), random.repeats) == (3, 0)
 
 
 def test_a_better_subject_is_called_better_and_a_worse_one_worse(
-    driver: PolicyDriver, results: dict[str, Result]
+    agent: PolicyAgent, results: dict[str, Result]
 ) -> None:
     """Rows whose difference is known: every error is 0.1 less, hardly more for some, one of which robots is missing."""
-    one = result("gait", driver, results)
+    one = result("gait", agent, results)
     rows = [
         {**row, "rmse_x": row["rmse_x"] - 0.1 - 1e-4 * row[ROBOT], "fell": True}
         for row in one.played.rows
@@ -205,8 +205,8 @@ def test_a_better_subject_is_called_better_and_a_worse_one_worse(
 # ---------------------------------------------------------------------- the stage
 
 
-def stage(driver: Driver, **changes: Any) -> Stage:
-    return Stage(driver, Setting(**{"noise": True, "randomize": True, "trunk_velocity": "exact", "seed": 1, **changes}))
+def stage(agent: Agent, **changes: Any) -> Stage:
+    return Stage(agent, Setting(**{"noise": True, "randomize": True, "trunk_velocity": "exact", "seed": 1, **changes}))
 
 
 class Listening:
@@ -225,7 +225,7 @@ def test_a_command_is_seen_in_the_step_that_it_is_for(make_task: Callable[..., T
     task = make_task("backend.threads=1", "sim.physics_dt=0.005")
     command = np.zeros((6, 1, 3))
     command[:, 0, 0] = np.arange(6) * 0.1
-    quiet = stage(PolicyDriver("listens", task, policy), noise=False, randomize=False)
+    quiet = stage(PolicyAgent("listens", task, policy), noise=False, randomize=False)
     motion = quiet.run(Plan(command))
     np.testing.assert_allclose(motion.command[:, 0, 0], command[:, 0, 0], atol=1e-7)
     seen = torch.cat(policy.seen).numpy()
@@ -233,11 +233,11 @@ def test_a_command_is_seen_in_the_step_that_it_is_for(make_task: Callable[..., T
     assert len(column) == 1
 
 
-def test_a_session_that_is_put_back_does_the_same_again(driver: PolicyDriver) -> None:
-    """Bit for bit, and another kick does something else; also where the driver must play it all again."""
+def test_a_session_that_is_put_back_does_the_same_again(agent: PolicyAgent) -> None:
+    """Bit for bit, and another kick does something else; also where the agent must play it all again."""
     nothing = np.zeros((2, 1))
-    task = driver.task
-    plain = PolicyDriver("stands", task, lambda observation: torch.zeros(len(observation), 12))
+    task = agent.task
+    plain = PolicyAgent("stands", task, lambda observation: torch.zeros(len(observation), 12))
     session = stage(plain).session(Plan(np.zeros((20, 2, 3)), impulses=Impulses(nothing, nothing, nothing, 0.05)))
     session.run(8)
     state = session.save()
@@ -252,10 +252,10 @@ def test_a_session_that_is_put_back_does_the_same_again(driver: PolicyDriver) ->
     assert np.array_equal(session.run(12).velocity, first.velocity)
 
 
-def test_a_kick_moves_a_robot_by_its_momentum(driver: PolicyDriver) -> None:
+def test_a_kick_moves_a_robot_by_its_momentum(agent: PolicyAgent) -> None:
     """In the air, before it touches: m dv is the impulse, whatever the legs do."""
-    task = dataclasses.replace(driver.task, rand=())
-    plain = PolicyDriver("stands", task, lambda observation: torch.zeros(len(observation), 12))
+    task = dataclasses.replace(agent.task, rand=())
+    plain = PolicyAgent("stands", task, lambda observation: torch.zeros(len(observation), 12))
     kick = Impulses(np.zeros((1, 1)), np.full((1, 1), 6.4), np.full((1, 1), np.pi / 2), 0.02)
     quiet = stage(plain, noise=False, randomize=False)
     session = quiet.session(Plan(np.zeros((1, 1, 3)), impulses=kick))
@@ -277,9 +277,9 @@ def test_the_physics_step_fits_the_rate(rate: float, step: float) -> None:
     assert fitting_step(1.0 / rate, 0.002) == pytest.approx(step)
 
 
-def test_a_driver_that_cannot_be_put_back_plays_it_all_again(driver: PolicyDriver) -> None:
+def test_an_agent_that_cannot_be_put_back_plays_it_all_again(agent: PolicyAgent) -> None:
     """The filter of an estimated velocity cannot: the map is that of kicks on the same walk all the same."""
-    one = play(small("push_map", "trunk_velocity=estimated", "watch_s=0.5"), driver, Rates(seed=1))
+    one = play(small("push_map", "trunk_velocity=estimated", "watch_s=0.5"), agent, Rates(seed=1))
     assert [row["impulse"] is not None for row in one.played.rows] == [not row["fell"] for row in one.played.rows]
 
 
@@ -311,7 +311,7 @@ def test_the_answer_to_a_step_is_that_of_a_first_order_lag() -> None:
     assert answer["overshoot"] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_robot_comes_back_when_it_does(driver: PolicyDriver) -> None:
+def test_a_robot_comes_back_when_it_does(agent: PolicyAgent) -> None:
     kicks: Any = small("kicks", "recovery={height:0.015,speed:0.15,hold_s:0.5,smooth_s:0.0}").protocol
     dt = 0.02
     t = np.arange(400) * dt
@@ -365,9 +365,9 @@ def test_a_wrong_protocol_is_refused_in_words(overrides: str, said: str) -> None
         chosen(compose("eval", [f"protocol={name}", *rest])["protocol"])
 
 
-def test_a_policy_that_does_not_see_the_velocity_is_refused(driver: PolicyDriver) -> None:
-    without = tuple(t for t in driver.task.observation if t.entry.name != "base_linear_velocity")
-    blind = PolicyDriver("blind", dataclasses.replace(driver.task, observation=without), driver.policy)
+def test_a_policy_that_does_not_see_the_velocity_is_refused(agent: PolicyAgent) -> None:
+    without = tuple(t for t in agent.task.observation if t.entry.name != "base_linear_velocity")
+    blind = PolicyAgent("blind", dataclasses.replace(agent.task, observation=without), agent.policy)
     from go1exp.cli.protocols import refuse
 
     with pytest.raises(ConfigError, match=r"protocol.rate.velocities = 'estimated': the policy of blind"):
@@ -396,13 +396,13 @@ def test_the_mpc_is_put_back_to_an_instant(make_task: Callable[..., TaskConfig])
     file = data_root() / "conf/controller/mpc.yaml"
     settings = parse_controller(yaml.safe_load(file.read_text()) | {"stand": 0.0})
     assert isinstance(settings, MpcSettings)
-    driver = ControllerDriver("mpc", make_task("backend.threads=1", "rand=table1"), lambda: Mpc(settings))
+    agent = ControllerAgent("mpc", make_task("backend.threads=1", "rand=table1"), lambda: Mpc(settings))
     nothing, command = np.zeros((2, 1)), np.broadcast_to([0.5, 0.0, 0.0], (40, 2, 3))
-    session = stage(driver).session(Plan(command, impulses=Impulses(nothing, nothing, nothing, 0.05)))
+    session = stage(agent).session(Plan(command, impulses=Impulses(nothing, nothing, nothing, 0.05)))
     session.run(20)
     state = session.save()
     assert state is not None
     first = session.run(20)
     session.load(state, 20)
     assert np.array_equal(session.run(20).velocity, first.velocity)
-    assert stage(driver, trunk_velocity="estimated").session(Plan(command)).save() is None
+    assert stage(agent, trunk_velocity="estimated").session(Plan(command)).save() is None

@@ -12,8 +12,8 @@ import pytest
 
 from go1exp import robot
 from go1exp.base.errors import Expected
-from go1exp.cli.play_web import _drivers, _grounds
-from go1exp.cli.subjects import driver, named
+from go1exp.cli.play_web import _agents, _grounds
+from go1exp.cli.subjects import agent, named
 from go1exp.config.compose import compose
 from go1exp.config.schema.contact import MUJOCO_CONTACT
 from go1exp.config.schema.registry import ConfigError
@@ -48,8 +48,8 @@ GO1 = parse_parts(compose("train", []), ("robot",))[0]["robot"]
 def robots() -> Robots:
     """Everything that ``go1exp play policy=trot viewer=web`` offers."""
     subject = named(None, "trot", None, None, "play.mp4")
-    first = driver(subject, {})
-    return Robots(_drivers(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
+    first = agent(subject, {})
+    return Robots(_agents(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_a_push_moves_the_robot_where_it_points_and_is_marked(session: Session) 
 
 @pytest.mark.parametrize("other", ["paper", "mpc"])
 def test_another_driver_takes_over_while_the_robot_walks(session: Session, other: str) -> None:
-    if other not in session.robots.drivers:
+    if other not in session.robots.agents:
         pytest.skip("the extra mpc is not installed")
     session.ask(ask.Command((0.4, 0.0, 0.0)))
     walk(session, 0.8)
@@ -411,7 +411,7 @@ def test_a_time_beyond_the_ends_is_an_end() -> None:
 
 def test_own_effects_of_a_run_that_do_nothing_are_off(robots: Robots) -> None:
     subject = named(None, "paper", None, None, "play.mp4")
-    task = driver(subject, {}).task
+    task = agent(subject, {}).task
     _, sizes = catalogue(task.effect, False)
     assert [name for name, size in sizes.items() if size] == []
     own = {term.key for term in task.effect}

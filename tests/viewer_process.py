@@ -16,8 +16,8 @@ from typing import Any
 
 import torch
 
-from go1exp.cli.play_web import _drivers, _grounds
-from go1exp.cli.subjects import driver, named
+from go1exp.cli.play_web import _agents, _grounds
+from go1exp.cli.subjects import agent, named
 from go1exp.evaluate.viewer import web
 from go1exp.evaluate.viewer.drive_window import DriveWindow
 from go1exp.evaluate.viewer.page_server import Gamepad
@@ -78,9 +78,9 @@ class TellingWindow(DriveWindow):
 def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where pytest runs in a shell's background
     torch.set_num_threads(1)
-    first = driver(named(None, "trot", None, None, "play.mp4"), {})
+    first = agent(named(None, "trot", None, None, "play.mp4"), {})
     subject = named(None, "trot", None, None, "play.mp4")
-    robots = Robots(_drivers(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
+    robots = Robots(_agents(subject, first, {}), _grounds(None)[1], catalogue(first.task.effect, False)[0])
     session = Session(robots, "trot", Setup(), (0.0, 0.0, 0.0))
     pad = Gamepad()
     web.run(

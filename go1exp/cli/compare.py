@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def _task(container: dict[str, Any]) -> None:
     import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
     from go1exp.cli.settings import CompareSettings, parse
-    from go1exp.cli.subjects import driver, varied
+    from go1exp.cli.subjects import agent, varied
     from go1exp.evaluate.protocol.base import chosen
 
     other, container = other_robot.split(container)
@@ -41,12 +41,12 @@ def _task(container: dict[str, Any]) -> None:
     from go1exp.cli.protocols import note_replaced, refuse
     from go1exp.evaluate.protocol.playing import Rates, play, refuse_lengths
 
-    first = driver(subjects[0][0], other)
+    first = agent(subjects[0][0], other)
     robot_of = first.task if settings.same_robot else None
-    drivers = [first, *(driver(named, other, robot_of) for named, _ in subjects[1:])]
+    agents = [first, *(agent(named, other, robot_of) for named, _ in subjects[1:])]
     of_each = [_with(protocols, how.trunk_velocity) for _, how in subjects]
     rates = [Rates(settings.seed, how.policy_dt, settings.physics_dt, how.engine) for _, how in subjects]
-    for theirs, drives, pace in zip(of_each, drivers, rates, strict=True):
+    for theirs, drives, pace in zip(of_each, agents, rates, strict=True):
         refuse(theirs, drives)
         refuse_lengths(theirs, drives, pace)
     writable(settings.folder, "folder")
@@ -55,7 +55,7 @@ def _task(container: dict[str, Any]) -> None:
     origin = {"robot": other_robot.described(other), "robot_of": settings.subjects[0] if robot_of else "each its own"}
     for k, protocol in enumerate(protocols):
         results = []
-        for theirs, drives, pace in zip(of_each, drivers, rates, strict=True):
+        for theirs, drives, pace in zip(of_each, agents, rates, strict=True):
             show = spinner(1, f"{protocol.key}: {drives.label}")
             results.append(play(theirs[k], drives, pace, origin, show))
         plays[protocol.key] = results

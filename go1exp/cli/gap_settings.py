@@ -11,7 +11,7 @@ from go1exp.config.schema.registry import FolderName
 from go1exp.config.schema.settings import settings
 from go1exp.gap.design.settings import DesignSettings
 from go1exp.gap.result import Angle, GapSettings
-from go1exp.logs.record.plan import Wishes
+from go1exp.logs.record.plan import RecordingConfig
 
 Logs = str | tuple[str, ...]
 """A folder of recordings, or folders and files."""
@@ -74,7 +74,7 @@ class GapNextSettings:
 
 
 @settings
-class GapLoopSettings(Wishes):
+class GapLoopSettings(RecordingConfig):
     """``conf/gap_loop.yaml`` without the groups.
 
     Attributes:

@@ -56,11 +56,11 @@ def _task(container: dict[str, Any]) -> None:
 
         writable_file(out)
 
-    from go1exp.cli.subjects import driver
+    from go1exp.cli.subjects import agent
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task, require_agreement
     from go1exp.sim.env.core import Go1Core
 
-    drives = driver(subject, other)
+    drives = agent(subject, other)
     whole = {"episodes": 1, "duration_s": settings.seconds, "settle_s": 0.0, "policy_dt": None}
     shown = EvalConfig.from_settings(settings, commands=(settings.velocity,), engine=judge, **whole)
     shown_task = evaluation_task(drives.task, shown)

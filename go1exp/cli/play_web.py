@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from go1exp.config.schema.backends import BackendConfig
     from go1exp.deploy.sim_robot.machine import Body
     from go1exp.deploy.sim_robot.settings import SimConfig
-    from go1exp.evaluate.drivers import Driver
+    from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.viewer.requests import Ground
     from go1exp.gap.robots.protocol import Robot
     from go1exp.robot.config import RobotConfig
@@ -82,7 +82,7 @@ def walk(
     from go1exp.base.tensors.threads import one_thread
 
     with one_thread():
-        from go1exp.cli.subjects import driver
+        from go1exp.cli.subjects import agent
         from go1exp.evaluate.viewer import web
         from go1exp.evaluate.viewer.drive_window import DriveWindow
         from go1exp.evaluate.viewer.page_server import Gamepad
@@ -90,7 +90,7 @@ def walk(
         from go1exp.evaluate.viewer.session import Robots, Session
         from go1exp.evaluate.viewer.walk import WalkShow
 
-        first = driver(subject, other)
+        first = agent(subject, other)
         name, grounds = _grounds(ground or (first.task.terrain if settings.train_ground else None))
         effects, sizes = catalogue(first.task.effect, settings.randomize)
         setup = Setup(
@@ -104,19 +104,19 @@ def walk(
             engine=judge,
             seed=settings.seed,
         )
-        robots = Robots(_drivers(subject, first, other), grounds, effects)
+        robots = Robots(_agents(subject, first, other), grounds, effects)
         session = Session(robots, subject.label, setup, settings.velocity)
         title, pad = f"go1exp: {subject.label}", Gamepad()
         web.run(WalkShow(session), [DriveWindow(pad)], title=title, host=where[0], port=where[1], pad=pad)
     print(f"\nclosed after {session.time:.0f} s of walking, {session.falls} falls")
 
 
-def _drivers(subject: Named, first: Driver, other: dict[str, Any]) -> dict[str, Callable[[], Driver]]:
+def _agents(subject: Named, first: Agent, other: dict[str, Any]) -> dict[str, Callable[[], Agent]]:
     """Return who could drive this robot, loaded when they are asked for: shipped policies, newest runs, the MPC."""
-    from go1exp.cli.subjects import driver, word
+    from go1exp.cli.subjects import agent, word
 
-    def loader(name: str) -> Callable[[], Driver]:
-        return lambda: driver(word(name, "play"), other, robot_of=first.task)
+    def loader(name: str) -> Callable[[], Agent]:
+        return lambda: agent(word(name, "play"), other, robot_of=first.task)
 
     runs = sorted((p.parent for p in RUNS.glob("*/config.yaml")), key=lambda p: -p.stat().st_mtime)
     walked = [run for run in runs if (run / "checkpoints").is_dir()][:MOST_RUNS]

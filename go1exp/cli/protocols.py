@@ -12,7 +12,7 @@ from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.cli.subjects import Named
-    from go1exp.evaluate.drivers import Driver
+    from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.protocol.base import Chosen
     from go1exp.evaluate.protocol.playing import Rates, Result
 
@@ -57,12 +57,12 @@ def _example(key: str, protocols: Sequence[Chosen]) -> str:
     )
 
 
-def refuse(protocols: Sequence[Chosen], driver: Driver) -> None:
-    """Refuse protocols that a driver cannot play; raise ConfigError."""
+def refuse(protocols: Sequence[Chosen], agent: Agent) -> None:
+    """Refuse protocols that an agent cannot play; raise ConfigError."""
     problems = []
     for c in protocols:
         for key, velocity in c.protocol.policy_velocities().items():
-            problems += driver.problems(velocity, f"protocol.{c.key}.{key}")
+            problems += agent.problems(velocity, f"protocol.{c.key}.{key}")
     if problems:
         raise ConfigError(problems)
 
@@ -82,10 +82,10 @@ def refuse_rates(protocols: Sequence[Chosen], controller: str | None, policy_dt:
         raise ConfigError([f"policy_dt = {policy_dt:g}: protocol={RATES} has rates of its own, rates_hz"])
 
 
-def playable(protocols: Sequence[Chosen], driver: Driver) -> list[Chosen]:
-    """Return the protocols that a driver can play, and say which one of several it cannot."""
-    if driver.senses and any(c.kind == RATES for c in protocols):
-        print(f"{RATES}: not played, it varies the rate of a policy; {driver.label} has one of its own\n")
+def playable(protocols: Sequence[Chosen], agent: Agent) -> list[Chosen]:
+    """Return the protocols that an agent can play, and say which one of several it cannot."""
+    if agent.senses and any(c.kind == RATES for c in protocols):
+        print(f"{RATES}: not played, it varies the rate of a policy; {agent.label} has one of its own\n")
         return [c for c in protocols if c.kind != RATES]
     return list(protocols)
 
@@ -117,12 +117,12 @@ def note_replaced(folder: Path, files: Sequence[str]) -> None:
 def play(protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[str, Any], rates: Rates) -> None:
     """Play protocols one after the other, write what came of each, and print the verdicts."""
     from go1exp.cli.logs import writable
-    from go1exp.cli.subjects import driver
+    from go1exp.cli.subjects import agent
     from go1exp.evaluate.protocol.playing import play as played
     from go1exp.evaluate.protocol.playing import refuse_lengths
     from go1exp.evaluate.protocol.report.pages import write
 
-    drives = driver(subject, other)
+    drives = agent(subject, other)
     refuse(protocols, drives)
     protocols = playable(protocols, drives)
     refuse_lengths(protocols, drives, rates)

@@ -19,7 +19,7 @@ from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
 from go1exp.evaluate.protocol.base import CompareSettings
 from go1exp.evaluate.report.settings import ReportSettings
 from go1exp.gap.actuator_net.settings import FitSettings
-from go1exp.logs.record.plan import Wishes
+from go1exp.logs.record.plan import RecordingConfig
 from go1exp.train.sweep.settings import TuneSettings
 
 T = TypeVar("T")
@@ -103,7 +103,7 @@ class EvalSettings:
 
 
 @settings
-class RecordSettings(Wishes):
+class RecordSettings(RecordingConfig):
     """``conf/record.yaml`` without the groups.
 
     Attributes:

@@ -15,8 +15,8 @@ from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.config.schema.backends import BackendConfig
+    from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.controller.settings import MpcSettings
-    from go1exp.evaluate.drivers import Driver
     from go1exp.sim.task import TaskConfig
 
 
@@ -140,7 +140,7 @@ def word(given: str, file: str) -> Named:
     )
 
 
-def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = None) -> Driver:
+def agent(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = None) -> Agent:
     """Load what drives the robots.
 
     Args:
@@ -152,7 +152,7 @@ def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = 
         ConfigError: if a run's configuration is not one that this version knows.
         go1exp.deploy.runtime.bundle.BundleError: if a bundle is damaged or was changed.
     """
-    from go1exp.evaluate.drivers import BundleDriver, PolicyDriver
+    from go1exp.evaluate.agents import BundleAgent, PolicyAgent
 
     if subject.bundle is not None:
         from go1exp.deploy.runtime.bundle import load
@@ -161,23 +161,23 @@ def driver(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = 
         bundle = load(subject.bundle)
         task = _robot(parse_train(bundle.config).task, other, robot_of)
         about = {"bundle": str(subject.bundle), "sha256": bundle.seal, **dataclasses.asdict(bundle.metadata.trained)}
-        return BundleDriver(subject.label, task, bundle, about)
+        return BundleAgent(subject.label, task, bundle, about)
     assert subject.run is not None
     if subject.controller is not None:
         return _controlled(subject, subject.controller, other, robot_of)
     from go1exp.train.policy import load_run
 
     of_run, policy, about = load_run(subject.run, subject.checkpoint)
-    return PolicyDriver(subject.label, _robot(of_run.task, other, robot_of), policy, about)
+    return PolicyAgent(subject.label, _robot(of_run.task, other, robot_of), policy, about)
 
 
-def _controlled(subject: Named, controller: MpcSettings, other: dict[str, Any], robot_of: TaskConfig | None) -> Driver:
-    from go1exp.evaluate.drivers import ControllerDriver
+def _controlled(subject: Named, controller: MpcSettings, other: dict[str, Any], robot_of: TaskConfig | None) -> Agent:
+    from go1exp.evaluate.agents import ControllerAgent
 
     assert subject.run is not None
     task = _robot(controllers.task_of(subject.run), other, robot_of)
     about = {"controller": dataclasses.asdict(controller), "robot_of_run": str(subject.run)}
-    return ControllerDriver(subject.label, task, controllers.maker(controller, task), about)
+    return ControllerAgent(subject.label, task, controllers.maker(controller, task), about)
 
 
 SAME = ("robot", "actuator", "effect", "contact", "rand", "termination")

@@ -22,17 +22,16 @@ from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
 from go1exp.train.policy import load_run
 
 FALLEN = 1.0
-"""Error that a robot on the ground counts with, at least, m/s."""
+"""Least error of a fallen robot, m/s."""
 
 NICE = 19
-"""Lowest priority: what is left over by the training."""
+"""Lowest priority: the training comes first."""
 
 
 def score(rows: Sequence[dict[str, Any]], duration_s: float) -> float:
-    """Return the root mean square horizontal error, m/s, in which time on the ground counts as the whole command.
+    """Return the root mean square horizontal error, m/s, falls included; lower is better.
 
-    A robot that has fallen is off by its command, and by 1 m/s at least, for the rest of the episode: falls and errors
-    in one number, lower is better.
+    The error of a fallen robot is its command, and at least 1 m/s, for the rest of the episode.
     """
     squares = []
     for row in rows:
@@ -91,7 +90,7 @@ def record(run: Path, policy_file: Path, settings: dict[str, Any], out: Path) ->
 
 
 def answered(run: Path, job: dict[str, Any]) -> dict[str, Any]:
-    """Do a job; return its result, or what went wrong."""
+    """Return the result of a job, or its error message."""
     result = {name: job[name] for name in ("kind", "iteration", "steps", "policy")}
     try:
         if job["kind"] == "evaluate":

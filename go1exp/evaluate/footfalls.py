@@ -1,4 +1,4 @@
-"""A gait diagram under a film: when each foot was on the ground, as in the figures of the literature on gaits."""
+"""Gait diagram under a video: stance phases of the feet over time."""
 
 from __future__ import annotations
 

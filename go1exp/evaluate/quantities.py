@@ -1,4 +1,4 @@
-"""From rows, one for each robot in each condition, to figures with n and a 95 % interval."""
+"""Figures with n and a 95 % interval from rows, one for each robot in each condition."""
 
 from __future__ import annotations
 

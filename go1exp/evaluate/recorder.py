@@ -1,4 +1,4 @@
-"""Listens to an environment on the CPU while it is evaluated, and makes the trace that measures see."""
+"""Recorder of the trace that measures need, from an environment on the CPU."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ SNAPSHOT_COLUMNS = ("command", "base_lin_vel_b", "projected_gravity_b", "joint_v
 
 
 STEP_BYTES = 4 * (3 * robot.NUM_JOINTS + 3 * 3 + 6 * robot.NUM_LEGS + 2) + 1
-"""What a robot's policy step takes beside contact."""
+"""Memory of a policy step of one robot without contact, B."""
 
 
 def bytes_per_second(task: TaskConfig, robots: int) -> float:
-    """Return what a ``Recorder`` takes, B/s."""
+    """Return the memory of a ``Recorder``, B/s."""
     return robots * bytes_per_step(task.sim.decimation) / task.sim.policy_dt
 
 
 def bytes_per_step(decimation: int) -> int:
-    """Return what a robot's policy step of so many physics steps takes in a ``Recorder``."""
+    """Return the memory of a policy step of one robot, of so many physics steps, B."""
     return STEP_BYTES + robot.NUM_LEGS * decimation
 
 
@@ -77,11 +77,11 @@ class Recorder:
         core.plant.observer = self._listen
 
     def begin_step(self) -> None:
-        """A policy step begins that is to be recorded."""
+        """Begin a policy step that is recorded."""
         self._listening, self._sample = True, -1
 
     def end_step(self, alive: Tensor) -> None:
-        """The step is done, and ``alive`` (N,) are the robots that count in it."""
+        """End the step; ``alive`` (N,) are the robots that count in it."""
         self._take()
         self._listening = False
         row, columns = self._row, self._columns

@@ -1,4 +1,4 @@
-"""How well a policy follows commands: a grid of constant commands, several episodes of each, as one batch."""
+"""Tracking of a grid of constant commands, several episodes of each, as one batch; the delay margin."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from go1exp.base import memory
 from go1exp.base.wording import counted
 from go1exp.config.schema.backends import BackendConfig, CpuBackend
 from go1exp.config.schema.registry import ConfigError, Term, TooLongError, members
+from go1exp.evaluate.agents import Agent, ControllerAgent, PolicyAgent
 from go1exp.evaluate.controller.types import Controller
-from go1exp.evaluate.drivers import ControllerDriver, Driver, PolicyDriver
 from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.evaluate.quantities import described, share
 from go1exp.evaluate.recorder import Recorder, bytes_per_second
@@ -138,7 +138,7 @@ def evaluate(
     ``controller`` makes what moves one robot in place of the policy, by its own sensors.
     ``measures`` (``go1exp/mdp/measures``) are over the same time and over robots that differ: ``distinct`` of them.
     ``rows`` has one entry for each robot (``rows.py``), for a file of its own.
-    ``agreement`` says how near another engine than MuJoCo came to it before anything else was done.
+    ``agreement`` has the differences of another engine from MuJoCo, checked first.
 
     Raises:
         Expected: if that is not near enough.
@@ -146,15 +146,15 @@ def evaluate(
         ConfigError: if no step is left after ``settle_s``.
     """
     count = len(config.commands) * config.episodes
-    driver = _driver(task, policy, controller)
-    imu = config.trunk_velocity == "estimated" or driver.senses
-    judged = evaluation_task(task, config)
-    _refuse_too_long(config, bytes_per_second(judged, count) if measures else 0.0, count)
-    dt = judged.sim.policy_dt
+    agent = _agent(task, policy, controller)
+    imu = config.trunk_velocity == "estimated" or agent.senses
+    task = evaluation_task(task, config)
+    _refuse_too_long(config, bytes_per_second(task, count) if measures else 0.0, count)
+    dt = task.sim.policy_dt
     steps, settle = _steps(config, dt)
-    checks = require_agreement(judged)
-    core = Go1Core(judged, count, config.seed, noise=config.noise, imu=imu)
-    act = driver.begin(core, config.trunk_velocity, config.seed)
+    checks = require_agreement(task)
+    core = Go1Core(task, count, config.seed, noise=config.noise, imu=imu)
+    act = agent.begin(core, config.trunk_velocity, config.seed)
     assert isinstance(core.command, FixedVelocity)
     # Robot i has command i // episodes: the robots of one command are neighbours.
     commands = torch.tensor(config.commands, dtype=torch.float32)
@@ -205,11 +205,11 @@ def _refuse_too_long(config: EvalConfig, rate: float, count: int) -> None:
         raise TooLongError([f"duration_s = {config.duration_s:g}: {what} {wrong}; measures=[] needs none of it"])
 
 
-def _driver(task: TaskConfig, policy: Policy | None, controller: Callable[[], Controller] | None) -> Driver:
+def _agent(task: TaskConfig, policy: Policy | None, controller: Callable[[], Controller] | None) -> Agent:
     if controller is not None:
-        return ControllerDriver("", task, controller)
+        return ControllerAgent("", task, controller)
     assert policy is not None  # or there would be a controller
-    return PolicyDriver("", task, policy)
+    return PolicyAgent("", task, policy)
 
 
 def _planar_velocity(core: Go1Core) -> torch.Tensor:
@@ -321,7 +321,7 @@ DELAY = "command_delay"
 
 
 def delayed(task: TaskConfig, delay: float) -> TaskConfig:
-    """Return the task with targets that take force ``delay`` s late, in place of another such effect of its own."""
+    """Return the task with a command delay of ``delay`` s, in place of that of its own effects."""
     others = tuple(e for e in task.effect if e.entry.name != DELAY)
     entry = members("effect")[DELAY]
     term = Term(DELAY, entry, entry.check({"delay": delay}, DELAY)[0], {"spread": {}})
@@ -336,10 +336,10 @@ def delay_margin(
     on_step: Callable[[int, int], None] = lambda done, total: None,
     controller: Callable[[], Controller] | None = None,
 ) -> dict[str, Any]:
-    """Run the grid with later and later targets until a robot falls.
+    """Run the grid with growing command delay until a robot falls.
 
     Args:
-        task: as for ``evaluate``; a delay within its actuator stays, and the margin comes on top of it.
+        task: as for ``evaluate``; a delay of its actuator stays, and the margin is added to it.
         policy: as for ``evaluate``.
         config: as for ``evaluate``.
         falls: ``distinct_falls`` of the grid without any further delay.

@@ -14,7 +14,7 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.train.policy import Policy
 
 
-def film(core: Go1Core, policy: Policy, seconds: float, count: int = 8) -> list[np.ndarray]:
+def poses_of(core: Go1Core, policy: Policy, seconds: float, count: int = 8) -> list[np.ndarray]:
     """Run the policy in environment 0 and return ``count`` poses: world x, z of each leg's joints, (4, 4, 2), m.
 
     The four points of a leg are hip, thigh joint, knee and foot.
@@ -58,6 +58,6 @@ def write_png(path: Path, poses: list[np.ndarray]) -> None:
 
 
 def picture(core: Go1Core, policy: Policy, seconds: float, path: Path) -> None:
-    """Film and draw."""
+    """Run a policy and draw its poses."""
     with torch.no_grad():
-        write_png(path, film(core, policy, seconds))
+        write_png(path, poses_of(core, policy, seconds))

@@ -74,8 +74,8 @@ def record(
     Args:
         core: the environments; all of them run.
         policy: gives the actions.
-        seconds: simulated time to film, s; if an episode ends within it, the next one follows.
-        env: index of the environment to film.
+        seconds: simulated time to record, s; if an episode ends within it, the next one follows.
+        env: index of the environment.
         fps: pictures per simulated second.
         on_frame: called with the progress: pictures done, pictures in all.
         caption: write time, command and velocity (mean over 0.5 s) on the picture.
@@ -134,7 +134,7 @@ def _frames(
 
 
 def length(seconds: float, fps: float) -> int:
-    """Return how many pictures a film of ``seconds`` at ``fps`` has."""
+    """Return the number of pictures in a video of ``seconds`` at ``fps``."""
     return round(seconds * fps)
 
 
@@ -146,7 +146,7 @@ def evenly(total: int, count: int) -> list[int]:
 def keeping(frames: Iterable[Picture], total: int, kept: list[Picture], count: int = PANELS) -> Iterator[Picture]:
     """Yield ``total`` pictures, and put ``count`` evenly spaced ones of them into ``kept``.
 
-    So a film of any length is written and its strip made from what is kept, without all pictures in memory.
+    So a video of any length is written, and a strip made of it, without all pictures in memory.
     """
     chosen = set(evenly(total, count))
     for k, picture in enumerate(frames):
@@ -156,7 +156,7 @@ def keeping(frames: Iterable[Picture], total: int, kept: list[Picture], count: i
 
 
 def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
-    """Write an H.264 film that browsers play; the frames are consumed one by one.
+    """Write an H.264 video that browsers play; the frames are consumed one by one.
 
     Raises:
         OSError: if it cannot be written; no partial file is left.
@@ -165,14 +165,14 @@ def write_mp4(path: Path, frames: Iterable[Picture], fps: float = 25) -> None:
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
-        raise ValueError(f"{path}: a film needs at least one frame")
+        raise ValueError(f"{path}: a video needs at least one frame")
     with _complete(path) as partial:
         # imageio.v3 has no writer that takes frames one by one and ends ffmpeg when one fails to come. Both sides must
         # be even for yuv420p, the only format that every browser plays; imageio would make them multiples of 16.
-        film = get_writer(partial, "FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", macro_block_size=2)
-        with closing(film):
+        video = get_writer(partial, "FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", macro_block_size=2)
+        with closing(video):
             for picture in chain([first], frames):
-                film.append_data(picture)
+                video.append_data(picture)
 
 
 def write_strip(path: Path, frames: Sequence[Picture], count: int = PANELS, size: int = 320) -> None:
@@ -199,7 +199,7 @@ def write_strip(path: Path, frames: Sequence[Picture], count: int = PANELS, size
 
 
 def write_gif(path: Path, frames: Iterable[Picture], fps: float = 12, width: int = GIF_WIDTH) -> None:
-    """Write a small looping GIF of frames that are ``fps`` apart (of a film at 25, every second is about 12).
+    """Write a small looping GIF of frames that are ``fps`` apart (every second one of a video at 25 is about 12).
 
     Keeps ``GIF_BYTES`` or more of each in memory.
 
@@ -322,7 +322,7 @@ def _window(stage: Stage, on_key: Callable[[int], None]) -> Iterator[Any]:
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if not display:  # without a display MuJoCo would wait without end
         raise RenderingUnavailable(
-            "cannot open a window: there is no display (DISPLAY and WAYLAND_DISPLAY are unset); record a film instead"
+            "cannot open a window: there is no display (DISPLAY and WAYLAND_DISPLAY are unset); record a video instead"
         )
     try:
         import glfw

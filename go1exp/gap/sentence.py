@@ -24,7 +24,7 @@ def told_apart(names: Sequence[str]) -> tuple[str, ...]:
     how = {name: tolerances.identification(name) for name in names}
     return tuple(
         dict.fromkeys(
-            how[first].told_apart_by if second in how[first].confounded else how[second].told_apart_by
+            how[first].separated_by if second in how[first].confounded else how[second].separated_by
             for first, second in combinations(names, 2)
             if second in how[first].confounded or first in how[second].confounded
         )

@@ -20,10 +20,10 @@ def trace_of(
     """Return one robot's trace; every row of the recording is a step.
 
     Args:
-        recording: of a Go1, with forces on its feet.
+        recording: of a Go1 with foot forces.
         contact_on: a foot is on the ground from this force on, N.
         contact_off: and until its force falls below this, N.
-        command: the velocity it was told, if one was.
+        command: the commanded velocity, if known.
         mass: of the robot, kg, if known.
 
     Raises:

@@ -328,14 +328,14 @@ def test_shapes_and_levels_are_parameters_within_their_bounds(entry: Entry) -> N
 @each
 def test_a_confounded_effect_exists_and_both_say_the_same_of_how_to_tell_them_apart(entry: Entry) -> None:
     how = kind(entry).identification
-    assert bool(how.confounded) == bool(how.told_apart_by)
-    assert how.told_apart_by == "" or how.told_apart_by.startswith("record ")
-    assert any(name in how.told_apart_by for name in EXCITATIONS) or "=[[" in how.told_apart_by or not how.confounded
+    assert bool(how.confounded) == bool(how.separated_by)
+    assert how.separated_by == "" or how.separated_by.startswith("record ")
+    assert any(name in how.separated_by for name in EXCITATIONS) or "=[[" in how.separated_by or not how.confounded
     for name in how.confounded:
         other = kind(EFFECTS[name]).identification
         assert name != entry.name
         if entry.name in other.confounded:
-            assert other.told_apart_by == how.told_apart_by
+            assert other.separated_by == how.separated_by
 
 
 @each

@@ -31,9 +31,9 @@ EFFECTS = {
 
 def small_net(rig: simulate.Rig, sensors: SensorConfig, folder: Path) -> Path:
     """Fit an actuator net of the usual size to a short recording of the rig, and return its file."""
-    wishes = plan.Wishes(((20.0, 0.5),), 10.0, (0, 1, 2), 0, "suspended", ((0.0, 0.0),), 0, sensors)
+    config = plan.RecordingConfig(((20.0, 0.5),), 10.0, (0, 1, 2), 0, "suspended", ((0.0, 0.0),), 0, sensors)
     motion = Term("multisine", members("excitation")["multisine"], {})
-    made = simulate.play(rig, plan.episodes([motion], wishes), sensors, 0, lambda done, total: None)
+    made = simulate.play(rig, plan.episodes([motion], config), sensors, 0, lambda done, total: None)
     result = fit(made, FitSettings(share="kind", epochs=15, half_net=False))
     file = folder / "net.npz"
     result.net.save(file)
@@ -44,9 +44,9 @@ def record_seconds(rig: simulate.Rig, sensors: SensorConfig, folder: Path) -> fl
     """Return how long it takes to record and write 60 s of a suspended robot with three gain sets, s."""
     start = time.perf_counter()
     gains = ((20.0, 0.5), (35.0, 0.6), (35.0, 1.2))
-    wishes = plan.Wishes(gains, 20.0, (0,), 0, "suspended", ((0.0, 0.0),), 0, sensors)
+    config = plan.RecordingConfig(gains, 20.0, (0,), 0, "suspended", ((0.0, 0.0),), 0, sensors)
     motions = [Term(name, members("excitation")[name], {}) for name in ("chirp", "steps", "slow_ramps")]
-    for r in simulate.play(rig, plan.episodes(motions, wishes), sensors, 0, lambda done, total: None):
+    for r in simulate.play(rig, plan.episodes(motions, config), sensors, 0, lambda done, total: None):
         recording.write(folder / f"{r.meta.episode}.parquet", r)
     return time.perf_counter() - start
 

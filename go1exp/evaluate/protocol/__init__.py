@@ -1,3 +1,3 @@
-"""Protocols: what robots are told and done to, what is measured, what counts as reached (``conf/protocol``)."""
+"""Protocols: commands, disturbances and ground over time, measures, and claims on figures (``conf/protocol``)."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every protocol is: settings that a file gives, what it plays, the rows, figures and drawings that it makes."""
+"""Base of protocols: settings of a file, what is played, rows, figures and drawings."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 
 @dataclass
 class Played:
-    """What came of a protocol.
+    """Rows and curves of a protocol.
 
     Attributes:
         rows: one for each robot in each condition.
         curves: plain data for drawings, by name.
-        notes: what a reader should know of how it went.
+        notes: remarks for the reader of the report.
     """
 
     rows: list[Row]
@@ -57,13 +57,13 @@ class Played:
 
 @settings
 class Protocol:
-    """What every protocol has.
+    """Settings and hooks of every protocol.
 
     Attributes:
-        robots: robots of each condition, of each their own draw of everything random.
+        robots: number of robots in each condition, each with random numbers of its own.
         noise: add the observation noise of training.
         randomize: randomise robots and starts as in training; false takes the nominal robot, which counts once.
-        trunk_velocity: what the policy sees of it, exact, or estimated by the robot's filter from its sensors.
+        trunk_velocity: velocity that the policy observes: exact, or estimated from the sensors by the filter.
         measures: further measures of gait and contact by name (go1exp list measure), [] for none.
         claims: limits of figures by name, and what counts as close.
     """
@@ -76,13 +76,13 @@ class Protocol:
     claims: dict[str, Claim]
 
     keys: ClassVar[tuple[str, ...]] = ()
-    """Columns that say the condition of a row."""
+    """Columns that identify the condition of a row."""
     robot_columns: ClassVar[tuple[Column, ...]] = ()
-    """Figures of a robot beside those that all protocols have."""
+    """Further figures of a robot."""
     alike: ClassVar[bool] = True
-    """Whether the robots of a condition do the same where nothing is random."""
+    """Whether the robots of a condition move identically where nothing is random."""
     always: ClassVar[tuple[str, ...]] = ()
-    """Measures that it cannot do without."""
+    """Measures that are always computed."""
 
     def terms(self) -> list[Term]:
         """Return the measures; raise ConfigError naming those that do not exist."""
@@ -97,7 +97,7 @@ class Protocol:
         return (*LIFE, *self.robot_columns, *columns_of(self.terms(), robot.LEGS))
 
     def policy_velocities(self) -> dict[str, TrunkVelocity]:
-        """Return what policies see of the trunk's velocity in it, by the key that says so."""
+        """Return the trunk velocity that policies observe, by the key that chooses it."""
         return {"trunk_velocity": self.trunk_velocity}
 
     def derived(self, rows: Sequence[Row]) -> list[Derived]:
@@ -105,19 +105,19 @@ class Protocol:
         return []
 
     def derived_names(self) -> list[str]:
-        """Return their names."""
+        """Return the names of the derived figures."""
         return []
 
     def play(self, stage: Stage) -> Played:
-        """Let the robots do it."""
+        """Play the protocol and return its rows."""
         raise NotImplementedError
 
     def lengths(self) -> list[Length]:
-        """Return how long its robots play, an entry for each batch; without any the memory is not looked at."""
+        """Return the lengths of its batches; without any the memory is not checked."""
         return []
 
     def steps(self, stage: Stage) -> float:
-        """Return about how many policy steps, times robots, it takes."""
+        """Return the approximate number of policy steps times robots."""
         return sum(stage.steps(length.seconds, length.policy_dt) * length.robots for length in self.lengths())
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
@@ -125,11 +125,11 @@ class Protocol:
         return []
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
-        """Return the figures that show several subjects together, each by its label."""
+        """Return the figures that compare several subjects, by their labels."""
         return []
 
     def measure(self, motion: Motion, rows: Sequence[Row]) -> None:
-        """Write the measures of what was recorded into the rows of its robots."""
+        """Write the measures of a recorded motion into the rows of its robots."""
         from go1exp import robot
         from go1exp.evaluate.quantities import add_measures
         from go1exp.mdp.measures import measured
@@ -159,19 +159,19 @@ class CompareSettings:
     folder: Annotated[str, Field(min_length=1)]
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
+        """Check settings against each other."""
         if len(set(self.subjects)) < len(self.subjects):
             raise ValueError(f"subjects = {list(self.subjects)}: each only once")
 
 
 def repeated(name: str, values: Sequence[Any]) -> list[str]:
-    """Return a complaint about a setting that has a value twice: its robots would be one condition."""
+    """Return a message about a setting with a repeated value: its robots would be one condition."""
     twice = [v for k, v in enumerate(values) if v in values[:k]]
     return [f"{name}: has {twice[0]} twice"] if twice else []
 
 
 def lives(motion: Motion) -> list[Row]:
-    """Return the columns that tell of each robot's life, one row for each."""
+    """Return one row for each robot: falls, time under a command, fingerprint."""
     lives_of_robots = zip(motion.fell, motion.left_map, motion.moving_s, motion.fingerprint, strict=True)
     return [
         {"fell": bool(fell), "left_map": bool(left), "moving_s": round(float(s), 4), FINGERPRINT: float(mark)}

@@ -1,4 +1,4 @@
-"""Claims about quantities, and the verdict on each."""
+"""Claims: limits of figures, and the verdict on each."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Word = Literal["met", "close", "not met", "inconclusive"]
 
 @settings
 class Claim:
-    """A limit of one figure, in every condition that it is about.
+    """Limits of one figure in the conditions that it is about.
 
     Attributes:
         quantity: the figure.
         at_least: its lower limit; null for none.
         at_most: its upper limit; null for none.
-        tolerance: how far beyond a limit it still counts as close, in the figure's unit.
+        tolerance: excess over a limit that still counts as close, in the unit of the figure.
         where: only conditions with these values, such as {period: 7.0}; {} takes all.
-        source: whose limit it is.
+        source: origin of the limit.
     """
 
     quantity: str
@@ -35,22 +35,22 @@ class Claim:
     source: str
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
+        """Check settings against each other."""
         if self.at_least is None and self.at_most is None:
             raise ValueError("at_most = None: a claim needs at_most or at_least")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim against the condition in which it comes off worst.
+    """A claim and its worst condition.
 
     Attributes:
         name: of the claim.
-        word: what is told.
-        claim: what was claimed.
-        figure: the worst condition's figure with its 95 % interval.
-        condition: that condition.
-        conditions: in how many it was looked for.
+        word: met, close, not met or inconclusive.
+        claim: the claim.
+        figure: figure of the worst condition with its 95 % interval.
+        condition: the worst condition.
+        conditions: number of conditions with the figure.
     """
 
     name: str
@@ -62,11 +62,11 @@ class Verdict:
 
 
 def verdict(figure: Interval, claim: Claim) -> Word:
-    """Return the word for a figure with its interval.
+    """Return the verdict on a figure with its interval.
 
-    met: the whole interval is within the limits. not met: the whole interval is beyond them and the estimate beyond the
-    tolerance. inconclusive: the interval holds values within the limits and values beyond the tolerance, or is
-    undefined. close: otherwise.
+    met: the whole interval is within the limits. not met: the whole interval is beyond a limit, and the estimate beyond
+    the tolerance. inconclusive: the interval reaches from within the limits to beyond the tolerance (n is too small),
+    or there is no interval. close: otherwise.
     """
     beyond = _excess(figure.estimate, claim)
     if not all(map(math.isfinite, (figure.estimate, figure.low, figure.high))):
@@ -85,8 +85,8 @@ ORDER: tuple[Word, ...] = ("not met", "inconclusive", "close", "met")
 """From the worst to the best."""
 
 
-def judged(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) -> list[Verdict]:
-    """Return the verdict on each claim in its worst condition (``quantities.summary``); inconclusive without one."""
+def evaluated(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) -> list[Verdict]:
+    """Return the verdict on each claim in its worst condition of a ``summary``; inconclusive without any condition."""
     verdicts = []
     for name, claim in claims.items():
         candidates = []
@@ -106,21 +106,21 @@ def judged(claims: Mapping[str, Claim], summary: Sequence[Mapping[str, Any]]) ->
 
 
 def limits(claim: Claim) -> str:
-    """Write the limits of a claim."""
+    """Return the limits of a claim as text."""
     if claim.at_least is not None and claim.at_most is not None:
         return f"{claim.at_least:g} to {claim.at_most:g}"
     return f"at least {claim.at_least:g}" if claim.at_least is not None else f"at most {claim.at_most:g}"
 
 
 def _excess(value: float, claim: Claim) -> float:
-    """By how much a value is beyond the limits; negative within them."""
+    """Return by how much a value is beyond the limits; negative within them."""
     low = -math.inf if claim.at_least is None else claim.at_least - value
     high = -math.inf if claim.at_most is None else value - claim.at_most
     return max(low, high)
 
 
 def _both_sides(figure: Interval, claim: Claim) -> bool:
-    """Whether an interval reaches over both limits, with what is within them in between."""
+    """Return whether an interval contains both limits."""
     if claim.at_least is None or claim.at_most is None:
         return False
     return figure.low < claim.at_least and figure.high > claim.at_most

@@ -1,4 +1,4 @@
-"""Subjects against the first of them: paired by robot and condition, with intervals and words."""
+"""Differences of subjects from the first one, paired by robot and condition, with intervals and verdicts."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ DRAWS = 200
 
 @dataclass(frozen=True)
 class Difference:
-    """One figure of one subject against the first.
+    """Difference of one figure between a subject and the first one.
 
     Attributes:
-        subject: label of the one.
+        subject: label of the subject.
         quantity: the figure.
         unit: its unit.
-        condition: what it is about.
-        first: of the first subject, of the pairs.
-        other: of the other subject.
-        difference: other less first, with its interval; n is the pairs.
-        word: whether the other is better.
-        needed: pairs (robots, where a figure is of all) that would tell such a difference; None if it is told, or none
-            was seen.
+        condition: condition of the figure.
+        first: figure of the first subject over the pairs.
+        other: figure of the other subject.
+        difference: other - first with its interval; n is the number of pairs.
+        word: whether the other subject is better.
+        needed: sample size for 80 % power at this difference, in pairs (robots, for a figure of all robots); None if it
+            is significant or zero.
     """
 
     subject: str
@@ -73,7 +73,7 @@ def compared(first: Result, other: Result) -> list[Difference]:
 
 
 def _pairs(first: Sequence[Row], other: Sequence[Row]) -> tuple[list[Row], list[Row]]:
-    """Return the rows of the robots that are in both, in the same order."""
+    """Return the rows of the robots that both subjects have, in the same order."""
     by_robot = {row[ROBOT]: row for row in other}
     kept = [row for row in first if row[ROBOT] in by_robot]
     return kept, [by_robot[row[ROBOT]] for row in kept]
@@ -94,7 +94,7 @@ def _difference(
 
 
 def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: Sequence[Row]) -> Difference:
-    """Return the difference of a figure of all robots together, by drawing the same robots of both."""
+    """Return the difference of a figure of all robots together, with a bootstrap over the robots of both subjects."""
     groups = [by_condition(about(rows, a.condition), (ROBOT,)) for rows in (first, other)]
     robots = [key for key in groups[0] if key in groups[1]]
 
@@ -115,7 +115,7 @@ def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: S
 
 
 POWER = (1.96 + 0.842) / 1.96
-"""How many times its interval's half-width a difference must be to be told in four of five tries."""
+"""Ratio of a difference to the half-width of its interval at 80 % power."""
 
 
 def as_json(difference: Difference) -> dict[str, Any]:

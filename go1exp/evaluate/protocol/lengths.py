@@ -1,4 +1,4 @@
-"""How long a protocol's robots play, and which settings say so."""
+"""Length of the batches of a protocol, and the settings that determine it."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Cause:
-    """A setting that says how long robots play.
+    """A setting that determines the length of a batch.
 
     Attributes:
         key: its name.
-        value: what it is.
-        least: what it must be at least.
-        fitting: gives the value with which they play for so many s, all other settings as they are.
+        value: its value.
+        least: its lower bound.
+        fitting: length, s -> the value that makes the batch so long, all other settings unchanged.
         unit: of the value.
-        falling: whether they play the longer, the smaller it is.
+        falling: whether the length falls as the value grows.
     """
 
     key: str
@@ -27,7 +27,7 @@ class Cause:
     falling: bool = False
 
     def limit(self, seconds: float) -> str | None:
-        """Return what it may be for ``seconds`` to be the length; None if that is not allowed."""
+        """Return the limit of the value for a length of ``seconds`` as text; None if that is out of bounds."""
         most = self.fitting(seconds)
         if most < self.least:
             return None
@@ -38,14 +38,14 @@ class Cause:
 
 @dataclass(frozen=True)
 class Length:
-    """How long robots play that are in memory at once.
+    """Length of one batch of robots.
 
     Attributes:
         seconds: the length, s.
-        robots: how many.
-        causes: settings that say so, the likeliest to be wrong first.
+        robots: number of robots.
+        causes: settings that determine the length, the likeliest to be wrong first.
         settle_s: time at its start that does not count, s.
-        recorded: whether what measures need is recorded after it.
+        recorded: whether the channels of measures are recorded after it.
         policy_dt: period of their policy, s; None is that of the stage.
     """
 

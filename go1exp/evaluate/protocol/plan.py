@@ -51,7 +51,7 @@ class Plan:
         impulses: kicks, or None.
         ground: what they walk on.
         friction: range of the feet's friction on it, in place of the randomisation's; None keeps that.
-        delay: (N,) s by which targets come late, beside what the robot has; None for none.
+        delay: (N,) further command delay, s; None for none.
         policy_dt: period of the policy, s; None keeps that of the stage.
         listen_from: policy step from which contacts, torques and the like are recorded; None records none.
         steer: turn the robots back into their lanes: yaw rate per rad of heading and per m beside the lane; None

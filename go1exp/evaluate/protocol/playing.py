@@ -14,9 +14,9 @@ from go1exp.base import memory
 from go1exp.base.wording import counted
 from go1exp.config.schema.backends import BackendConfig
 from go1exp.config.schema.registry import ConfigError, TooLongError
-from go1exp.evaluate.drivers import Driver, Progress
+from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.protocol.base import Chosen, Played, Protocol
-from go1exp.evaluate.protocol.claims import Verdict, judged
+from go1exp.evaluate.protocol.claims import Verdict, evaluated
 from go1exp.evaluate.protocol.lengths import Length
 from go1exp.evaluate.protocol.stage import Setting, Stage
 from go1exp.evaluate.quantities import Derived, Row, about, distinct, plain, resampled, summary
@@ -25,7 +25,7 @@ from go1exp.evaluate.statistics.intervals import Interval, bootstrap_interval
 
 @dataclass(frozen=True)
 class Rates:
-    """What a command line says for all protocols.
+    """Settings of the command line for all protocols.
 
     Attributes:
         seed: seed of everything random.
@@ -42,14 +42,14 @@ class Rates:
 
 @dataclass
 class Result:
-    """What came of one protocol with one driver.
+    """Result of one protocol with one agent.
 
     Attributes:
         chosen: the protocol.
-        label: name of the driver.
-        about: its origin, the robot, seed and rates: plain data.
+        label: name of the agent.
+        about: origin of the agent, robot, seed and rates: plain data.
         played: rows without repeats, curves, notes.
-        repeats: rows that repeated another one and do not count.
+        repeats: number of rows that repeated another one and do not count.
         summary: figures with n and interval, by condition.
         verdicts: of its claims.
         seconds: what it took, s.
@@ -95,18 +95,18 @@ def as_json(result: Result) -> dict[str, Any]:
 
 def play(
     chosen: Chosen,
-    driver: Driver,
+    agent: Agent,
     rates: Rates,
     origin: dict[str, Any] | None = None,
     on_step: Progress = lambda done, total: None,
 ) -> Result:
-    """Play a protocol and judge it; ``origin`` is what a report shall say beside that of the driver.
+    """Play a protocol and evaluate its claims; ``origin`` is further information for the report.
 
     Raises:
         ConfigError: before anything is played, if it is too long for the memory, or too short.
     """
     began, protocol = time.monotonic(), chosen.protocol
-    stage = _stage(protocol, driver, rates, on_step)
+    stage = _stage(protocol, agent, rates, on_step)
     refuse(chosen, stage)
     stage.expect(protocol.steps(stage))
     played = protocol.play(stage)
@@ -114,18 +114,18 @@ def play(
     repeats, played.rows = len(played.rows) - len(rows), rows
     figures = summarised(chosen, rows)
     stage.finished()
-    about_play = {"driver": driver.about, "rates": dataclasses.asdict(rates), "go1exp": __version__, **(origin or {})}
-    verdicts = judged(protocol.claims, figures)
-    return Result(chosen, driver.label, about_play, played, repeats, figures, verdicts, time.monotonic() - began)
+    about_play = {"agent": agent.about, "rates": dataclasses.asdict(rates), "go1exp": __version__, **(origin or {})}
+    verdicts = evaluated(protocol.claims, figures)
+    return Result(chosen, agent.label, about_play, played, repeats, figures, verdicts, time.monotonic() - began)
 
 
-def refuse_lengths(protocols: Sequence[Chosen], driver: Driver, rates: Rates) -> None:
+def refuse_lengths(protocols: Sequence[Chosen], agent: Agent, rates: Rates) -> None:
     """Refuse one of several protocols that is too long or too short, as ``play`` does, before the first is played."""
     for chosen in protocols:
-        refuse(chosen, _stage(chosen.protocol, driver, rates))
+        refuse(chosen, _stage(chosen.protocol, agent, rates))
 
 
-def _stage(protocol: Protocol, driver: Driver, rates: Rates, on_step: Progress = lambda done, total: None) -> Stage:
+def _stage(protocol: Protocol, agent: Agent, rates: Rates, on_step: Progress = lambda done, total: None) -> Stage:
     setting = Setting(
         protocol.noise,
         protocol.randomize,
@@ -135,7 +135,7 @@ def _stage(protocol: Protocol, driver: Driver, rates: Rates, on_step: Progress =
         rates.physics_dt,
         rates.engine,
     )
-    return Stage(driver, setting, on_step)
+    return Stage(agent, setting, on_step)
 
 
 def summarised(chosen: Chosen, rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -203,7 +203,7 @@ def _needed(length: Length, stage: Stage) -> float:
 
 
 def _problem(chosen: Chosen, length: Length, needed: float, available: float, fitting: float) -> str:
-    """Word that a length needs too much: of the first setting that alone can mend it, or of all where none can."""
+    """Return the message for a length that does not fit: the first setting that alone can shorten it, or all."""
     path, robots = f"protocol.{chosen.key}", chosen.protocol.robots
     amounts = memory.too_much(needed, available)
     what = f"to play {length.seconds:g} s with {counted(length.robots, 'robot')} {amounts}"

@@ -22,7 +22,7 @@ class Constant:
     Attributes:
         kind: constant.
         velocity: x m/s, y m/s, yaw rad/s.
-        rest: time for which the robot is told to stand first, s.
+        rest: time with a zero command at the start, s.
     """
 
     kind: Literal["constant"] = "constant"
@@ -78,7 +78,7 @@ class Sine:
 Signal = Annotated[Constant | Steps | Sine, Field(discriminator="kind")]
 
 
-# ---------------------------------------------------------------------- how a robot answered a sine
+# ---------------------------------------------------------------------- response to a sine
 
 
 def phasors(values: ArrayLike, t: ArrayLike, period: float) -> NDArray[np.complex128]:
@@ -102,10 +102,10 @@ def phasors(values: ArrayLike, t: ArrayLike, period: float) -> NDArray[np.comple
 def response(
     measured: ArrayLike, commanded: ArrayLike, t: ArrayLike, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return gain, lag (s, positive if late) and coherence of an answer to a sine, (...) each; NaN without a period.
+    """Return gain, lag (s, positive if late) and coherence of the response to a sine, (...) each; NaN without a period.
 
     Gain and lag are those of the mean phasors. Coherence is |mean of M conj(C)|^2 / (mean |M|^2 mean |C|^2) over the
-    periods: 1 if each is answered alike.
+    periods: 1 if all responses are equal.
     """
     m, c = phasors(measured, t, period), phasors(commanded, t, period)
     if not len(m):

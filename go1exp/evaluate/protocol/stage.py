@@ -15,7 +15,7 @@ from torch import Tensor
 
 from go1exp.config.schema.backends import BackendConfig
 from go1exp.config.schema.registry import Entry, Term, members
-from go1exp.evaluate.drivers import Driver, Progress
+from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.observed import TrunkVelocity
 from go1exp.evaluate.protocol.lengths import Length
 from go1exp.evaluate.protocol.plan import STEP_BYTES, Array, Impulses, Kicker, Motion, Plan, heading
@@ -50,17 +50,17 @@ class Setting:
 
 
 class Stage:
-    """One driver on its robots."""
+    """One agent on its robots."""
 
-    def __init__(self, driver: Driver, setting: Setting, on_step: Progress = lambda done, total: None) -> None:
+    def __init__(self, agent: Agent, setting: Setting, on_step: Progress = lambda done, total: None) -> None:
         """Prepare; ``on_step`` is called with the progress of everything that is played after ``expect``."""
-        self.driver, self.setting = driver, setting
+        self.agent, self.setting = agent, setting
         self._on_step, self._done, self._total = on_step, 0.0, 0.0
 
     @property
     def policy_dt(self) -> float:
         """Period of the policy, s."""
-        return self.setting.policy_dt or self.driver.task.sim.policy_dt
+        return self.setting.policy_dt or self.agent.task.sim.policy_dt
 
     def times(self, duration: float, policy_dt: float | None = None) -> Array:
         """Return the instants (T,) at which the policy acts in ``duration`` s."""
@@ -73,7 +73,7 @@ class Stage:
 
     def physics_dt(self, policy_dt: float) -> float:
         """Return the physics step with a policy of that period, s."""
-        return self.setting.physics_dt or fitting_step(policy_dt, self.driver.task.sim.physics_dt)
+        return self.setting.physics_dt or fitting_step(policy_dt, self.agent.task.sim.physics_dt)
 
     def bytes_per_second(self, length: Length) -> tuple[float, float]:
         """Return what robots take, B/s: always, and beside it while what measures need is recorded."""
@@ -82,16 +82,16 @@ class Stage:
         return length.robots * STEP_BYTES / dt, length.robots * recorded / dt
 
     def expect(self, steps_of_robots: float) -> None:
-        """Say how many policy steps, times their robots, are to come: for the progress alone."""
+        """Add to the expected number of policy steps times robots, for the progress."""
         self._total += steps_of_robots
 
     def count(self, steps_of_robots: float) -> None:
-        """Say that so many are done."""
+        """Report so many policy steps times robots as done."""
         self._done += steps_of_robots
         self._on_step(min(round(self._done), round(self._total) - 1), round(self._total))
 
     def finished(self) -> None:
-        """Say that all is done."""
+        """Report the end."""
         self._on_step(max(round(self._total), 1), max(round(self._total), 1))
 
     def run(self, plan: Plan) -> Motion:
@@ -104,7 +104,7 @@ class Stage:
 
     def task(self, plan: Plan) -> TaskConfig:
         """Return the environment of a plan."""
-        setting, of_driver = self.setting, self.driver.task
+        setting, of_agent = self.setting, self.agent.task
         policy_dt = plan.policy_dt or self.policy_dt
         config = EvalConfig(
             commands=(),
@@ -121,7 +121,7 @@ class Stage:
             engine=setting.engine,
         )
         command = Term("command", Entry("command", "scheduled", _Scheduled), {})
-        task = dataclasses.replace(evaluation_task(of_driver, config), terrain=plan.ground, command=command)
+        task = dataclasses.replace(evaluation_task(of_agent, config), terrain=plan.ground, command=command)
         if plan.friction is not None:
             task = dataclasses.replace(task, rand=_with_friction(task.rand, plan.friction))
         return task if plan.delay is None else delayed(task, 0.0)
@@ -139,7 +139,7 @@ class _Scheduled(FixedVelocity):
 
 
 class Session:
-    """A plan that is played piece by piece, and that can be put back to where it was saved."""
+    """A plan that is played piece by piece, and that can return to a saved state."""
 
     def __init__(self, stage: Stage, plan: Plan) -> None:
         """Build the robots and put them at the start."""
@@ -147,15 +147,15 @@ class Session:
         self._velocity = plan.trunk_velocity or stage.setting.trunk_velocity
         task, seed = stage.task(plan), stage.setting.seed
         require_agreement(task)
-        imu = stage.driver.senses or self._velocity == "estimated"
+        imu = stage.agent.senses or self._velocity == "estimated"
         self.core = Go1Core(task, plan.robots, seed, noise=stage.setting.noise, imu=imu)
-        self._pilot = stage.driver.begin(self.core, self._velocity, seed)
+        self._running = stage.agent.begin(self.core, self._velocity, seed)
         recording = plan.listen_from is not None
         self._recorder = Recorder(self.core, len(plan.command) - (plan.listen_from or 0)) if recording else None
         self._kicker = Kicker(self.core.backend, task.sim.physics_dt, plan.impulses) if plan.impulses else None
         if plan.delay is not None:  # before the first reset, which puts effects into force
             late: Tensor = self.core.plant.effects.effects[DELAY].delay  # type: ignore[attr-defined]
-            usual = delay_of_effects(stage.driver.task)
+            usual = delay_of_effects(stage.agent.task)
             late.copy_(torch.from_numpy(plan.delay + usual)[:, None].expand_as(late))
         assert isinstance(self.core.command, _Scheduled)
         self._command, self._coming = self.core.command, 0
@@ -173,29 +173,29 @@ class Session:
         self._start = self.core.snapshot().base_pos_w[:, :2].numpy().copy()  # type: ignore[index]
 
     def use(self, impulses: Impulses) -> None:
-        """Kick otherwise from now on."""
+        """Apply other kicks from now on."""
         assert self._kicker is not None
         self._kicker.use(impulses)
 
     def save(self) -> Any | None:
-        """Return everything that is needed to be back here, or None if the driver cannot be put back."""
-        pilot = self._pilot.save()
-        if pilot is None:
+        """Return the state, or None if the agent cannot restore its own."""
+        running = self._running.save()
+        if running is None:
             return None
         counters = [self.step, self._alive.copy(), self._fell.copy(), self._left.copy(), self._observation.clone()]
-        return self.core.state_dict(), pilot, counters, self._kicker.time if self._kicker else 0.0
+        return self.core.state_dict(), running, counters, self._kicker.time if self._kicker else 0.0
 
     def load(self, state: Any | None, step: int) -> None:
-        """Be back at ``step``, where ``save`` was called; without a state, by playing everything up to it again."""
+        """Restore the state saved at ``step``; without a state, play everything up to it again."""
         if state is None:
-            self._pilot = self._stage.driver.begin(self.core, self._velocity, self._stage.setting.seed)
+            self._running = self._stage.agent.begin(self.core, self._velocity, self._stage.setting.seed)
             self.core.reseed(self._stage.setting.seed)
             self._begin()
             self.run(step)
             return
-        environment, pilot, (self.step, alive, fell, left, observation), time = state
+        environment, running, (self.step, alive, fell, left, observation), time = state
         self.core.load_state_dict(environment)
-        self._pilot.load(pilot)
+        self._running.load(running)
         self._alive, self._fell, self._left = alive.copy(), fell.copy(), left.copy()
         self._observation, self._coming = observation.clone(), self.step + 1
         if self._kicker:
@@ -213,7 +213,7 @@ class Session:
             listening = self._recorder is not None and self.step >= (plan.listen_from or 0)
             if self._recorder and listening:
                 self._recorder.begin_step()
-            result = core.step(self._pilot(self._observation))
+            result = core.step(self._running(self._observation))
             core.check(result)
             self._observation = result.observation
             self._end(result.terminated.numpy(), result.truncated.numpy())
@@ -264,7 +264,7 @@ class Session:
 
 
 def delay_of_effects(task: TaskConfig) -> float:
-    """Return by how much the targets of a task's robots come late by its effects, s, without their spread."""
+    """Return the command delay by the effects of a task, without their spread, s."""
     return sum(float(e.parameters["delay"]) for e in task.effect if e.entry.name == DELAY)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.config.schema.registry import TooLongError, bind_list
-from go1exp.evaluate.drivers import PolicyDriver
+from go1exp.evaluate.agents import PolicyAgent
 from go1exp.evaluate.protocol.base import Chosen
 from go1exp.evaluate.protocol.playing import Rates, play
 from go1exp.evaluate.protocol.report.pages import write as write_protocol
@@ -63,12 +63,12 @@ def play_protocol(run: Run, protocol: Chosen, settings: EvaluationSettings, on_s
         ValueError: if the policy cannot play the protocol.
     """
     config, policy, about = load_run(run.folder, _checkpoint(run.folder, settings))
-    driver = PolicyDriver(run.label, config.task, policy, about)
+    agent = PolicyAgent(run.label, config.task, policy, about)
     velocities = protocol.protocol.policy_velocities().items()
-    problems = [p for key, v in velocities for p in driver.problems(v, f"protocol.{protocol.key}.{key}")]
+    problems = [p for key, v in velocities for p in agent.problems(v, f"protocol.{protocol.key}.{key}")]
     if problems:
         raise ValueError("; ".join(problems))
-    result = play(protocol, driver, Rates(settings.seed), {"robot": {}}, on_step)
+    result = play(protocol, agent, Rates(settings.seed), {"robot": {}}, on_step)
     write_protocol(result, run.folder / PROTOCOLS)
 
 

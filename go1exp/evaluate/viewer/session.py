@@ -16,7 +16,7 @@ from go1exp import robot
 from go1exp.base.errors import Expected
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.deploy.estimation import EstimatorError
-from go1exp.evaluate.drivers import Driver, VelocityFilters
+from go1exp.evaluate.agents import Agent, VelocityFilters
 from go1exp.evaluate.protocol.plan import Impulses, Kicker, heading
 from go1exp.evaluate.rollout import require_agreement
 from go1exp.evaluate.viewer import requests
@@ -98,12 +98,12 @@ class Robots:
     """Selectable policies, grounds and effects.
 
     Attributes:
-        drivers: label -> loader of the policy, bundle or controller.
+        agents: label -> loader of the policy, bundle or controller.
         grounds: by name.
         effects: by name, at size 1.
     """
 
-    drivers: Mapping[str, Callable[[], Driver]]
+    agents: Mapping[str, Callable[[], Agent]]
     grounds: Mapping[str, Ground]
     effects: Mapping[str, Term]
 
@@ -150,7 +150,7 @@ class Session:
             ConfigError: if the policy is incompatible with ``setup``.
         """
         self.robots, self.command = robots, velocity
-        self._loaded: dict[str, Driver] = {}
+        self._loaded: dict[str, Agent] = {}
         self.paused, self.speed, self.time, self.falls = False, 1.0, 0.0, 0
         self._history: History | None = None
         self.rewards: tuple[str, ...] = ()
@@ -161,26 +161,26 @@ class Session:
 
     # ------------------------------------------------------------------ building
 
-    def _driver(self, label: str) -> Driver:
-        if label not in self.robots.drivers:
-            raise ConfigError([f"policy {label!r}: known are {', '.join(self.robots.drivers)}"])
+    def _agent(self, label: str) -> Agent:
+        if label not in self.robots.agents:
+            raise ConfigError([f"policy {label!r}: known are {', '.join(self.robots.agents)}"])
         if label not in self._loaded:
-            self._loaded[label] = self.robots.drivers[label]()
+            self._loaded[label] = self.robots.agents[label]()
         return self._loaded[label]
 
     def task_of(self, label: str, setup: Setup) -> TaskConfig:
         """Return the task of a policy under ``setup``; raise ConfigError if they are incompatible."""
-        driver = self._driver(label)
-        if problems := driver.problems(setup.trunk_velocity, "trunk_velocity"):
+        agent = self._agent(label)
+        if problems := agent.problems(setup.trunk_velocity, "trunk_velocity"):
             raise ConfigError(problems)
-        return task_under(driver.task, setup, self.robots.grounds, self.robots.effects)
+        return task_under(agent.task, setup, self.robots.grounds, self.robots.effects)
 
     def _build(self, label: str, setup: Setup) -> None:
         """Build another policy or setup; nothing changes unless all of it can be built."""
-        task, driver = self.task_of(label, setup), self._driver(label)
+        task, agent = self.task_of(label, setup), self._agent(label)
         require_agreement(task)
         core = Go1Core(task, 1, setup.seed, noise=setup.noise, imu=True)
-        policy = driver.begin(core, setup.trunk_velocity, setup.seed)
+        policy = agent.begin(core, setup.trunk_velocity, setup.seed)
         self._kicker = Kicker(core.backend, task.sim.physics_dt, one_push(math.nan, 0.0, 0.0))
         try:
             self._estimate: VelocityFilters | None = VelocityFilters(core, core.noise, setup.seed)
@@ -350,7 +350,7 @@ class Session:
 
     def trained_for(self) -> dict[str, tuple[float, float]]:
         """Return the trained ranges of velocity by the names of the command's parameters."""
-        parameters = self._driver(self.label).task.command.parameters
+        parameters = self._agent(self.label).task.command.parameters
         return {name: tuple(v) for name, v in parameters.items() if isinstance(v, tuple | list) and len(v) == 2}
 
     def velocity(self, seconds: float = 0.5) -> Vector:

@@ -203,7 +203,7 @@ class WalkShow:
         begins = np.flatnonzero(np.diff(pushed, prepend=False) & pushed)
         return WalkView(
             label=s.label,
-            labels=tuple(s.robots.drivers),
+            labels=tuple(s.robots.agents),
             setup=s.setup,
             grounds=s.robots.grounds,
             effects=self._effects,

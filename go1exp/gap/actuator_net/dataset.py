@@ -229,16 +229,16 @@ def split(
     chosen: dict[str, set[str]] = {"holdout": set(), "validation": set()}
     # Names first: a share is drawn from the episodes that are not named.
     requests: list[tuple[str, float | tuple[str, ...]]] = [("holdout", holdout), ("validation", validation)]
-    for key, wish in sorted(requests, key=lambda request: isinstance(request[1], float)):
+    for key, request in sorted(requests, key=lambda pair: isinstance(pair[1], float)):
         taken = set().union(*chosen.values())
-        if isinstance(wish, float):
+        if isinstance(request, float):
             free = [cluster for cluster in shuffled if not cluster & taken]
-            chosen[key] = set().union(*free[: max(1, round(wish * len(clusters)))])
+            chosen[key] = set().union(*free[: max(1, round(request * len(clusters)))])
             continue
-        unknown = [unknown_name(key, name, names, "episode") for name in wish if name not in names]
+        unknown = [unknown_name(key, name, names, "episode") for name in request if name not in names]
         if unknown:
             raise FitError("\n".join(unknown))
-        chosen[key] = set().union(*(c for c in clusters if c & set(wish)))
+        chosen[key] = set().union(*(c for c in clusters if c & set(request)))
         both = sorted(chosen[key] & taken)
         if both:
             raise FitError(f"{key}: {', '.join(both)} repeats an episode of the other part")

@@ -111,7 +111,7 @@ def _explained(
 
 def doubts(named: Sequence[NamedEffect], on_ground: bool) -> list[str]:
     """Return what to look at before what is named is believed, where it has been wrong on sealed cases."""
-    doubted = (identification(n.effect).doubt_on_feet for n in named if on_ground)
+    doubted = (identification(n.effect).standing_caveat for n in named if on_ground)
     return [line for line in doubted if line]
 
 

@@ -19,7 +19,7 @@ from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.recording import Recording, problems, read
 
 SHORTEST = 20
-"""Rows of a recording below which nothing is judged (chosen: a median step and its spread need about as many)."""
+"""Fewest rows of a recording that are checked (chosen: a median step and its spread need about as many)."""
 
 
 def audit_file(path: Path) -> AuditReport:
@@ -148,7 +148,7 @@ def _report(
     steps = np.diff(t) if t.ndim == 1 else np.empty(0)
     middle = float(np.median(steps)) if len(steps) else 0.0
     if t.ndim == 1 and len(t) < SHORTEST:
-        message = f"{len(t)} samples are too few to judge; at least {SHORTEST} are needed"
+        message = f"{len(t)} samples are too few for an audit; at least {SHORTEST} are needed"
         findings = [*findings, finding("length", "all", "suspect", len(t), "samples", message)]
     ranked = sorted(findings, key=lambda f: -ORDER.index(f.verdict))
     duration = float(t[-1] - t[0]) if t.ndim == 1 and len(t) else 0.0
@@ -180,7 +180,7 @@ class CommandDelay:
 
     @property
     def ahead(self) -> bool:
-        """Whether joints answer before they are told to."""
+        """Return whether joints respond before the command."""
         return self.time + 2 * self.error < -limits.DELAY
 
 
@@ -200,7 +200,7 @@ def clock_flaws(reports: Sequence[AuditReport]) -> dict[str, str]:
     """Return what is wrong with recordings whose commands have a clock that is not that of the readings, by episode.
 
     A robot answers its commands after the same time in every recording, up to what gains and motion change of it. Where
-    recordings differ by more, or joints answer before they are told to, commands and readings were not stamped by
+    recordings differ by more, or joints respond before the command, commands and readings were not stamped by
     one clock. Single recordings are named where ``EXCEPTION`` times as many agree. Otherwise all are: a clock that is
     set anew for each recording is so in those that do not show it, too.
     """

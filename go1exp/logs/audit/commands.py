@@ -18,7 +18,7 @@ from go1exp.logs.audit.signals import Log, finding
 from go1exp.logs.recording import joint_channel
 
 SMOOTH = 0.2
-"""s of smoothing: order and sign are judged below about 3 Hz, where a joint follows its target at any gains."""
+"""s of smoothing: order and sign are checked below about 3 Hz, where a joint follows its target at any gains."""
 LONGEST_LAG = 0.12
 """s by which a joint may trail its target (chosen: longer than the response of any drive under position control)."""
 LONGEST_TRAIL = 0.3
@@ -96,7 +96,7 @@ def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
     """Check the delay of each joint; return the delays, too, by the name of the ``q`` column."""
     if log.command is None or not log.recording.has("q") or not _enough(log):
         return [], {}
-    if log.dt < limits.LEAST_STEP:  # of such a clock nothing can be told, and its grid would fill the memory
+    if log.dt < limits.LEAST_STEP:  # such a clock is wrong, and its grid would fill the memory
         return [], {}
     q = log.recording.joint("q")
     estimates = delays(log.t, log.recording.joint(log.command), q, log.on)
@@ -146,7 +146,7 @@ def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
         verb, by = ("trails its target" if len(trail) == 1 else "trail their targets"), f"{low:.3g}"
         by += f" to {high:.3g}" if f"{high:.3g}" != by else ""
         message = f"{', '.join(trail)} {verb} by {by} ms, delay and drive together; "
-        yield finding("trail", "q", "ok", high, "ms", message + "the motion does not tell them apart")
+        yield finding("trail", "q", "ok", high, "ms", message + "this motion cannot separate them")
 
 
 # ---------------------------------------------------------------------- delay, without a model of the robot

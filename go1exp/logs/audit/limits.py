@@ -34,7 +34,7 @@ ENOUGH = 50
 SURE = 4.0
 """Standard deviations (of a count) by which stale samples must exceed chance."""
 ENOUGH_NOISE = 500
-"""Fewest samples from which a noise floor is judged; shorter recordings (a second of walking) are mostly motion."""
+"""Fewest samples from which a noise floor is checked; shorter recordings (a second of walking) are mostly motion."""
 COARSE_ANGLE = 4e-3
 """rad; a coarser encoder than any known one (the coarsest, 2 pi / 4096, is 1.5e-3)."""
 NOISE = {"rad": (5e-3, 2e-2), "rad/s": (0.5, 2.0), "N m": (1.0, 5.0), "m/s2": (2.0, 10.0)}
@@ -99,7 +99,7 @@ CLEARLY = 0.7
 BETTER = 0.25
 """The correlation with another joint must exceed that with the joint itself by this."""
 LEAST_TIME = 2.0
-"""s of motion below which order, sign and delay are not judged: any two slow curves of one second look alike."""
+"""s of motion below which order, sign and delay are not checked: any two slow curves of one second look alike."""
 DELAY = 8e-3
 """s beyond one sample period: an intact bus and drive respond within it. (A Go1 under a policy has 20 ms.)"""
 DELAY_SPREAD = 5e-3

@@ -139,7 +139,7 @@ def resolution(log: Log) -> Iterator[Finding]:
 def noise(log: Log, repeats: dict[str, float]) -> tuple[list[Finding], dict[str, float]]:
     """Measure the noise floor of each channel.
 
-    It is judged only if it looks white and the channel has few stale samples, since both stale samples and motion look
+    It is checked only if it looks white and the channel has few stale samples, since both stale samples and motion look
     like noise otherwise.
     """
     findings, floors = [], {}

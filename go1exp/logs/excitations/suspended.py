@@ -1,6 +1,6 @@
 """Smooth motions over a range of frequencies and speeds. All except the gait need a suspended robot.
 
-Joints differ in phase, frequency and level, so that forces between joints can be told from forces of the joint itself.
+Joints differ in phase, frequency and level, so that forces between joints are identifiable.
 """
 
 from __future__ import annotations

@@ -147,7 +147,7 @@ def torque_off(
 ) -> Motion:
     """Take up a pose, switch the drives off and let the joints swing; then switch on and go to the next pose.
 
-    Without the drives only the mechanism acts, so that friction can be told from damping by the velocity gain. In two
+    Without the drives only the mechanism acts, so that friction is identifiable against the velocity gain. In two
     successive swings each joint starts once on either side of ``centre``, so that at least one starts away from where
     the joint hangs. Only whole swings are made; one takes up to 2 * ``move`` + ``settle`` + ``off[1]``. While the
     drives are off the target goes to ``centre`` and waits there; :attr:`Motion.soft_start` asks for a blend from the

@@ -119,7 +119,7 @@ SECONDS = 20.0
 """Length of a motion that is no file, if none is given."""
 
 GAINS = (20.0, 0.5)
-"""kp, N m/rad, and kd, N m s/rad, of a motion for which nobody gives any: those of the paper."""
+"""kp, N m/rad, and kd, N m s/rad, of a motion without gains of its own: those of the paper."""
 
 Gains = tuple[np.ndarray, np.ndarray]
 
@@ -145,7 +145,7 @@ class PlayedMotion:
                 [f"motion = {name!r}: is for a robot on the ground; deploy plays what a suspended one can do"]
             )
         if not motion.torque_enable.all():
-            raise ConfigError([f"motion = {name!r}: has the drives off at times, which a robot here cannot be told"])
+            raise ConfigError([f"motion = {name!r}: switches actuators off, which deploy cannot do"])
         self.name, self.rate, self.gains = name, rate, gains
         self._target, self._blend = motion.target, round(BLEND_S * rate)
         self.seconds = (self._blend + len(motion.target)) / rate
@@ -163,12 +163,12 @@ class PlayedMotion:
 
 
 def played(
-    wish: str, seconds: float | None, rate: float | None, gains: tuple[float, float] | None, seed: int
+    source: str, seconds: float | None, rate: float | None, gains: tuple[float, float] | None, seed: int
 ) -> PlayedMotion:
     """Return the motion that is asked for.
 
     Args:
-        wish: an excitation's name, or a CSV of targets (see the module), whose gains and times count.
+        source: an excitation's name, or a CSV of targets (see the module), whose gains and times count.
         seconds: of an excitation; a file's own length if None.
         rate: of the targets, Hz; that of the file, or 400, if None.
         gains: kp, N m/rad, and kd, N m s/rad; those of the file, or ``GAINS``, if None.
@@ -178,22 +178,22 @@ def played(
         ConfigError: if there is no such motion, it is not for a suspended robot, or it does not fit into memory.
         go1exp.logs.excitations.ExcitationError: if the file is no table of targets, or leaves the joints' range.
     """
-    table = written(Path(wish)) if wish.endswith(".csv") else None
+    table = written(Path(source)) if source.endswith(".csv") else None
     chosen: Gains | None = None
     if table is None:
-        name, given = wish, {}
+        name, given = source, {}
         rate, seconds = rate or RATE_HZ, seconds or SECONDS
     else:
-        name, given = "playback", {"file": wish}
+        name, given = "playback", {"file": source}
         period = float(np.median(np.diff(table["t"]))) if len(table["t"]) > 1 else 1.0 / RATE_HZ
         rate, seconds = rate or 1.0 / period, seconds or float(table["t"][-1] - table["t"][0]) + period
-        chosen = _gains(wish, table)
+        chosen = _gains(source, table)
     if gains is not None or chosen is None:
         kp, kd = gains or GAINS
         chosen = np.full(robot.NUM_JOINTS, kp), np.full(robot.NUM_JOINTS, kd)
     term, problems = bind("excitation", name, given, "motion", MANY_TERMS.get("excitation"))
     if term is None:
-        raise ConfigError([f"motion = {wish!r}: {problem}" for problem in problems])
+        raise ConfigError([f"motion = {source!r}: {problem}" for problem in problems])
     if wrong := memory.too_long(seconds, rate * MOTION_BYTES):
         raise ConfigError([f"seconds = {seconds:g}: the motion {wrong}"])
     return PlayedMotion(name, make_motion(term, seconds, rate, seed), rate, chosen)

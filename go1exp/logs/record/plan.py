@@ -53,8 +53,8 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """What is to be recorded.
+class RecordingConfig:
+    """Settings of a set of recordings.
 
     Attributes:
         gains: pairs of kp (N m/rad) and kd (N m s/rad); every motion is recorded with each pair.
@@ -97,31 +97,31 @@ def make_motion(term: Term, seconds: float, rate_hz: float, seed: int) -> Motion
     return motion
 
 
-def refuse_too_long(wishes: Wishes, key: str, count: int, each: int = 1, others: int = 0) -> None:
+def refuse_too_long(config: RecordingConfig, key: str, count: int, each: int = 1, others: int = 0) -> None:
     """Raise ConfigError if so many recordings do not fit into memory, by ``key`` if fewer of it would.
 
     Args:
-        wishes: what is to be recorded.
+        config: settings of the recordings.
         key: the setting that says how many recordings there are.
         count: its value.
         each: recordings for each of it.
         others: recordings that there are without it; if none, a recording is needed that ``key`` asks for.
     """
     recordings = others + each * count
-    rate = wishes.sensors.rate_hz * ROW_BYTES  # B/s
-    one = wishes.seconds * rate  # B, of a recording
+    rate = config.sensors.rate_hz * ROW_BYTES  # B/s
+    one = config.seconds * rate  # B, of a recording
     available = memory.free()
     if available is None or recordings * one <= available:
         return
     fitting = (int(available / one) - others) // each  # of the key
     made, much = counted(recordings, "recording"), memory.too_much(recordings * one, available)
     if fitting >= (0 if others else 1) and count > fitting:
-        raise ConfigError([f"{key} = {count}: {made} of {wishes.seconds:g} s: it {much}; {fitting} at most would fit"])
+        raise ConfigError([f"{key} = {count}: {made} of {config.seconds:g} s: it {much}; {fitting} at most would fit"])
     most = max(available / rate / recordings, 0.0)
-    raise ConfigError([f"seconds = {wishes.seconds:g}: with {made} it {much}; {int(most)} s at most would fit"])
+    raise ConfigError([f"seconds = {config.seconds:g}: with {made} it {much}; {int(most)} s at most would fit"])
 
 
-def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
+def episodes(terms: Sequence[Term], config: RecordingConfig) -> list[Episode]:
     """Return an episode for each combination of motion, seed, base and gain set, and then the repetitions.
 
     The first episode of each gain set is repeated.
@@ -131,22 +131,22 @@ def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
             fit into memory.
     """
     if terms:  # as many as there are at least: where a motion is suspended is not known yet
-        sets = len(wishes.gains)
-        refuse_too_long(wishes, "repeats", wishes.repeats, sets, sets * len(terms) * len(wishes.seeds))
+        sets = len(config.gains)
+        refuse_too_long(config, "repeats", config.repeats, sets, sets * len(terms) * len(config.seeds))
     planned: list[Episode] = []
     for term in terms:
-        for seed in wishes.seeds:
-            motion = make_motion(term, wishes.seconds, wishes.sensors.rate_hz, seed)
-            if wishes.support != "auto" and motion.support not in ("either", wishes.support):
-                raise ConfigError([f"support = {wishes.support!r}: {term.key} is for a robot that is {motion.support}"])
-            support = motion.support if wishes.support == "auto" else wishes.support
-            for base in (None,) if support == "ground" else wishes.hang:
-                for kp, kd in wishes.gains:
+        for seed in config.seeds:
+            motion = make_motion(term, config.seconds, config.sensors.rate_hz, seed)
+            if config.support != "auto" and motion.support not in ("either", config.support):
+                raise ConfigError([f"support = {config.support!r}: {term.key} is for a robot that is {motion.support}"])
+            support = motion.support if config.support == "auto" else config.support
+            for base in (None,) if support == "ground" else config.hang:
+                for kp, kd in config.gains:
                     name = f"{term.key}_kp{kp:g}_kd{kd:g}_{seed}"
-                    if base is not None and len(wishes.hang) > 1:
+                    if base is not None and len(config.hang) > 1:
                         name += f"_roll{base[0]:g}_pitch{base[1]:g}"
                     planned.append(
-                        Episode(name, term.entry.name, motion, kp, kd, base, None, _seed(wishes, len(planned)))
+                        Episode(name, term.entry.name, motion, kp, kd, base, None, _seed(config, len(planned)))
                     )
     twice = sorted({e.name for e in planned if [f.name for f in planned].count(e.name) > 1})
     if twice:
@@ -156,13 +156,13 @@ def episodes(terms: Sequence[Term], wishes: Wishes) -> list[Episode]:
     pairs = dict.fromkeys((e.kp, e.kd) for e in planned)
     firsts = [next(e for e in planned if (e.kp, e.kd) == gains) for gains in pairs]
     for e in firsts:
-        for k in range(wishes.repeats):
+        for k in range(config.repeats):
             name = f"{e.name}_repeat{k + 1}"
-            again = Episode(name, e.excitation, e.motion, e.kp, e.kd, e.hang, e.name, _seed(wishes, len(planned)))
+            again = Episode(name, e.excitation, e.motion, e.kp, e.kd, e.hang, e.name, _seed(config, len(planned)))
             planned.append(again)
     return planned
 
 
-def _seed(wishes: Wishes, index: int) -> int:
+def _seed(config: RecordingConfig, index: int) -> int:
     """Return a seed for the noise of one recording."""
-    return int(np.random.SeedSequence([wishes.seed, index]).generate_state(1)[0])
+    return int(np.random.SeedSequence([config.seed, index]).generate_state(1)[0])

@@ -38,7 +38,7 @@ class SensorConfig:
         jitter: scale of the delay of a time stamp, s: the absolute value of a Gaussian with this standard deviation.
         dropped: share of the samples that are lost.
         q: joint angle, rad.
-        qd: joint speed, rad/s.
+        qd: joint velocity, rad/s.
         tau_est: torque that the drive reports, N m.
         gyro: angular velocity, rad/s.
         acc: specific force, m/s2.

@@ -28,7 +28,7 @@ class Armature(Effect):
         nominal=True,
         rank=3,
         confounded=("kp_scale", "link_mass", "strength"),
-        told_apart_by=TWO_GAIN_SETS,
+        separated_by=TWO_GAIN_SETS,
     )
     fields = ("dof_armature",)
     added: Tensor

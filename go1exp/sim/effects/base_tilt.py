@@ -31,7 +31,7 @@ class BaseTilt(Effect):
     """A held trunk hangs tilted, against what is believed; in one that is free the IMU sits tilted.
 
     Held: gravity turns in the trunk's frame, for the joints and for the IMU. Free: what the IMU says turns. Tilt: by
-    ``pitch`` (nose down) and then by ``roll`` (left side up). 1 to 8 degrees are likely (a judgement). A held robot's
+    ``pitch`` (nose down) and then by ``roll`` (left side up). 1 to 8 degrees are likely (estimate). A held robot's
     looks like an ``encoder_offset`` in one pose, and every leg feels the same; two orientations of the trunk tell.
     """
 
@@ -45,7 +45,7 @@ class BaseTilt(Effect):
         rank=9,
         excitation="slow_ramps",
         confounded=("encoder_offset", "link_com"),
-        told_apart_by=TWO_ATTITUDES,
+        separated_by=TWO_ATTITUDES,
     )
     fields = ("opt.gravity",)
     roll: Tensor

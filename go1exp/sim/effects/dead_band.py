@@ -30,7 +30,7 @@ class DeadBand(Effect):
         levels=({"band": 0.002}, {"band": 0.005}, {"band": 0.015}, {"band": 0.03}),
         excitation="slow_ramps",
         confounded=("coulomb", "backlash"),
-        told_apart_by=TWO_GAIN_SETS,
+        separated_by=TWO_GAIN_SETS,
     )
     band: Tensor
 

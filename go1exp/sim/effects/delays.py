@@ -54,7 +54,7 @@ class Delayed(Effect):
 class CommandDelay(Delayed):
     """The drive acts on the target of a while ago: target(t - delay); its own feedback is not delayed.
 
-    Computer, bus and motor controller take their time: 2 to 40 ms on robots of this class (a judgement). The published
+    Computer, bus and motor controller take their time: 2 to 40 ms on robots of this class (estimate). The published
     Go1 actuator net acts one policy step (20 ms) late. A log whose commands and states have clocks of their own shows a
     shift between them as a delay; in a narrow band so do ``kp_scale`` and armature.
     """
@@ -104,7 +104,7 @@ class TorqueDelay(Delayed):
     """The motor makes the torque that the drive asked for a while ago: tau(t) = demand(t - delay).
 
     Feedback is late too, unlike with ``command_delay``, so that a joint rings: the delay acts like a kd that is smaller
-    by kp delay. Loops that run over the bus have 1 to 8 ms (a judgement). To first order the same as ``lag``; sharp
+    by kp delay. Loops that run over the bus have 1 to 8 ms (estimate). To first order the same as ``lag``; sharp
     command edges tell them apart.
     """
 
@@ -115,7 +115,7 @@ class TorqueDelay(Delayed):
         rank=11,
         excitation="steps",
         confounded=("lag",),
-        told_apart_by=SHARP_EDGES,
+        separated_by=SHARP_EDGES,
     )
     order = 30
 

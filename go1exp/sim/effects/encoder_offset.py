@@ -17,7 +17,7 @@ class EncoderOffset(Effect):
     """The encoder reads the angle plus a constant, and so do the drive, the policy and the log: q_read = q + offset.
 
     Walk-these-ways randomises +-0.02 rad on a Go1; calibration by hand against the hard stops is good to some 10 mrad.
-    In one pose it cannot be told from a tilted trunk, a shifted centre of mass or a constant torque of kp offset.
+    In one pose a tilted trunk, a shifted centre of mass or a constant torque of kp offset look the same.
     """
 
     title = "a zero error of the encoders"
@@ -28,10 +28,10 @@ class EncoderOffset(Effect):
         alike=True,
         excitation="slow_ramps",
         confounded=("base_tilt", "link_com"),
-        told_apart_by=TWO_ATTITUDES,
+        separated_by=TWO_ATTITUDES,
         # Sealed walks: hips of 85 % were named as certified offsets of the calves (docs/notebook/gap_walks.md).
-        doubt_on_feet="Drives that are weak at one kind of joints can look like this encoder_offset while the robot is "
-        "on its feet: look at its zeros, or record it hung, before training takes it.",
+        standing_caveat="Actuators that are weak at one kind of joints can look like this encoder_offset on a standing "
+        "robot: look at its zeros, or record it suspended, before training takes it.",
     )
     order = 10  # after the transmission: the encoder reads the motor's side
     offset: Tensor

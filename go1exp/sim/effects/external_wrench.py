@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class ExternalWrench(Effect):
     """A constant force (world frame) and torque (trunk frame) on the trunk: wind, a tether, a cable.
 
-    0 to 20 N are likely (a judgement). It adds to the acceleration of the trunk and turns with neither robot nor gait.
+    0 to 20 N are likely (estimate). It adds to the acceleration of the trunk and turns with neither robot nor gait.
     A held trunk shows none of it. On a level robot a vertical one looks like a ``payload``, a horizontal one like a
     ``base_tilt``.
     """

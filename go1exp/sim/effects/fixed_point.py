@@ -33,7 +33,7 @@ class FixedPoint(Effect):
         levels=({"steps": 4.0},),
         excitation="torque_off",
         confounded=("viscous",),
-        told_apart_by=TWO_KD,
+        separated_by=TWO_KD,
     )
     order = -10
     steps: Tensor

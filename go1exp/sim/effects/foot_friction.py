@@ -1,4 +1,4 @@
-"""``effect=foot_friction``: the feet grip more or less."""
+"""``effect=foot_friction``: another friction of the feet."""
 
 from __future__ import annotations
 

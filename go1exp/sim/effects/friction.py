@@ -27,7 +27,7 @@ class AsymmetricFriction(Effect):
 
     The bound goes to the joint's dry friction, the constant acts on the joint; neither half alone is friction, together
     they only brake. So data cannot tell this effect from ``coulomb`` with a constant torque, such as that of an
-    ``encoder_offset`` in one pose. Differences of up to 0.6 N m are likely (a judgement).
+    ``encoder_offset`` in one pose. Differences of up to 0.6 N m are likely (estimate).
     """
 
     title = "dry friction that depends on direction"
@@ -97,7 +97,7 @@ class LoadFriction(Effect):
         simpler="coulomb",
         excitation="slow_ramps",
         confounded=("coulomb",),
-        told_apart_by="record slow_ramps through poses of different load, and torque_off",
+        separated_by="record slow_ramps through poses of different load, and torque_off",
     )
     coefficient: Tensor
     external: Tensor
@@ -111,7 +111,7 @@ class LoadFriction(Effect):
 class QuadraticDrag(Effect):
     """Friction in proportion to the square of the joint's speed: tau = -drag qd |qd|.
 
-    Churned grease and air. Ranges of 0 to 0.05 N m s2/rad2 are likely (a judgement); at 10 rad/s the tolerance is 0.2 N
+    Churned grease and air. Ranges of 0 to 0.05 N m s2/rad2 are likely (estimate); at 10 rad/s the tolerance is 0.2 N
     m. Only fast motion shows it; there it resembles ``viscous`` and a torque that falls with speed
     (``torque_speed_limit``).
     """
@@ -160,8 +160,8 @@ class Viscous(Effect):
     """Friction in proportion to the joint's speed: tau = -damping qd.
 
     Published Go1 models have 0.01 to 0.5 N m s/rad, the larger ones in place of kd. It acts on the joint, not in the
-    drive: the drive's torque limit and its report do not include it. While the drive does not saturate it cannot be
-    told from a larger kd (``kd_scale``), unless kd is varied, the drive switched off or its torque measured well.
+    drive: the drive's torque limit and its report do not include it. While the drive does not saturate it is
+    ``kd_scale``, unless kd is varied, the drive switched off or its torque measured well.
     """
 
     title = "viscous friction"
@@ -171,7 +171,7 @@ class Viscous(Effect):
         rank=5,
         excitation="torque_off",
         confounded=("kd_scale",),
-        told_apart_by=TWO_KD,
+        separated_by=TWO_KD,
     )
     damping: Tensor
 

@@ -45,7 +45,7 @@ class Backlash(Effect):
     """The joint is free within a gap of the gears: no torque passes while |rotor angle - joint angle| < gap / 2.
 
     Flanks meet without bouncing; the drive reads the rotor. The law is that of ``sim/effects/gears.py``, where
-    ``flexibility`` is in series. 5 to 40 mrad are likely (a judgement). It shows at reversals and as a small cycle at
+    ``flexibility`` is in series. 5 to 40 mrad are likely (estimate). It shows at reversals and as a small cycle at
     rest; within the gap the joint has lost its rotor, which ``armature`` mimics in part.
     """
 
@@ -67,7 +67,7 @@ class Flexibility(Effect):
     """The gears twist under load: rotor angle - joint angle = compliance torque, and the drive reads the rotor.
 
     Rotor and joint swing against each other at sqrt((1 / J_rotor + 1 / J_joint) / compliance); the law is that of
-    ``sim/effects/gears.py``. Stiffnesses of 60 to 400 N m/rad are likely at robots of this size (a judgement). Dry
+    ``sim/effects/gears.py``. Stiffnesses of 60 to 400 N m/rad are likely at robots of this size (estimate). Dry
     friction stays at the joint. To a slow drive it looks like a smaller kp, below the resonance like ``lag`` or
     ``armature``. A drive with kd > J_rotor / physics step (2.2 N m s/rad for a hip at 2 ms)
     shakes the rotor.

@@ -58,7 +58,7 @@ class Identification:
         weighs_on_legs: one such error, equal at all joints, moves the legs of a standing robot as a change of weight
             does; an effect of the trunk must explain recordings better than it.
         alike: one fault may give all joints the same value of it (a low battery, a wrong pose at calibration), so it is
-            tried as the one cause of all that a robot on its feet lacks, with one value.
+            tried as the one cause of all model errors of a standing robot, with one value.
         levels: changes from null, by parameter, in its unit, at which it is probed; each may become the start of a fit.
             For effects with a threshold, or far from linear. Empty: twice the tolerance of each parameter.
         limits_torque: parameter that is a limit of the torque as a share of the peak; it is also probed part by part,
@@ -71,10 +71,9 @@ class Identification:
         simpler: effect that explains nearly the same with fewer numbers, and is taken where it does as well.
         simpler_if_equal: two parameters that make it the simpler effect where they are equal.
         excitation: motion that shows it best (``go1exp list excitations``).
-        confounded: effects that many recordings cannot tell from it. It is enough if one of two names the other.
-        told_apart_by: what to record to tell them apart, the end of a sentence that begins with "record".
-        doubt_on_feet: what to look at before it is believed of a robot on its feet, where it was named wrongly; a
-            sentence. Empty: nothing.
+        confounded: effects that are not identifiable against it from many recordings. One of two may name the other.
+        separated_by: what to record to make them identifiable, the end of a sentence that begins with "record".
+        standing_caveat: what to check before it is accepted for a standing robot, a sentence. Empty: nothing.
     """
 
     nominal: bool = False
@@ -94,5 +93,5 @@ class Identification:
     simpler_if_equal: tuple[str, ...] = ()
     excitation: str = "chirp"
     confounded: tuple[str, ...] = ()
-    told_apart_by: str = ""
-    doubt_on_feet: str = ""
+    separated_by: str = ""
+    standing_caveat: str = ""

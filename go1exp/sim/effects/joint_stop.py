@@ -51,7 +51,7 @@ class JointStop(Effect):
         ),
         excitation="steps",
         confounded=("encoder_offset",),
-        told_apart_by="record steps that reach the stops, and slow_ramps that do not",
+        separated_by="record steps that reach the stops, and slow_ramps that do not",
     )
     fields = ("jnt_solref", "jnt_range")
     time_constant: Tensor

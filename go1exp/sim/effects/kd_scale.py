@@ -1,4 +1,4 @@
-"""``effect=kd_scale``: the drives' speed gain is off."""
+"""``effect=kd_scale``: the velocity gain of the actuators is off."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class KdScale(Effect):
     """The drives' speed gain is a multiple of the configured one: kd = scale kd.
 
-    Walk-these-ways randomises 0.5 to 1.5; +-15 to 75 % are likely (a judgement). While the drive does not saturate it
+    Walk-these-ways randomises 0.5 to 1.5; +-15 to 75 % are likely (estimate). While the drive does not saturate it
     is ``viscous``, unless kd is varied or the torque is measured well; and ``torque_delay`` takes kp delay away from
     kd. New values count from ``Plant.refresh`` on.
     """
@@ -28,7 +28,7 @@ class KdScale(Effect):
         rank=1,
         excitation="torque_off",
         confounded=("viscous",),
-        told_apart_by=TWO_KD,
+        separated_by=TWO_KD,
     )
     scale: Tensor
 

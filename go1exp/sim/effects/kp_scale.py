@@ -1,4 +1,4 @@
-"""``effect=kp_scale``: the drives' position gain is off."""
+"""``effect=kp_scale``: the position gain of the actuators is off."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 class KpScale(Effect):
     """The drives' position gain is a multiple of the configured one: kp = scale kp.
 
-    Walk-these-ways randomises 0.8 to 1.3; +-5 to 30 % are likely (a judgement). At rest it cannot be told from
-    ``strength``, in a narrow band not from ``command_delay``. New values count from ``Plant.refresh`` on.
+    Walk-these-ways randomises 0.8 to 1.3; +-5 to 30 % are likely (estimate). At rest it is not identifiable
+    against ``strength``, in a narrow band not against ``command_delay``. New values count from ``Plant.refresh`` on.
     """
 
     title = "a change of the position gain"
@@ -28,7 +28,7 @@ class KpScale(Effect):
         weighs_on_legs=True,
         alike=True,
         confounded=("armature", "link_mass", "strength"),
-        told_apart_by=TWO_GAIN_SETS,
+        separated_by=TWO_GAIN_SETS,
     )
     scale: Tensor
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Lag(Effect):
     """The motor's torque follows the demand as a first-order lag: time d(tau)/dt = demand - tau.
 
-    The current loop's bandwidth: 2 to 15 ms (a judgement). Solved exactly for a demand that changes linearly between
+    The current loop's bandwidth: 2 to 15 ms (estimate). Solved exactly for a demand that changes linearly between
     two steps, so that no step makes it unstable and a time of zero is the demand itself. To first order the same as
     ``torque_delay``; fast chirps, which it damps and a delay does not, tell them apart. An episode begins settled.
     """
@@ -30,7 +30,7 @@ class Lag(Effect):
     params = (Param("time", "s", 0.0, 0.05, 0.0, 0.001, "joint", "time constant"),)
     identification = Identification(
         confounded=("torque_delay",),
-        told_apart_by=SHARP_EDGES,
+        separated_by=SHARP_EDGES,
     )
     memory = ("_made", "_asked", "_fresh")
     order = 40

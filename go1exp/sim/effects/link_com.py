@@ -21,7 +21,7 @@ class LinkCom(Effect):
 
     By ``forward`` and ``left`` along its x and y axes, and by ``along`` against z, which is down the leg: with all
     joints of a Go1 at zero the legs hang straight and every link has the trunk's axes. 1 to 20 mm are likely, along
-    the calf from the mass of the foot, across from motors and cables (a judgement). A shift along a joint's own axis
+    the calf from the mass of the foot, across from motors and cables (estimate). A shift along a joint's own axis
     does not turn that joint. In one pose the torque of gravity is also that of ``link_mass``, of an
     ``encoder_offset`` or of ``base_tilt``.
     """
@@ -36,7 +36,7 @@ class LinkCom(Effect):
         nominal=True,
         rank=7,
         confounded=("base_tilt", "encoder_offset"),
-        told_apart_by=TWO_ATTITUDES,
+        separated_by=TWO_ATTITUDES,
     )
     fields = ("body_ipos",)
     along: Tensor

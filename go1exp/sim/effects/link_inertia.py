@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class LinkInertia(Effect):
     """Rotational inertia of the link that a joint moves, about its centre of mass, scaled by one factor.
 
-    Mass that sits further from, or nearer to, the centre than the model says: +-20 % are likely (a judgement). It shows
+    Mass that sits further from, or nearer to, the centre than the model says: +-20 % are likely (estimate). It shows
     at fast motion only, like ``armature``, from which the coupling between joints tells it.
     """
 

@@ -29,7 +29,7 @@ class LinkMass(Effect):
         weighs_on_legs=True,
         alike=True,
         confounded=("armature", "kp_scale", "strength"),
-        told_apart_by=TWO_GAIN_SETS,
+        separated_by=TWO_GAIN_SETS,
     )
     fields = ("body_mass", "body_inertia")
     scale: Tensor

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class ParallelStiffness(Effect):
     """A spring between the links beside the drive: tau = -stiffness (q - rest).
 
-    Cables and covers: 0.5 to 5 N m/rad (a judgement). It acts on the joint, so the drive neither limits nor reports it;
+    Cables and covers: 0.5 to 5 N m/rad (estimate). It acts on the joint, so the drive neither limits nor reports it;
     ``rest`` is the true angle without its torque. It resembles ``kp_scale`` and, within a small range of angles,
     gravity.
     """

@@ -62,7 +62,7 @@ class Payload(Effect):
 class PointLoad(Effect):
     """A point mass on the link that a joint moves, at (x, y, z) in its frame: mass, centre, inertia change (Steiner).
 
-    A boot, a sensor at the foot, a cable clamp on the shank: 0.01 to 0.3 kg are likely (a judgement); the tolerance is
+    A boot, a sensor at the foot, a cable clamp on the shank: 0.01 to 0.3 kg are likely (estimate); the tolerance is
     a twentieth of a Go1's calf, the bound the mass of its thigh twice. At its null place it hangs where a Go1's thigh
     and calf end, 0.213 m from their joints. At the link's centre of mass it is ``link_mass``, but without its inertia;
     elsewhere ``link_mass`` and ``link_com`` make its weight, and ``link_inertia`` what is left of it.
@@ -80,7 +80,7 @@ class PointLoad(Effect):
         free_shapes=("x", "y", "z"),
         simpler="link_mass",
         confounded=("link_com", "link_inertia", "link_mass"),
-        told_apart_by="record a chirp and slow_ramps at two attitudes of the trunk (hang=[[0,0],[0,0.5]])",
+        separated_by="record a chirp and slow_ramps at two attitudes of the trunk (hang=[[0,0],[0,0.5]])",
     )
     fields = FIELDS
     order = 10  # after what changes the link's own mass and centre

@@ -1,4 +1,4 @@
-"""``effect=soft_mount``: what holds a trunk gives way."""
+"""``effect=soft_mount``: a compliant mount of the trunk."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from go1exp.sim.effects.identification import Identification
 if TYPE_CHECKING:
     from torch import Tensor
 
-BOLT = "record a chirp with the trunk bolted to something heavy"
+RIGID = "record a chirp with the trunk fixed to something heavy"
 
 RESOLVED = 0.1
 """Square of the largest frequency of the mount, in radians per physics step, that is left as it is."""
 
-BOLTED = 1.0e9
-"""Inertia, kg or kg m2, of a direction in which a trunk is bolted while it yields in others: legs move it by 1e-8."""
+FIXED = 1.0e9
+"""Inertia, kg or kg m2, of a direction in which a trunk is fixed while it yields in others: legs move it by 1e-8."""
 
 
 @effect("soft_mount")
@@ -33,14 +33,14 @@ class SoftMount(Effect):
     In each direction: deflection = compliance load at rest, and a damping ratio of ``damping`` with the legs straight.
     ``sway`` along the world's x and y, ``heave`` along z, ``roll`` and ``pitch`` about the trunk's axes. The
     weight is borne without deflection. Legs that swing push the trunk, and all legs feel it. Straps of half a metre
-    let 12 kg sway by 0.004 m/N, at 0.7 Hz; stands turn by 0.001 to 0.01 rad/(N m) (a judgement). The model has joints
+    let 12 kg sway by 0.004 m/N, at 0.7 Hz; stands turn by 0.001 to 0.01 rad/(N m) (estimate). The model has joints
     of the trunk for it (``sim/physics/scene.py``) where the effect is not null; a trunk that is free, and the simulated
     robot of ``go1exp deploy``, feel nothing. It looks like ``base_tilt``, ``link_com`` and ``armature``.
 
-    A spring that the physics step cannot resolve is given inertia until it can; with compliance 0 that is ``BOLTED``.
+    A spring that the physics step cannot resolve is given inertia until it can; with compliance 0 that is ``FIXED``.
     """
 
-    title = "a mount of the trunk that gives way"
+    title = "a compliant mount of the trunk"
     params = (
         Param("sway", "m/N", 0.0, 0.01, 0.0, 2e-5, "robot", "deflection along x and y per force"),
         Param("heave", "m/N", 0.0, 0.005, 0.0, 2e-5, "robot", "along z"),
@@ -57,7 +57,7 @@ class SoftMount(Effect):
         ),
         free_shapes=("damping",),
         confounded=("base_tilt", "link_com", "armature"),
-        told_apart_by=BOLT,
+        separated_by=RIGID,
     )
     fields: ClassVar[tuple[str, ...]] = (
         *("jnt_stiffness", "dof_damping", "dof_armature", "qpos_spring", "opt.tolerance"),
@@ -92,7 +92,7 @@ class SoftMount(Effect):
         whole = model.nominal("dof_M0").to(k)
         mount, slides = slice(len(MOUNT)), slice(len(MOUNT_SLIDES))
         inertia, legs = whole[:, mount], whole[:, len(MOUNT) :].sum()
-        added = torch.where(soft, (k * dt**2 / RESOLVED - inertia).clamp(min=0.0), BOLTED)
+        added = torch.where(soft, (k * dt**2 / RESOLVED - inertia).clamp(min=0.0), FIXED)
         stiffness[:, mount], armature[:, mount] = k, added
         damping[:, mount] = 2.0 * self.damping * torch.sqrt(k * (inertia + added))
         # The engine solves friction and stops to a tolerance in units of all inertia, and the legs' is what counts.

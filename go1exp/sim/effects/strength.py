@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class Strength(Effect):
     """The motor makes a multiple of the torque that its drive asks for: tau = scale demand.
 
-    Walk-these-ways randomises 0.9 to 1.1 on a Go1; +-5 to 30 % are likely (a judgement). Slow motion cannot tell it
+    Walk-these-ways randomises 0.9 to 1.1 on a Go1; +-5 to 30 % are likely (estimate). Slow motion cannot tell it
     from ``kp_scale``, and dynamics scaled the other way round (payload and armature together) look much the same.
     """
 
@@ -28,7 +28,7 @@ class Strength(Effect):
         weighs_on_legs=True,
         alike=True,
         confounded=("armature", "kp_scale", "link_mass"),
-        told_apart_by=TWO_GAIN_SETS,
+        separated_by=TWO_GAIN_SETS,
     )
     order = 10
     scale: Tensor

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class StrengthDrift(Effect):
     """The motor weakens in the course of an episode: tau = max(1 - rate t, floor) demand.
 
-    Windings and magnets warm up, the battery goes down: -10 to -30 % (a judgement), here spread over an episode of some
+    Windings and magnets warm up, the battery goes down: -10 to -30 % (estimate), here spread over an episode of some
     20 s. t is the time since the episode began. The mean of it is ``strength``.
     """
 

@@ -1,4 +1,4 @@
-"""``protocol=hardware``: would an engineer put this policy on a Go1?"""
+"""``protocol=hardware``: acceptance of a policy for a Go1."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from go1exp.base.report.plots import Drawing
 from go1exp.config.schema.registry import protocol
 from go1exp.config.schema.settings import settings
 from go1exp.evaluate.protocol.base import Played, lives
-from go1exp.evaluate.protocol.claims import judged
+from go1exp.evaluate.protocol.claims import evaluated
 from go1exp.evaluate.protocol.kinds.energy import effort
 from go1exp.evaluate.protocol.kinds.rate import LATEST_MS
 from go1exp.evaluate.protocol.kinds.steady import AXES, ERRORS, Steady
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 @protocol("hardware")
 @settings
 class Hardware(Steady):
-    """Item by item whether a policy may go on a Go1: torque, speed, power, impact, slip, delay margin, target steps.
+    """Limits of a Go1: torque, speed, power, impact, slip, delay margin, action rate.
 
     Attributes:
-        delays_ms: time by which targets come late, beside what the robot has of that, rising.
+        delays_ms: further command delays, added to those of the robot, rising.
     """
 
     delays_ms: Annotated[tuple[Annotated[float, Field(gt=0, le=LATEST_MS)], ...], Field(min_length=1)]
@@ -52,18 +52,18 @@ class Hardware(Steady):
     )
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
+        """Check settings against each other."""
         Steady.__post_init__(self)
         if sorted(set(self.delays_ms)) != list(self.delays_ms):
             raise ValueError(f"delays_ms = {list(self.delays_ms)}: must rise")
 
     def lengths(self) -> list[Length]:
-        """Return those of the commands as they are, and of all of them again with late targets."""
+        """Return the lengths of the commands without and with further delays."""
         late = self.robots * len(self.commands) * len(self.delays_ms)
         return [*Steady.lengths(self), Length(self.duration_s, late, self.causes(), self.settle_s)]
 
     def play(self, stage: Stage) -> Played:
-        """Play the commands as they are, and all of them again with late targets, for falls alone."""
+        """Play the commands without further delays, and again with them, for falls alone."""
         from go1exp.evaluate.protocol.plan import Plan
 
         played = Steady.play(self, stage)
@@ -92,7 +92,7 @@ class Hardware(Steady):
 
     def derived(self, rows: Sequence[Row]) -> list[Derived]:
         """Return the delay margin."""
-        text = "largest delay of the targets up to which no robot falls"
+        text = "largest command delay up to which no robot falls"
         return [Derived("delay_margin", "ms", text, {}, "higher", _margin)]
 
     def derived_names(self) -> list[str]:
@@ -102,13 +102,13 @@ class Hardware(Steady):
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw each item against its limit, and falls over the delay."""
         bars = (
-            "Worst command's figure over its upper limit, with its 95 % interval; beyond the line the limit is missed."
+            "Figure of the worst command over its upper limit, 95 % interval; beyond the line the limit is not met."
             " Green: met; brown: close; red: not met; grey: inconclusive."
         )
         delay = "Share of robots of all commands that fell, with Wilson's 95 % interval."
         return [
             Drawing("items", "Items against their limits", bars, partial(_items, self, summary)),
-            Drawing("delay", "Falls with late targets", delay, partial(_falls, played.rows)),
+            Drawing("delay", "Falls with command delay", delay, partial(_falls, played.rows)),
         ]
 
 
@@ -123,7 +123,7 @@ def _margin(rows: Sequence[Row]) -> float:
 
 
 def _items(hardware: Hardware, summary: Sequence[Mapping[str, Any]]) -> Figure:
-    verdicts = [v for v in judged(hardware.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
+    verdicts = [v for v in evaluated(hardware.claims, summary) if v.claim.at_most and np.isfinite(v.figure.estimate)]
     figure, axes = plots.panels(1, height=0.5 + 0.26 * max(len(verdicts), 1))
     ax = axes[0, 0]
     tones = {"met": "#00705a", "close": "#8a5a00", "not met": "#a63f00", "inconclusive": "#59616a"}
@@ -150,5 +150,5 @@ def _falls(rows: Sequence[Row]) -> Figure:
         i = share_interval(sum(fell), len(fell))
         entries.append({"figures": {"fell": {"estimate": i.estimate, "low": i.low, "high": i.high}}})
     plots.intervals(axes[0, 0], delays, entries, "fell", plots.MEASURED, "")
-    axes[0, 0].set(xlabel="delay of the targets (ms)", ylabel="share that fell", ylim=(-0.03, 1.03))
+    axes[0, 0].set(xlabel="command delay (ms)", ylabel="share that fell", ylim=(-0.03, 1.03))
     return figure

@@ -62,7 +62,7 @@ class Kicks(Protocol):
     """Kicks of rising strength while walking: lowest height, recovery, success (paper, Fig. 6).
 
     Attributes:
-        command: what the robots are told.
+        command: commanded velocity.
         impulses: of the kicks one after the other, N s; 12.74 kg gain 1 m/s by 12.7.
         push_s: duration of the half-sine force, s.
         direction_deg: of the force from the heading, counter-clockwise; 90 is to the left. Odd robots the other way.
@@ -103,7 +103,7 @@ class Kicks(Protocol):
     )
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
+        """Check settings against each other."""
         if wrong := repeated("impulses", self.impulses):
             raise ValueError(wrong[0])
         if self.push_s > self.every_s:

@@ -46,7 +46,7 @@ class PushMap(Protocol):
     """Largest kick that is survived, by direction and gait phase, found by bisection; area of the region.
 
     Attributes:
-        command: what the robots are told.
+        command: commanded velocity.
         directions: of the force, evenly around the robot.
         phases: instants of the kick, evenly in the stride of the foot FR.
         settle_s: time before, s.
@@ -74,7 +74,7 @@ class PushMap(Protocol):
     )
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
+        """Check settings against each other."""
         if self.push_s > self.watch_s:
             raise ValueError(f"push_s = {self.push_s}: must be at most watch_s = {self.watch_s}")
 
@@ -164,7 +164,7 @@ class PushMap(Protocol):
         return [*figures, area, Derived("weakest", "N s", "smallest median of all directions", {}, "higher", _weakest)]
 
     def derived_names(self) -> list[str]:
-        """Return their names."""
+        """Return the names of the derived figures."""
         return ["impulse_median", "impulse_p10", "area", "weakest"]
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:

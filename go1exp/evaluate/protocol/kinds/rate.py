@@ -1,4 +1,4 @@
-"""``protocol=rate``: how often the policy acts, how late its targets come, what it sees of the velocity."""
+"""``protocol=rate``: rate of the policy, command delay, exact or estimated velocity."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from go1exp.evaluate.protocol.stage import Stage
 
 LATEST_MS = 60.0
-"""What the effect ``command_delay`` allows."""
+"""Upper bound of the effect ``command_delay``, ms."""
 
 
 @protocol("rate")
@@ -35,11 +35,11 @@ class Rate(Protocol):
     """Rate of the policy and delay of its targets, with true and with estimated velocity: errors, falls, effort.
 
     Attributes:
-        command: what the robots are told.
+        command: commanded velocity.
         duration_s: length, s.
         settle_s: time at its start that counts for falls alone, s.
         rates_hz: of the policy; the physics step is the largest up to that of training that divides its period.
-        delays_ms: time by which targets take force late, beside what the robot has of that.
+        delays_ms: further command delays, added to those of the robot.
         velocities: what the policy sees of the trunk's velocity, in place of ``trunk_velocity``.
         slower_faster: two of the rates whose error is compared.
     """
@@ -61,7 +61,7 @@ class Rate(Protocol):
     )
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
+        """Check settings against each other."""
         wrong = repeated("rates_hz", self.rates_hz) + repeated("delays_ms", self.delays_ms)
         wrong += repeated("velocities", self.velocities)
         if self.settle_s >= self.duration_s:
@@ -120,7 +120,7 @@ class Rate(Protocol):
 
     def derived(self, rows: Sequence[Row]) -> list[Derived]:
         """Return by how much the error falls from the slower to the faster rate, of the same robots."""
-        text = f"error at {self.slower_faster[0]:g} Hz less that at {self.slower_faster[1]:g} Hz, of robots up at both"
+        text = "error at {:g} Hz - error at {:g} Hz, of robots standing at both".format(*self.slower_faster)
         return [
             Derived("faster_is_better", "m/s", text, {"velocity": v, "delay_ms": float(d)}, "higher", self._gain)
             for v in self.velocities
@@ -128,7 +128,7 @@ class Rate(Protocol):
         ]
 
     def derived_names(self) -> list[str]:
-        """Return their names."""
+        """Return the names of the derived figures."""
         return ["faster_is_better"]
 
     def _gain(self, rows: Sequence[Row]) -> float:
@@ -170,7 +170,7 @@ def _over_rate(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
                 at = [e["condition"]["rate_hz"] * 1.02 ** (d + w) for e in entries]
                 for row, (name, _) in enumerate(SHOWN):
                     colour = plots.COLOURS[(d + w) % len(plots.COLOURS)]
-                    plots.intervals(axes[row, column], at, entries, name, colour, who or f"{delay:g} ms late")
+                    plots.intervals(axes[row, column], at, entries, name, colour, who or f"{delay:g} ms delay")
     for row, (_, text) in enumerate(SHOWN):
         axes[row, 0].set_ylabel(text)
     for column, velocity in enumerate(velocities):

@@ -1,4 +1,4 @@
-"""What protocols of constant commands share: a batch with the robots of each command side by side."""
+"""Base of protocols of constant commands: a batch with the robots of each command side by side."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Steady(Protocol):
         commands: each as x m/s, y m/s, yaw rad/s.
         duration_s: length, s.
         settle_s: time at its start that counts for falls alone, s.
-        rest_s: time at its start, within ``settle_s``, for which the robots are told to stand, s.
+        rest_s: time at its start, within ``settle_s``, with a zero command, s.
     """
 
     commands: Annotated[tuple[Velocity, ...], Field(min_length=1)]
@@ -46,7 +46,7 @@ class Steady(Protocol):
     keys: ClassVar[tuple[str, ...]] = AXES
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
+        """Check settings against each other."""
         if not self.rest_s <= self.settle_s < self.duration_s:
             order = f"rest_s = {self.rest_s} and duration_s = {self.duration_s}"
             raise ValueError(f"settle_s = {self.settle_s}: must lie between {order}")

@@ -65,7 +65,7 @@ class OnTerrain(Protocol):
     )
 
     def __post_init__(self) -> None:
-        """Check what concerns two settings."""
+        """Check settings against each other."""
         wrong = [
             f"grounds.{name} = {list(levels)}: must rise"
             for name, levels in self.ladders.items()
@@ -154,7 +154,7 @@ class OnTerrain(Protocol):
         return figures
 
     def derived_names(self) -> list[str]:
-        """Return their names."""
+        """Return the names of the derived figures."""
         return list(SHARES)
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:

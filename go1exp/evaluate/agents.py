@@ -28,25 +28,25 @@ from go1exp.sim.task import TaskConfig
 from go1exp.train.policy import Policy
 
 
-class Pilot(Protocol):
-    """Drives the N robots of one environment.
+class RunningAgent(Protocol):
+    """An agent that moves the N robots of one environment.
 
-    It is called once a policy step and may have hung itself into the environment's physics steps before that
-    (``Plant.observer``, ``backend.step``), as a controller with a rate of its own does.
+    It is called once a policy step and may also act in the physics steps (``Plant.observer``, ``backend.step``), as a
+    controller with a rate of its own does.
     """
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Return the actions (N, 12) of the next policy step for the observations (N, O)."""
 
     def save(self) -> Any | None:
-        """Return a copy of everything that it remembers, or None if that cannot be put back."""
+        """Return a copy of the memory, or None if it cannot be restored."""
 
     def load(self, state: Any) -> None:
-        """Put back what ``save`` returned."""
+        """Restore what ``save`` returned."""
 
 
-class Driver(Protocol):
-    """Something that drives robots, before there are any."""
+class Agent(Protocol):
+    """What moves robots in an evaluation, before there are any."""
 
     @property
     def label(self) -> str:
@@ -65,9 +65,9 @@ class Driver(Protocol):
         """Whether it reads the robots' sensors itself, the IMU too, at a rate of its own."""
 
     def problems(self, trunk_velocity: TrunkVelocity, key: str) -> list[str]:
-        """Return why it cannot be played so, each beginning with the ``key`` that asks for it."""
+        """Return why it cannot be played so, each message beginning with the ``key`` of the setting."""
 
-    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> Pilot:
+    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> RunningAgent:
         """Take the robots of an environment, which is to be reset next."""
 
 
@@ -133,7 +133,7 @@ class EstimatedVelocity(VelocityFilters):
 
 
 @dataclass(frozen=True)
-class PolicyDriver:
+class PolicyAgent:
     """A trained policy: observations in, actions out."""
 
     label: str
@@ -148,17 +148,17 @@ class PolicyDriver:
             return [f"{key} = 'estimated': the policy of {self.label} does not see {TERM}"]
         return []
 
-    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> Pilot:
+    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> RunningAgent:
         """Take the robots of an environment."""
-        return _PolicyPilot(self, core, trunk_velocity, seed)
+        return _RunningPolicy(self, core, trunk_velocity, seed)
 
 
-class _PolicyPilot:
-    def __init__(self, driver: PolicyDriver, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
-        self._policy, self._core = driver.policy, core
+class _RunningPolicy:
+    def __init__(self, agent: PolicyAgent, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
+        self._policy, self._core = agent.policy, core
         self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
         # A policy that runs faster than it was trained sees its action, and frames, of one training period ago.
-        self._past = Past[tuple[Tensor, Tensor]](driver.task.sim.policy_dt, core.task.sim.policy_dt)
+        self._past = Past[tuple[Tensor, Tensor]](agent.task.sim.policy_dt, core.task.sim.policy_dt)
         self._columns = columns(core.task, "previous_action") if self._past.cycles > 1 else None
         self._history = history_columns(core.task.observation)
         self._remembered: tuple[Tensor, Tensor] | None = None
@@ -186,7 +186,7 @@ class _PolicyPilot:
 
 
 @dataclass(frozen=True)
-class BundleDriver:
+class BundleAgent:
     """The policy of a bundle as the robot's computer runs it: readings in, by ONNX.
 
     Its noise is that of the robot's sensors (the simulated robot's of ``go1exp deploy``), not that of training.
@@ -205,20 +205,20 @@ class BundleDriver:
             return [f"{key} = 'estimated': the policy of {self.label} does not see base_lin_vel_b"]
         return []
 
-    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> Pilot:
+    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> RunningAgent:
         """Take the robots of an environment."""
-        return _BundlePilot(self, core, trunk_velocity, seed)
+        return _RunningBundle(self, core, trunk_velocity, seed)
 
 
 NOISY = {"joint_pos": "q", "joint_vel": "qd", "imu_quat": "quat", "imu_gyro": "gyro"}
 """Readings and the names of their noise."""
 
 
-class _BundlePilot:
-    def __init__(self, driver: BundleDriver, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
-        self._bundle, self._core = driver.bundle, core
+class _RunningBundle:
+    def __init__(self, agent: BundleAgent, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> None:
+        self._bundle, self._core = agent.bundle, core
         self._filter = EstimatedVelocity(core, core.noise, seed) if trunk_velocity == "estimated" else None
-        self._memory = PolicyMemory(driver.bundle.metadata, core.task.sim.policy_dt, core.num_envs)
+        self._memory = PolicyMemory(agent.bundle.metadata, core.task.sim.policy_dt, core.num_envs)
         self._rng = np.random.default_rng([seed, 3])
 
     def __call__(self, observation: Tensor) -> Tensor:
@@ -239,7 +239,7 @@ class _BundlePilot:
 
 
 @dataclass(frozen=True)
-class ControllerDriver:
+class ControllerAgent:
     """Controllers of their own rate, one for each robot (``go1exp/evaluate/controller``)."""
 
     label: str
@@ -252,7 +252,7 @@ class ControllerDriver:
         """Return nothing: a controller takes either velocity."""
         return []
 
-    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> Pilot:
+    def begin(self, core: Go1Core, trunk_velocity: TrunkVelocity, seed: int) -> RunningAgent:
         """Take the robots of an environment."""
         return Driven(core, self.make, noise=core.noise, seed=seed, trunk_velocity=trunk_velocity)
 
