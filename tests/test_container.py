@@ -239,6 +239,6 @@ def test_the_lines_of_the_dockerfile_make_a_runtime_that_walks(tmp_path: Path, m
                 break
         rest, _ = process.communicate(timeout=30)
     assert process.returncode == STATUS["operator_stop"]
-    assert rest.splitlines()[-1].endswith("asked for by SIGTERM")
+    assert rest.splitlines()[-1].endswith("requested by SIGTERM")
     assert len(list((logs / "runs/deploy").glob("*.parquet"))) == 2
     assert list(home.iterdir()) == []  # onnxruntime would keep an identifier for its reports there

@@ -30,11 +30,11 @@ from go1exp.deploy.export.build import build
 from go1exp.deploy.runtime import walk
 from go1exp.deploy.runtime.bundle import load
 from go1exp.deploy.runtime.commands import (
+    CommandConfig,
     CommandError,
     Keyboard,
     Sinusoid,
     Table,
-    Wish,
     make,
     parsed,
     range_array,
@@ -46,6 +46,7 @@ from go1exp.deploy.runtime.estimate import BLIND_S, KalmanEstimator, settings
 from go1exp.deploy.runtime.job import Job, run_job
 from go1exp.deploy.runtime.launch import RefusedError, RobotError
 from go1exp.deploy.runtime.log import About, Log, Ring
+from go1exp.deploy.runtime.report import DONE
 from go1exp.deploy.runtime.safety import RULES
 from go1exp.deploy.runtime.walk import FAULTS, STATUS, Plan
 from go1exp.deploy.sim_robot.__main__ import bundle_task, sim_config
@@ -214,7 +215,7 @@ def test_of_the_truth_the_newest_is_kept_and_memory_does_not_grow() -> None:
     ("change", "message"),
     [
         ({"joints": (*robot.JOINTS[3:6], *robot.JOINTS[:3], *robot.JOINTS[6:])}, "has FL_hip at place 1; the motors"),
-        ({"robot": "go2"}, "is for the robot 'go2'; deploy drives a 'go1'"),
+        ({"robot": "go2"}, "is for the robot 'go2'; deploy commands a 'go1'"),
         ({"estimator": {"foot_radus": 1}}, r"estimator\.foot_radus: unknown key"),
     ],
     ids=["order", "robot", "estimator"],
@@ -269,7 +270,7 @@ def play(
 ) -> SimpleNamespace:
     """Walk; return status, what was said, the account, the recording, the cycles and the world."""
     usual: dict[str, Any] = {"seconds": 1.0, "stand_up": 0.2, "lie_down": 0.0, "brake": 0.1}
-    usual["wish"] = Wish((0.4, 0.0, 0.0))
+    usual["command"] = CommandConfig((0.4, 0.0, 0.0))
     output: list[str] = []
     with lockstep(spoil) as world:
         status = run_job(Job(file, "sim", Plan(**{**usual, **plan}), str(out), **(job or {})), output.append)
@@ -295,7 +296,7 @@ def test_a_model_predictive_controller_walks_in_the_runtime(file: str, tmp_path:
     assert done.output[-1] == "walked for 2.0 s, to the end"
     x, y, _ = done.account["velocity"]["mean"]
     assert (x, y) == (pytest.approx(0.4, abs=0.05), pytest.approx(0.0, abs=0.05))
-    assert done.recording.meta.notes.endswith("torques that are fed forward are not recorded")
+    assert done.recording.meta.notes.endswith("feed-forward torques are not recorded")
 
 
 def test_a_walk_from_the_bundle_to_the_recording(file: str, tmp_path: Path) -> None:
@@ -364,7 +365,7 @@ def test_jitter_reorders_and_the_walk_goes_on(file: str, tmp_path: Path) -> None
     assert r.joint("q_target").tobytes() == np.array([had[round(t / TICK)] for t in r.t]).tobytes()
     packets = done.account["packets"]
     assert 0.0 <= packets["age"]["p50"] <= packets["age"]["worst"] <= 0.005 + TICK
-    assert any("beyond the fastest way" in line for line in done.output)
+    assert any("relative to the fastest" in line for line in done.output)
 
 
 def test_the_log_is_fit_for_gap_and_says_nothing_of_what_it_does_not_know(file: str, tmp_path: Path) -> None:
@@ -428,7 +429,7 @@ def test_a_walk_ends_with_lying_down(file: str, tmp_path: Path) -> None:
     sinking = play(file, tmp_path / "a", seconds=0.5, brake=0.5)
     lying = play(file, tmp_path / "b", seconds=0.5, brake=0.5, lie_down=2.0)
     assert sinking.status == lying.status == 0
-    assert lying.account["ended"] == sinking.account["ended"] == walk.DONE
+    assert lying.account["ended"] == sinking.account["ended"] == DONE
     assert lying.account["walked_s"] == pytest.approx(0.5)
     assert list(lying.account["phases"]) == list(PHASES)
     assert lying.account["phases"]["damping"] - lying.account["phases"]["lying_down"] == pytest.approx(2.0, abs=0.03)
@@ -485,15 +486,15 @@ def test_a_key_ends_a_walk_in_order_and_twice_at_once(
 
     with os.fdopen(theirs, "rb", buffering=0) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
-        done = play(file, tmp_path, pressed, seconds=None, lie_down=lie_down, wish=Wish("keyboard"))
+        done = play(file, tmp_path, pressed, seconds=None, lie_down=lie_down, command=CommandConfig("keyboard"))
     os.close(ours)
     assert done.status == status
     assert ("lying_down" in done.account["phases"]) == (lie_down > 0)
     if status:
         assert done.account["ended"] == "operator_stop"
     else:
-        assert done.account["ended"] == "asked for by the q key"
-        assert done.output[-1] == "walked for 0.3 s, until the q key"
+        assert done.account["ended"] == "stopped by key q"
+        assert done.output[-1] == "walked for 0.3 s, stopped by key q"
         assert ended(done)[0] < 0.1
 
 
@@ -524,12 +525,12 @@ FAULTY: list[tuple[str, Callable[[LowState], LowState | None], str]] = [
     ("stale_state", lambda state: None, "ms old"),
     ("stale_state", odd(joint_pos=np.full(12, np.nan)), "ms old"),  # such packets are rejected
     ("attitude", odd(imu_quat=np.zeros(4)), "length is 0.000"),
-    ("tilt", leaning, "leans by 69 degrees"),
+    ("tilt", leaning, "tilt 69 deg"),
     ("joint_range", odd(joint_pos=robot.NOMINAL_STANCE + 1.5), "beyond its stop"),
     ("torque", odd(joint_torque=np.full(12, 60.0)), "reports 60.0 N m"),
     ("power", odd(joint_torque=np.full(12, 20.0), joint_vel=np.full(12, 5.0)), "1200 W"),
-    ("operator_stop", kill(signal.SIGTERM), "asked for by SIGTERM"),
-    ("operator_stop", kill(signal.SIGINT), "asked for by SIGINT"),
+    ("operator_stop", kill(signal.SIGTERM), "requested by SIGTERM"),
+    ("operator_stop", kill(signal.SIGINT), "requested by SIGINT"),
 ]
 
 
@@ -655,15 +656,15 @@ RANGES = np.array([[-0.5, 1.0], [-0.3, 0.3], [-1.0, 1.0]])
 
 
 def test_a_constant_is_kept_within_the_ranges_and_cuts_are_counted() -> None:
-    source = make(Wish((2.0, -0.1, -3.0)), RANGES, print)
+    source = make(CommandConfig((2.0, -0.1, -3.0)), RANGES, print)
     assert source(0.0).tolist() == source(1.0).tolist() == [1.0, -0.1, -1.0]
     assert source.cut.tolist() == [2, 0, 2]
     assert range_array({"lin_vel_x": (-1.0, 2.0)}).tolist() == [[-1, 2], [-np.inf, np.inf], [-np.inf, np.inf]]
     for wrong in ((1.0, 2.0), (np.nan, 0.0, 0.0)):
         with pytest.raises(CommandError, match="must be three finite numbers"):
-            make(Wish(wrong), RANGES, print)
+            make(CommandConfig(wrong), RANGES, print)
     with pytest.raises(CommandError, match="'fast': must be three numbers"):
-        make(Wish("fast"), RANGES, print)
+        make(CommandConfig("fast"), RANGES, print)
 
 
 def test_rows_of_a_file_are_held(tmp_path: Path) -> None:
@@ -714,7 +715,7 @@ def test_keys_change_the_velocity_and_stop_the_robot() -> None:
         for key in (b"\x1b", b"q"):
             os.write(ours, key)
             source.poll()
-        assert stops == ["the Esc key", "the q key"]
+        assert stops == ["key Esc", "key q"]
     finally:
         source.close()
         os.close(ours)
@@ -744,7 +745,7 @@ def test_a_terminal_is_given_back_as_it_was() -> None:
 def test_a_gamepad_needs_its_package_and_sticks_reach_the_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(CommandError, match="needs pygame"):
-        make(Wish("gamepad"), RANGES, print)
+        make(CommandConfig("gamepad"), RANGES, print)
     np.testing.assert_allclose(stretched(np.array([1.0, -1.0, 0.05]), RANGES), [1.0, -0.3, 0.0])
     np.testing.assert_allclose(stretched(np.array([-1.0, 0.5, -0.5]), RANGES), [-0.5, 0.15, -0.5])
 
@@ -757,12 +758,12 @@ def test_a_gamepad_needs_its_package_and_sticks_reach_the_ranges(monkeypatch: py
     event = SimpleNamespace(get=list)
     game = SimpleNamespace(init=nothing, quit=nothing, joystick=joystick, event=event, JOYDEVICEREMOVED=1)
     monkeypatch.setitem(sys.modules, "pygame", game)
-    source = make(Wish("gamepad"), RANGES, stops.append)
+    source = make(CommandConfig("gamepad"), RANGES, stops.append)
     source.poll()
     np.testing.assert_allclose(source(0.0), [0.5, 0.0, -1.0])
     buttons[1] = 1
     source.poll()
-    assert stops == ["a button of the gamepad"]
+    assert stops == ["gamepad button"]
     source.close()
 
 
@@ -906,7 +907,7 @@ def test_the_light_way_stops_at_a_signal_and_loads_nothing_heavy(file: str, tmp_
     rest, errors = process.communicate(timeout=60)
     assert process.returncode == STATUS["operator_stop"], (lines, rest, errors)
     assert errors == ""
-    assert rest.splitlines()[-1].endswith("asked for by SIGINT")
+    assert rest.splitlines()[-1].endswith("requested by SIGINT")
     heavy = {"torch", "stable_baselines3", "gymnasium", "mujoco", "hydra", "omegaconf", "scipy", "onnx"}
     modules = set(json.loads((tmp_path / "modules.json").read_text()))
     assert {"onnxruntime", "pyarrow"} <= modules

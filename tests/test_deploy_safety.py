@@ -19,7 +19,7 @@ from go1exp.deploy.runtime.bundle import Bundle
 from go1exp.deploy.runtime.controller import Controller, Cycle, Stages
 from go1exp.deploy.runtime.loop import Deadlines, MonotonicClock, Timing, run
 from go1exp.deploy.runtime.metadata import Port
-from go1exp.deploy.runtime.safety import RULES, Safety, SafetyConfig, lean, sdk_range
+from go1exp.deploy.runtime.safety import RULES, Safety, SafetyConfig, sdk_range, tilt_angle
 from go1exp.robot.messages import LowCmd, LowState
 
 NOMINAL = robot.NOMINAL_STANCE
@@ -86,10 +86,10 @@ FAULTS: dict[str, list[tuple[LowState, LowCmd, float, str]]] = {
         (make_state(imu_quat=np.array([1.06, 0, 0, 0])), make_command(), 0.0, "length is 1.060"),
     ],
     "tilt": [
-        (make_state(imu_quat=leaning(1.01, axis)), make_command(), 0.0, "the trunk leans by 58 degrees")
+        (make_state(imu_quat=leaning(1.01, axis)), make_command(), 0.0, "tilt 58 deg, the limit is 57 deg")
         for axis in ((1, 0, 0), (0, 1, 0), (0, -1, 0), (0.6, -0.8, 0))
     ]
-    + [(make_state(imu_quat=leaning(math.pi)), make_command(), 0.0, "by 180 degrees")],
+    + [(make_state(imu_quat=leaning(math.pi)), make_command(), 0.0, "tilt 180 deg")],
     "joint_range": [
         (make_state(joint_pos=at(NOMINAL, 0, 0.863 + 0.088)), make_command(), 0.0, "FR_hip is at 0.951 rad, 0.088"),
         (make_state(joint_pos=at(NOMINAL, 11, -2.818 - 0.1)), make_command(), 0.0, "RL_calf is at -2.918 rad, 0.100"),
@@ -102,7 +102,7 @@ FAULTS: dict[str, list[tuple[LowState, LowCmd, float, str]]] = {
         # A joint that brakes does not make good for one that drives.
         (
             make_state(joint_torque=np.array([20.0, -20.0] * 6), joint_vel=np.full(12, 2.1)),
-            *(make_command(), 0.0, "turn over 504 W, the limit is 500 W"),
+            *(make_command(), 0.0, "power is 504 W, the limit is 500 W"),
         ),
     ],
 }
@@ -154,7 +154,7 @@ def test_a_stop_acts_in_the_next_cycle_and_comes_first() -> None:
     assert not safety.review(make_state(), make_command(), 0.0).damping
     safety.stop("SIGINT")
     assert safety.review(make_state(imu_quat=np.zeros(4)), make_command(), 1.0).damping
-    assert str(safety.fault) == "operator_stop at 1.000 s: asked for by SIGINT"
+    assert str(safety.fault) == "operator_stop at 1.000 s: requested by SIGINT"
 
 
 @pytest.mark.parametrize("name", COUNTED)
@@ -195,7 +195,7 @@ def test_lean_is_the_angle_to_the_vertical_whatever_the_heading() -> None:
         turned = np.array(
             [yaw[0] * w - yaw[3] * z, yaw[0] * x - yaw[3] * y, yaw[0] * y + yaw[3] * x, yaw[0] * z + yaw[3] * w]
         )
-        assert lean(turned) == pytest.approx(angle, abs=1e-7)
+        assert tilt_angle(turned) == pytest.approx(angle, abs=1e-7)
 
 
 # ---------------------------------------------------------------------- what is cut
@@ -506,7 +506,7 @@ def test_gains_that_nobody_knows_have_to_be_given() -> None:
     about = SimpleNamespace(kp=None, kd=None, nominal_stance=tuple(NOMINAL), policy_dt=0.02, **ports)
     bundle = cast(Bundle, SimpleNamespace(metadata=about, policy=FakePolicy()))
     arguments = (FakeLink(always), lambda t: np.zeros(3), Velocity(), make_safety())
-    with pytest.raises(ValueError, match="kp, kd: the bundle does not know any"):
+    with pytest.raises(ValueError, match="kp, kd: the bundle has none"):
         Controller(bundle, *arguments)
     assert Controller(bundle, *arguments, kp=KP, kd=KD).cycle(0.0)
 
@@ -555,7 +555,7 @@ def test_a_little_lateness_delays_the_next_cycle_and_no_more() -> None:
     starts, timing = played([1.0, 12.0, 1.0, 1.0])
     assert starts == [0.0, 10.0, 22.0, 30.0]
     assert (timing.missed, timing.left_out) == (1, 0)
-    assert timing.late_worst == pytest.approx(0.002)
+    assert timing.start_delay_worst == pytest.approx(0.002)
     assert timing.period_worst == pytest.approx(0.012)
     assert timing.missed_share == pytest.approx(1 / 4)
 
@@ -572,7 +572,7 @@ def test_a_late_sleeper_is_seen_in_the_periods() -> None:
     starts, timing = played([1.0] * 5, late=lambda sleep: 0.004 if sleep == 1 else 0.0)
     assert starts == [0.0, 14.0, 20.0, 30.0, 40.0]
     assert timing.period_worst == pytest.approx(0.014)
-    assert timing.late_worst == pytest.approx(0.004)
+    assert timing.start_delay_worst == pytest.approx(0.004)
     assert timing.missed == 0
 
 

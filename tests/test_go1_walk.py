@@ -27,9 +27,9 @@ from go1exp.deploy.export.build import build
 from go1exp.deploy.runtime import go1_check, job
 from go1exp.deploy.runtime import go1_wire as wire
 from go1exp.deploy.runtime.bundle import load
-from go1exp.deploy.runtime.commands import Wish
+from go1exp.deploy.runtime.commands import CommandConfig
 from go1exp.deploy.runtime.estimate import BOTH, TORQUE, KalmanEstimator, settings
-from go1exp.deploy.runtime.go1_check import Bounds, Heard, judged, listen
+from go1exp.deploy.runtime.go1_check import Bounds, Observed, evaluated, listen
 from go1exp.deploy.runtime.job import CheckJob, Job, run_check, run_job
 from go1exp.deploy.runtime.launch import RobotError
 from go1exp.deploy.runtime.udp import Go1Link
@@ -61,7 +61,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def play(file: str, out: Path, meddle: Callable[[World], None] = lambda world: None, **sim: Any) -> SimpleNamespace:
     """Walk for a second by the robot's packets; ``meddle`` is called when the simulated robot is there."""
-    plan = Plan(seconds=1.0, stand_up=0.2, lie_down=0.0, brake=0.1, wish=Wish((0.4, 0.0, 0.0)))
+    plan = Plan(seconds=1.0, stand_up=0.2, lie_down=0.0, brake=0.1, command=CommandConfig((0.4, 0.0, 0.0)))
     output: list[str] = []
     with lockstep(on_server=meddle) as world:
         status = run_job(Job(file, "sim", plan, str(out), sim=sim, truth=True), output.append)
@@ -178,7 +178,7 @@ def watched(walking: str, out: Path, monkeypatch: pytest.MonkeyPatch, feet: str 
         velocities.append(update(self, state))
         return velocities[-1]
 
-    plan = Plan(seconds=3.0, stand_up=0.3, lie_down=0.0, brake=0.05, wish=Wish((0.8, 0.0, 0.3)))
+    plan = Plan(seconds=3.0, stand_up=0.3, lie_down=0.0, brake=0.05, command=CommandConfig((0.8, 0.0, 0.3)))
     with monkeypatch.context() as patch, lockstep(on_server=worlds.append) as world:
         patch.setattr(KalmanEstimator, "update", listening)
         assert run_job(Job(walking, "sim", plan, str(out), sim=RAW, feet=feet), said.append) == 0, said
@@ -194,7 +194,7 @@ def test_raw_sensors_with_a_calibration_and_torques_tell_contact_better_than_tor
     """A fresh filter over the same states gives the walk's own velocities, and with another source larger errors."""
     path = of_sensors(5, tmp_path)
     done = watched(walking, tmp_path / "both", monkeypatch, path)
-    assert f"contact of the feet: by the joints' torques and by the sensors that {path} calibrates" in done.said
+    assert f"foot contact: from joint torques and the foot sensors, calibrated by {path}" in done.said
     assert min(state.foot_force.min() for state in done.states) > 60.0  # counts
     about = load(walking).metadata.estimator
 
@@ -216,7 +216,7 @@ def test_raw_sensors_without_a_calibration_leave_contact_to_the_torques(
     walking: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = watched(walking, tmp_path / "torques", monkeypatch, None)
-    assert any(line.startswith("contact of the feet: by the joints' torques alone; feet=FILE") for line in done.said)
+    assert any(line.startswith("foot contact: from joint torques alone; feet=FILE") for line in done.said)
     again = KalmanEstimator(settings(load(walking).metadata.estimator, **TORQUE), lambda *_: None)
     assert np.array([again.update(state) for state in done.states]).tobytes() == done.velocity.tobytes()
     assert not any(
@@ -228,7 +228,7 @@ def test_raw_sensors_without_a_calibration_leave_contact_to_the_torques(
 @pytest.mark.parametrize("sim", [{}, {"feet": "newton"}])
 def test_a_calibration_of_sensors_that_say_newtons_is_refused(file: str, tmp_path: Path, sim: dict[str, str]) -> None:
     job = Job(file, "sim", Plan(seconds=1.0), str(tmp_path / "out"), sim=sim, feet=of_sensors(0, tmp_path))
-    with pytest.raises(RobotError, match=r"feet\.json: calibrates sensors that count.*unless sim\.feet=raw"):
+    with pytest.raises(RobotError, match=r"feet\.json: calibrates sensors that report counts.*unless sim\.feet=raw"):
         run_job(job, print)
     assert not (tmp_path / "out").exists()
 
@@ -396,7 +396,7 @@ def test_a_check_asks_for_no_torque_and_calibrates_feet_from_lying_and_standing(
         assert set(heard) == {wire.IDLE}
         assert not made.robot.commanded
     learnt = [line for line in said if line.startswith("calibration")]
-    assert ["zeros are not known" in learnt[0], "zeros, from" in learnt[1], "scales, from" in learnt[2]] == [True] * 3
+    assert ["zeros are unknown" in learnt[0], "zeros, from" in learnt[1], "scales, from" in learnt[2]] == [True] * 3
     known = FootCalibration.read(feet)
     sensors = made.packets.feet
     np.testing.assert_allclose(known.zero, sensors.zero, atol=8.0)  # the calves of a lying robot rest on its feet
@@ -411,7 +411,7 @@ def test_a_walk_begins_only_after_the_check_has_passed(
     file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = Plan(seconds=0.2, stand_up=0.1, lie_down=0.0, brake=0.1, stale=5.0)
-    monkeypatch.setattr(go1_check.Heard, "tick_s", 0.001)  # measured by the clock, which here a busy machine disturbs
+    monkeypatch.setattr(go1_check.Observed, "tick_s", 0.001)  # by the clock, which a busy machine disturbs
     made = server(file, start="standing")
     made.packets.health = wire.Health(charge=7)
     there = f"127.0.0.1:{made.port}"
@@ -440,13 +440,13 @@ def test_nobody_there_is_said_in_a_line(tmp_path: Path, monkeypatch: pytest.Monk
     with speakers(1) as (silent,):
         address = "{}:{}".format(*silent.getsockname())
         assert run_check(CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", address), said.append) == 1
-    assert said[1].startswith("problem: no robot: 0 states in 0.1 s; nothing came")
+    assert said[1].startswith("problem: no robot: 0 states in 0.1 s; nothing arrived")
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(RobotError, match=r"address=here: must be HOST:PORT, such as 192\.168\.123\.10:8007"):
         run_check(CheckJob(robot.JOINTS, robot.JOINT_POS_LIMITS, tmp_path / "f", "here"), said.append)
 
 
-def heard_of(**changes: Any) -> Heard:
+def heard_of(**changes: Any) -> Observed:
     """What a good robot says for a second, with changes."""
     from go1exp.robot.messages import LowState
 
@@ -462,7 +462,7 @@ def heard_of(**changes: Any) -> Heard:
     health = changes.pop("health", wire.Health())
     period = changes.pop("period", 0.002)
     states = [LowState(period * k, **{**usual, **changes}) for k in range(500)]
-    return Heard(1.0, states, [(2 * k, 0.002 * k) for k in range(500)], health)
+    return Observed(1.0, states, [(2 * k, 0.002 * k) for k in range(500)], health)
 
 
 def at(k: int, value: float, rest: np.ndarray) -> np.ndarray:
@@ -475,20 +475,20 @@ def at(k: int, value: float, rest: np.ndarray) -> np.ndarray:
     ("changes", "problem"),
     [
         ({}, None),
-        ({"period": 0.005}, "packets: 200 a second; at least 400"),
+        ({"period": 0.005}, "packets: 200 per second; at least 400"),
         ({"health": wire.Health(charge=19)}, "battery: 19 %; at least 20 %"),
         ({"health": wire.Health(motor_temperature=(30,) * 5 + (66,) + (30,) * 6)}, "temperature: FL_calf has 66 °C"),
         ({"joint_pos": at(3, 1.0, robot.NOMINAL_STANCE)}, "joints: FL_hip is at 1.000 rad; its range is -0.863"),
         ({"joint_pos": at(3, np.nan, robot.NOMINAL_STANCE)}, "joints: FL_hip is at nan rad"),
         ({"joint_vel": at(2, 1.5, np.zeros(12))}, "joints: FR_calf moves at 1.50 rad/s"),
         ({"imu_quat": np.zeros(4)}, "attitude quaternion's length is 0.000"),
-        ({"imu_acc": np.array([0.0, 0.0, 5.0])}, "accelerometer says 5.00 m/s2"),
-        ({"imu_quat": np.array([np.cos(0.4), np.sin(0.4), 0, 0])}, "leans by 46 degrees"),
+        ({"imu_acc": np.array([0.0, 0.0, 5.0])}, "accelerometer reports 5.00 m/s2"),
+        ({"imu_quat": np.array([np.cos(0.4), np.sin(0.4), 0, 0])}, "tilt 46 deg"),
     ],
 )
 def test_each_finding_of_the_check_keeps_a_walk_from_beginning(changes: dict[str, Any], problem: str | None) -> None:
     link = Go1Link("127.0.0.1", 9)
-    report = judged(heard_of(**changes), link, robot.JOINTS, robot.JOINT_POS_LIMITS, go1(), Bounds())
+    report = evaluated(heard_of(**changes), link, robot.JOINTS, robot.JOINT_POS_LIMITS, go1(), Bounds())
     link.close()
     assert bool(report.problems) == (problem is not None), report.problems
     assert problem is None or any(problem in line for line in report.problems)
@@ -497,10 +497,10 @@ def test_each_finding_of_the_check_keeps_a_walk_from_beginning(changes: dict[str
 
 def test_the_ticks_unit_is_measured() -> None:
     for unit, per_packet in ((0.001, 2), (0.000001, 2000), (0.002, 1)):
-        heard = Heard(ticks=[(per_packet * k + 2**32 - 50, 0.002 * k + 0.0001 * (k % 3)) for k in range(300)])
+        heard = Observed(ticks=[(per_packet * k + 2**32 - 50, 0.002 * k + 0.0001 * (k % 3)) for k in range(300)])
         assert heard.tick_s == unit
-    assert np.isnan(Heard(ticks=[(7 * k, 0.002 * k) for k in range(300)]).tick_s)
-    assert np.isnan(Heard().tick_s)
+    assert np.isnan(Observed(ticks=[(7 * k, 0.002 * k) for k in range(300)]).tick_s)
+    assert np.isnan(Observed().tick_s)
 
 
 def test_a_calibration_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
@@ -525,7 +525,7 @@ def test_feet_are_not_calibrated_by_a_robot_that_neither_lies_nor_stands() -> No
     for forces in ([10.0] * 4, [60.0, 60.0, 5.0, 5.0]):
         after, learnt = calibrated(np.full(4, 130.0), np.array(forces), zeros)
         assert after is zeros
-        assert learnt.startswith("nothing: ")
+        assert learnt.startswith("unchanged: ")
     after, learnt = calibrated(np.array([90.0, 130, 130, 130]), np.full(4, 30.0), zeros)
     assert (after, "the counts of FR do not grow" in learnt) == (zeros, True)
     after, _ = calibrated(np.full(4, 130.0), np.full(4, 30.0), zeros)

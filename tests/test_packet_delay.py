@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from go1exp import robot
 from go1exp.deploy.estimation import Status, go1, make_filter, sample
 from go1exp.deploy.runtime.estimate import LONGEST_AHEAD, KalmanEstimator, acceleration
-from go1exp.deploy.runtime.job import summary_lines
 from go1exp.deploy.runtime.packet_delay import MOST_SLIP, WINDOW_S, PacketDelay, delays, slip, spread
+from go1exp.deploy.runtime.report import summary_lines
 from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import OVERTAKEN_S, LowState
 
@@ -50,12 +50,13 @@ def test_the_slip_of_the_robots_clock_is_told_apart_from_delays(share: float) ->
 
 
 @pytest.mark.parametrize(
-    ("share", "words"), [(0.14, "ran 14 % slow"), (-0.0021, "ran 0.21 % fast"), (5e-4, None), (None, None)]
+    ("share", "words"),
+    [(0.14, "at 0.8600x real time"), (-0.0021, "at 1.0021x real time"), (5e-4, None), (None, None)],
 )
 def test_delays_of_a_clock_that_slips_are_reported_with_a_note(share: float | None, words: str | None) -> None:
     times = {"p50": 0.1379, "p99": 0.282, "worst": 0.3}
     first, *notes = summary_lines({"packets": {"delay": times, "age": times, "clock_slip": share}})
-    assert first.startswith("packets, beyond the fastest way: delay p50 137.9")
+    assert first.startswith("packets, relative to the fastest: delay p50 137.9")
     assert len(notes) == (words is not None)
     assert words is None or words in notes[0]
 

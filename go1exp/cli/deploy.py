@@ -36,15 +36,15 @@ def _task(container: dict[str, Any]) -> int:
         rate, seconds = motion.rate, motion.seconds
 
     from go1exp.cli.logs import remove_empty, writable
-    from go1exp.deploy.runtime.commands import Wish
+    from go1exp.deploy.runtime.commands import CommandConfig
     from go1exp.deploy.runtime.job import Job, run_job
     from go1exp.deploy.runtime.launch import RefusedError
     from go1exp.deploy.runtime.walk import Plan
 
     existed = Path(settings.out).exists()
     writable(settings.out)
-    wish = Wish(settings.command, settings.sinusoid.amplitude, settings.sinusoid.period)
-    plan = subset(Plan, settings, wish=wish, rate=rate, seconds=seconds)
+    command = CommandConfig(settings.command, settings.sinusoid.amplitude, settings.sinusoid.period)
+    plan = subset(Plan, settings, command=command, rate=rate, seconds=seconds)
     sim = dataclasses.asdict(settings.sim)
     job = Job(
         settings.bundle,
@@ -87,7 +87,7 @@ def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled:
 
 
 def _check(settings: DeploySettings) -> int:
-    """Look at the robot."""
+    """Check the robot."""
     from go1exp import robot
     from go1exp.deploy.runtime.job import CheckJob, run_check
 
@@ -109,7 +109,7 @@ def _rate(settings: DeploySettings, controller: MpcSettings | None) -> float | N
 
 
 def _mover(controller: MpcSettings | None) -> Mover | None:
-    """Return what walks in place of the bundle's policy, if anything does."""
+    """Return what commands the robot in place of the bundle's policy, if anything does."""
     if controller is None:
         return None
     from go1exp.evaluate.controller.adapters import Deployed
@@ -119,13 +119,13 @@ def _mover(controller: MpcSettings | None) -> Mover | None:
 
 
 def _motion(settings: DeploySettings, controlled: bool) -> PlayedMotion | None:
-    """Return the motion of a hung robot, if one is asked for."""
+    """Return the motion of a suspended robot, if one is requested."""
     if settings.motion is None:
         if settings.gains is not None:
             raise ConfigError(["gains: are of motion; a policy walks with those that it was trained with"])
         return None
     if controlled:
-        raise ConfigError(["controller=mpc: walks; motion moves a robot that hangs. Leave out one of them"])
+        raise ConfigError(["controller=mpc: walks; motion moves a suspended robot. Leave out one of them"])
     if settings.robot == "sim" and settings.sim.start != "suspended":
         raise ConfigError([f"motion = {settings.motion!r}: is for a suspended robot; add sim.start=suspended"])
     from go1exp.logs.record.motions import played

@@ -33,8 +33,8 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("bundle", help="file that go1exp export wrote")
     parser.add_argument("--robot", default="sim", help="sim, go1, or the port where a simulated robot listens")
     parser.add_argument("--address", help="HOST:PORT of go1; 192.168.123.10:8007 if left out")
-    parser.add_argument("--check", action="store_true", help="with go1: look at the robot; no torque is ever asked for")
-    parser.add_argument("--feet", help="calibration of foot sensors that count, by --check (OUT/feet.json)")
+    parser.add_argument("--check", action="store_true", help="with go1: check the robot; no torque is commanded")
+    parser.add_argument("--feet", help="calibration of raw foot sensors, by --check (OUT/feet.json)")
     parser.add_argument("--rate", type=positive, help="Hz of policy and commands; that of training if left out")
     parser.add_argument("--seconds", type=positive, help="s under the policy; until it is stopped if left out")
     parser.add_argument(
@@ -52,9 +52,9 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
         help="s for lying down at the end of a walk; 0: brake at once",
     )
     parser.add_argument(
-        "--brake", type=not_negative, default=Plan.brake, help="s for which the drives brake at the end"
+        "--brake", type=not_negative, default=Plan.brake, help="s for which the motors brake at the end"
     )
-    parser.add_argument("--keep", type=positive, default=Plan.keep, help="newest seconds that the log has room for")
+    parser.add_argument("--keep", type=positive, default=Plan.keep, help="newest seconds that the log holds")
     parser.add_argument(
         "--stale", type=positive, default=Plan.stale, help="s without a state after which the robot is lost"
     )
@@ -64,18 +64,18 @@ def arguments(given: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--out", default="runs/deploy", help="folder of the logs")
     sim = parser.add_argument_group("with --robot sim")
     sim.add_argument("--start", choices=("standing", "lying", "suspended"), default="standing")
-    sim.add_argument("--noise", type=float, default=1.0, help="times that of the paper's Table II")
-    sim.add_argument("--delay", type=float, default=0.0, help="of datagrams, each way, s")
-    sim.add_argument("--jitter", type=float, default=0.0, help="largest further delay of each datagram, s")
-    sim.add_argument("--loss", type=float, default=0.0, help="share of datagrams that get lost, each way")
-    sim.add_argument("--foot-sensors", choices=("newton", "raw"), default="newton", help="raw: counts, as a robot's")
+    sim.add_argument("--noise", type=float, default=1.0, help="relative to the paper's Table II")
+    sim.add_argument("--delay", type=float, default=0.0, help="of packets, each way, s")
+    sim.add_argument("--jitter", type=float, default=0.0, help="largest additional delay of each packet, s")
+    sim.add_argument("--loss", type=float, default=0.0, help="share of packets that are lost, each way")
+    sim.add_argument("--foot-sensors", choices=("newton", "raw"), default="newton", help="raw: counts, as on a robot")
     sim.add_argument("--seed", type=int, default=0)
     sim.add_argument("--truth", action="store_true", help="also write the true motion into the recording")
     return parser.parse_args(given)
 
 
 def main(given: Sequence[str]) -> int:
-    """Walk as the command line says; return the exit status."""
+    """Walk by the command line; return the exit status."""
     try:
         with handled(interrupt):
             return _walk(arguments(given))
@@ -85,17 +85,17 @@ def main(given: Sequence[str]) -> int:
 
 
 def _walk(options: argparse.Namespace) -> int:
-    from go1exp.deploy.runtime.commands import Wish, parsed
+    from go1exp.deploy.runtime.commands import CommandConfig, parsed
     from go1exp.deploy.runtime.job import Job, run_job
     from go1exp.deploy.runtime.walk import Plan
 
     try:
         amplitude = tuple(float(part) for part in options.amplitude.split(","))
-        wish = Wish(parsed(options.command), amplitude, options.period)
+        command = CommandConfig(parsed(options.command), amplitude, options.period)
         plan = Plan(
             rate=options.rate,
             seconds=options.seconds,
-            wish=wish,
+            command=command,
             stand_up=options.stand_up,
             lie_down=options.lie_down,
             brake=options.brake,

@@ -1,4 +1,4 @@
-"""The feet's loads: counts of uncalibrated sensors to newtons, and the forces that balance the joints' torques."""
+"""Loads of the feet: calibration of raw sensors, and the forces that balance the joint torques."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from go1exp.deploy.estimation import FilterConfig, compiled_legs
 
 LEGS = 4
 SINGULAR = 1e-6
-"""Smallest determinant of a leg's Jacobian, m3/rad3: a straighter leg says nothing about the force along it."""
+"""Smallest determinant of a leg's Jacobian, m3/rad3: a straighter leg's torques do not give the force along it."""
 
 LIGHT, STANDING = 10.0, 60.0
-"""Sum of the feet's vertical forces by torques below which they carry nothing, and above which a Go1 stands, N
-(chosen: a Go1 weighs 125 N, and its drives' friction looks like up to 2 N a foot)."""
+"""Sum of the feet's vertical forces by torques below which they are unloaded, and above which a Go1 stands, N
+(chosen: a Go1 weighs 125 N, and joint friction adds up to 2 N a foot)."""
 
 
 class CalibrationError(Expected):
-    """A calibration cannot be read or made; the message says why."""
+    """A calibration cannot be read or made."""
 
 
 @dataclass(frozen=True)
 class FootCalibration:
-    """What four foot sensors say without load, and how much more for each newton.
+    """Zeros and scales of four foot sensors.
 
     Attributes:
         zero: (4,) counts without load.
@@ -71,18 +71,17 @@ class FootCalibration:
                 raise ValueError(f"scale = {scale}: must be greater than 0")
             return cls(tuple(map(float, zero)), tuple(map(float, scale)) if scale else None)  # type: ignore[arg-type]
         except (ValueError, KeyError, TypeError) as error:
-            raise CalibrationError(f"{path}: is no calibration of the feet: {error}") from None
+            raise CalibrationError(f"{path}: is no calibration of foot sensors: {error}") from None
 
 
 class LoadByBoth:
-    """The feet's loads from calibrated sensors and from the joints' torques together: their mean.
+    """Loads of the feet: the mean of calibrated sensors and joint torques.
 
-    The torques have the inertia of the swinging leg in them, the sensors an error of their calibration; each alone
-    finds contact in a foot that swings, or loses a loaded one, at other times than the other.
+    The torques contain the inertia of a swinging leg, the sensors an error of calibration: their errors differ in time.
     """
 
     def __init__(self, config: FilterConfig, calibration: FootCalibration) -> None:
-        """Take the legs and the calibration.
+        """Use the legs of ``config`` and a calibration.
 
         Raises:
             CalibrationError: if the calibration has no scales.
@@ -111,7 +110,7 @@ def forces_by_torque(
 ) -> np.ndarray:
     """Return the vertical forces (4,), N, by which the ground balances the joints' torques: tau + J' f = 0.
 
-    Of a leg whose readings are not finite it is NaN, of a straight leg 0.
+    NaN for a leg with readings that are not finite, 0 for a straight leg.
 
     Args:
         q: (12,) joint angles, rad.
@@ -145,27 +144,27 @@ def kinematics(config: FilterConfig) -> list[Callable[[np.ndarray], Kinematics]]
 def calibrated(
     counts: np.ndarray, by_torque: np.ndarray, before: FootCalibration | None = None
 ) -> tuple[FootCalibration | None, str]:
-    """Return the calibration after a robot at rest was looked at, and what was learnt in words.
+    """Return the calibration updated by a robot at rest, and a description of the update.
 
-    A robot whose feet carry nothing (lying, or hung) gives zeros, a standing one scales.
+    A robot with unloaded feet (lying or suspended) gives zeros, a standing one scales.
 
     Args:
         counts: (4,) mean counts of the sensors.
         by_torque: (4,) mean vertical forces that balance the torques, N.
-        before: what is known already.
+        before: the present calibration.
     """
     total = float(by_torque.sum())
     if abs(total) < LIGHT:
         scale = None if before is None else before.scale
-        return FootCalibration(tuple(map(float, counts)), scale), "zeros, from a robot that lies or hangs"  # type: ignore[arg-type]
+        return FootCalibration(tuple(map(float, counts)), scale), "zeros, from a lying or suspended robot"  # type: ignore[arg-type]
     if total < STANDING or by_torque.min() < 0.3 * total / LEGS:
-        return before, f"nothing: the feet carry {total:.0f} N by the torques, which is neither lying nor standing"
+        return before, f"unchanged: the feet carry {total:.0f} N by the torques, which is neither lying nor standing"
     if before is None:
-        return None, "nothing: it stands, but the zeros are not known; check=true while it lies or hangs comes first"
+        return None, "unchanged: zeros are unknown; run check=true first while the robot lies or is suspended"
     scale = (counts - before.zero) / by_torque
     if scale.min() <= 0.0:
-        return before, f"nothing: the counts of {legs_below(scale)} do not grow under load"
-    return FootCalibration(before.zero, tuple(map(float, scale))), "scales, from a robot that stands"  # type: ignore[arg-type]
+        return before, f"unchanged: the counts of {legs_below(scale)} do not grow under load"
+    return FootCalibration(before.zero, tuple(map(float, scale))), "scales, from a standing robot"  # type: ignore[arg-type]
 
 
 def legs_below(values: np.ndarray) -> str:

@@ -1,7 +1,7 @@
-"""Sources of commanded velocities: numbers, a file, a sine, keys, a gamepad; all within the bundle's ranges.
+"""Command sources: numbers, a file, a sine, keys, a gamepad; all limited to the bundle's ranges.
 
 A source is called with the time since walking began, s, and returns the velocity (3,): x and y in m/s, yaw in rad/s,
-in the trunk's frame. ``poll`` is called in every cycle, also before walking; ``close`` releases what was taken.
+in the trunk's frame. ``poll`` is called in every cycle, also before walking; ``close`` releases its devices.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -26,31 +26,18 @@ AXES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """Names of the ranges in a bundle's metadata, in the order of a command."""
 
 Stop = Callable[[str], None]
-"""``Safety.stop``: called with the name of who asks for the end."""
+"""``Safety.stop``: called with the origin of the request."""
 
 
 class CommandError(Expected):
-    """A source of commands is not available; the message says why and what would help."""
-
-
-class Source(Protocol):
-    """Gives commanded velocities."""
-
-    def __call__(self, t: float) -> np.ndarray:
-        """Return the velocity (3,) at ``t`` s since walking began."""
-
-    def poll(self) -> None:
-        """Read keys, sticks and buttons without waiting."""
-
-    def close(self) -> None:
-        """Release the terminal or the gamepad."""
+    """A command source is not available; the message gives the reason and an alternative."""
 
 
 class Constant:
-    """One constant velocity."""
+    """A constant velocity; base of the other sources."""
 
     def __init__(self, velocity: Sequence[float]) -> None:
-        """Keep the velocity (3,).
+        """Command the velocity (3,).
 
         Raises:
             CommandError: if it is not three finite numbers.
@@ -64,10 +51,10 @@ class Constant:
         return self._velocity
 
     def poll(self) -> None:
-        """Nothing."""
+        """Read keys, sticks and buttons without waiting."""
 
     def close(self) -> None:
-        """Nothing."""
+        """Release the terminal or the gamepad."""
 
 
 class Table(Constant):
@@ -102,7 +89,7 @@ class Table(Constant):
         self._times, self._rows = table[:, 0], table[:, 1:]
 
     def __call__(self, t: float) -> np.ndarray:
-        """Return the row in force."""
+        """Return the latest row."""
         k = int(np.searchsorted(self._times, t + 1e-9)) - 1  # 1e-9: rounding of t must not miss a row's time
         return self._rows[k] if k >= 0 else self._velocity
 
@@ -111,7 +98,7 @@ class Sinusoid(Constant):
     """Sines of one period for all three velocities, as in the paper's velocity experiment."""
 
     def __init__(self, amplitude: Sequence[float], period: float) -> None:
-        """Keep amplitudes (3,), m/s, m/s and rad/s, and the period, s.
+        """Set amplitudes (3,), m/s, m/s and rad/s, and the period, s.
 
         Raises:
             CommandError: if they are not finite numbers, or the period is not positive.
@@ -136,8 +123,8 @@ STEPS = {
 }
 """Key -> change of the velocity: m/s, m/s, rad/s. Arrow keys arrive as three characters."""
 
-ENDS = {"\x1b": "the Esc key", "q": "the q key", "Q": "the q key"}
-"""Keys that end the walk. Q is one of them: in many games it turns, but in a terminal it means the end."""
+ENDS = {"\x1b": "key Esc", "q": "key q", "Q": "key q"}
+"""Keys that end the walk."""
 
 KEYS = "W S or up down: forward, back; A D: left, right; left right: turn; space: zero; Esc or q: end (twice: brake)"
 
@@ -175,7 +162,7 @@ class Keyboard(Constant):
         while self._open and select.select([self._keys], [], [], 0)[0]:
             data = os.read(self._keys, 64)
             if not data:
-                self._stop("the end of the terminal")
+                self._stop("end of the terminal")
                 return
             for key in split_keys(data.decode(errors="replace")):
                 self._press(key)
@@ -199,7 +186,7 @@ class Keyboard(Constant):
 
 
 def split_keys(text: str) -> list[str]:
-    """Split the characters that a terminal sent into keys: an arrow is three characters, Esc alone is one."""
+    """Split the characters of a terminal into keys: an arrow is three characters, Esc alone is one."""
     keys, place = [], 0
     while place < len(text):
         size = 3 if text[place] == "\x1b" and text[place + 1 : place + 2] in ("[", "O") else 1
@@ -241,9 +228,9 @@ class Gamepad(Constant):
         """Read sticks and buttons."""
         for event in self._pygame.event.get():
             if event.type == self._pygame.JOYDEVICEREMOVED:
-                self._stop("the gamepad, which is gone")
+                self._stop("loss of the gamepad")
         if self._pad.get_button(0) or self._pad.get_button(1):
-            self._stop("a button of the gamepad")
+            self._stop("gamepad button")
         last = self._pad.get_numaxes() - 1
         # Sticks count right and back as positive, commands left and forward: hence the sign.
         sticks = -np.array([self._pad.get_axis(min(axis, last)) for axis in (1, 0, 3)])
@@ -264,20 +251,20 @@ class Limited:
     """A source whose commands are limited to ranges.
 
     Attributes:
-        cut: cycles in which each axis was cut, (3,).
+        cut: number of cycles in which each axis was limited, (3,).
     """
 
-    def __init__(self, source: Source, ranges: np.ndarray) -> None:
-        """Keep the commands of ``source`` within ``ranges`` (3, 2)."""
+    def __init__(self, source: Constant, ranges: np.ndarray) -> None:
+        """Limit the commands of ``source`` to ``ranges`` (3, 2)."""
         self._source, self._ranges = source, ranges
         self.cut = np.zeros(3, dtype=np.int64)
 
     def __call__(self, t: float) -> np.ndarray:
-        """Return the command, cut to the ranges; NaN stays NaN, which the controller treats as a fault."""
-        asked = self._source(t)
-        given = np.clip(asked, self._ranges[:, 0], self._ranges[:, 1])
-        self.cut += asked != given
-        return given
+        """Return the limited command; NaN stays NaN, which the controller treats as a fault."""
+        command = self._source(t)
+        limited = np.clip(command, self._ranges[:, 0], self._ranges[:, 1])
+        self.cut += command != limited
+        return limited
 
     def poll(self) -> None:
         """Poll the source."""
@@ -291,46 +278,45 @@ class Limited:
 def range_array(given: Mapping[str, tuple[float, float]]) -> np.ndarray:
     """Return lowest and highest command (3, 2) of a bundle's metadata.
 
-    An axis without a range in the bundle is not limited, because the trained range is not known.
+    An axis without a range in the bundle is not limited.
     """
     return np.array([given.get(name, (-math.inf, math.inf)) for name in AXES], dtype=float)
 
 
 @dataclass(frozen=True)
-class Wish:
-    """The wanted source: three numbers, a file, ``sinusoid``, ``keyboard`` or ``gamepad``; and the sine's values."""
+class CommandConfig:
+    """A command source: three numbers, a file, ``sinusoid``, ``keyboard`` or ``gamepad``; and the sine's values."""
 
-    command: tuple[float, ...] | str
+    source: tuple[float, ...] | str
     amplitude: tuple[float, ...] = (1.0, 0.3, 0.8)
     period: float = 10.0
 
 
-def make(wish: Wish, ranges: np.ndarray, stop: Stop, end: Stop | None = None) -> Limited:
-    """Return the wanted source, limited to ``ranges`` (3, 2).
+def make(config: CommandConfig, ranges: np.ndarray, stop: Stop, end: Stop | None = None) -> Limited:
+    """Return a command source, limited to ``ranges`` (3, 2).
 
-    ``stop`` is called if the drives must brake at once, ``end`` (if given) if an orderly end is asked for; both with
-    the name of what asked.
+    ``stop`` is called to brake at once, ``end`` (if given) for an orderly end; both with the origin of the request.
 
     Raises:
         CommandError: if the source is not available.
         OSError: if its file cannot be read.
     """
-    source: Source
-    if not isinstance(wish.command, str):
-        source = Constant(wish.command)
-    elif wish.command == "sinusoid":
-        source = Sinusoid(wish.amplitude, wish.period)
-    elif wish.command == "keyboard":
+    source: Constant
+    if not isinstance(config.source, str):
+        source = Constant(config.source)
+    elif config.source == "sinusoid":
+        source = Sinusoid(config.amplitude, config.period)
+    elif config.source == "keyboard":
         source = Keyboard(stop, lambda velocity: np.clip(velocity, ranges[:, 0], ranges[:, 1]), end=end)
-    elif wish.command == "gamepad":
+    elif config.source == "gamepad":
         # A stick needs an end of the range; an axis without one gets 1 m/s or 1 rad/s.
         finite = np.where(np.isfinite(ranges), ranges, np.sign(ranges))
         source = Gamepad(stop, finite)
-    elif Path(wish.command).suffix == ".csv":
-        source = Table(Path(wish.command))
+    elif Path(config.source).suffix == ".csv":
+        source = Table(Path(config.source))
     else:
         raise CommandError(
-            f"command {wish.command!r}: must be three numbers such as [0.5,0.0,0.0], a file.csv, "
+            f"command {config.source!r}: must be three numbers such as [0.5,0.0,0.0], a file.csv, "
             "sinusoid, keyboard or gamepad"
         )
     return Limited(source, ranges)

@@ -1,7 +1,4 @@
-"""One cycle of the runtime: newest state, estimate, policy, safety, command.
-
-The controller does not know which robot the link leads to, where commands come from, or how velocity is estimated.
-"""
+"""One cycle of the runtime: newest state, estimate, policy, safety, command."""
 
 from __future__ import annotations
 
@@ -23,21 +20,21 @@ PHASES = ("waiting", "standing_up", "walking", "lying_down", "damping")
 the end."""
 
 LYING = (0.0, 1.3, -2.65)
-"""Hip, thigh and calf angle of every leg of a Go1 that lies on its belly, rad."""
+"""Hip, thigh and calf angle of every leg of a lying Go1, rad."""
 
 HALTED, STOOD = 0.4, 0.6
-"""Shares of the time for lying down. Until the first, a walking policy is commanded to stand still; at the second, the
-robot has reached the nominal stance. Directly from a gait it would tip over (chosen on a shipped policy)."""
+"""Shares of the time for lying down: end of standing still under a policy that walked, and of the motion to the nominal
+stance (chosen on a shipped policy, which tips over without them)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stages:
-    """How long the stages of a walk take, for every command line that starts one.
+    """Durations of the stages of a walk.
 
     Attributes:
         stand_up: time from the first pose to the nominal stance, s.
-        lie_down: time that the robot is given to lie down when a walk ends in order, s; 0: the drives brake at once.
-        brake: time for which the drives brake at the end, before ``cycle`` returns False, s.
+        lie_down: time for lying down at an orderly end, s; 0: the motors brake at once.
+        brake: time for which the motors brake at the end, s.
         patience: time to wait for the robot's first state, s.
 
     Raises:
@@ -70,7 +67,7 @@ class Estimator(Protocol):
 
 
 class Mover(Protocol):
-    """What walks the robot in place of the bundle's policy."""
+    """Commands the robot in place of the bundle's policy."""
 
     def step(self, velocity: np.ndarray, state: LowState, base_lin_vel: np.ndarray) -> LowCmd:
         """Return the command of a cycle.
@@ -88,19 +85,19 @@ CommandSource = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Cycle:
-    """Everything about one cycle, for the log.
+    """Data of one cycle, for the log.
 
     Attributes:
         t: the runtime's clock, s.
         phase: one of ``PHASES``.
         state: the newest state; None before the first.
         command: the command that was sent; None if none was.
-        velocity: (3,) the commanded velocity as the policy saw it.
+        velocity: (3,) the commanded velocity that the policy observed.
         base_lin_vel: (3,) the estimate; NaN before the first.
         observation: (O,) input of the network; None unless walking.
         fresh: the states received since the last cycle, in the order of arrival.
-        sent_at: when the command left, s of the runtime's clock; NaN if none did.
-        age: time since the newest state was measured, less the fastest way, s; NaN if the robot tells no clock.
+        sent_at: time at which the command was sent, s of the runtime's clock; NaN if none was.
+        age: age of the newest state, less the latency of the fastest packet, s; NaN if the robot reports no clock.
     """
 
     t: float
@@ -121,7 +118,7 @@ class Controller:
     Attributes:
         phase: one of ``PHASES``.
         safety: checks every command before it is sent.
-        finished: whether the walk came to its orderly end; a fault of the braking robot after that does not count.
+        finished: whether the walk reached its orderly end; a fault while braking after that does not count.
     """
 
     def __init__(
@@ -148,11 +145,11 @@ class Controller:
             estimator: gets every new state.
             safety: has the robot's limits.
             rate: cycles per second, Hz; that of training if None.
-            stages: how long they take.
+            stages: their durations.
             kp: (J,) N m/rad; those of the bundle if None.
             kd: (J,) N m s/rad.
             on_cycle: called after every cycle.
-            mover: walks in place of the bundle's policy, once every cycle.
+            mover: commands the robot in place of the policy.
 
         Raises:
             ValueError: if neither the bundle nor the caller gives gains.
@@ -160,7 +157,7 @@ class Controller:
         about = bundle.metadata
         gains = (about.kp if kp is None else kp), (about.kd if kd is None else kd)
         if gains[0] is None or gains[1] is None:
-            raise ValueError("kp, kd: the bundle does not know any; they have to be given")
+            raise ValueError("kp, kd: the bundle has none; they must be given")
         self._policy, self._link, self._commands = bundle.policy, link, commands
         self._estimator, self.safety, self._on_cycle = estimator, safety, on_cycle
         self._kp, self._kd = (np.asarray(values, dtype=float) for values in gains)
@@ -173,7 +170,7 @@ class Controller:
         self._memory = PolicyMemory(about, about.policy_dt if rate is None else 1.0 / rate)
         self._target = self._nominal.copy()
         self._state: LowState | None = None
-        self._way, self._age = PacketDelay(), math.nan
+        self._delay, self._age = PacketDelay(), math.nan
         self._early: list[LowState] = []  # received before their cycle; of these so many are in the estimate
         self._estimated, self._failed_early = 0, cast("Exception | None", None)
         self._origin, self._halting = self._nominal, False
@@ -185,40 +182,40 @@ class Controller:
     def cycle(self, now: float) -> bool:
         """Run one cycle; return whether there should be another. ``now`` is the clock's time, s.
 
-        If anything fails in it, the drives are commanded to brake; only the link and ``on_cycle`` can raise.
+        On any error the motors are commanded to brake; only the link and ``on_cycle`` can raise.
         """
         self._begin = now if self._begin is None else self._begin
         fresh, estimated = [*self._early, *self._link.receive()], self._estimated
         self._early, self._estimated = [], 0
         for each in fresh:
-            self._way.note(each.t, each.clock)
+            self._delay.note(each.t, each.clock)
             # `not <`: the clock may be NaN
             self._state = each if self._state is None or not each.clock < self._state.clock else self._state
         if self._state is not None:
-            self._age = self._way.age(now, self._state.clock)
+            self._age = self._delay.age(now, self._state.clock)
         elif now - self._begin > self._stages.patience:
-            self.safety.fail("no_state", f"the robot has not said anything for {self._stages.patience:g} s", now)
+            self.safety.fail("no_state", f"no state from the robot for {self._stages.patience:g} s", now)
         self._observation = None
         try:
             wanted = self._wanted(now, fresh[estimated:])
-        except Exception as error:  # without a new command the robot would go on with its last one
+        except Exception as error:  # without a new command the robot would keep its last one
             self.safety.fail("runtime", f"{type(error).__name__}: {error}", now)
             wanted = None
         sent = self.safety.review(self._state, wanted, now)
         if self.safety.fault is not None and self.phase != "damping":  # also while lying down
             self.phase, self._since = "damping", now
-        heard = self._state is not None or self.phase == "damping"
-        if heard:
+        commanding = self._state is not None or self.phase == "damping"
+        if commanding:
             self._target = sent.joint_target
             self._link.send(sent)
-        command = sent if heard else None
-        sent_at = self._link.sent_at if heard else math.nan
+        command = sent if commanding else None
+        sent_at = self._link.sent_at if commanding else math.nan
         about = (self._velocity, self._base, self._observation, fresh, sent_at, self._age)
         self._on_cycle(Cycle(now, self.phase, self._state, command, *about))
         return self.phase != "damping" or now - self._since < self._stages.brake
 
     def finish(self, now: float) -> None:
-        """End the walk without a fault: from the next cycle on the robot lies down, then the drives brake."""
+        """End the walk without a fault: from the next cycle on the robot lies down, then the motors brake."""
         if self.phase in ("lying_down", "damping"):
             return
         if self._stages.lie_down > 0 and self.phase != "waiting":
@@ -228,7 +225,7 @@ class Controller:
             self.phase, self._since, self.finished = "damping", now, True
 
     def prepare(self) -> None:
-        """Take the states that have come by now, so that the next cycle has less to do; what fails, fails there."""
+        """Process the states that have arrived, so that the next cycle has less to do; errors are raised there."""
         try:
             for state in self._link.receive():
                 self._early.append(state)
@@ -246,11 +243,11 @@ class Controller:
             self._link.rehearse(command)
 
     def walked(self, now: float) -> float:
-        """Return the time since walking began, s; 0 unless the robot walks now."""
+        """Return the time since walking began, s; 0 in other phases."""
         return now - self._since if self.phase == "walking" else 0.0
 
     def _wanted(self, now: float, unestimated: Sequence[LowState]) -> LowCmd | None:
-        """Return the command of the present phase; None if it has none. ``unestimated``: states to estimate from."""
+        """Return the command of the present phase; None to brake. ``unestimated``: states for the estimator."""
         state = self._state
         if state is None or self.phase == "damping":
             return None
@@ -272,7 +269,7 @@ class Controller:
         return self._walk(state, now)
 
     def _lie(self, state: LowState, now: float) -> LowCmd | None:
-        """Stand still under the policy if it walked, move to the nominal stance, lie down; None when that is done."""
+        """Stand still under the policy if it walked, move to the nominal stance, lie down; None at the end."""
         share = (now - self._since) / self._stages.lie_down
         if share < HALTED and self._halting:
             self._origin = self._target
@@ -288,8 +285,8 @@ class Controller:
 
     def _walk(self, state: LowState, now: float) -> LowCmd | None:
         """Return the policy's command; None, and a fault, if the estimate or the commanded velocity is not finite."""
-        asked = self._commands(now - self._since) if self.phase == "walking" else np.zeros(3)
-        self._velocity = np.asarray(asked, dtype=float)
+        command = self._commands(now - self._since) if self.phase == "walking" else np.zeros(3)
+        self._velocity = np.asarray(command, dtype=float)
         given: dict[str, Any] = {
             "joint_pos": state.joint_pos,
             "joint_vel": state.joint_vel,

@@ -85,10 +85,10 @@ class About:
         simulated: not measured on hardware.
         newton: the feet's readings are in newtons; if not, they are left out of the recording.
         episode: the recording's name.
-        excitation: what moved the robot.
-        hung: whether its trunk was held in the air; the mean of what the IMU says is its attitude then.
-        notes: anything else that a reader must know.
-        trained: the configuration of the policy's run, which says the contact of its feet.
+        excitation: name of the motion.
+        suspended: whether its trunk was held in the air; the mean attitude of the IMU is recorded then.
+        notes: for the reader.
+        trained: the configuration of the policy's run, with the contact of its feet.
     """
 
     metadata: Metadata
@@ -98,7 +98,7 @@ class About:
     newton: bool
     episode: str
     excitation: str = "policy"
-    hung: bool = False
+    suspended: bool = False
     notes: str = ""
     trained: Mapping[str, Any] = field(default_factory=dict)
 
@@ -197,7 +197,7 @@ class Log:
     def measured(self, name: str) -> np.ndarray:
         """Return a part of the states that are kept, (T, ...), in the order in which they were measured.
 
-        A state that others overtook on the way arrived, as far as commands go, no later than those.
+        An overtaken state counts as having arrived with the first of those that overtook it.
         """
         rows = self.states.rows()
         clock = self.states.part_of(rows, "clock")
@@ -239,8 +239,8 @@ def _meta(about: About, channels: Mapping[str, np.ndarray], notes: str) -> Meta:
         robot=about.metadata.robot,
         joints=about.metadata.joints,
         rate_hz=float(np.round(1.0 / np.median(np.diff(channels["t"])), 3)),
-        base="fixed" if about.hung else "floating",
-        base_quat=_attitude(np.stack([channels[name] for name in VECTORS["imu_quat"]])) if about.hung else None,
+        base="fixed" if about.suspended else "floating",
+        base_quat=_attitude(np.stack([channels[name] for name in VECTORS["imu_quat"]])) if about.suspended else None,
         kp=tuple(map(float, about.kp)),
         kd=tuple(map(float, about.kd)),
         tau_limit=about.metadata.torque_limit,

@@ -92,7 +92,7 @@ class Timing:
         work_p50: time that a cycle's work took, median, s.
         work_p99: s.
         work_worst: s.
-        late_worst: latest start after the time that was due, s.
+        start_delay_worst: largest delay of a start after its due time, s.
         missed: missed deadlines: cycles that were not done when the next was due, and cycles that were left out.
         left_out: cycles that never ran.
     """
@@ -104,7 +104,7 @@ class Timing:
     work_p50: float
     work_p99: float
     work_worst: float
-    late_worst: float
+    start_delay_worst: float
     missed: int
     left_out: int
 
@@ -132,7 +132,7 @@ class Deadlines:
         self._periods, self._work = np.zeros(kept), np.zeros(kept)
         self.cycles = self.missed = self.left_out = 0
         self._last_start = np.nan
-        self._period_worst = self._work_worst = self._late_worst = 0.0
+        self._period_worst = self._work_worst = self._start_delay_worst = 0.0
 
     def note(self, due: float, start: float, end: float, left_out: int) -> None:
         """Count a cycle.
@@ -146,7 +146,7 @@ class Deadlines:
         place = self.cycles % len(self._work)
         self._work[place] = end - start
         self._work_worst = max(self._work_worst, end - start)
-        self._late_worst = max(self._late_worst, start - due)
+        self._start_delay_worst = max(self._start_delay_worst, start - due)
         if self.cycles:
             since = start - self._last_start
             self._periods[(self.cycles - 1) % len(self._periods)] = since
@@ -170,7 +170,7 @@ class Deadlines:
             work_p50=float(w50),
             work_p99=float(w99),
             work_worst=self._work_worst,
-            late_worst=self._late_worst,
+            start_delay_worst=self._start_delay_worst,
             missed=self.missed,
             left_out=self.left_out,
         )

@@ -1,7 +1,7 @@
-"""How much later than the fastest a robot's packets come, by its own clock.
+"""Delays of a robot's packets relative to the fastest one, by the robot's clock.
 
-The two clocks have different origins and a Go1 answers to no packet by name, so the time that the fastest packet takes
-is not known. What another one takes beyond it is: arrival less the robot's clock, less the smallest such difference.
+The two clocks have different origins, so the latency of the fastest packet is unknown. The delay of another one
+relative to it is: arrival less the robot's clock, less the smallest such difference.
 """
 
 from __future__ import annotations
@@ -13,31 +13,31 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 WINDOW_S = 1.0
-"""Time in which the fastest packet is looked for, s: 500 packets, and clocks that are 100 ppm apart move by 0.1 ms."""
+"""Window of the fastest packet, s: 500 packets, and clocks that differ by 100 ppm drift by 0.1 ms."""
 
 
 MOST_SLIP = 1e-3
-"""Share by which clocks may differ before delays are not told alone: within ``WINDOW_S`` that makes 1 ms of delay."""
+"""Relative difference of the clocks from which it is reported: 1 ms of delay within ``WINDOW_S``."""
 
 SHORTEST_S = 2.0
-"""Time over which clocks are compared at least, s: those that tick in ms make an error of 1 ms in half of it."""
+"""Shortest time over which clocks are compared, s: the tick's resolution is 1 ms."""
 
 FEWEST = 8
-"""Packets that this takes at least."""
+"""Smallest number of packets for that."""
 
 
 class PacketDelay:
-    """Delays of packets beyond the fastest of the last ``WINDOW_S``."""
+    """Delays of packets relative to the fastest of the last ``WINDOW_S``."""
 
     def __init__(self) -> None:
-        """Begin without any packet."""
+        """Start without any packet."""
         # Arrival and offset. Offsets increase, so that the first is the least.
         self._least: deque[tuple[float, float]] = deque()
 
     def note(self, arrived: float, clock: float) -> float:
-        """Take a packet that ``arrived`` by our clock, s, measured at ``clock`` by the robot's; return its delay, s.
+        """Add a packet that ``arrived`` by our clock, s, measured at ``clock`` by the robot's; return its delay, s.
 
-        Packets come in the order of arrival. NaN if the robot tells no clock.
+        Packets are given in the order of arrival. NaN if the robot reports no clock.
         """
         if math.isnan(clock):
             return math.nan
@@ -50,24 +50,24 @@ class PacketDelay:
         return offset - least[0][1]
 
     def age(self, now: float, clock: float) -> float:
-        """Return how long ago by our clock, at ``now``, the robot's was ``clock``, less the fastest way, s.
+        """Return the age at ``now`` of a state measured at ``clock``, less the latency of the fastest packet, s.
 
-        NaN if the robot tells no clock, or before the first packet.
+        NaN if the robot reports no clock, or before the first packet.
         """
         return now - clock - self._least[0][1] if self._least else math.nan
 
 
 def delays(arrived: Iterable[float], clock: Iterable[float]) -> np.ndarray:
     """Return the delays (T,), s, of packets in the order of arrival; arguments as those of ``PacketDelay.note``."""
-    way = PacketDelay()
-    return np.array([way.note(float(t), float(c)) for t, c in zip(arrived, clock, strict=True)])
+    packets = PacketDelay()
+    return np.array([packets.note(float(t), float(c)) for t, c in zip(arrived, clock, strict=True)])
 
 
 def slip(arrived: np.ndarray, clock: np.ndarray) -> float | None:
-    """Return by what share of our time the robot's clock, both (T,), s, runs slow, negative if it runs fast.
+    """Return the relative rate error of the robot's clock, both (T,), s: positive if it runs slow.
 
-    By the fastest packets of the first and of the last quarter, so that a delay that varies is no slip. None without a
-    clock, and over less than ``SHORTEST_S``, where its resolution would count.
+    Computed from the fastest packets of the first and of the last quarter, so that variable delays do not count. None
+    without a clock, or over less than ``SHORTEST_S``.
     """
     known = np.isfinite(clock)
     arrived, offset = arrived[known], (arrived - clock)[known]

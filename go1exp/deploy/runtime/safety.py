@@ -1,8 +1,8 @@
 """All safety of the runtime, in one module.
 
-Targets are limited to what the drives can do (``Safety.limited``). A fault by any of ``RULES`` ends the walk: from then
-on the drives only brake, whatever is commanded, until a person starts again. A rule is a method that returns a message,
-or None; its name is that of the fault in the log.
+Targets are limited by torque and range (``Safety.limited``). A fault by any of ``RULES`` ends the walk: from then on
+the motors only brake, whatever is commanded, until a person starts again. A rule is a method that returns a message or
+None; its name is that of the fault in the log.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 from go1exp.robot.messages import LowCmd, LowState
 
 SDK_RANGE = {"hip": (-1.047, 1.047), "thigh": (-0.663, 2.966), "calf": (-2.721, -0.837)}
-"""Targets that the vendor's SDK lets through, rad (``go1_const.h``, used by its Safety.PositionLimit)."""
+"""Targets that the vendor's SDK accepts, rad (``go1_const.h``, used by its Safety.PositionLimit)."""
 
 DEFAULT_KD = 2.0
-"""Braking gain, N m s/rad (chosen): a Go1 sinks in about a second, and its drives are far from chattering."""
+"""Braking gain, N m s/rad (chosen): a Go1 sinks in about a second, without chattering."""
 
 
-READ = ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
-ASKED = ("joint_target", "kp", "kd", "feedforward")
+READINGS = ("joint_pos", "joint_vel", "joint_torque", "imu_quat", "imu_gyro", "imu_acc")
+COMMANDED = ("joint_target", "kp", "kd", "feedforward")
 """Parts of a state and of a command that must be finite."""
 
 
@@ -35,11 +35,11 @@ class SafetyConfig:
         tilt: largest angle between the trunk's z axis and the vertical, rad (chosen: beyond any gait of training).
         stale: largest age of the newest state, s (15 messages of the SDK).
         beyond_stop: largest measured angle beyond a stop, rad (the SDK's PositionProtect: 5 degrees).
-        power: sum of |torque x speed| over the joints, W (the SDK's PowerProtect at level 5 of 10).
-        torque_margin: reported torque over the joint's limit, as a factor (the report is an estimate).
+        power: sum of |torque x velocity| over the joints, W (the SDK's PowerProtect at level 5 of 10).
+        torque_margin: largest reported torque / limit (the report is an estimate).
         count: cycles over the limit, minus cycles under it, that make a torque or power fault (the SDK: 6 of 2 ms).
         quat_error: largest difference of the attitude quaternion's length from 1.
-        damping_kd: gain with which the drives brake, N m s/rad.
+        damping_kd: braking gain, N m s/rad.
     """
 
     tilt: float = 1.0
@@ -54,7 +54,7 @@ class SafetyConfig:
 
 @dataclass(frozen=True)
 class Fault:
-    """Why the walk ended: name of the rule, time (s, the runtime's clock), and message."""
+    """Reason for the end of a walk: name of the rule, time (s, the runtime's clock), and message."""
 
     name: str
     t: float
@@ -66,13 +66,13 @@ class Fault:
 
 
 class _Counter:
-    """Counts up while a limit is broken and down while it is not, as the SDK's PowerProtect does."""
+    """Counts up while a limit is exceeded and down otherwise, as the SDK's PowerProtect."""
 
     def __init__(self, most: int) -> None:
         self._most, self.value = most, 0
 
-    def broken(self, now: bool) -> bool:
-        """Count a cycle; return whether the limit has been broken for long enough."""
+    def exceeded(self, now: bool) -> bool:
+        """Count a cycle; return whether the limit has been exceeded for long enough."""
         self.value = min(self.value + 1, 2 * self._most) if now else max(self.value - 1, 0)
         return self.value >= self._most
 
@@ -114,10 +114,10 @@ class Safety:
         self.clamped = np.zeros(len(self._joints), dtype=np.int64)
         self.fault: Fault | None = None
 
-    # ------------------------------------------------------------------ what callers use
+    # ------------------------------------------------------------------ interface
 
     def stop(self, who: str) -> None:
-        """Stop at the next cycle; ``who`` (a key, a signal) asked for it. Only a flag is set: signal-safe."""
+        """Stop at the next cycle, as requested by ``who`` (a key, a signal). Only a flag is set: signal-safe."""
         self._stop = who
 
     def review(self, state: LowState | None, command: LowCmd | None, now: float) -> LowCmd:
@@ -125,7 +125,7 @@ class Safety:
 
         Args:
             state: the newest state ever received; None before the first.
-            command: the wanted command; None if there is none: the drives brake.
+            command: the wanted command; None to brake.
             now: the runtime's clock, s.
         """
         if self.fault is None:
@@ -143,17 +143,16 @@ class Safety:
             self.fault = Fault(name, now, message)
 
     def damping(self, state: LowState | None) -> LowCmd:
-        """Return the command with which the drives only brake."""
+        """Return the command with which the motors only brake."""
         usable = state is not None and bool(np.isfinite(state.joint_pos).all())
         target = state.joint_pos.copy() if state is not None and usable else self._zeros
         return LowCmd(target, self._zeros, self._braking, damping=True)
 
     def limited(self, state: LowState, command: LowCmd) -> LowCmd:
-        """Limit targets so that they need at most the peak torque, and then to the SDK's range and the stops.
+        """Limit targets to those that need at most the peak torque, and then to the SDK's range and the stops.
 
-        Torque that is fed forward is limited to the peak torque by itself, and counts in what targets need.
-
-        If a joint moves so fast that both are not possible, the range has priority.
+        Feed-forward torque is limited to the peak torque first, and counts towards that of the target. The range has
+        priority: a fast joint may need more than the peak torque to stay within it.
         """
         if command.feedforward is not None:
             within = np.minimum(np.maximum(command.feedforward, -self._torque_limit), self._torque_limit)
@@ -163,7 +162,7 @@ class Safety:
         return replace(command, joint_target=target)
 
     def rehearse(self, state: LowState, command: LowCmd) -> None:
-        """Do the work of a review without any result, for ``Controller.rehearse``."""
+        """Do the work of a review without a result, for ``Controller.rehearse``."""
         for rule in (Safety.not_finite, Safety.attitude, Safety.tilt, Safety.joint_range):
             rule(self, state, command, state.t)
         self._cut(state, command)
@@ -174,7 +173,7 @@ class Safety:
         if command.feedforward is not None:  # a joint without kp has no target that could make up for it
             still = still - np.divide(command.feedforward, command.kp, out=self._zeros.copy(), where=command.kp > 0.0)
         target = np.minimum(np.maximum(command.joint_target, still - reach), still + reach)
-        # The range comes last: it holds even if the torque limit asks for a target outside it.
+        # The range comes last: it applies even if the torque limit gives a target outside it.
         return np.minimum(np.maximum(target, self._low), self._high)
 
     def _reach(self, kp: np.ndarray, kd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,21 +188,21 @@ class Safety:
     # ------------------------------------------------------------------ the rules
 
     def operator_stop(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """A person, or a signal, asked for the end."""
-        return None if self._stop is None else f"asked for by {self._stop}"
+        """A person, or a signal, requested the end."""
+        return None if self._stop is None else f"requested by {self._stop}"
 
     def stale_state(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
         """The newest state is too old; before the first state this is no fault."""
         if state is None:
-            return None  # the drives brake until a first state arrives
+            return None  # the motors brake until a first state arrives
         age = now - state.t
         return f"the newest state is {1e3 * age:.0f} ms old" if age > self.config.stale else None
 
     def not_finite(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
         """A reading or a command is not finite."""
-        given: list[tuple[LowState | LowCmd, str]] = [(state, name) for name in READ] if state is not None else []
+        given: list[tuple[LowState | LowCmd, str]] = [(state, name) for name in READINGS] if state is not None else []
         if command is not None:
-            given += [(command, name) for name in ASKED if getattr(command, name) is not None]
+            given += [(command, name) for name in COMMANDED if getattr(command, name) is not None]
         vectors = [getattr(message, name) for message, name in given]
         if not vectors or np.isfinite(np.concatenate(vectors)).all():
             return None
@@ -221,11 +220,13 @@ class Safety:
         return f"the attitude quaternion's length is {length:.3f} instead of 1" if off else None
 
     def tilt(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """The trunk leans too far: the robot falls."""
+        """The tilt of the trunk is too large: the robot falls."""
         if state is None:
             return None
-        angle = lean(state.imu_quat)
-        return f"the trunk leans by {math.degrees(angle):.0f} degrees" if angle > self.config.tilt else None
+        angle, limit = tilt_angle(state.imu_quat), self.config.tilt
+        if angle <= limit:
+            return None
+        return f"tilt {math.degrees(angle):.0f} deg, the limit is {math.degrees(limit):.0f} deg"
 
     def joint_range(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
         """A joint is measured beyond its stop."""
@@ -238,23 +239,23 @@ class Safety:
         return f"{self._joints[k]} is at {state.joint_pos[k]:.3f} rad, {beyond[k]:.3f} rad beyond its stop"
 
     def torque(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """A drive reports more than its peak torque, for some cycles."""
+        """A motor reports more than its peak torque, for some cycles."""
         if state is None:
             return None
         share = np.abs(state.joint_torque) / self._torque_limit
         k = int(share.argmax())
-        if not self._torque.broken(bool(share[k] > self.config.torque_margin)):
+        if not self._torque.exceeded(bool(share[k] > self.config.torque_margin)):
             return None
         return f"{self._joints[k]} reports {state.joint_torque[k]:.1f} N m, its limit is {self._torque_limit[k]:g} N m"
 
     def power(self, state: LowState | None, command: LowCmd | None, now: float) -> str | None:
-        """The sum of |torque x speed| is too large, for some cycles; driving and braking count alike."""
+        """The sum of |torque x velocity| is too large, for some cycles; driving and braking count alike."""
         if state is None:
             return None
         power = float(np.abs(state.joint_torque * state.joint_vel).sum())
-        if not self._power.broken(power > self.config.power):
+        if not self._power.exceeded(power > self.config.power):
             return None
-        return f"the drives turn over {power:.0f} W, the limit is {self.config.power:g} W"
+        return f"the motors' power is {power:.0f} W, the limit is {self.config.power:g} W"
 
 
 Rule = Callable[[Safety, LowState | None, LowCmd | None, float], str | None]
@@ -272,7 +273,7 @@ RULES: dict[str, Rule] = {
 """Name of a fault -> its rule, in the order of evaluation; the first rule with a message is the fault."""
 
 
-def lean(quat: np.ndarray) -> float:
+def tilt_angle(quat: np.ndarray) -> float:
     """Return the angle between the trunk's z axis and the vertical, rad, of an attitude w-x-y-z."""
     x, y = float(quat[1]), float(quat[2])
     squared = float(quat @ quat)

@@ -1,4 +1,4 @@
-"""The simulated Go1's body and drives, one tick of 2 ms at a time."""
+"""The simulated Go1: body, motors and sensors, one tick of 2 ms at a time."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ from go1exp.sim.task import TaskConfig
 from go1exp.sim.terrain import Terrain, TerrainConfig, build_terrain
 
 TICK = 0.002
-"""Period of the drives and of the states that the robot sends, s: the vendor's SDK has 500 Hz."""
+"""Period of the motors and of the states, s: 500 Hz in the vendor's SDK."""
 
 SILENCE = 0.05
-"""The drives brake when no command has come for this time, s."""
+"""Time without a command after which the motors brake, s."""
 
 NOISE = {"joint_pos": 0.05, "joint_vel": 0.1, "imu_gyro": 0.01, "attitude": 0.05}
 """Half-widths of the paper's Table II: rad, rad/s, rad/s, and of projected gravity, taken as a rotation in rad."""
 
 OWN_NOISE = {"imu_acc": 0.1, "foot_force": 2.0}
-"""Standard deviations of noises that Table II does not list, m/s2 and N, as in ``conf/record.yaml``."""
+"""Standard deviations of noises that are not in Table II, m/s2 and N, as in ``conf/record.yaml``."""
 
 LYING_HEIGHT = 0.12
-"""Height of the trunk when a lying robot is put down, m."""
+"""Initial height of the trunk of a lying robot, m."""
 
 SETTLE_S = 1.0
-"""Simulated time in which the robot comes to rest before it takes commands, s."""
+"""Settling time before the first command, s."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A robot and the ground that it stands on, without any training.
+    """A robot and its ground, without a training.
 
     Attributes:
         robot: masses and limits.
-        actuator: its drives.
-        effect: what else acts.
-        contact: how its feet touch the ground.
+        actuator: its term.
+        effect: further effects.
+        contact: of its feet.
         terrain: the ground.
-        tile: row and column of the tile on which it begins.
+        tile: row and column of its initial tile.
     """
 
     robot: RobotConfig
@@ -70,22 +70,20 @@ class Robot:
 
     Attributes:
         clock: time of the robot, s.
-        braking: whether its drives only brake: no command for too long, or a damping command.
+        braking: whether its motors only brake: no command for too long, or a damping command.
     """
 
     def __init__(self, task: TaskConfig | Body, config: SimConfig) -> None:
-        """Put the task's robot, with its drives and effects, where ``config.start`` says, at rest.
+        """Build the task's robot, with actuator and effects, at rest in the pose of ``config.start``.
 
         The robot of a training stands on flat ground, a ``Body`` on its own.
 
         Raises:
-            ConfigError: if its drives have no gains, since commands set gains; if there is no such tile.
+            ConfigError: if its actuator has no gains, since commands set gains; if there is no such tile.
         """
         if not has_gains(task.actuator):
             name = task.actuator.entry.name
-            raise ConfigError(
-                [f"actuator = {name}: has no kp and kd, which the runtime commands with every target; use actuator=pd"]
-            )
+            raise ConfigError([f"actuator = {name}: has no kp and kd, which every command sets; use actuator=pd"])
         self._config, self._rng = config, np.random.default_rng(config.seed)
         held = (1.0, 0.0, 0.0, 0.0) if config.start == "suspended" else None
         terrain = build_terrain(task.terrain if isinstance(task, Body) else TerrainConfig())
@@ -104,18 +102,18 @@ class Robot:
 
     @property
     def backend(self) -> MujocoCpu:
-        """What computes its motion."""
+        """The physics."""
         return self._backend
 
     def restart(self) -> None:
-        """Put the robot back into its first state, where no command is in force; its clock goes on."""
+        """Reset the robot to its initial state without a command; its clock continues."""
         self._commanded, self.braking = -np.inf, False
         if self._fed is not None:
             self._fed = torch.zeros_like(self._fed)
         self._place()
 
     def take_over(self, old: Robot) -> None:
-        """Go on from where ``old`` is: its pose, speeds, clock, noise and command; drives and effects begin anew."""
+        """Continue from ``old``: pose, velocities, clock, noise and command; actuator and effects are reset."""
         self.clock, self.braking, self._rng = old.clock, old.braking, old._rng
         self._commanded, self._measured = old._commanded, old._measured
         self._target: torch.Tensor = old._target.clone()
@@ -130,7 +128,7 @@ class Robot:
         plant.effects.reset(everyone)
 
     def _place(self) -> None:
-        """Put the robot into its first state and let it come to rest; default gains hold it until a command comes."""
+        """Reset the robot and let it settle; default gains hold it until a command arrives."""
         plant, start = self._plant, self._config.start
         joints = np.tile(LYING, robot.NUM_LEGS) if start == "lying" else robot.NOMINAL_STANCE
         qpos, qvel = torch.zeros_like(plant.backend.qpos), torch.zeros_like(plant.backend.qvel)
@@ -148,12 +146,12 @@ class Robot:
         for _ in range(round(SETTLE_S / TICK) - 1):
             plant.step(self._target)
         self._advance()
-        plant.effects.reset(everyone)  # an effect that drifts starts now
+        plant.effects.reset(everyone)  # a drifting effect starts now
 
     _braking_kd = np.full(robot.NUM_JOINTS, DEFAULT_KD)
 
     def _set_gains(self, kp: np.ndarray, kd: np.ndarray) -> None:
-        """Set the gains of the drives, unless they already have these."""
+        """Set the gains, unless they are the present ones."""
         if all(np.array_equal(present, new) for present, new in zip(self._gains, (kp, kd), strict=True)):
             return
         self._gains = (np.array(kp), np.array(kd))
@@ -170,7 +168,7 @@ class Robot:
         self._set_gains(command.kp, command.kd)
 
     def release(self) -> None:
-        """Do as a command says that asks for nothing: the joints are free, once a command has moved them."""
+        """Apply a command without torque: the joints are free, unless no command has been applied yet."""
         if self.commanded:
             nothing = np.zeros(robot.NUM_JOINTS)
             self.apply(LowCmd(self._target[0].numpy().astype(float), nothing, nothing))
@@ -180,7 +178,7 @@ class Robot:
         return np.concatenate([[self.commanded and not self.braking], self._target[0].numpy()])
 
     def step(self) -> None:
-        """Advance by a tick; drives without a command for ``SILENCE`` brake."""
+        """Advance by a tick; without a command for ``SILENCE`` the motors brake."""
         if np.isfinite(self._commanded) and self.clock - self._commanded > SILENCE + 1e-9:
             self.braking = True
             self._set_gains(np.zeros(robot.NUM_JOINTS), self._braking_kd)
@@ -191,9 +189,9 @@ class Robot:
         self.clock = round(self.clock / TICK + 1) * TICK  # a whole number of ticks: no rounding adds up
 
     def _advance(self) -> None:
-        """Make a step, and keep the readings of the instant at which it begins.
+        """Make a step, and keep the readings of its beginning.
 
-        The engine computes forces and IMU readings of that instant during the step, and has speeds half a step before
+        The engine computes forces and IMU readings of that instant during the step, and velocities half a step before
         and after it. Read before the step, they would be one to three milliseconds old.
         """
         plant, backend = self._plant, self._plant.backend
@@ -217,7 +215,7 @@ class Robot:
 
     @property
     def commanded(self) -> bool:
-        """Whether any command has come that asked for something."""
+        """Whether a command has been applied."""
         return bool(np.isfinite(self._commanded))
 
     @property
@@ -226,7 +224,7 @@ class Robot:
         return self._now
 
     def pose(self) -> np.ndarray:
-        """Return position, attitude and joint angles (19,) after the last step; a robot that hangs has its place."""
+        """Return position, attitude and joint angles (19,) after the last step."""
         qpos: np.ndarray = self.backend.qpos[0].numpy().copy()
         held = (0.0, 0.0, HELD_HEIGHT, 1.0, 0.0, 0.0, 0.0)
         return qpos if len(qpos) > robot.NUM_JOINTS else np.concatenate([held, qpos])
@@ -238,8 +236,8 @@ class Robot:
     def sense(self) -> tuple[LowState, np.ndarray]:
         """Return the sensors' readings of the instant at which the last step began, and the truth (13,) then.
 
-        The truth is position, attitude and velocities of the trunk, in the columns of ``TRUTH``; NaN for a robot that
-        hangs.
+        The truth is position, attitude and velocities of the trunk, in the columns of ``TRUTH``; NaN for a suspended
+        robot.
         """
         readings = noisy(self._now, self._config.noise, self._rng)
         state = LowState(

@@ -29,7 +29,7 @@ TICK_MS = 2
 """Increment per 2 ms of the tick that the simulated robot reports: the unit of SDK 3.8.6's comment."""
 
 MOST_AT_ONCE = 10
-"""Most ticks that are simulated at once after a delay; for a longer one the robot's clock falls behind for good."""
+"""Largest number of ticks that are made up after a delay; after a longer one the robot's clock stays behind."""
 
 TRUTH = (
     *("base_pos_x_w", "base_pos_y_w", "base_pos_z_w", "base_quat_w", "base_quat_x", "base_quat_y", "base_quat_z"),
@@ -39,7 +39,7 @@ TRUTH = (
 """Columns of the truth, named as in a recording."""
 
 GONE_S = 1.0
-"""A speaker who has been silent for this time is gone: the next one is heard, s."""
+"""Time without a packet after which a client is gone, and another one is accepted, s."""
 
 STRANGER = "another sender"
 
@@ -50,14 +50,14 @@ CHUNK = 5000
 """Rows of a block: 10 s."""
 
 KEPT_S = 60.0
-"""How much is kept of the truth and of what was in force unless told otherwise, s: nobody reads it of a robot alone."""
+"""Default time for which truth and applied commands are kept, s."""
 
 ASK_EVERY = 20
-"""Calls between two checks whether to continue."""
+"""Cycles between two checks whether to continue."""
 
 
 class Network:
-    """Delays datagrams, each by a time of its own, and loses each with the same probability, independently."""
+    """Delays packets by independent times, and loses each with the same probability."""
 
     def __init__(self, delay: float, loss: float, rng: np.random.Generator, jitter: float = 0.0) -> None:
         """Delay by ``delay`` s and up to ``jitter`` s more, evenly distributed, and lose a share ``loss``."""
@@ -76,7 +76,7 @@ class Network:
         heapq.heappush(self._way, (now + self._delay + further, self._count, data))
 
     def take(self, now: float) -> list[bytes]:
-        """Return the datagrams that have arrived by ``now``, in the order of arrival."""
+        """Return the packets that have arrived by ``now``, in the order of arrival."""
         arrived = []
         while self._way and self._way[0][0] <= now + 1e-9:
             arrived.append(heapq.heappop(self._way)[2])
@@ -84,7 +84,7 @@ class Network:
 
 
 class Truth:
-    """The newest rows of numbers by the robot's clock, kept in blocks so that no array is ever copied to grow."""
+    """The newest rows of numbers by the robot's clock, kept in blocks so that no array is copied to grow."""
 
     def __init__(self, width: int = len(TRUTH), kept: float = KEPT_S) -> None:
         """Keep at least the rows of the last ``kept`` s."""
@@ -178,17 +178,18 @@ class Packets:
 
 @dataclass
 class Counts:
-    """Counts at the robot's end: datagrams by what happened to them, and how real time was kept.
+    """Counts of the robot's packets, and its real-time performance.
 
     Attributes:
-        heard: datagrams of the one who is listened to, those that ask for nothing included.
-        commands: commands put into force.
-        foreign: datagrams that were not a valid message, or came from another sender.
-        refused: these by their reason.
+        heard: packets of the client, including those without torque.
+        commands: accepted commands.
+        foreign: rejected packets: invalid, or of another sender.
+        refused: rejected packets by reason.
         states: states sent.
-        lost: datagrams that the simulated network lost.
-        slipped: time by which the robot's clock fell behind for good, s.
+        lost: packets that the simulated network lost.
+        slipped: time by which the robot's clock is behind real time, s.
         ticks: simulated ticks of 2 ms.
+        timing: of the loop.
     """
 
     heard: int = 0
@@ -205,18 +206,18 @@ class Counts:
 class Server:
     """A robot at a port of this machine.
 
-    It answers to the first who speaks to it in its protocol. Other senders are refused until that one has been silent
-    for ``GONE_S``.
+    Its client is the first sender of a valid packet. Other senders are rejected until the client has been silent for
+    ``GONE_S``.
 
     Attributes:
-        robot: what is simulated.
+        robot: the simulated one.
         address: where it listens.
-        counts: what has happened.
-        peer: who it listens to; None before anybody has spoken.
-        truth: the trunk's true motion, the newest of it.
+        counts: of packets.
+        peer: address of the client; None before the first packet.
+        truth: the newest of the trunk's true motion.
         applied: the newest applied commands, in the columns of ``APPLIED``.
         packets: packs states and unpacks commands.
-        on_heard: called for each datagram of ``peer``: its time of arrival, s on ``time.perf_counter``'s clock; itself.
+        on_heard: called for each packet of ``peer`` with its time of arrival, s on ``time.perf_counter``'s clock.
         on_tick: called after each tick.
     """
 
@@ -251,7 +252,7 @@ class Server:
         return self.address[1]
 
     def serve(self, going: Callable[[], bool], seconds: float | None = None) -> Timing:
-        """Run in real time while ``going``; return how the time was kept."""
+        """Run in real time while ``going``; return the timing."""
         clock = MonotonicClock()
         begin, calls = math.inf, 0
 
@@ -261,10 +262,10 @@ class Server:
             # Ticks that should have been simulated by now, less those that were.
             due = int((now - begin) / TICK) + 1 - self.counts.ticks
             if due > MOST_AT_ONCE:
-                # The start is moved, so that the lost time is never made up for.
-                late = (due - MOST_AT_ONCE) * TICK
-                begin, due = begin + late, MOST_AT_ONCE
-                self.counts.slipped += late
+                # The start is moved, so that the lost time is not made up.
+                behind = (due - MOST_AT_ONCE) * TICK
+                begin, due = begin + behind, MOST_AT_ONCE
+                self.counts.slipped += behind
             for _ in range(due):
                 self.tick()
             calls += 1
@@ -288,8 +289,8 @@ class Server:
         data = self.packets.written(state, round(now / TICK))
         if self.peer is not None:
             self._downlink.put(now, data)
-            for late in self._downlink.take(now):
-                self._send(late)
+            for delayed in self._downlink.take(now):
+                self._send(delayed)
         self.counts.ticks += 1
         self.counts.lost = self._uplink.lost + self._downlink.lost
         if self.on_tick is not None:
@@ -337,5 +338,5 @@ class Server:
             pass
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the socket."""
         self._socket.close()

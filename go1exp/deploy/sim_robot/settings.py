@@ -1,4 +1,4 @@
-"""How the simulated robot is set up."""
+"""Settings of the simulated robot."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ class SimConfig:
     """Setup of the simulated robot.
 
     Attributes:
-        start: standing in the nominal stance, lying on its belly, or hung up so that no foot reaches the ground.
-        noise: noise of its sensors, as a multiple of the paper's Table II.
-        delay: delay of datagrams, each way, s.
-        jitter: largest further delay, drawn for each datagram from 0 to this, s; so one may overtake another.
-        loss: share of the datagrams that are lost, each way.
-        feet: what the foot sensors say in the robot's own packets, newton, or raw counts with zeros and scales of their
-            own (by seed), as the robot's.
+        start: standing in the nominal stance, lying on its belly, or suspended above the ground.
+        noise: noise of its sensors, relative to the paper's Table II.
+        delay: delay of packets, each way, s.
+        jitter: largest additional delay, drawn for each packet from 0 to this, s; so one may overtake another.
+        loss: share of the packets that are lost, each way.
+        feet: unit of the foot sensors, newton, or raw: counts with zeros and scales drawn by seed, as on a robot.
         seed: seed of noise, loss and random effects.
     """
 
@@ -42,10 +41,10 @@ class SimSettings(SimConfig):
     """``conf/sim.yaml`` without the groups.
 
     Attributes:
-        address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to the network, to anybody in it.
-        tile: row and column of the tile of terrain=rough on which it begins; rows grow harder.
-        seconds: how long it lives, s; null until Ctrl-C.
-        viewer: web shows it in the browser, with the timing of whoever drives it; null prints lines alone.
+        address: HOST:PORT to listen at; another host than 127.0.0.1 opens it to the network, to everybody in it.
+        tile: row and column of its initial tile of terrain=rough; difficulty grows with the row.
+        seconds: how long it runs, s; null until Ctrl-C.
+        viewer: web shows it in the browser, with the timing of its client; null prints lines alone.
         host: interface on which viewer=web serves its page; another one than 127.0.0.1 opens it to the network.
         port: of that page; 0 takes the first free one from 8080 on.
     """
