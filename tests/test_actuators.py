@@ -166,18 +166,6 @@ def test_a_robots_delays_are_its_own_and_follow_from_the_seed(drives: Drives) ->
     assert not torch.equal(other.delay, batch.delay)
 
 
-def test_an_environment_that_is_seeded_again_draws_the_same_delays(make_core: Callable[..., Go1Core]) -> None:
-    core = make_core("actuator=delay", num_envs=3)
-    core.reset()
-    first = core.plant.actuator.delay.clone()  # type: ignore[attr-defined]
-    core.step(torch.zeros(3, 12))
-    core.reset()
-    assert not torch.equal(core.plant.actuator.delay, first)  # type: ignore[attr-defined]
-    core.reseed(0)
-    core.reset()
-    assert torch.equal(core.plant.actuator.delay, first)  # type: ignore[attr-defined]
-
-
 def test_a_drive_without_delay_is_that_drive(make_core: Callable[..., Go1Core]) -> None:
     """In the environment, and so with its resets; bit for bit."""
 

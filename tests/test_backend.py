@@ -123,17 +123,6 @@ def test_a_batch_is_a_serial_loop_over_its_own_models_bit_for_bit(make_backend: 
 DERIVED = ["body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "actuator_acc0"]
 
 
-def test_derived_constants_follow_the_masses_of_each_simulation(make_backend: Build) -> None:
-    backend = make_backend(3)
-    own = randomize(backend)
-    for i in range(3):
-        mine, theirs = backend.env_model(i), own_model(backend.model, own, i)
-        for name in [*own, *DERIVED]:
-            np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)
-        assert mine.body_subtreemass[1] == pytest.approx(own["body_mass"][i].sum())
-        assert mine.body_subtreemass[1] != backend.model.body_subtreemass[1]
-
-
 def test_constants_are_derived_in_masked_rows_only(make_backend: Build) -> None:
     backend = make_backend(4)
     randomize(backend)
@@ -144,94 +133,6 @@ def test_constants_are_derived_in_masked_rows_only(make_backend: Build) -> None:
     backend.derive_constants(mask)
     changed = [not np.array_equal(backend.env_model(i).dof_invweight0, before[i]) for i in range(4)]
     assert changed == mask.tolist()
-
-
-def test_the_number_of_threads_changes_no_bit(make_backend: Build) -> None:
-    n = 7
-    one, two = make_backend(n, threads=1), make_backend(n, threads=2)
-    for backend in (one, two):
-        randomize(backend)
-        backend.reset(everyone(n), *initial(n))
-    for ctrl in torques(n, 150):
-        one.step(ctrl)
-        two.step(ctrl)
-    assert torch.equal(one.qpos, two.qpos)
-    assert torch.equal(one.qvel, two.qvel)
-    assert torch.equal(one.sensordata, two.sensordata)
-
-
-def test_a_reset_touches_only_masked_rows_and_they_go_on_like_new(make_backend: Build) -> None:
-    n = 5
-    backend, twin, new = make_backend(n), make_backend(n), make_backend(n)
-    for b in (backend, twin):
-        b.reset(everyone(n), *initial(n))
-        for ctrl in torques(n, 120):
-            b.step(ctrl)
-    mask = torch.tensor([False, True, False, False, True])
-    garbage = torch.full((n, 19), torch.nan, dtype=torch.float64), torch.full((n, 18), torch.nan, dtype=torch.float64)
-    fresh = initial(n, seed=5)
-    wanted = [torch.where(mask.unsqueeze(1), good, bad) for good, bad in zip(fresh, garbage, strict=True)]
-    backend.reset(mask, *wanted)
-    new.reset(everyone(n), *fresh)
-    assert torch.equal(backend.qpos[mask], fresh[0][mask])
-    assert torch.equal(backend.qvel[mask], fresh[1][mask])
-    for ctrl in [None, *torques(n, 60, seed=1)]:
-        if ctrl is not None:
-            for b in (backend, twin, new):
-                b.step(ctrl)
-        for name in ("qpos", "qvel", "sensordata"):
-            after = getattr(backend, name)
-            assert torch.equal(after[~mask], getattr(twin, name)[~mask]), name
-            assert torch.equal(after[mask], getattr(new, name)[mask]), name
-
-
-def test_a_reset_of_nobody_changes_nothing(make_backend: Build) -> None:
-    backend = make_backend(2)
-    backend.reset(everyone(2), *initial(2))
-    for ctrl in torques(2, 20):
-        backend.step(ctrl)
-    before = [x.clone() for x in (backend.qpos, backend.qvel, backend.sensordata)]
-    backend.reset(~everyone(2), *initial(2, seed=3))
-    assert all(torch.equal(a, b) for a, b in zip(before, (backend.qpos, backend.qvel, backend.sensordata), strict=True))
-
-
-def feet_at(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """Positions and velocities of the feet (4 x 3, 4 x 3) in a state, m and m/s."""
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = qpos, qvel
-    mujoco.mj_forward(model, data)
-    sites, velocity = [model.site(name).id for name in FEET], np.zeros((4, 3))
-    jacobian = np.zeros((3, model.nv))
-    for k, site in enumerate(sites):
-        mujoco.mj_jacSite(model, data, jacobian, None, site)
-        velocity[k] = jacobian @ data.qvel
-    return np.stack([data.site_xpos[sites], velocity])
-
-
-def feet_sensed(backend: MujocoCpu, env: int) -> np.ndarray:
-    s = backend.sensors
-    readings = [backend.sensordata[env, block].reshape(4, 3).numpy() for block in (s.foot_pos_w, s.foot_vel_w)]
-    return np.stack(readings)
-
-
-def test_after_a_step_sensors_describe_the_state_before_it_and_after_a_reset_the_new_state(make_backend: Build) -> None:
-    n = 2
-    backend = make_backend(n)
-    backend.reset(everyone(n), *initial(n))
-    for ctrl in torques(n, 30):
-        before = backend.qpos.numpy().copy(), backend.qvel.numpy().copy()
-        backend.step(ctrl)
-        for i in range(n):
-            np.testing.assert_allclose(
-                feet_sensed(backend, i), feet_at(backend.model, before[0][i], before[1][i]), atol=1e-12
-            )
-    now = feet_at(backend.model, backend.qpos[0].numpy(), backend.qvel[0].numpy())
-    assert np.abs(feet_sensed(backend, 0) - now).max() > 1e-4
-    qpos, qvel = initial(n, seed=8)
-    backend.reset(torch.tensor([False, True]), qpos, qvel)
-    np.testing.assert_allclose(
-        feet_sensed(backend, 1), feet_at(backend.model, qpos[1].numpy(), qvel[1].numpy()), atol=1e-12
-    )
 
 
 def test_contact_forces_after_a_reset_are_those_of_the_new_state(make_backend: Build) -> None:
@@ -273,20 +174,6 @@ def test_a_saved_state_continues_bit_for_bit_in_another_batch(make_backend: Buil
         assert first.env_data(i).time == second.env_data(i).time == pytest.approx(0.4)
         for name in ("body_mass", *DERIVED):
             np.testing.assert_array_equal(getattr(first.env_model(i), name), getattr(second.env_model(i), name))
-
-
-def test_a_saved_state_does_not_move_with_the_simulation(make_backend: Build) -> None:
-    backend = make_backend(2)
-    randomize(backend)
-    backend.reset(everyone(2), *initial(2))
-    state = backend.state_dict()
-    copies = copy.deepcopy(state)
-    for ctrl in torques(2, 20):
-        backend.step(ctrl)
-    backend.field("body_mass").mul_(2.0)
-    for kind in ("state", "fields"):
-        for name, value in state[kind].items():
-            assert torch.equal(value, copies[kind][name]), name
 
 
 def test_the_step_tensors_stay_the_same_objects_in_memory(make_backend: Build) -> None:

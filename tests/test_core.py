@@ -139,12 +139,13 @@ def test_a_saved_environment_continues_bit_for_bit(make_core: Make, ground: tupl
     list(run(core, inputs[:37]))
     if ground:
         core.level.copy_(torch.tensor([3, 1, 2, 0]))
-    file = io.BytesIO()
-    torch.save(core.state_dict(), file)
+    state = core.state_dict()
     now = {k: getattr(core, k).clone() for k in ("action", "previous_action", "target", "level", "reward_sums")}
     expected = list(run(core, inputs[37:]))
     assert any(r["terminated"].any() or r["truncated"].any() for r in expected)
     after = core.reset()
+    file = io.BytesIO()
+    torch.save(state, file)  # which has not moved with the environment
 
     new = make_core(*LIVELY, *ground, num_envs=n, seed=99)
     used = make_core(*LIVELY, *ground, num_envs=n, seed=98)
@@ -158,17 +159,6 @@ def test_a_saved_environment_continues_bit_for_bit(make_core: Make, ground: tupl
         for want, got in zip(expected, run(resumed, inputs[37:]), strict=True):
             assert same(want, got)
         assert torch.equal(resumed.reset(), after)  # not taken for a first reset either
-
-
-def test_a_saved_state_does_not_move_with_the_environment(make_core: Make) -> None:
-    core = make_core(*LIVELY)
-    core.reset()
-    inputs = actions(4, 40)
-    list(run(core, inputs[:20]))
-    state = core.state_dict()
-    expected = list(run(core, inputs[20:]))
-    core.load_state_dict(state)
-    assert all(same(a, b) for a, b in zip(expected, run(core, inputs[20:]), strict=True))
 
 
 @pytest.mark.parametrize("when", ["startup", "reset"])
@@ -264,14 +254,6 @@ def test_a_fall_at_the_time_limit_is_a_termination_only(make_core: Make) -> None
     result = core.step(torch.zeros(2, 12))
     assert result.terminated.tolist() == [False, True]
     assert result.truncated.tolist() == [True, False]
-
-
-def test_without_terminations_a_fallen_robot_goes_on(make_core: Make) -> None:
-    core = make_core(*QUIET, num_envs=2)
-    core.reset()
-    core.backend.qpos[:, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
-    for result in run(core, torch.zeros(20, 2, 12)):
-        assert not (result["terminated"] | result["truncated"]).any()
 
 
 def test_first_episodes_may_begin_at_random_times_and_later_ones_at_zero(make_core: Make) -> None:
@@ -482,20 +464,6 @@ def foot_forces(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray,
                 force[leg] += one[:3] @ contact.frame.reshape(3, 3)
     total = np.linalg.norm(force, axis=1)
     return total, total > 0
-
-
-def test_a_foot_in_contact_bears_force(make_core: Make) -> None:
-    """`Snapshot.foot_contact`: "the foot bears force now"."""
-    core = make_core(*QUIET, num_envs=8, noise=False)
-    core.reset()
-    seen = 0
-    for action in actions(8, 60, 2.0):
-        core.step(action)
-        s = core.snapshot()
-        assert (s.foot_force[s.foot_contact] > 0.0).all()
-        assert not s.foot_force[~s.foot_contact].any()
-        seen += int(s.foot_contact.sum())
-    assert seen > 100
 
 
 def test_the_snapshot_describes_the_state(make_core: Make) -> None:
@@ -801,11 +769,12 @@ def test_a_state_that_is_not_finite_is_a_fault_of_that_environment(
         core.check(core.step(torch.zeros(3, 12)))
 
 
+@pytest.mark.parametrize("termination", ["none", "fall"])
 def test_a_state_that_is_not_finite_is_not_blamed_on_the_torque_that_follows_from_it(
-    make_core: Make, elsewhere: None
+    make_core: Make, elsewhere: None, termination: str
 ) -> None:
-    """MuJoCo takes a torque that is not finite for zero, so it cannot have been the cause."""
-    core = make_core("rand=none", "termination=none", num_envs=3)
+    """MuJoCo takes a torque that is not finite for zero; a state that is not finite counts as a fall."""
+    core = make_core("rand=none", f"termination={termination}", num_envs=3)
     core.reset()
     core.backend.step(torch.full((3, 12), torch.nan))
     assert torch.isfinite(core.backend.qpos).all()
@@ -814,18 +783,6 @@ def test_a_state_that_is_not_finite_is_not_blamed_on_the_torque_that_follows_fro
         core.check(core.step(torch.zeros(3, 12)))
     assert not np.isfinite(caught.value.dump["qpos"]).all()
     assert caught.value.quantity in ("qpos", "qvel")
-
-
-def test_the_dump_of_a_fault_is_the_moment_of_the_fault_and_not_the_episode_after_it(
-    make_core: Make, elsewhere: None
-) -> None:
-    """A state that is not finite counts as trunk contact, so the episode ends in the same step."""
-    core = make_core("rand=none", num_envs=3)
-    core.reset()
-    core.backend.qpos[1, 9] = torch.nan
-    with pytest.raises(NumericalFault) as caught:
-        core.check(core.step(torch.zeros(3, 12)))
-    assert not np.isfinite(caught.value.dump["qpos"]).all()
 
 
 @pytest.mark.parametrize("what", ["qpos", "qvel", "action"])
@@ -880,13 +837,6 @@ def test_an_observation_that_is_not_finite_is_a_fault_even_when_its_episode_ends
     with pytest.raises(NumericalFault) as caught:
         core.check(core.step(torch.zeros(2, 12)))
     assert caught.value.quantity == "observation"
-
-
-def test_a_healthy_step_is_no_fault(make_core: Make) -> None:
-    core = make_core(*LIVELY)
-    core.reset()
-    for action in actions(4, 60, 3.0):
-        core.check(core.step(action))
 
 
 def test_commands_are_slower_on_harder_tiles_and_not_on_flat_ones(make_core: Make) -> None:

@@ -145,15 +145,6 @@ def test_the_state_restores_every_stream_and_forgets_those_that_came_later() -> 
             assert torch.equal(resumed.stream(name).uniform(4), draw), name
 
 
-def test_a_saved_state_does_not_move_with_the_stream() -> None:
-    random = EnvRandom(4, 3)
-    random.stream("a").uniform(5)
-    state = random.state_dict()
-    expected = random.stream("a").uniform(5)
-    random.load_state_dict(state)
-    assert torch.equal(random.stream("a").uniform(5), expected)
-
-
 def test_reseeding_is_starting_anew_through_the_same_stream_object() -> None:
     random = EnvRandom(1, 3)
     stream = random.stream("a")
