@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from go1exp import robot
 from go1exp.config.schema.registry import Entry, members
 from go1exp.extend.testing.randomness import everyone, model_fields, parts, start_states, stream, with_fields
-from go1exp.extend.testing.snapshots import ODD, mirrored, random_snapshot, rows
+from go1exp.extend.testing.snapshots import ODD, mirrored, random_snapshot
 from go1exp.mdp.types import Snapshot, TermSetup
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.physics.scene import build_model
@@ -65,17 +65,6 @@ def once(entry: Entry, s: Snapshot) -> torch.Tensor:
 def test_a_reward_tells_robots_apart(entry: Entry) -> None:
     if entry.name != "air_time_variance_literal":  # identically zero
         assert once(entry, random_snapshot(500)).unique().numel() > 1
-
-
-@pytest.mark.parametrize("group", ["reward", "observation", "termination"])
-def test_a_robot_gets_the_same_alone_and_in_a_batch_bit_for_bit(group: str) -> None:
-    s = random_snapshot(ODD)
-    for name, entry in members(group).items():
-        together = once(entry, s)
-        for i in range(ODD):
-            assert torch.equal(once(entry, rows(s, slice(i, i + 1))), together[i : i + 1]), (name, i)
-        for size in (2, 4, 8, 16):
-            assert torch.equal(once(entry, rows(s, slice(0, size))), together[:size]), (name, size)
 
 
 @each("reward")
@@ -312,19 +301,6 @@ def test_a_state_term_with_a_range_of_zero_changes_nothing(entry: Entry) -> None
             assert torch.equal(values, before[name]), name
 
 
-@each("rand", kind="state")
-def test_a_state_term_draws_by_seed_and_gives_a_robot_the_same_alone_and_in_a_batch(entry: Entry) -> None:
-    batch, again, other, alone = start_states(4), start_states(4), start_states(4), start_states(1)
-    entry.target(batch, stream(4, 7))
-    entry.target(again, stream(4, 7))
-    entry.target(other, stream(4, 8))
-    entry.target(alone, stream(1, 7, first_env=3))
-    for name, values in parts(batch).items():
-        assert torch.equal(values, parts(again)[name])
-        assert torch.equal(values[3], parts(alone)[name][0])
-        assert torch.equal(values, parts(other)[name]) == (name not in WRITES[entry.name])
-
-
 def test_state_terms_add_uniform_draws_of_table_i() -> None:
     state, n = start_states(2000), 2000
     for name in ("body_velocity", "body_position", "joint_velocities"):
@@ -487,23 +463,3 @@ def test_a_restart_begins_a_new_wait_for_a_push() -> None:
         assert pushed == [k >= 10, False]
     push.advance(state, 0.1, ~everyone(2))
     assert (state.base_lin_vel_w[:, :2] != 0.0).all()
-
-
-# Curricula
-
-
-@each("curriculum")
-def test_a_curriculum_keeps_levels_on_the_map_and_judges_each_robot_by_itself(entry: Entry) -> None:
-    rule, n = entry.target(), 300
-    rng = np.random.default_rng(0)
-    level, anywhere = (torch.as_tensor(rng.integers(0, 10, n)) for _ in range(2))
-    walked, told = (torch.as_tensor(rng.uniform(0, top, n)).float() for top in (8.0, 20.0))
-    after = rule(level, walked, told, 8.0, 9, anywhere)
-    assert after.shape == (n,)
-    assert after.dtype == torch.int64
-    assert after.min() >= 0
-    assert after.max() <= 9
-    assert ((after - level).abs() <= 1)[level < 9].all()
-    for i in range(0, n, 29):
-        row = slice(i, i + 1)
-        assert torch.equal(rule(level[row], walked[row], told[row], 8.0, 9, anywhere[row]), after[row])
