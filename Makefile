@@ -52,14 +52,14 @@ docs: setup ## build the documentation in build/docs; any warning or dead link i
 	@$(BIN)/python -m sphinx -q -b html -n -W --keep-going -d build/doctrees docs build/docs
 	@echo "docs: build/docs/index.html"
 
-demo: setup ## train for five minutes, judge the policy, film it, find what a log hides, all in runs/demo
+demo: setup ## train for five minutes, evaluate the policy, render a video, find a model error, all in runs/demo
 	@echo "demo 1/4: go1exp train experiment=five_minutes (five minutes on two cores)"
 	@$(BIN)/go1exp train experiment=five_minutes hydra.run.dir=runs/demo
 	@echo "demo 2/4: go1exp eval, at a finer physics step than in training (a quarter of a minute)"
 	@$(BIN)/go1exp eval run=runs/demo 'grid.x=[0.5,-0.5]' 'grid.y=[0.3]' 'grid.yaw=[0.8]' duration_s=10 physics_dt=0.002 noise=true
 	@echo "demo 3/4: go1exp play (half a minute)"
 	@$(BIN)/go1exp play run=runs/demo viewer=clip physics_dt=0.002
-	@echo "demo 4/4: go1exp gap, on recordings of a robot that is not quite like its model (a minute)"
+	@echo "demo 4/4: go1exp gap, on recordings of a robot with friction that the model does not have (a minute)"
 	@$(BIN)/go1exp gap logs=assets/demo/suspended_go1 out=runs/demo/gap || [ $$? -eq 10 ]
 
 # SLOW: none, all, or a commit: then the slow tests that are about a file changed since (tests/selection.py).

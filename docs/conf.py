@@ -16,10 +16,12 @@ reference.write(HERE / "reference")
 
 project = "go1exp"
 author = "go1exp developers"
+copyright = "2026, the go1exp developers"
 release = __version__
 extensions = ["myst_parser"]
 exclude_patterns = ["results"]
-suppress_warnings = ["misc.highlighting_failure"]
+highlight_language = "none"
+suppress_warnings = ["misc.highlighting_failure"]  # there is no highlighter of CSV
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["deflist"]
@@ -30,4 +32,3 @@ html_static_path: list[str] = []
 html_copy_source = False
 html_show_sourcelink = False
 html_theme_options = {"footer_icons": [], "navigation_with_keys": True}
-# furo's own stacks name only fonts of the reader's system
