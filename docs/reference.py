@@ -11,6 +11,8 @@ import inspect
 import io
 import os
 import re
+import sys
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -64,7 +66,7 @@ def write(folder: Path) -> None:
 
 
 def _index() -> str:
-    from go1exp.cli.verbs import VERBS
+    from go1exp.cli import VERBS
 
     verbs = "\n".join(f"verb-{verb}" for verb in VERBS)
     return "\n".join(
@@ -145,52 +147,83 @@ def _place(target: Any) -> str:
 
 
 def _verbs() -> dict[str, str]:
-    from go1exp.cli.verbs import SUBVERBS, VERBS
+    from go1exp.cli import SUBVERBS, VERBS
 
     pages = {}
     for verb, about in VERBS.items():
         lines = [f"# go1exp {verb}", "", f"{about[0].upper()}{about[1:]}.", "", *_help(verb)]
         for word in SUBVERBS.get(verb, ()):
-            lines += [f"## go1exp {verb} {word}", "", *_help(f"{verb}_{word}")]
+            lines += [f"## go1exp {verb} {word}", "", *_help(verb, word)]
         pages[verb] = "\n".join(lines)
     return pages
 
 
-def _help(verb: str) -> list[str]:
-    from go1exp.cli.helptext import show
-    from go1exp.config.choices import groups_of
-
-    title = f"go1exp {verb.replace('_', ' ')}"
-    lines = ["```text", _printed(show, verb, title, []), "```", ""]
-    for group in groups_of(verb) if verb == "train" else ():
-        lines += [f"## Group {group}", "", "```text", _printed(show, verb, title, [group]), "```", ""]
+def _help(*words: str) -> list[str]:
+    text = _printed(*words, "--help")
+    lines = _sections(text)
+    groups = re.search(r"^Groups \(.*\):\n((?:  .*\n)+)", text, re.MULTILINE)
+    for group, _ in _rows(groups[1].splitlines()) if groups and words == ("train",) else []:
+        name = group.strip("`")
+        lines += [f"## Group {name}", "", *_sections(_printed("train", "--help", name))[2:]]
     return lines
 
 
-def _printed(function: Any, *arguments: Any) -> str:
+def _sections(help_text: str) -> list[str]:
+    """Return a help page as Markdown: groups, settings and choices as tables, usage and examples as code."""
+    lines: list[str] = []
+    for block in help_text.split("\n\n"):
+        first, *rest = block.splitlines()
+        if match := re.match(r"(Groups|Settings|Choices|Keys) \((.*)\):$", first):
+            lines += [f"**{match[1]}** ({match[2]})", "", *_table(("", ""), _rows(rest))]
+        elif first.startswith(("Usage", "Examples", " ")):
+            lines += [
+                "```text",
+                textwrap.dedent("\n".join(rest if first == "Examples:" else [first, *rest])),
+                "```",
+                "",
+            ]
+        else:
+            lines += [" ".join(line.strip() for line in [first, *rest]), ""]
+    return lines
+
+
+def _rows(lines: Iterable[str]) -> list[list[str]]:
+    rows: list[list[str]] = []
+    for line in lines:
+        if match := re.match(r" {2,8}(\S.*?)(?: {2,}(.*))?$", line):
+            rows.append([f"`{match[1]}`", match[2] or ""])
+        else:
+            rows[-1][1] += f" {line.strip()}"
+    return rows
+
+
+def _printed(*words: str) -> str:
+    """Return what the command line prints for ``go1exp WORDS``, 110 columns wide."""
+    from unittest import mock
+
+    from go1exp.cli import main
+
     out = io.StringIO()
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "110"
-    with contextlib.redirect_stdout(out):
-        function(*arguments)
-    os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
+    with (
+        mock.patch.dict(os.environ, COLUMNS="110"),
+        mock.patch.object(sys, "argv", ["go1exp", *words]),
+        contextlib.redirect_stdout(out),
+    ):
+        main()
     return out.getvalue().rstrip()
 
 
 def _choices() -> str:
-    from go1exp.config.choices import about, choice_files, groups_in
-    from go1exp.config.source import shown_folders
-
     lines = [
         "# Configuration files",
         "",
         "Every group of `conf/` with its choices: `group=choice` on the command line.",
         "",
     ]
-    folders = shown_folders()
-    for group in dict.fromkeys(group for folder in folders for group in groups_in(folder)):
-        rows = [(f"`{group}={name}`", about(file)) for name, file in choice_files(group, folders).items()]
-        lines += [f"## {group}", "", *_table(("choice", "what it is"), rows)]
+    for block in _printed("list", "what=groups").split("\n\n"):
+        group, *rest = block.splitlines()
+        if rest:
+            lines += [f"## {group}", "", *_table(("choice", "what it is"), _rows(rest))]
     return "\n".join(lines)
 
 
@@ -213,6 +246,7 @@ def _object(module: str, name: str, value: Any) -> list[str]:
     lines = [f"### {name}", "", "```python", f"from {module} import {name}", "", _signature(name, value), "```", ""]
     lines += _text(value)
     if inspect.isclass(value) and value.__module__.startswith("go1exp"):
+        lines += ["**Methods and properties**", ""]
         for method, target in vars(value).items():
             function = target.fget if isinstance(target, property) else getattr(target, "__func__", target)
             if not method.startswith("_") and inspect.isfunction(function):
@@ -228,7 +262,8 @@ def _signature(name: str, value: Any) -> str:
         text = str(inspect.signature(value))
     except (TypeError, ValueError):
         return name
-    return name + re.sub(r"(\w+\.)+(?=\w)", "", text.replace("'", "").replace("(self, ", "(").replace("(self)", "()"))
+    text = name + re.sub(r"(\w+\.)+(?=\w)", "", text.replace("'", "").replace("(self, ", "(").replace("(self)", "()"))
+    return text if len(text) < 80 or not name[0].isupper() else re.sub(r", (?=\*|\w+:)", ",\n    ", text)
 
 
 # ---------------------------------------------------------------------- text
