@@ -29,7 +29,7 @@ from go1exp.evaluate.criteria import ROBOT
 from go1exp.evaluate.rollout import EvalConfig, delay_margin, evaluate, grid
 from go1exp.mdp.measures import every_measure
 from go1exp.sim.task import TaskConfig
-from go1exp.train import checkpoint, start
+from go1exp.train import checkpoint, policy
 from go1exp.train.policy import Policy, load_run
 
 GRID = {
@@ -68,7 +68,7 @@ def shipped(run: Path, to: Path) -> None:
     """Copy the parts of a shipped policy: configuration, origin, curves, the policy's weights."""
     state, path = checkpoint.load_latest(run)
     (to / "checkpoints").mkdir(parents=True, exist_ok=True)
-    for old in [*(to / "checkpoints").glob("*"), *(to / FIRST).glob("*"), to / start.FILE]:
+    for old in [*(to / "checkpoints").glob("*"), *(to / FIRST).glob("*"), to / policy.START]:
         old.unlink(missing_ok=True)
     kept = {name: state[name] for name in ("format", "policy", "iteration", "num_timesteps")}
     torch.save(kept, to / "checkpoints" / path.name)
@@ -78,7 +78,7 @@ def shipped(run: Path, to: Path) -> None:
 def copy_origin(run: Path, to: Path) -> None:
     """Copy the origin of a policy from its run: configuration, versions, curves."""
     to.mkdir(exist_ok=True)
-    for name in ("config.yaml", "meta.json", start.FILE):
+    for name in ("config.yaml", "meta.json", policy.START):
         if (run / name).exists():
             shutil.copyfile(run / name, to / name)
     head, *rows = (run / "metrics.csv").read_text().splitlines(keepends=True)

@@ -378,7 +378,7 @@ def test_robots_come_in_order_however_many_are_worked_on(
 
 ABOUT = (
     *("benchmarks/closed_loop.py", "benchmarks/closed_loop_figures.py", "benchmarks/closed_loop_sizes.py"),
-    *("benchmarks/gap/", "go1exp/train/start.py", "go1exp/gap/stages/"),
+    *("benchmarks/gap/", "go1exp/train/policy.py", "go1exp/gap/stages/"),
 )
 
 

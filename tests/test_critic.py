@@ -18,7 +18,7 @@ from go1exp.mdp.ground import SCAN_COLUMNS, SCAN_ROWS, GroundHeight, HeightScan
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import TrainConfig, parse_train
-from go1exp.train import checkpoint, run_folder, start, trainer
+from go1exp.train import checkpoint, policy, run_folder, trainer
 from go1exp.train.device import DevicePPO
 from go1exp.train.policy import load_network
 from go1exp.train.ppo import AdaptivePPO
@@ -147,9 +147,9 @@ def test_a_run_resumes_and_another_begins_with_its_weights(trained: Path) -> Non
     checkpoint.restore(ppo, state)
     assert ppo.iteration == 2
     same = settings("critic=privileged")
-    assert start.read(same, trained).policy.keys() == ppo.policy.state_dict().keys()
+    assert policy.read_weights(same, trained).policy.keys() == ppo.policy.state_dict().keys()
     with pytest.raises(ConfigError, match=r"critic is \[\] here and \['base_linear_velocity \(3\)'"):
-        start.read(settings(), trained)
+        policy.read_weights(settings(), trained)
 
 
 def test_a_run_of_a_version_without_the_group_has_no_critic_of_its_own() -> None:

@@ -54,7 +54,7 @@ from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
 from go1exp.sim.task import MANY_TERMS, ONE_TERM, TrainConfig, parse_parts, parse_train
-from go1exp.train import run_folder, start, trainer, wandb_writer
+from go1exp.train import policy, run_folder, trainer, wandb_writer
 from tests.lockstep import lockstep
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `render_mode` attribute is not defined")
@@ -887,7 +887,7 @@ def verb_trace(container: dict[str, Any], walk: Walk) -> Trace:
     folders: list[list[str | None]] = []
     chosen = [f"{key}={json.dumps(container[key])}" for key in THE_VERBS if container[key]]
 
-    def noted(config: TrainConfig, container: dict[str, Any], run: Path, first: start.Weights | None) -> None:
+    def noted(config: TrainConfig, container: dict[str, Any], run: Path, first: policy.Weights | None) -> None:
         folders.append([run.name, first.about["run"] if first else None])
 
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()):

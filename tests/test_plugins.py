@@ -24,7 +24,7 @@ from go1exp.deploy.export.graph import ExportError, required_inputs
 from go1exp.deploy.sim_robot.__main__ import bundle_task
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import parse_task, parse_train
-from go1exp.train import checkpoint, run_folder, start, trainer
+from go1exp.train import checkpoint, policy, run_folder, trainer
 from go1exp.train.policy import load_run
 from tests.small_run import SMALL
 
@@ -455,7 +455,7 @@ def test_a_resumed_run_has_its_own_terms_and_continues_bit_for_bit(
 def test_a_new_run_starts_from_one_with_other_terms_of_the_same_name(trained: Path) -> None:
     write("my_terms.py", LAZY.replace("2.0", "7.0"))
     config = parse_train(compose("train", [*SMALL, "plugins=[my_terms.py]", "+reward.lazy.weight=-1"]))
-    start.read(config, trained)
+    policy.read_weights(config, trained)
     assert registry.members("reward")["lazy"].parameters["scale"].default == 7.0
 
 

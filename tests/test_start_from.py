@@ -16,7 +16,7 @@ from go1exp.cli.train import APP
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.task import parse_train
-from go1exp.train import checkpoint, run_folder, start, trainer
+from go1exp.train import checkpoint, policy, run_folder, trainer
 from go1exp.train.policy import load_run
 
 SMALL = (
@@ -31,7 +31,7 @@ def train_here(run: Path, *overrides: str, source: Path | None = None) -> Any:
     container = compose("train", [*SMALL, *overrides])
     config = parse_train(container)
     run_folder.write(run, container)
-    return trainer.train(config, container, run, start.read(config, source) if source else None)
+    return trainer.train(config, container, run, policy.read_weights(config, source) if source else None)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_the_weights_are_the_others_and_all_else_is_new(
     first: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: dict[str, Any] = {}
-    begin = start.begin
+    begin = policy.begin_with
 
     def spied(ppo: Any, *arguments: Any) -> None:
         fresh = [p.clone() for p in ppo.policy.state_dict().values()]
@@ -53,7 +53,7 @@ def test_the_weights_are_the_others_and_all_else_is_new(
         begun.update(policy={k: v.clone() for k, v in ppo.policy.state_dict().items()}, fresh=fresh)
         begun.update(iteration=ppo.iteration, moments=dict(ppo.policy.optimizer.state))
 
-    monkeypatch.setattr(start, "begin", spied)
+    monkeypatch.setattr(trainer, "begin_with", spied)
     run = tmp_path / "second"
     ppo = train_here(run, "reward.gait.weight=20", "ppo.learning_rate=0.0001", source=first)
     old = checkpoint.read(first / "checkpoints/000001.pt")["policy"]
@@ -103,7 +103,7 @@ def test_a_run_that_has_a_checkpoint_goes_on_from_that(first: Path, tmp_path: Pa
 def test_weights_of_another_function_are_refused(first: Path, override: str, said: str) -> None:
     config = parse_train(compose("train", [*SMALL, override]))
     with pytest.raises(ConfigError, match=said):
-        start.read(config, first)
+        policy.read_weights(config, first)
 
 
 def test_from_the_command_line(

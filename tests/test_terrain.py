@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from go1exp.mdp.curricula import terrain_levels_after
+from go1exp.mdp.curricula import TerrainLevel
 from go1exp.mdp.ground import GroundHeight
-from go1exp.sim.physics.terrain_geom import add_to_spec
+from go1exp.sim.physics.scene import add_to_spec
 from go1exp.sim.task import parse_parts
 from go1exp.sim.terrain import TILE_TYPES, Terrain, TerrainConfig, build_terrain, column_types
 
@@ -339,7 +339,7 @@ def test_outside_the_field_the_nearest_edge_counts_and_nan_stays_nan() -> None:
     ],
 )
 def test_terrain_levels_move_by_the_rule(level: int, distance: float, commanded: float, expected: int) -> None:
-    after = terrain_levels_after(
+    after = TerrainLevel()(
         torch.tensor([level, 5]),
         torch.tensor([distance, 3.0]),
         torch.tensor([commanded, 5.0]),

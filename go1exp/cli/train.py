@@ -20,7 +20,7 @@ from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
     from go1exp.sim.task import TrainConfig
-    from go1exp.train.start import Weights
+    from go1exp.train.policy import Weights
 
 RESUMABLE = (
     *("ppo.iterations", "checkpoint.every", "checkpoint.keep", "torch_threads", "device", "devices", "backend"),
@@ -206,10 +206,10 @@ def _run(job: TrainJob) -> int | None:
 
 def _first_weights(job: TrainJob) -> Weights | None:
     """Read what ``start_from`` names, unless the run has begun already."""
-    from go1exp.train import checkpoint, start
+    from go1exp.train import checkpoint, policy
 
     source = job.config.process.start_from
-    return start.read(job.config, _source(source)) if source and not checkpoint.checkpoints(job.run) else None
+    return policy.read_weights(job.config, _source(source)) if source and not checkpoint.checkpoints(job.run) else None
 
 
 def _is_finished(job: TrainJob) -> bool:

@@ -5,7 +5,7 @@ ground and follow +y, as in legged_gym. A tile is at height 0 along its whole bo
 
 The kinds follow the paper ("boxes with slight variations in height close to 0 on the z-axis", "bumpy patches by adding
 noise to terrain heights", ramps in its figure); tile grid, column rule and interpolation follow legged_gym, sizes the
-Go1 rough task of Isaac Lab. Nothing here knows the simulator or torch: `sim/physics/terrain_geom.py` hands the field to
+Go1 rough task of Isaac Lab. Nothing here knows the simulator or torch: `sim/physics/scene.py` hands the field to
 MuJoCo, `mdp/ground.py` reads it for batches.
 """
 

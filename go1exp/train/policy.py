@@ -1,8 +1,11 @@
-"""A trained policy as a function, from a run folder alone."""
+"""Policies out of run folders: as a function, and as the first weights of a new run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +15,86 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from go1exp import robot
+from go1exp.base.files import write_json
+from go1exp.config.schema import plugins
+from go1exp.config.schema.history import frame_width, frames_of
+from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.sim.task import PPOConfig, TrainConfig
-from go1exp.train import checkpoint, run_folder, start
-from go1exp.train.ppo import GaussianPolicy, policy_settings
+from go1exp.train import checkpoint, run_folder
+from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, policy_settings
+
+START = "start.json"
+"""In the new run's folder: where its first weights are from."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The state of a policy, and what ``start.json`` tells of it."""
+
+    policy: dict[str, Any]
+    about: dict[str, Any]
+
+
+def read_weights(config: TrainConfig, source: Path) -> Weights:
+    """Return the weights of ``source``'s newest checkpoint.
+
+    Args:
+        config: the new run's.
+        source: run folder, or that of a shipped policy.
+
+    Raises:
+        ConfigError: if a policy of the new run is another function than one of ``source``.
+        FileNotFoundError: if ``source`` holds no checkpoint.
+    """
+    with plugins.restored():
+        theirs = run_folder.read_parsed(source)
+    differ = [
+        f"{name} is {new} here and {old} there"
+        for name, new, old in (
+            ("observation", *(_inputs(c.task.observation) for c in (config, theirs))),
+            ("critic", *(_inputs(c.task.critic) for c in (config, theirs))),
+            ("ppo.hidden", list(config.ppo.hidden), list(theirs.ppo.hidden)),
+            ("ppo.activation", config.ppo.activation, theirs.ppo.activation),
+        )
+        if new != old
+    ]
+    if differ:
+        raise ConfigError([f"start_from = {str(source)!r}: its weights fit no policy of this run: {'; '.join(differ)}"])
+    state, path = checkpoint.load_latest(source)
+    about = {
+        "run": str(source),
+        "checkpoint": path.name,
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "iteration": state["iteration"],
+        "num_timesteps": state["num_timesteps"] + timesteps_before(source),
+    }
+    return Weights(state["policy"], about)
+
+
+def _inputs(terms: Sequence[Term]) -> list[str]:
+    """Return what each term gives a policy: its name, and how many numbers of how many steps."""
+    frames = ((t, frame_width(t), frames_of(t)) for t in terms)
+    return [
+        f"{t.entry.name} ({wide} x {steps} steps)" if steps > 1 else f"{t.entry.name} ({wide})"
+        for t, wide, steps in frames
+    ]
+
+
+def timesteps_before(run: Path) -> int:
+    """Return the policy steps that a run's first weights had learnt from, over all stages before it."""
+    file = run / START
+    return int(json.loads(file.read_text())["num_timesteps"]) if file.is_file() else 0
+
+
+def begin_with(ppo: AdaptivePPO, weights: Weights, run: Path) -> None:
+    """Give ``ppo`` the weights (actor, critic, standard deviations), and note in ``run`` where they are from.
+
+    Iterations, optimiser, learning rate, robots and curriculum begin anew.
+    """
+    ppo.policy.load_state_dict(weights.policy)
+    write_json(run / START, weights.about)
+    print(f"starting from {weights.about['run']}, iteration {weights.about['iteration']}")
+
 
 Policy = Callable[[Tensor], Tensor]
 """Observations (N, O) float32 -> actions (N, 12), deterministic."""
@@ -67,6 +147,6 @@ def load_network(run: Path, config: PPOConfig, which: Path | None = None) -> tup
     )
     network.load_state_dict(state["policy"])
     network.set_training_mode(False)
-    steps = state["num_timesteps"] + start.timesteps_before(run)
+    steps = state["num_timesteps"] + timesteps_before(run)
     about = {"iteration": state["iteration"], "num_timesteps": steps, "file": str(path)}
     return network, about

@@ -22,11 +22,12 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.faults import NumericalFault
 from go1exp.sim.env.sb3_env import Go1VecEnv
 from go1exp.sim.task import TrainConfig, parse_train
-from go1exp.train import checkpoint, metrics, preflight, run_folder, start
+from go1exp.train import checkpoint, metrics, preflight, run_folder
 from go1exp.train.asynchronous import AsyncEvaluation
 from go1exp.train.device import DevicePPO
 from go1exp.train.early_stop import EarlyStop
 from go1exp.train.group import Group, together
+from go1exp.train.policy import Weights, begin_with
 from go1exp.train.ppo import AdaptivePPO
 from go1exp.train.progress import Progress
 from go1exp.train.schedule import Schedule
@@ -74,7 +75,7 @@ def build(config: TrainConfig, group: Group | None = None) -> AdaptivePPO:
     return ppo
 
 
-def train(config: TrainConfig, container: dict[str, Any], run: Path, first: start.Weights | None = None) -> AdaptivePPO:
+def train(config: TrainConfig, container: dict[str, Any], run: Path, first: Weights | None = None) -> AdaptivePPO:
     """Train in ``run``, from its newest checkpoint if it has one, on as many GPUs as asked for; return the learner.
 
     SIGINT, SIGTERM and SIGHUP end training after the iteration under way, with a checkpoint. A third SIGINT ends it at
@@ -154,7 +155,7 @@ def _learn(ppo: AdaptivePPO, config: TrainConfig, logger: Logger) -> None:
             print(f"ended early: {ended}")
 
 
-def _begun(config: TrainConfig, run: Path, first: start.Weights | None, group: Group) -> AdaptivePPO:
+def _begun(config: TrainConfig, run: Path, first: Weights | None, group: Group) -> AdaptivePPO:
     """Return the learner as training begins or goes on with it."""
     ppo = build(config, group)
     latest = group.agreed(checkpoint.load_latest(run)[1].name if group.first and checkpoint.checkpoints(run) else None)
@@ -164,7 +165,7 @@ def _begun(config: TrainConfig, run: Path, first: start.Weights | None, group: G
         if group.first:
             print(f"continuing from {path}")
     elif first is not None:
-        start.begin(ppo, first, run)
+        begin_with(ppo, first, run)
     group.share_weights(ppo.policy)
     return ppo
 

@@ -90,7 +90,7 @@ class EnvRandom:
         num_envs: N.
         first_env: number of the first environment, so that env 7 of a batch can be replayed alone.
         device: where the numbers are wanted.
-        alike: give every environment the numbers of the first: one robot, many times.
+        shared: give every environment the numbers of the first.
         units: does the arithmetic of ``unit_numbers``, faster.
     """
 
@@ -101,17 +101,17 @@ class EnvRandom:
         first_env: int = 0,
         device: str | torch.device = "cpu",
         *,
-        alike: bool = False,
+        shared: bool = False,
         units: Units | None = None,
     ) -> None:
         self.num_envs, self.first_env, self.device = num_envs, first_env, torch.device(device)
-        self._alike, self._units = alike, units
+        self._shared, self._units = shared, units
         self._streams: dict[str, Stream] = {}
         self.seed = seed
 
     def _key(self, name: str) -> Tensor:
         env = torch.arange(self.first_env, self.first_env + self.num_envs, device=self.device).unsqueeze(1)
-        if self._alike:
+        if self._shared:
             env = torch.full_like(env, self.first_env)
         start = torch.tensor(_signed((self.seed * 0x632BE59BD9B4E019 + zlib.crc32(name.encode())) % (1 << 64)))
         return _mix(_mix(start.to(self.device)) + env * _GAMMA)

@@ -75,11 +75,11 @@ def play(rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int
         def part(done: int, total: int, k: int = k) -> None:
             on_step(k * total + done, len(places) * total)
 
-        recordings |= {r.meta.episode: r for r in _play_alike(rig, group, sensors, seed, part)}
+        recordings |= {r.meta.episode: r for r in _play_together(rig, group, sensors, seed, part)}
     return [recordings[e.name] for e in episodes]
 
 
-def _play_alike(
+def _play_together(
     rig: Rig, episodes: Sequence[Episode], sensors: SensorConfig, seed: int, on_step: Progress
 ) -> list[Recording]:
     """Simulate episodes that share a base."""
@@ -105,7 +105,7 @@ def _build_plant(rig: Rig, episodes: Sequence[Episode], seed: int) -> Plant:
         mounted=on_mount(rig.effect),
     )
     backend = make_backend(rig.backend, model, blocks, n)
-    random = EnvRandom(seed, n, device=backend.qpos.device, alike=True)  # one robot, in all its recordings
+    random = EnvRandom(seed, n, device=backend.qpos.device, shared=True)  # one robot, in all its recordings
     plant = Plant(backend, actuator_setup(rig.robot, rig.physics_dt, backend, random), rig.actuator, rig.effect)
     if has_gains(rig.actuator):
         # (n, 1) each, then the same gain for all joints: (n, 12)
@@ -236,7 +236,9 @@ def play_policy(rig: Rig, walk: Walk, sensors: SensorConfig, seed: int, on_step:
     A robot that falls is recorded up to its fall.
     """
     held = None if walk.hang is None else held_quat(walk.hang)
-    core = Go1Core(policy_task(rig, walk.trained, walk.seconds), len(walk.names), seed, imu=True, held=held, alike=True)
+    core = Go1Core(
+        policy_task(rig, walk.trained, walk.seconds), len(walk.names), seed, imu=True, held=held, shared_dynamics=True
+    )
     observation = core.reset()
     policy = walk.policy if walk.drive is None else walk.drive(core)
     assert policy is not None

@@ -25,8 +25,7 @@ from torch import Tensor
 
 from go1exp.config.schema.registry import Expected
 from go1exp.sim.env.core import Go1Core
-from go1exp.sim.physics.scene import build_model
-from go1exp.sim.physics.terrain_geom import FLOOR
+from go1exp.sim.physics.scene import FLOOR, build_model
 from go1exp.sim.terrain import Terrain
 
 Picture = NDArray[np.uint8]

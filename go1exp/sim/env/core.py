@@ -56,7 +56,7 @@ class Go1Core:
         spread_starts: let first episodes begin at random times (training only).
         imu: simulate the IMU's sensors too, for a logger.
         held: attitude w-x-y-z in which the trunks are held in the air; None lets them go.
-        alike: draw the effects and actuators once, for all robots: one robot, many times (for a logger).
+        shared_dynamics: draw effects and actuators once, for all robots (for a logger).
         critic: append what only the critic sees to the observations (training only).
         changing: keys of the settings that ``change`` may write (training only).
     """
@@ -75,7 +75,7 @@ class Go1Core:
         spread_starts: bool = False,
         imu: bool = False,
         held: tuple[float, float, float, float] | None = None,
-        alike: bool = False,
+        shared_dynamics: bool = False,
         critic: bool = False,
         changing: Collection[str] = (),
     ) -> None:
@@ -88,7 +88,9 @@ class Go1Core:
         self.random = EnvRandom(seed, num_envs, first_env, self.device, units=self.backend.units)
         self._held, self._state = held, KinematicState.view(self.backend.qpos, self.backend.qvel, held)
         self._build_ground(first_env)
-        actuators = EnvRandom(seed, num_envs, first_env, self.device, alike=True) if alike else self.random
+        actuators = self.random
+        if shared_dynamics:
+            actuators = EnvRandom(seed, num_envs, first_env, self.device, shared=True)
         self.terms = StepTerms(task, num_envs, self.device, critic, changing)
         self._build_terms(actuators)
         self._restarts = Restarts(self._restart, (self.random, actuators))

@@ -15,7 +15,7 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.sim.physics.physx_robot import pair_friction
-from go1exp.sim.physics.terrain_geom import FLOOR
+from go1exp.sim.physics.scene import FLOOR
 
 ROUNDING = 1e-4
 """Depth of a contact, m, beyond which it is one although it bears nothing: its body is pushed out at another point."""

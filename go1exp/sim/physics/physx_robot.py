@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from go1exp.config.schema.backends import PhysxBackend
 from go1exp.config.schema.registry import Expected
-from go1exp.sim.physics.terrain_geom import FLOOR
+from go1exp.sim.physics.scene import FLOOR
 
 try:
     with warnings.catch_warnings():  # that it brings its own Vulkan, which nothing here uses

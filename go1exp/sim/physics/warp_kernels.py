@@ -17,8 +17,7 @@ from mujoco_warp._src import collision_gjk
 from mujoco_warp._src.collision_gjk import Geom, GJKResult, Polytope, _get_face_verts, _tri_affine_coord
 
 from go1exp import robot
-from go1exp.sim.physics.scene import Sensors
-from go1exp.sim.physics.terrain_geom import FLOOR
+from go1exp.sim.physics.scene import FLOOR, Sensors
 
 _CONSTRAINT = 1
 """Bit of a contact that takes part in the dynamics (``mujoco_warp``'s ``ContactType.CONSTRAINT``)."""
