@@ -27,7 +27,7 @@ MEASURE = """
   parent.postMessage({width: innerWidth, all: all.length, drawings: document.querySelectorAll("figure svg").length,
     verdicts: document.querySelectorAll("td .word").length, page: document.documentElement.scrollWidth,
     empty: [...document.querySelectorAll("svg")].filter(e => e.getBoundingClientRect().height < 20).length,
-    wide: wide.filter(e => !e.closest(".heat")).map(say)}, "*");
+    wide: wide.filter(e => !e.closest(".heat, .scroll")).map(say)}, "*");
 });</script>
 """
 

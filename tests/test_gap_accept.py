@@ -79,7 +79,7 @@ def test_every_joint_of_a_window_must_be_within_beside_the_noise(monkeypatch: py
 
 def test_the_report_says_the_share_and_older_files_have_none() -> None:
     errors = AngleErrors(10, (0.005, 0.001), 0.8, 0.1, {"a": (0.005, 0.001)}, {"e": (0.005, 0.001)}, (0.2, 0.95))
-    assert "Within what you accept: 20 % of the windows before, 95 % after." in words.angles(errors)
+    assert "Within the accepted error: 20 % of the windows before, 95 % after." in words.angles(errors)
     plain = dataclasses.asdict(errors)
     assert _errors(plain) == errors
     older = {k: v for k, v in plain.items() if k != "within"}
@@ -90,6 +90,6 @@ def test_the_report_says_the_share_and_older_files_have_none() -> None:
 def test_a_verdict_by_what_is_accepted_says_what_would_change_it() -> None:
     about = {"settings": {"accept": 0.006, "adequate": 0.5}}
     result = GapResult("no gap", "", excess={"null": 400.0, "box": 77.0, "final": 77.0}, provenance=about)
-    assert words.would_change(result)[0].startswith("A smaller accept than 6 mrad: by the noise alone, 78 is above 1.5")
+    assert words.would_change(result)[0].startswith("An accept below 6 mrad: relative to the noise, 78 is above 1.5")
     small = dataclasses.replace(result, excess={"null": 1.0, "box": 0.2, "final": 0.2})
     assert words.would_change(small)[0].startswith("A held-out error above 1.5")

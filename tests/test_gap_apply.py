@@ -74,7 +74,7 @@ def whole() -> GapResult:
         not_excited={"payload": "squat"},
         advice=("Record steps.",),
         bootstrap_share={"coulomb": 0.9, "base_tilt": NAN},
-        waterfall=(("model as it is", 56.3), ("within tolerances", NAN)),
+        waterfall=(("nominal model", 56.3), ("within tolerances", NAN)),
         contact=STIFF,
         overlays=(Overlay("chirp_0", np.array([0.0, 0.002, 0.004]), curves, curves, curves, {"q_a": NAN}),),
         box={"viscous": {"damping": {"FR_hip": 0.01, "FL_hip": NAN}}},
@@ -377,7 +377,7 @@ def test_what_is_not_for_training_is_not_asked_of_the_proof(tmp_path: Path) -> N
     alone = proof(tmp_path, result(lean, excess={"box": before, "final": 0.0}))
     assert alone.holds
     assert alone.reported == before == alone.after
-    steps = (("model as it is", before), ("coulomb", 0.2), ("viscous", 0.1))
+    steps = (("nominal model", before), ("coulomb", 0.2), ("viscous", 0.1))
     both = result(named("coulomb", bound=HIDDEN), lean, excess={"final": 0.1}, waterfall=steps)
     assert proof(tmp_path, both).reported == 0.2
     assert not proof(tmp_path, result(excess={"box": 0.5 * before, "final": 0.5 * before})).holds

@@ -106,5 +106,5 @@ def test_errors_are_told_in_mrad_by_joint_and_episode() -> None:
     assert errors.by_episode["slow"] == pytest.approx((4e-3 / np.sqrt(2), 2e-3 / np.sqrt(2)), rel=0.02)
     assert errors.removed == pytest.approx(0.5, abs=0.01)
     assert errors.worse == 0.25
-    assert "50 % of a window's error is gone in the median" in words.angles(errors).replace("50.0", "50")
+    assert "The error of a window decreases by 50 % in the median" in words.angles(errors).replace("50.0", "50")
     assert ("calf", "6", "3") in words.angle_rows(errors)

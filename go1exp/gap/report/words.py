@@ -1,4 +1,4 @@
-"""Numbers, units, places and commands, worded alike in the page, its figures and the terminal."""
+"""Units, joints, effects and next recordings in words, for the page, its figures and the terminal."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import go1exp.logs.excitations  # noqa: F401  (registers every effect and excitation)
+from go1exp.base.report.table import NOTHING, number, share
 from go1exp.config.schema.registry import members
 from go1exp.gap.result import AngleErrors, Clock, ClockChoice, GapResult, GapSettings, Localisation, NamedEffect
 from go1exp.gap.robots.go1_logs import GO1
@@ -19,100 +20,72 @@ from go1exp.gap.sentence import where
 from go1exp.sim.effects.base import Param
 from go1exp.sim.effects.tolerances import DECLARED, Tolerances
 
-NOTHING = "–"
-"""Stands for a number that there is not."""
-
 UNITS: dict[str, str] = {"q": "rad", "qd": "rad/s", "tau_est": "N m"}
 """Logged quantity of a joint -> unit."""
 
 TRUNK_UNITS: dict[str, str] = {"imu_gyro": "rad/s", "imu_acc": "m/s²"}
-"""The same of the trunk, along x, y and z."""
+"""Logged quantity of the trunk, along x, y and z -> unit."""
 
 ALL_UNITS: dict[str, str] = UNITS | TRUNK_UNITS
-"""The same of both."""
+"""Logged quantity -> unit."""
 
 ERRORS: dict[str, str] = {
-    "null": "model as it is",
+    "null": "nominal model",
     "box": "within its tolerances",
-    "final": "with what is named",
-    "confirm": "on windows kept for the last check",
+    "final": "with the identified effects",
+    "confirm": "on windows reserved for confirmation",
 }
-"""Key of ``GapResult.excess`` -> what it is of."""
+"""Key of ``GapResult.excess`` -> label."""
 
 GROUND = ("squat", "drop")
-"""Excitations of a robot that stands; all others hang it up."""
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """Return a number with ``digits`` significant digits, without an exponent where it can be read without."""
-    if value is None or math.isnan(value):
-        return NOTHING
-    if math.isinf(value):
-        return "∞" if value > 0 else "-∞"
-    rounded = float(f"{value:.{digits - 1}e}") + 0.0  # no minus zero
-    if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
-        return f"{rounded:.12f}".rstrip("0").rstrip(".")
-    digit, _, power = f"{rounded:.{digits - 1}e}".partition("e")
-    return f"{digit.rstrip('0').rstrip('.') if '.' in digit else digit}e{int(power)}"
-
-
-def share(value: float) -> str:
-    """Return a share as a percentage, its distance from 100 % kept visible."""
-    if math.isnan(value):
-        return NOTHING
-    return f"{number(100.0 * value, 4 if value > 0.99 else 3)} %"
-
-
-def error(excess: float) -> str:
-    """Return an excess as what a reader is told: the error, whose floor is 1."""
-    return number(1.0 + excess)
+"""Excitations of a standing robot; all others are of a suspended one."""
 
 
 def errors(result: GapResult) -> list[tuple[str, str]]:
-    """Return (of what, error) of the held-out errors that there are."""
+    """Return (label, normalised chi2) of the available held-out errors."""
     keys = [k for k in ERRORS if k in result.excess and (result.named or k != "final")]
-    return [(ERRORS[k], error(result.excess[k])) for k in keys]
+    return [(ERRORS[k], number(1.0 + result.excess[k])) for k in keys]
 
 
 def angles(errors: AngleErrors) -> str:
-    """Return the errors of the angles as a sentence."""
+    """Return the errors of the angles as sentences."""
     before, after = (number(1e3 * value) for value in errors.median)
     accepted = ""
     if errors.within is not None:
         first, second = (share(value) for value in errors.within)
-        accepted = f" Within what you accept: {first} of the windows before, {second} after."
+        accepted = f" Within the accepted error: {first} of the windows before, {second} after."
     return (
-        f"Angles in the median of {errors.windows} held-out windows: {before} mrad off as the model is, {after} mrad "
-        f"with what is named and the tolerances used; {share(errors.removed)} of a window's error is gone in the "
-        f"median, and {share(errors.worse)} of the windows are worse.{accepted}"
+        f"Median angle error of {errors.windows} held-out windows: {before} mrad of the nominal model, {after} mrad of "
+        f"the fitted one. The error of a window decreases by {share(errors.removed)} in the median; "
+        f"{share(errors.worse)} of the windows are worse.{accepted}"
     )
 
 
 def angle_rows(errors: AngleErrors, most: int | None = None) -> list[tuple[str, str, str]]:
     """Return (joint or episode, before, after) of the errors of the angles, mrad; of ``most`` episodes, the worst."""
-    episodes = errors.by_episode.items()
+    episodes = list(errors.by_episode.items())
     if most is not None:
-        episodes = sorted(episodes, key=lambda item: -item[1][1])[:most]  # type: ignore[assignment]
+        episodes = sorted(episodes, key=lambda item: -item[1][1])[:most]
     both = [*errors.by_joint.items(), *episodes]
-    return [(name, *(number(1e3 * value) for value in pair)) for name, pair in both]  # type: ignore[misc]
+    return [(name, number(1e3 * before), number(1e3 * after)) for name, (before, after) in both]
 
 
 def clock_rows(choice: ClockChoice) -> list[tuple[str, str, str, str, str]]:
     """Return (clock, rate of rows in Hz, error within the tolerances and with the first terms in mrad, these terms)."""
 
     def milli(errors: Mapping[Clock, float], clock: Clock) -> str:
-        return number(1e3 * errors[clock]) if clock in errors else "–"
+        return number(1e3 * errors[clock]) if clock in errors else NOTHING
 
     rows = []
     for clock, name in OF_CLOCK.items():
-        rate = span(*choice.rate_hz[clock]) if clock in choice.rate_hz else "–"
-        terms = ", ".join(choice.terms.get(clock, ())) or "–"
+        rate = span(*choice.rate_hz[clock]) if clock in choice.rate_hz else NOTHING
+        terms = ", ".join(choice.terms.get(clock, ())) or NOTHING
         rows.append((name, rate, milli(choice.nominal_errors, clock), milli(choice.errors, clock), terms))
     return rows
 
 
 def param(effect: str, name: str, tolerances: Tolerances = DECLARED) -> Param | None:
-    """Return the declaration of a parameter, None for one that is not registered (any more)."""
+    """Return the declaration of a parameter; None for an unregistered one."""
     entry = members("effect").get(effect)
     known: Iterable[Param] = getattr(entry.target, "params", ()) if entry else ()
     return tolerances.param((effect, name)) if any(p.name == name for p in known) else None
@@ -125,13 +98,13 @@ def unit(effect: str, name: str) -> str:
 
 
 def meaning(effect: str) -> str:
-    """Return what an effect is, in its own words."""
+    """Return the description of an effect."""
     entry = members("effect").get(effect)
     return entry.doc.replace("``", "") if entry else ""
 
 
 def is_size(effect: str, name: str) -> bool:
-    """Return whether a parameter says how much of the effect there is, as opposed to its shape."""
+    """Return whether a parameter is a magnitude of the effect, as opposed to a shape."""
     declared = param(effect, name)
     return declared is None or math.isfinite(declared.tolerance)
 
@@ -144,12 +117,12 @@ def of_robot(effect: str) -> bool:
 
 
 def everyone(result: GapResult) -> tuple[str, ...]:
-    """Return all joints that were compared, as far as the result knows them."""
+    """Return all joints that were compared."""
     return result.before.joints if result.before else ()
 
 
 def place(effect: str, joints: Sequence[str], all_joints: Sequence[str]) -> str:
-    """Say where an effect acts."""
+    """Return the location of an effect."""
     if not joints:
         return "the whole robot" if of_robot(effect) else NOTHING
     if not set(joints) <= set(all_joints):
@@ -159,7 +132,7 @@ def place(effect: str, joints: Sequence[str], all_joints: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Size:
-    """One parameter of a named effect in short.
+    """One parameter of an identified effect.
 
     Attributes:
         name: of the parameter.
@@ -167,7 +140,7 @@ class Size:
         half: mean half width of their 95 % intervals.
         low: smallest value over the joints.
         high: largest.
-        count: how many joints.
+        count: number of joints.
         unit: empty for none.
     """
 
@@ -193,7 +166,7 @@ class Size:
 
 
 def sizes(named: NamedEffect) -> list[Size]:
-    """Return the parameters that say how much of a named effect there is."""
+    """Return the magnitudes of an identified effect."""
     rows = []
     for name, by_joint in named.params.items():
         values = np.array(list(by_joint.values()), dtype=float)
@@ -207,12 +180,12 @@ def sizes(named: NamedEffect) -> list[Size]:
 
 
 def rivals(named: NamedEffect) -> tuple[str, ...]:
-    """Return the effects that do as well as this one."""
+    """Return the effects that are not distinguishable from this one."""
     return tuple(name for name in named.alias_set if name != named.effect)
 
 
 def limit(result: GapResult, name: str) -> float:
-    """Return a limit of the settings (``adequate``, ``certified``), from the provenance if it says them."""
+    """Return a limit of the settings (``adequate``, ``certified``), from the provenance if available."""
     settings = result.provenance.get("settings")
     value = settings.get(name) if isinstance(settings, Mapping) else None
     return float(value if isinstance(value, int | float) else getattr(GapSettings(), name))
@@ -228,45 +201,44 @@ def worst(cells: Localisation | None) -> str:
 
 
 def would_change(result: GapResult) -> list[str]:
-    """Return what would change the verdict, a sentence each."""
+    """Return the observations that would change the verdict, a sentence each."""
     allowed = number(1.0 + limit(result, "adequate"))
     final, box = (result.excess.get(k, math.nan) for k in ("final", "box"))
     rest, left = worst(result.after), final if result.named else box
     changes = []
     if result.verdict == "bad log":
-        changes.append(
-            "Recordings without these flaws; the command go1exp record audit FILE says whether they are gone."
-        )
+        changes.append("Recordings without these flaws; go1exp record audit FILE checks for them.")
     elif result.verdict == "not excited":
-        changes.append("Recordings that move more: the last section says which.")
+        changes.append("Recordings with more excitation; the section on next recordings lists them.")
     elif result.verdict in ("no gap", "explained") and limit(result, "accept") and left > limit(result, "adequate"):
         changes.append(
-            f"A smaller accept than {number(1e3 * limit(result, 'accept'))} mrad: by the noise alone, {error(left)} "
-            f"is above {allowed}."
+            f"An accept below {number(1e3 * limit(result, 'accept'))} mrad: relative to the noise, "
+            f"{number(1.0 + left)} is above {allowed}."
         )
     elif result.verdict == "no gap":
-        changes.append(f"A held-out error above {allowed} that the tolerances cannot take up; it is {error(box)}.")
+        changes.append(f"A held-out error above {allowed} within the tolerances; it is {number(1.0 + box)}.")
     elif result.verdict == "explained":
-        changes.append(f"A held-out error above {allowed} in spite of what is named; it is {error(final)}.")
+        changes.append(f"A held-out error above {allowed} with the identified effects; it is {number(1.0 + final)}.")
     else:
         at = f", largest at {rest}" if rest else ""
         changes.append(
-            f"An effect that takes the held-out error to {allowed} or less; {error(final)} is left{at}. "
-            "None that was fitted does."
+            f"An effect that reduces the held-out error to {allowed} or less; it is {number(1.0 + final)}{at}. "
+            "No fitted candidate does."
         )
     for named in result.named:
         if rivals(named):
-            changes.append(f"Data that separate {named.effect} from {' and '.join(rivals(named))} may change the name.")
+            others = " and ".join(rivals(named))
+            changes.append(f"Data that distinguish {named.effect} from {others} may change the effect.")
         if named.status == "compensating":
-            bar = share(limit(result, "certified"))
-            needs = f"that needs its name again in {bar} of the bootstraps and little left"  # of an older result
+            least = share(limit(result, "certified"))
+            needs = f"that needs {least} of the bootstrap resamples and a small residual"  # of an older result
             changes.append(f"{named.effect} is not certified: {named.reason or needs}.")
     if result.verdict == "unexplained" and result.candidates:
         near = max(result.candidates, key=lambda c: c.log_gain)
         if near.status == "rejected":
-            changes.append(f"The nearest was {near.effect}: {near.reason}.")
+            changes.append(f"The best candidate was {near.effect}: {near.reason}.")
     if result.verdict in ("no gap", "explained") and result.not_excited:
-        changes.append("Motions that show what these logs cannot (last section) may reveal more.")
+        changes.append("Motions that excite further effects (section on next recordings) may reveal more.")
     return changes
 
 
@@ -275,9 +247,9 @@ class Next:
     """A recording to make next.
 
     Attributes:
-        why: what it is for.
-        command: to paste into a shell.
-        effects: what it shows.
+        why: purpose.
+        command: for a shell.
+        effects: that it excites.
     """
 
     why: str
@@ -292,14 +264,14 @@ def record(names: Sequence[str], *settings: str, out: str) -> str:
 
 
 def motions(result: GapResult, names: Sequence[str], *settings: str, out: str) -> str:
-    """Return the command that records excitations; for a robot that ``go1exp record`` does not move, designs others."""
+    """Return the command that records excitations; for a robot other than the Go1, the one that designs excitations."""
     if result.provenance.get("robot", GO1) == GO1:
         return record(names, *settings, out=out)
     return f"go1exp gap next logs=RECORDINGS model=MODEL out=GAP  # for your robot; like {', '.join(names)}"
 
 
 def next_recordings(result: GapResult) -> list[Next]:
-    """Return what to record next: first what tells apart equals, then what shows effects that these logs cannot."""
+    """Return the next recordings: first to distinguish alias effects, then to excite further effects."""
     known = members("excitation")
     recordings: list[Next] = []
     for sentence in result.advice:
@@ -316,6 +288,6 @@ def next_recordings(result: GapResult) -> list[Next]:
         names = [name for name in by_name if (name in GROUND) == ground]
         if names:
             effects = tuple(effect for name in names for effect in by_name[name])
-            why = "Shows what a robot feels only on its feet." if ground else "Shows what these logs cannot."
+            why = f"Excites effects that {'only a standing robot shows' if ground else 'these logs do not show'}."
             recordings.append(Next(why, motions(result, names, out=out), effects))
     return recordings

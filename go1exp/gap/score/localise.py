@@ -12,7 +12,7 @@ from go1exp.gap.score.likelihood import Scorer
 from go1exp.gap.score.robust import log_chi2, weighted_excess
 
 REGIMES = (
-    *("stick", "reversal", "slow", "fast", "high torque", "after an edge", "drives off"),
+    *("stiction", "reversal", "slow", "fast", "high torque", "after a step", "actuators off"),
     *("early in the episode", "late in the episode", "small angle", "large angle"),
 )
 ON_FEET = ("stance", "swing", "impact")

@@ -176,7 +176,7 @@ def written(
         not_excited=silent,
         advice=suggestions,
         bootstrap_share=dict(search.shares),
-        waterfall=(("model as it is", answer.excess["null"]), *search.steps),
+        waterfall=(("nominal model", answer.excess["null"]), *search.steps),
         overlays=overlays(score, comparison.recordings, search.state.theta, parts.select, settings.overlays, dt),
         tolerances=comparison.robot.tolerances.by_effect(),
         contact=comparison.robot.tolerances.contact,

@@ -1,0 +1,207 @@
+"""The page of a comparison and its JSON file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import go1exp.gap.report.figures as figures
+import go1exp.gap.report.tables as tables
+import go1exp.gap.report.words as words
+from go1exp.base.files import write_text
+from go1exp.base.report.page import Block, Card, Page, Section, render
+from go1exp.base.report.table import Table, number, share
+from go1exp.gap.result import GapResult, NamedEffect
+from go1exp.gap.search import clocks
+
+MOST_WINDOWS = 6
+"""Windows that are drawn, so that the page stays small; the JSON file has all."""
+
+MOST_FORESTS = 16
+"""Parameters that are drawn; the table has all."""
+
+
+def write_report(result: GapResult, folder: Path) -> list[Path]:
+    """Write ``report.html`` and ``report.json`` into ``folder``, created if missing; return the two files.
+
+    The page needs no other file. The JSON file holds ``GapResult.as_dict``, with null for numbers that are not finite.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    plain = json.dumps(result.as_dict(), indent=1, allow_nan=False, default=str)
+    files = [folder / "report.html", folder / "report.json"]
+    for file, content in zip(files, (page(result), plain + "\n"), strict=True):
+        write_text(file, content)
+    return files
+
+
+def page(result: GapResult) -> str:
+    """Return the page, one HTML document."""
+    cards = [*(_effect(result, n) for n in result.named), *_errors(result), *_angles(result), *_clock(result)]
+    return render(
+        Page(
+            title=f"go1exp gap: {result.verdict}",
+            kind=f"go1exp gap · verdict (exit code {result.exit_code})",
+            heading=result.verdict.capitalize(),
+            lead=result.sentence,
+            cards=[*cards, Card("What would change the verdict", points=words.would_change(result))],
+            warnings=result.warnings,
+            sections=[
+                _overlays(result),
+                _localisation(result),
+                _evidence(result),
+                _waterfall(result),
+                *_parameters(result),
+                _stability(result),
+                *_next(result),
+                *_provenance(result),
+            ],
+            tone=f"is-{result.verdict.replace(' ', '-')}",
+        )
+    )
+
+
+# ---------------------------------------------------------------------- cards
+
+
+def _effect(result: GapResult, named: NamedEffect) -> Card:
+    rivals = words.rivals(named)
+    sizes = [
+        (f"{s.name} {s.short}", f"{s.spread}; ± is the mean half width of the 95 % intervals" if s.spread else "")
+        for s in words.sizes(named)
+    ]
+    notes = []
+    if rivals:
+        notes.append(f"Not distinguishable from {' or '.join(rivals)} with these data.")
+    if named.effect in result.bootstrap_share:
+        notes.append(f"selected in {share(result.bootstrap_share[named.effect])} of bootstrap resamples")
+    return Card(
+        title=" or ".join((named.effect, *rivals)),
+        tag=named.status,
+        note=words.meaning(named.effect),
+        sizes=[
+            ("", words.place(named.effect, named.joints, words.everyone(result))),
+            *(sizes or [("", "not significantly beyond its tolerance at any single joint")]),
+        ],
+        notes=notes,
+    )
+
+
+def _errors(result: GapResult) -> list[Card]:
+    rows = [list(pair) for pair in words.errors(result)]
+    if not rows:
+        return []
+    if result.closed == result.closed:
+        rows.append(["explained share", share(result.closed)])
+    note = (
+        "Chi2 per sample, normalised by the noise: a correct model scores 1, the noise level. A model is adequate up to"
+        f" {number(1.0 + words.limit(result, 'adequate'))}. Windows beyond ten times the noise level enter by their"
+        " logarithm, so that outliers do not dominate."
+    )
+    return [Card("Held-out error", "(normalised chi2)", table=Table("", [], rows), notes=[note])]
+
+
+def _angles(result: GapResult) -> list[Card]:
+    if result.errors is None:
+        return []
+    table = Table("", ["", "nominal", "fitted"], words.angle_rows(result.errors))
+    notes = ["Medians over windows, by joint and by episode."]
+    return [Card("Joint angles", "(mrad, held-out)", note=words.angles(result.errors), table=table, notes=notes)]
+
+
+def _clock(result: GapResult) -> list[Card]:
+    if result.clock is None:
+        return []
+    rows = words.clock_rows(result.clock)
+    header = ["", "rows, Hz", "within tolerances, mrad", "with first terms, mrad", "first terms"]
+    note = "Errors of the angles in the median held-out window of the same rows, and the first terms, by each clock."
+    table = Table("", header, rows) if rows else None
+    return [Card("Clock", "(time between rows)", note=clocks.sentence(result.clock), table=table, notes=[note])]
+
+
+# ---------------------------------------------------------------------- sections
+
+
+def _overlays(result: GapResult) -> Section:
+    windows = [w for w in result.overlays[:MOST_WINDOWS] if len(w.t) and figures.rows_of(w)]
+    drawn = [figures.overlay(window, f"window{k}") for k, window in enumerate(windows)]
+    trunk = any(words.TRUNK_UNITS.keys() & figures.rows_of(window) for window in windows)
+    note = (
+        "From the worst window of the nominal model to its median one: the joints with the largest error of the nominal"
+        f" model{', and the measurements of the IMU' if trunk else ''}. Small panels: model - measurement in standard"
+        " deviations of the noise, linear up to 3 and logarithmic beyond; the grey band is ± 2."
+    )
+    more = len(result.overlays) - len(windows)
+    blocks = [*drawn, *([Block(f"{more} more in report.json.")] if more else [])]
+    title = "Nominal and fitted model on held-out windows"
+    return Section(title, blocks if drawn else [Block("No curves were kept.")], note if drawn else "", "overlays")
+
+
+def _localisation(result: GapResult) -> Section:
+    maps = tables.heat_maps(result)
+    note = (
+        "Mean of normalised chi2 - 1 by joint and regime on held-out samples. Framed and bold: significant at a false"
+        " discovery rate of 5 % (block permutation)."
+    )
+    title, nothing = "Location of the model error", [Block("Nothing was compared.")]
+    key = tables.scale(result) if maps else []
+    return Section(title, maps or nothing, note if maps else "", "localisation", grid=bool(maps), key=key)
+
+
+def _evidence(result: GapResult) -> Section:
+    note = (
+        "Every fitted candidate, best first, on held-out windows. Log gain: mean decrease of log chi2. p: sign-flip"
+        " test, corrected for the number of candidates. Tolerances: largest deviation from null, in tolerances."
+    )
+    if not result.candidates:
+        return Section("Evidence", [Block("No candidate was tried.")], name="evidence")
+    return Section("Evidence", [tables.evidence(result)], note, "evidence")
+
+
+def _waterfall(result: GapResult) -> Section:
+    drawn = figures.waterfall(result)
+    return Section("From the nominal model to the noise level", drawn or [Block("No steps.")], name="waterfall-section")
+
+
+def _parameters(result: GapResult) -> list[Section]:
+    drawn = [(n, name) for n in result.named for name, values in n.params.items() if values][:MOST_FORESTS]
+    forests = [figures.forest(result, n, name, k) for k, (n, name) in enumerate(drawn)]
+    values, box = tables.values(result), figures.box(result)
+    note = "Points: fitted values; bars: 95 % intervals over resampled episodes; dotted: null; grey: its tolerance."
+    if not values.rows:
+        return [Section("Parameters", [Block("No effect is identified."), *box], name="parameters")]
+    return [Section("Parameters", forests, note, "parameters", grid=True), Section("", [values, *box])]
+
+
+def _stability(result: GapResult) -> Section:
+    drawn = figures.bootstraps(result)
+    note = "Share of resampled episode sets that select the effect. Hatched: below the threshold of certification."
+    blocks = drawn or [Block("Nothing was resampled.")]
+    return Section("Stability over bootstrap resamples", blocks, note if drawn else "", "stability")
+
+
+def _next(result: GapResult) -> list[Section]:
+    recordings = words.next_recordings(result)
+    note = (
+        "Each command simulates the recording with the model of this project, to check its value beforehand; drive the"
+        " robot through the same targets (q_target in its files)."
+    )
+    blocks: list[Block | Table] = []
+    for todo in recordings:
+        effects = f" ({', '.join(todo.effects)})" if todo.effects else ""
+        blocks += [Block(f"{todo.why}{effects}"), Block(todo.command, fixed=True)]
+    if not recordings:
+        unknown = "Unknown: the logs are not usable." if result.verdict == "bad log" else "Nothing."
+        blocks += [Block(unknown), *map(Block, result.advice)]
+    if result.not_excited:
+        rows = [[effect, words.meaning(effect), excitation] for effect, excitation in result.not_excited.items()]
+        blocks.append(Table("", ["effect", "meaning", "excitation"], rows))
+    return [Section("Not identifiable from these logs; next recordings", blocks, note if recordings else "", "next")]
+
+
+def _provenance(result: GapResult) -> list[Section]:
+    floors = tables.floors(result)
+    blocks = [floors] if floors else [Block("No noise levels were measured.")]
+    first = Section("Noise levels and provenance", blocks, name="provenance")
+    origin = tables.provenance(result)
+    return [first, Section("", origin, grid=True)] if origin else [first]
