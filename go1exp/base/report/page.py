@@ -48,6 +48,9 @@ class Block:
     fixed: bool = False
 
 
+Content = Sequence[Block | Table | Drawing]
+
+
 @dataclass(frozen=True)
 class Section:
     """One section of a page.
@@ -62,7 +65,7 @@ class Section:
     """
 
     title: str
-    blocks: Sequence[Block | Table | Drawing] = ()
+    blocks: Content = ()
     note: str = ""
     name: str = ""
     grid: bool = False

@@ -264,8 +264,8 @@ def _bootstraps(rows: Sequence[tuple[str, float]], certified: float) -> Figure:
     figure, axes = listing([name for name, _ in rows], WIDE, 0.27, xlabel)
     for row, (_, value) in enumerate(rows):
         stable = value >= certified
-        look = {"color": AFTER} if stable else {"color": GREY, "hatch": "///"}
-        axes.barh(row, 100 * value, height=0.6, ec="white", **look)
+        colour, hatch = (AFTER, None) if stable else (GREY, "///")
+        axes.barh(row, 100 * value, height=0.6, ec="white", color=colour, hatch=hatch)
         _note(axes, 100 * value, row, share(value))
     axes.axvline(100 * certified, color="black", lw=1.0, ls="--")
     axes.set_xlim(0, 112)

@@ -9,7 +9,7 @@ import go1exp.gap.report.figures as figures
 import go1exp.gap.report.tables as tables
 import go1exp.gap.report.words as words
 from go1exp.base.files import write_text
-from go1exp.base.report.page import Block, Card, Page, Section, render
+from go1exp.base.report.page import Block, Card, Content, Page, Section, render
 from go1exp.base.report.table import Table, number, share
 from go1exp.gap.result import GapResult, NamedEffect
 from go1exp.gap.search import clocks
@@ -132,9 +132,12 @@ def _overlays(result: GapResult) -> Section:
         " deviations of the noise, linear up to 3 and logarithmic beyond; the grey band is ± 2."
     )
     more = len(result.overlays) - len(windows)
-    blocks = [*drawn, *([Block(f"{more} more in report.json.")] if more else [])]
-    title = "Nominal and fitted model on held-out windows"
-    return Section(title, blocks if drawn else [Block("No curves were kept.")], note if drawn else "", "overlays")
+    title, rest = (
+        "Nominal and fitted model on held-out windows",
+        [Block(f"{more} more in report.json.")] if more else [],
+    )
+    blocks: Content = [*drawn, *rest] if drawn else [Block("No curves were kept.")]
+    return Section(title, blocks, note if drawn else "", "overlays")
 
 
 def _localisation(result: GapResult) -> Section:
@@ -176,7 +179,7 @@ def _parameters(result: GapResult) -> list[Section]:
 def _stability(result: GapResult) -> Section:
     drawn = figures.bootstraps(result)
     note = "Share of resampled episode sets that select the effect. Hatched: below the threshold of certification."
-    blocks = drawn or [Block("Nothing was resampled.")]
+    blocks: Content = drawn or [Block("Nothing was resampled.")]
     return Section("Stability over bootstrap resamples", blocks, note if drawn else "", "stability")
 
 
