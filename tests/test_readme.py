@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import importlib.util
+import json
 import re
 import shlex
 import tomllib
@@ -133,6 +135,38 @@ def test_guides_stay_short() -> None:
     guides = (ROOT / "docs").glob("*.md")
     assert sum(len(guide.read_text().split()) for guide in guides) <= 35_000
     assert len(README.splitlines()) <= 130
+
+
+RESULTS = ROOT / "docs/results"
+GAP = (ROOT / "docs/gap.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "digits", "n"),
+    [
+        ("gap.json", "nulls_no_gap", 0, True),
+        ("gap.json", "param_error", 1, True),
+        ("gap.json", "coverage", 0, True),
+        ("closed_loop_full.json", "closed_loop_won_back_plain", 0, False),
+        ("closed_loop_full.json", "closed_loop_won_back_net", 0, False),
+    ],
+)
+def test_figures_of_the_gap_guide_are_those_of_the_results(name: str, key: str, digits: int, n: bool) -> None:
+    results = json.loads((RESULTS / name).read_text())
+    value, low, high = (f"{100 * results[key + end]:.{digits}f}" for end in ("", "_low", "_high"))
+    assert f"{value} % [{low}, {high}]" + (f" | {results[f'{key}_n']} |" if n else "") in GAP
+
+
+def test_ablations_of_the_gap_guide_are_those_of_the_results() -> None:
+    with open(RESULTS / "gap_ablations.csv") as file:
+        rows = {row["method"]: row for row in reversed(list(csv.DictReader(file)))}  # the newest search comes first
+    false = {name: round(float(row["false_name_rate"]) * float(row["false_name_rate_n"])) for name, row in rows.items()}
+    assert (false["whole"], false["no_box"], false["sysid"]) == (0, 9, 21)
+    text = " ".join(GAP.split())
+    assert f"Without it {false['no_box']} of 24" in text
+    assert f"a false name in {false['sysid']} of 24" in text
+    for name in ("sysid", "whole"):
+        assert f"truth first in {100 * float(rows[name]['first']):.0f} %" in text
 
 
 def reference() -> ModuleType:
