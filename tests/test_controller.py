@@ -27,9 +27,10 @@ from go1exp.evaluate.controller.gait import Clock, Feet
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 from go1exp.evaluate.controller.state import Ground, frame
-from go1exp.evaluate.controller.types import Drive, Sensed
+from go1exp.evaluate.controller.types import Sensed
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.robot import GRAVITY
+from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.physics.dynamics import Kinematics
 from go1exp.sim.physics.scene import load_robot
@@ -312,7 +313,7 @@ def told(one: Mpc, steps: int = 160) -> np.ndarray:
     """All that the drives are told (steps, 48)."""
     commands = [one.step((0.6, 0.2, 0.8), each) for each in readings(steps)]
     return np.array(
-        [[*c.target, *c.kp, *c.kd, *(c.feedforward if c.feedforward is not None else ())] for c in commands]
+        [[*c.joint_target, *c.kp, *c.kd, *(c.feedforward if c.feedforward is not None else ())] for c in commands]
     )
 
 
@@ -398,27 +399,28 @@ class Asks:
 
     period = 0.002
 
-    def __init__(self, drive: Drive) -> None:
+    def __init__(self, drive: LowCmd) -> None:
         self.drive = drive
 
     def reset(self) -> None:
         """Forget nothing."""
 
-    def step(self, command: object, sensed: object) -> Drive:
+    def step(self, command: object, sensed: object) -> LowCmd:
         return self.drive
 
 
 def test_targets_alone_make_the_same_torque() -> None:
     rng = np.random.default_rng(0)
-    drive = Drive(*(rng.uniform(0.0, 2.0, 12) for _ in range(4)))
+    target, kp, kd, torque = (rng.uniform(0.0, 2.0, 12) for _ in range(4))
+    drive = LowCmd(target, kp, kd, feedforward=torque)
     sensed = next(readings(1))
     kp, kd = np.full(12, 20.0), np.full(12, 0.5)
     found = AsTargets(Asks(drive), kp, kd).step((0.0, 0.0, 0.0), sensed)
     assert found.feedforward is None
     assert drive.feedforward is not None
     q, qd = sensed.joint_pos, sensed.joint_vel
-    wanted = drive.kp * (drive.target - q) - drive.kd * qd + drive.feedforward
-    np.testing.assert_allclose(kp * (found.target - q) - kd * qd, wanted, atol=1e-12)
+    wanted = drive.kp * (drive.joint_target - q) - drive.kd * qd + drive.feedforward
+    np.testing.assert_allclose(kp * (found.joint_target - q) - kd * qd, wanted, atol=1e-12)
 
 
 WALK = EvalConfig(

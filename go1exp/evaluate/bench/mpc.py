@@ -12,7 +12,8 @@ import torch
 from go1exp.evaluate.controller.batch import Driven
 from go1exp.evaluate.controller.mpc import Mpc
 from go1exp.evaluate.controller.settings import MpcSettings
-from go1exp.evaluate.controller.types import Command, Drive, Sensed
+from go1exp.evaluate.controller.types import Command, Sensed
+from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig
 
@@ -30,7 +31,7 @@ class _Timed:
         """Forget everything."""
         self.inner.reset()
 
-    def step(self, command: Command, sensed: Sensed) -> Drive:
+    def step(self, command: Command, sensed: Sensed) -> LowCmd:
         """Act, and note the time that it took."""
         start = time.perf_counter()
         drive = self.inner.step(command, sensed)

@@ -1,1 +1,1 @@
-"""What moves a robot other than a policy: command and estimated state in, targets, gains and torques out."""
+"""Controllers other than a policy: command and estimated state in, targets, gains and torques out."""

@@ -4,44 +4,40 @@ from __future__ import annotations
 
 import numpy as np
 
-from go1exp.evaluate.controller.types import Command, Controller, Drive, Sensed
+from go1exp.evaluate.controller.types import Command, Controller, Sensed
 from go1exp.robot.messages import LowCmd, LowState
 
 
 class AsTargets:
-    """Turns what a controller asks for into targets alone, so that the drives make the same torque at its ticks.
+    """Converts a controller's commands to position targets at fixed gains, with the same torque at its ticks.
 
-    With the gains kp and kd of the drives, the target is q + (torque + kd qd) / kp. Between two ticks the drives react
-    with their own gains, not with those of the controller. Recordings of such a walk are complete: what moved the robot
-    are its targets.
+    With the actuator's gains kp and kd, the target is q + (torque + kd qd) / kp. Between two ticks the actuator's gains
+    act, not the controller's. Recordings of such a walk are complete: the targets determine the motion.
 
     Attributes:
         period: time between two calls, s.
     """
 
     def __init__(self, inner: Controller, kp: np.ndarray, kd: np.ndarray) -> None:
-        """Wrap ``inner`` for drives with gains (12,), N m/rad, positive, and N m s/rad."""
+        """Wrap ``inner`` for an actuator with gains (12,), N m/rad, positive, and N m s/rad."""
         self.period = inner.period
         self._inner, self._kp, self._kd = inner, np.asarray(kp, dtype=float), np.asarray(kd, dtype=float)
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Reset the controller."""
         self._inner.reset()
 
-    def step(self, command: Command, sensed: Sensed) -> Drive:
-        """Return targets at the drives' own gains, without any torque that is fed forward."""
-        drive, q, qd = self._inner.step(command, sensed), sensed.joint_pos, sensed.joint_vel
-        torque = drive.kp * (drive.target - q) - drive.kd * qd
-        if drive.feedforward is not None:
-            torque = torque + drive.feedforward
-        return Drive(q + (torque + self._kd * qd) / self._kp, self._kp, self._kd)
+    def step(self, command: Command, sensed: Sensed) -> LowCmd:
+        """Return targets at the actuator's gains, without feed-forward torque."""
+        inner, q, qd = self._inner.step(command, sensed), sensed.joint_pos, sensed.joint_vel
+        torque = inner.kp * (inner.joint_target - q) - inner.kd * qd
+        if inner.feedforward is not None:
+            torque = torque + inner.feedforward
+        return LowCmd(q + (torque + self._kd * qd) / self._kp, self._kp, self._kd)
 
 
 class Deployed:
-    """Gives a controller what the robot reports, and the drives what the controller says.
-
-    The loop must run at the controller's own rate.
-    """
+    """A controller in the runtime's loop, which must run at its rate, in place of a bundle's policy."""
 
     def __init__(self, controller: Controller) -> None:
         """Walk by ``controller``."""
@@ -50,13 +46,5 @@ class Deployed:
     def step(self, velocity: np.ndarray, state: LowState, base_lin_vel: np.ndarray) -> LowCmd:
         """Return the command of a cycle; arguments as those of ``go1exp.deploy.runtime.controller.Mover``."""
         x, y, yaw = velocity.tolist()
-        sensed = Sensed(
-            joint_pos=state.joint_pos,
-            joint_vel=state.joint_vel,
-            quat=state.imu_quat,
-            gyro=state.imu_gyro,
-            velocity_b=base_lin_vel,
-            foot_force=state.foot_force,
-        )
-        drive = self._controller.step((x, y, yaw), sensed)
-        return LowCmd(drive.target, drive.kp, drive.kd, feedforward=drive.feedforward)
+        readings = state.joint_pos, state.joint_vel, state.imu_quat, state.imu_gyro, base_lin_vel, state.foot_force
+        return self._controller.step((x, y, yaw), Sensed(*readings))

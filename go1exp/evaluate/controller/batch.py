@@ -1,4 +1,4 @@
-"""Controllers that drive the robots of an environment, each by what its own sensors say."""
+"""Controllers of the robots of an environment, each by its robot's sensors."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.estimation import Filters
 from go1exp.deploy.sim_robot.machine import noisy
-from go1exp.evaluate.controller.types import Command, Controller, Drive, Savable, Sensed
+from go1exp.evaluate.controller.types import Command, Controller, Savable, Sensed
 from go1exp.logs.record.tape import sample
+from go1exp.robot.messages import LowCmd
 from go1exp.sim.env.core import Go1Core
 
 VELOCITY_NOISE = 0.02
@@ -27,11 +28,11 @@ VELOCITY_NOISE = 0.02
 class Driven:
     """N controllers in place of a policy: built once, they act in every ``core.step``.
 
-    Each physics step whose time has come, every robot's sensors are read, its controller called, and the answer kept in
-    force: targets, feed-forward torques and gains. Drives without gains get the targets and torques alone.
+    Once every controller period, each robot's sensors are read, its controller is called, and its command is applied:
+    targets, feed-forward torques and gains. An actuator without gains gets targets and torques alone.
 
-    It is called like a policy, between steps: robots whose episode begins then get a new start, and the actions that
-    it returns are read by nobody. Further restarts are up to the caller: ``restart``.
+    It is called like a policy, between steps: then it resets the controllers of robots whose episode begins. The
+    actions that it returns are not used. Further restarts are up to the caller: ``restart``.
     """
 
     def __init__(
@@ -43,12 +44,12 @@ class Driven:
         seed: int,
         trunk_velocity: Literal["exact", "estimated"] = "exact",
     ) -> None:
-        """Take over the robots of ``core``, which must have been built with ``imu=True``.
+        """Control the robots of ``core``, which must have been built with ``imu=True``.
 
         Args:
             core: the environment; its commands (``core.command.value``) are those of the robots.
             make: makes one robot's controller.
-            noise: give the sensors the noise of the paper's Table II, and the feet that of a logger.
+            noise: add the sensor noise of the paper's Table II, and a logger's to the feet.
             seed: of the noise.
             trunk_velocity: the true one, or that of the Kalman filter.
 
@@ -70,19 +71,19 @@ class Driven:
         core.driver = self._step
 
     def __call__(self, observation: Tensor) -> Tensor:
-        """Begin anew with the robots whose episode begins; return zeros (N, 12), which nobody reads."""
+        """Reset the controllers of robots whose episode begins; return zeros (N, 12), which are not used."""
         self.restart(self._core.steps == 0)
         return torch.zeros(len(observation), robot.NUM_JOINTS)
 
     def restart(self, mask: Tensor) -> None:
-        """Begin anew with the robots of ``mask`` (N,) bool."""
+        """Reset the controllers of the robots of ``mask`` (N,) bool."""
         for i in np.flatnonzero(mask.numpy()):
             self.controllers[i].reset()
             if self._estimates:
                 self._filters.restart(int(i))
 
     def save(self) -> Any | None:
-        """Return a copy of what all remember, or None where a controller or the filter cannot be put back."""
+        """Return a copy of the state; None if a controller or the filter cannot be restored."""
         each = [one.save() for one in self.controllers if isinstance(one, Savable)]
         if self._estimates or len(each) < len(self.controllers):
             return None
@@ -90,7 +91,7 @@ class Driven:
         return each, tensors, self._steps, self._feeds, copy.deepcopy(self._rng)
 
     def load(self, state: Any) -> None:
-        """Put back what ``save`` returned, after the environment was put back."""
+        """Restore what ``save`` returned, after the environment was restored."""
         each, tensors, self._steps, self._feeds, rng = state
         self._rng = copy.deepcopy(rng)
         for one, of_controller in zip(self.controllers, each, strict=True):
@@ -102,31 +103,31 @@ class Driven:
             self._plant.set_gains(self._kp, self._kd)
 
     def _tensors(self) -> tuple[Tensor, ...]:
-        """What is in force, and the last readings, which the engine writes in its next step only."""
+        """Present commands, and the last readings, which the engine writes in its next step only."""
         return self._target, self._forward, self._kp, self._kd, self._core.backend.sensordata
 
     def _step(self) -> None:
-        """Let the controllers act where their time has come, and advance the physics."""
+        """Call the controllers when they are due, and advance the physics."""
         sensed = self._sense()
         if self._steps % self._every == 0:
             commands = self._core.command.value.double().numpy()
-            drives = [
+            applied = [
                 one.step(_command(row), of_robot)
                 for one, row, of_robot in zip(self.controllers, commands, sensed, strict=True)
             ]
-            self._put(drives)
+            self._apply(applied)
         self._steps += 1
         self._plant.step(self._target, self._forward if self._feeds else None)
         self._core.target.copy_(self._target)
 
-    def _put(self, drives: Sequence[Drive]) -> None:
-        """Put what the controllers say into force."""
-        rows = [(self._target, [one.target for one in drives])]
-        self._feeds = drives[0].feedforward is not None  # all are of one kind
+    def _apply(self, commands: Sequence[LowCmd]) -> None:
+        """Apply the controllers' commands."""
+        rows = [(self._target, [one.joint_target for one in commands])]
+        self._feeds = commands[0].feedforward is not None  # all are of one kind
         if self._feeds:
-            rows.append((self._forward, [one.feedforward for one in drives]))  # type: ignore[misc]
+            rows.append((self._forward, [one.feedforward for one in commands]))  # type: ignore[misc]
         if self._has_gains:
-            rows += [(self._kp, [one.kp for one in drives]), (self._kd, [one.kd for one in drives])]
+            rows += [(self._kp, [one.kp for one in commands]), (self._kd, [one.kd for one in commands])]
         for tensor, values in rows:
             tensor.copy_(torch.as_tensor(np.stack(values)))
         if self._has_gains:
@@ -153,7 +154,7 @@ def _command(row: np.ndarray) -> Command:
 
 
 def _whole(period: float, dt: float) -> int:
-    """Return how many physics steps of ``dt`` s a period has."""
+    """Return the number of physics steps of ``dt`` s in a period."""
     ratio = period / dt
     if ratio < 1.0 - 1e-9 or not math.isclose(ratio, round(ratio), rel_tol=1e-6):
         raise ConfigError([f"controller.period = {period:g}: must be a multiple of the physics step, {dt:g} s"])

@@ -77,7 +77,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Structure:
-    """What a programme owes to which feet stand when alone; n feet-in-intervals, three columns each.
+    """Parts of a programme that depend on the schedule alone; n foot intervals, three columns each.
 
     Attributes:
         interval: (n,) of each.
@@ -103,14 +103,14 @@ class Structure:
 
 
 MOST_STRUCTURES = 500
-"""Schedules whose structure is kept; a gait repeats some tens of them."""
+"""Largest number of cached structures; a gait repeats some tens of schedules."""
 
 
 class ForcePlan:
-    """Builds the programme and solves it."""
+    """Builds and solves the quadratic programme."""
 
     def __init__(self, settings: ForceSettings, body: Body) -> None:
-        """Prepare what does not depend on the state.
+        """Compute what does not depend on the state.
 
         Raises:
             SolverError: if the solver is not installed.
@@ -141,7 +141,7 @@ class ForcePlan:
         column_interval, n = structure.column_interval, len(structure.interval)
         rotation = problem.attitude
         inverse = rotation @ self._inverse @ rotation.T
-        # Columns: what each force component does to the acceleration and to the angular acceleration.
+        # Columns: accelerations and angular accelerations of each force component.
         r = problem.arms[structure.interval, structure.foot]
         turn = inverse @ _crossed(r, problem.ground)
         push = np.tile(problem.ground / body.mass, (1, n))
@@ -167,13 +167,13 @@ class ForcePlan:
         return rates - wanted[:, 2:].reshape(-1, 6), places - wanted[:, :2].reshape(-1, 6)
 
     def _share(self, problem: Problem, interval: np.ndarray) -> np.ndarray:
-        """Return the forces (3 n,) that the effort is counted from: the weight, shared by the standing feet."""
+        """Return the reference forces (3 n,) of the effort: the weight, shared by the standing feet."""
         weight = problem.ground.T @ np.array([0.0, 0.0, self._body.mass * GRAVITY])
         count = problem.stands.sum(1)[interval]
         return np.asarray((weight[None, :] / count[:, None]).ravel())
 
     def _structure(self, stands: np.ndarray) -> Structure:
-        """Return what depends on the schedule (K, 4) alone; kept for the next time."""
+        """Return the structure of a schedule (K, 4), cached."""
         key = stands.tobytes()
         if key not in self._structures:
             if len(self._structures) >= MOST_STRUCTURES:

@@ -46,15 +46,15 @@ class Clock:
         return (1.0 - self.duty) * self.period
 
     def stands(self) -> np.ndarray:
-        """(4,) bool: meant to stand now."""
+        """Return the scheduled stance (4,) bool."""
         return self.phases < self.duty
 
     def swing_share(self) -> np.ndarray:
-        """(4,) how much of the swing has passed, 0 to 1; negative while standing."""
+        """Return the passed share of the swing (4,), 0 to 1; negative in stance."""
         return (self.phases - self.duty) / (1.0 - self.duty)
 
     def schedule(self, steps: int, dt: float) -> np.ndarray:
-        """(steps, 4) bool: meant to stand in the middle of each of the coming intervals of ``dt`` s."""
+        """Return the scheduled stance (steps, 4) bool in the middle of each of the next intervals of ``dt`` s."""
         middles = (np.arange(steps) + 0.5)[:, None] * (dt / self.period)
         return (self._phase + middles + self._offsets) % 1.0 < self.duty
 
@@ -65,30 +65,30 @@ LEGS = robot.NUM_LEGS
 class Feet:
     """Schedule and contact of the four feet.
 
-    A foot leaves the ground when the schedule says so. It stands again as soon as it feels the ground: early, in the
-    second half of its swing, or late, when its stance has begun without any ground to push on.
+    A foot lifts off by the schedule. It stands at its contact: early, in the second half of its swing, or after the
+    scheduled touch-down.
 
     Attributes:
-        down: (4,) bool, which feet stand.
-        lift: (4, 3) where each foot last left the ground, m.
-        anchor: (4, 3) where each foot stands or last stood, m.
-        overdue: (4,) time since a foot should have found the ground, s; 0 for those that stand or swing.
+        down: (4,) bool, standing feet.
+        lift: (4, 3) position of each foot's last lift-off, m.
+        anchor: (4, 3) position of each foot's present or last stance, m.
+        overdue: (4,) time since the scheduled touch-down of feet without contact, s; 0 for the others.
     """
 
     def __init__(self, contact_force: float, dt: float) -> None:
-        """Feel the ground from ``contact_force`` N on; called every ``dt`` s."""
+        """Detect contact from ``contact_force`` N on; called every ``dt`` s."""
         self._contact_force, self._dt = contact_force, dt
         self.restart()
 
     def restart(self) -> None:
-        """Forget all; the next call is the first one."""
+        """Reset: the next call is the first one."""
         self.down, self._planned = np.ones(LEGS, dtype=bool), np.ones(LEGS, dtype=bool)
         self.lift, self.anchor = np.zeros((LEGS, 3)), np.zeros((LEGS, 3))
         self.overdue = np.zeros(LEGS)
         self._fresh = True
 
     def update(self, clock: Clock, force: np.ndarray, places: np.ndarray) -> bool:
-        """Take forces (4,), N, and places (4, 3), m, of the feet; return whether other feet stand than before."""
+        """Update by forces (4,), N, and positions (4, 3), m, of the feet; return whether other feet stand."""
         planned, before = clock.stands(), self.down
         if self._fresh:
             self.lift[:], self.anchor[:] = places, places
@@ -109,10 +109,10 @@ SIDES = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]])
 """(4, 2) signs of x and y of the legs."""
 
 HIPS = SIDES * [robot.HIP_OFFSET[0], robot.HIP_OFFSET[1] + robot.LINK_LENGTHS[0]]
-"""(4, 2) points of the trunk below which feet stand: the hips' axes with the abduction offset, trunk frame, m."""
+"""(4, 2) points of the trunk above the nominal footholds: hip axes with abduction offset, trunk frame, m."""
 
 ACROSS = HIPS[:, ::-1] * [-1.0, 1.0]
-"""(4, 2) how these points move where the trunk turns by 1 rad/s, m/s."""
+"""(4, 2) velocities of these points at a yaw rate of 1 rad/s, m/s."""
 
 
 def footholds(
@@ -123,18 +123,17 @@ def footholds(
     stance: float,
     legs: np.ndarray,
 ) -> np.ndarray:
-    """Return where feet are to stand (n, 2), from the trunk's origin, m; all in the axes of the robot's heading.
+    """Return footholds (n, 2) relative to the trunk's origin, m; all in the axes of the robot's heading.
 
-    Below the hip, where that will be half-way through the coming stance (Raibert 1986), and further out by
-    ``velocity_gain`` times what the robot is too fast.
+    Below the position of the hip in mid-stance (Raibert 1986), plus ``velocity_gain`` times the error of the velocity.
 
     Args:
         settings: ``velocity_gain``.
         velocity: (3,) of the trunk, m/s.
         command: commanded velocity, m/s, m/s, rad/s.
-        left: (n,) time until each foot is to stand, s.
-        stance: time that it will stand, s.
-        legs: (n,) their numbers.
+        left: (n,) time until each touch-down, s.
+        stance: duration of the stance, s.
+        legs: (n,) indices of the legs.
     """
     vx, vy, _ = velocity.tolist()
     x, y, yaw = command
@@ -147,15 +146,15 @@ def footholds(
 def way(
     start: np.ndarray, end: np.ndarray, height: float, share: np.ndarray, duration: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return place (n, 3), m, and velocity (n, 3), m/s, of feet on their way.
+    """Return position (n, 3), m, and velocity (n, 3), m/s, of swinging feet.
 
     Horizontally a cubic from rest to rest; vertically the same plus a bump 16 s^2 (1 - s)^2.
 
     Args:
-        start: (n, 3) where each foot left the ground, m.
-        end: (n, 3) where it is to stand, m.
+        start: (n, 3) positions of lift-off, m.
+        end: (n, 3) footholds, m.
         height: of the bump, m.
-        share: (n,) of the swing that has passed, 0 to 1.
+        share: (n,) passed share of the swing, 0 to 1.
         duration: of the swing, s.
     """
     left = share * (1.0 - share)

@@ -17,7 +17,8 @@ from go1exp.evaluate.controller.forces import Body, ForcePlan, Problem
 from go1exp.evaluate.controller.gait import Clock, Feet, footholds, solved, way
 from go1exp.evaluate.controller.settings import MpcSettings
 from go1exp.evaluate.controller.state import Ground, Smoothed, frame, heading, matrix, roll_pitch_yaw, skew, wrapped
-from go1exp.evaluate.controller.types import Command, Drive, Sensed
+from go1exp.evaluate.controller.types import Command, Sensed
+from go1exp.robot.messages import LowCmd
 from go1exp.sim.physics.dynamics import Kinematics
 
 LIMIT = robot.per_joint(robot.EFFORT_LIMIT)
@@ -25,23 +26,26 @@ LOW, HIGH = robot.JOINT_POS_LIMITS.T
 MOST_CHANGE = 0.6
 """Largest difference between a target and the joint's angle, rad."""
 MOST_SPEED = 25.0
-"""Largest joint speed that a swinging leg is told, rad/s."""
+"""Largest commanded joint velocity of a swinging leg, rad/s."""
 
 
-STANDING = Drive(
-    robot.NOMINAL_STANCE, np.full(robot.NUM_JOINTS, 60.0), np.full(robot.NUM_JOINTS, 2.0), np.zeros(robot.NUM_JOINTS)
+STANDING = LowCmd(
+    robot.NOMINAL_STANCE,
+    np.full(robot.NUM_JOINTS, 60.0),
+    np.full(robot.NUM_JOINTS, 2.0),
+    feedforward=np.zeros(robot.NUM_JOINTS),
 )
 """The nominal stance, before the first step: 60 N m/rad and 2 N m s/rad hold the trunk to some millimetres (chosen)."""
 
 BUILT = ("settings", "period", "_kin", "_plan", "_every")
-"""What no step changes, or each one works out anew from the readings."""
+"""Attributes that no step changes, or that each one computes from the readings."""
 
 
 class Mpc:
-    """Walks one robot.
+    """Model predictive controller of one robot.
 
-    The world of this controller has z up and x where the IMU's heading is zero. Places in it are the integrated
-    velocity: only differences within a stride matter, so that drift does not.
+    Its world frame has z up and x at zero heading of the IMU. Positions in it are the integrated velocity: only
+    differences within a stride matter, so drift does not.
 
     Attributes:
         period: time between two calls, s.
@@ -65,7 +69,7 @@ class Mpc:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next call is the first one."""
+        """Reset: the next call is the first one."""
         for part in (self._clock, self._smoothed, self._ground, self._feet):
             part.restart()
         self._since_plan, self._first, self._stands = 0, True, round(self.settings.stand / self.period)
@@ -74,15 +78,15 @@ class Mpc:
         self._forces = np.zeros((robot.NUM_LEGS, 3))
 
     def save(self) -> Any:
-        """Return a copy of everything that it remembers."""
+        """Return a copy of its state."""
         return copy.deepcopy({name: value for name, value in vars(self).items() if name not in BUILT})
 
     def load(self, state: Any) -> None:
-        """Put back what ``save`` returned."""
+        """Restore what ``save`` returned."""
         vars(self).update(copy.deepcopy(state))
 
-    def step(self, command: Command, sensed: Sensed) -> Drive:
-        """Return what the drives are told until the next call."""
+    def step(self, command: Command, sensed: Sensed) -> LowCmd:
+        """Return the motors' command until the next call."""
         if self._stands:
             self._stands -= 1
             return STANDING
@@ -96,12 +100,12 @@ class Mpc:
             self._since_plan = 0
         self._since_plan += 1
         self._first = False
-        return self._drive(command)
+        return self._joint_commands(command)
 
-    # ------------------------------------------------------------------ what is known
+    # ------------------------------------------------------------------ state
 
     def _sense(self, sensed: Sensed) -> None:
-        """Smooth the readings and put the model where they say; let time pass."""
+        """Smooth the readings, update the kinematic model, and advance the clock."""
         now = self._smoothed
         now.update(sensed)
         self._rotation = matrix(now.quat)
@@ -122,7 +126,7 @@ class Mpc:
         return a, b
 
     def _ramped(self, command: Command) -> Command:
-        """Return the command with its changes limited: after a jump from rest the first steps would be too long."""
+        """Return the command with limited rate of change: after a jump from rest the first steps would be too long."""
         limits = self.settings.ramp.speed, self.settings.ramp.speed, self.settings.ramp.turn
         moved = (
             before + max(-self.period * most, min(self.period * most, wanted - before))
@@ -140,7 +144,7 @@ class Mpc:
         return share * x, share * y, yaw
 
     def _lead(self, command: Command) -> None:
-        """Move the wanted place and heading on, but not far away from the robot."""
+        """Advance the reference position and heading, within their largest distance from the robot."""
         x, y, yaw = command
         force = self.settings.force
         self._lag += self.period * (np.array([x, y]) - self._ahead[:2])
@@ -162,9 +166,8 @@ class Mpc:
         state = np.array([[self._roll, self._pitch, 0.0], com, rate, self._ahead + skew(rate) @ offset])
         stands = self._clock.schedule(force.steps, force.dt)
         stands[0] = self._feet.down
-        stands[~stands.any(1)] = True  # a gait with phases of flight has forces to plan all the same
-        # Arms are those of now, also for later intervals: tried against arms that follow the wanted motion, with which
-        # the robot falls at 2 m/s.
+        stands[~stands.any(1)] = True  # the programme needs forces also in a flight phase
+        # The present arms also for later intervals: with arms along the reference the robot falls at 2 m/s.
         arms = (self._kin.feet - self._place) @ self._turned + (trunk - com)
         problem = Problem(
             state=state,
@@ -198,10 +201,10 @@ class Mpc:
         wanted[:, 1, 2] = offset[2] + upright + wanted[:, 1, :2] @ slope
         return wanted
 
-    # ------------------------------------------------------------------ what the drives are told
+    # ------------------------------------------------------------------ joint commands
 
-    def _drive(self, command: Command) -> Drive:
-        """Return forces of standing feet as torques, and targets for the swinging ones."""
+    def _joint_commands(self, command: Command) -> LowCmd:
+        """Return torques for the standing legs, and targets for the swinging ones."""
         kin, swing = self._kin, self.settings.swing
         down = self._feet.down
         # Standing legs: the weight of the leg, and tau = -J' f; their targets are their angles.
@@ -220,11 +223,11 @@ class Mpc:
             torque[legs] += swing.kd * _cut(change[:, :, 1], MOST_SPEED)  # so that kd brakes differences only
             kp[legs], kd[legs] = swing.kp, swing.kd
         within = np.minimum(np.maximum(target.ravel(), LOW), HIGH)
-        return Drive(within, kp.ravel(), kd.ravel(), _cut(torque.ravel(), LIMIT))
+        return LowCmd(within, kp.ravel(), kd.ravel(), feedforward=_cut(torque.ravel(), LIMIT))
 
     def _swing(self, command: Command, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the swinging feet ``legs`` are to be now (n, 3), m, and how fast (n, 3), m/s, in the world."""
-        swing, clock, late = self.settings.swing, self._clock, self._feet.overdue[legs]
+        """Return reference positions (n, 3), m, and velocities (n, 3), m/s, of the feet ``legs`` in the world."""
+        swing, clock, overdue = self.settings.swing, self._clock, self._feet.overdue[legs]
         duration = clock.swing_time
         share = clock.swing_share()[legs]
         share[share < 0.0] = 1.0  # overdue: the swing has ended
@@ -233,10 +236,10 @@ class Mpc:
         end[:, :2] = below
         end[:, 2] = below @ self._slope() + (robot.FOOT_RADIUS - swing.depth - self._ground.height)
         place, velocity = way(self._feet.lift[legs], end @ self._turned.T + self._place, swing.height, share, duration)
-        if late.any():
-            further = late * swing.reach_speed
+        if overdue.any():
+            further = overdue * swing.reach_speed
             place[:, 2] -= np.minimum(further, swing.reach)
-            velocity[:, 2] -= swing.reach_speed * ((late > 0.0) & (further < swing.reach))
+            velocity[:, 2] -= swing.reach_speed * ((overdue > 0.0) & (further < swing.reach))
         return place, velocity
 
 

@@ -1,38 +1,37 @@
-"""The settings of the group ``controller``: what moves a robot, as ``conf/controller`` writes it."""
+"""Settings of the group ``controller``: the policy, or a model predictive controller."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import fields
+from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
-from go1exp.config.schema.registry import STRICT, ConfigError, NonNegative, Positive, as_json, explain, unknown_name
+from go1exp.config.schema.registry import ConfigError, NonNegative, Positive, as_json, explain, unknown_name
+from go1exp.config.schema.settings import settings
 
 Share = Annotated[float, Field(gt=0, lt=1)]
 Phase = Annotated[float, Field(ge=0, lt=1)]
 Weights = tuple[NonNegative, NonNegative, NonNegative]
 
 
-@dataclass(frozen=True)
+@settings
 class GaitSettings:
-    """When the feet stand.
+    """Schedule of the feet.
 
     Attributes:
         offsets: phases of FR, FL, RR, RL, in cycles.
-        duty: share of a cycle in which a foot stands.
+        duty: stance share of a cycle.
         period: of a cycle, s.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     offsets: tuple[Phase, Phase, Phase, Phase]
     duty: Annotated[float, Field(ge=0.4, le=0.9)]
     period: Annotated[float, Field(ge=0.1, le=2.0)]
 
 
-@dataclass(frozen=True)
+@settings
 class WeightSettings:
     """Weights of squared errors, each as x, y, z (roll, pitch, yaw).
 
@@ -43,31 +42,27 @@ class WeightSettings:
         velocity: s2/m2.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
     attitude: Weights
     position: Weights
     angular_velocity: Weights
     velocity: Weights
 
 
-@dataclass(frozen=True)
+@settings
 class ForceSettings:
-    """The programme for the forces of the feet.
+    """The quadratic programme of the foot forces.
 
     Attributes:
         every: time between two plans, s.
         steps: intervals of the horizon.
         dt: length of an interval, s.
-        friction: coefficient of friction that the forces keep to.
+        friction: coefficient of friction of the constraints.
         max_force: largest normal force of a foot, N.
-        effort: weight of squared forces, counted from an even share of the weight, 1/N2.
+        effort: weight of squared deviations of forces from an even share of the weight, 1/N2.
         weights: of the errors.
         max_lag: largest distance between the wanted and the present place, m.
         max_turn_lag: largest angle between the wanted and the present heading, rad.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     every: Annotated[float, Field(ge=0.002, le=0.1)]
     steps: Annotated[int, Field(ge=2, le=30)]
@@ -80,21 +75,19 @@ class ForceSettings:
     max_turn_lag: NonNegative
 
 
-@dataclass(frozen=True)
+@settings
 class SwingSettings:
     """The feet in the air.
 
     Attributes:
-        height: of the foot above its straight way, m.
-        depth: how far below the ground it is aimed, m.
+        height: of the foot above the straight line, m.
+        depth: of its target below the ground, m.
         velocity_gain: shift of the foothold per error of velocity, s.
-        kp: of the drives of a swinging leg, N m/rad.
+        kp: of a swinging leg, N m/rad.
         kd: N m s/rad.
-        reach: how far a foot that finds no ground is extended downward, m.
-        reach_speed: how fast, m/s.
+        reach: downward extension of a foot that finds no ground, m.
+        reach_speed: its speed, m/s.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     height: Annotated[float, Field(gt=0, le=0.2)]
     depth: Annotated[float, Field(ge=0, le=0.05)]
@@ -105,19 +98,17 @@ class SwingSettings:
     reach_speed: NonNegative
 
 
-@dataclass(frozen=True)
+@settings
 class StanceSettings:
     """The feet on the ground.
 
     Attributes:
-        kd: of the drives of a standing leg, N m s/rad.
+        kd: of a standing leg, N m s/rad.
         contact_force: force from which a foot counts as standing, N.
-        slope: lean with the ground, whose slope is that of a plane through the feet.
+        slope: tilt the trunk with the ground, a plane through the feet.
         slope_time: time constant of that plane, s.
         max_slope: steepest ground that it may follow, rad.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     kd: Annotated[float, Field(ge=0, le=10)]
     contact_force: Positive
@@ -126,33 +117,29 @@ class StanceSettings:
     max_slope: Annotated[float, Field(ge=0, le=0.6)]
 
 
-@dataclass(frozen=True)
+@settings
 class RampSettings:
-    """How fast the command may change; an episode begins with a command to stand.
+    """Largest rate of change of the command; an episode begins with zero.
 
     Attributes:
         speed: of x and y each, m/s2.
         turn: of the yaw rate, rad/s2.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-
     speed: Positive
     turn: Positive
 
 
-@dataclass(frozen=True)
+@settings
 class SmoothingSettings:
-    """How readings are smoothed: rates carry them on, readings correct with a time constant.
+    """Time constants of the complementary filters of readings.
 
     Attributes:
-        attitude: time constant of the attitude, s; 0 takes readings as they are.
+        attitude: of the attitude, s; 0 takes the readings.
         joints: of the joint angles, s.
         height: of the height above ground, s.
         velocity: of the velocity, s.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     attitude: NonNegative
     joints: NonNegative
@@ -160,24 +147,22 @@ class SmoothingSettings:
     velocity: NonNegative
 
 
-@dataclass(frozen=True)
+@settings
 class MpcSettings:
     """``conf/controller/mpc.yaml``.
 
     Attributes:
         name: ``mpc``.
-        stand: time for which the robot first stands, its drives at the nominal stance, s: it may begin in any pose.
+        stand: initial time at the nominal stance, s: the robot may begin in any pose.
         period: time between two ticks, s.
         height: of the trunk's origin above the ground, m.
-        ramp: how fast the command may change.
-        gait: when the feet stand.
-        force: the programme for their forces.
+        ramp: rate limits of the command.
+        gait: schedule of the feet.
+        force: programme of their forces.
         swing: the feet in the air.
         stance: the feet on the ground.
         smoothing: of the readings.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     name: Literal["mpc"]
     stand: Annotated[float, Field(ge=0.0, le=5.0)]
@@ -191,15 +176,13 @@ class MpcSettings:
     smoothing: SmoothingSettings
 
 
-@dataclass(frozen=True)
+@settings
 class PolicySettings:
     """``conf/controller/policy.yaml``.
 
     Attributes:
         name: ``policy``: the one that the verb's own settings name.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     name: Literal["policy"]
 

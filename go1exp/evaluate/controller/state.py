@@ -60,19 +60,19 @@ class Smoothed:
     """
 
     def __init__(self, settings: SmoothingSettings, dt: float) -> None:
-        """Smooth readings that come every ``dt`` s."""
+        """Smooth readings with a period of ``dt`` s."""
         self._dt = dt
         times = (settings.attitude, settings.joints, settings.velocity)
         self._attitude, self._joints, self._velocity = (dt / (time + dt) for time in times)
         self.restart()
 
     def restart(self) -> None:
-        """Take the next readings as they are."""
+        """Reset: the next readings are taken without smoothing."""
         self.quat, self.joint_pos, self.velocity_b = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(12), np.zeros(3)
         self._fresh = True
 
     def update(self, sensed: Sensed) -> None:
-        """Take one set of readings."""
+        """Update by one set of readings."""
         if self._fresh:
             self.quat, self.joint_pos, self.velocity_b = sensed.quat, sensed.joint_pos, sensed.velocity_b
             self._fresh = False
@@ -110,12 +110,12 @@ class Ground:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the ground: at the next call it is where the feet are."""
+        """Reset: the next call initialises the ground by the feet."""
         self.gradient, self.height = np.zeros(2), 0.0
         self._fresh = True
 
     def update(self, feet: np.ndarray, down: np.ndarray, velocity: np.ndarray) -> None:
-        """Take the places (4, 3) of the feet, from the trunk's origin in the world's axes, m.
+        """Update by the positions (4, 3) of the feet relative to the trunk's origin in the world's axes, m.
 
         Args:
             feet: where each stands or last stood.
@@ -134,7 +134,7 @@ class Ground:
         self._fresh = False
 
     def _limited(self, gradient: np.ndarray) -> np.ndarray:
-        """Return a gradient cut at the steepest one."""
+        """Return a gradient limited to the steepest one."""
         steepest, most = math.hypot(*gradient.tolist()), math.tan(self._settings.max_slope)
         return gradient if steepest <= most else gradient * (most / steepest)
 
@@ -143,7 +143,7 @@ def _gradient(feet: np.ndarray) -> np.ndarray:
     """Return the gradient (2,) of the plane through four points (4, 3), by least squares."""
     x, y, z = (feet - feet.mean(0)).T
     xx, xy, yy, xz, yz = float(x @ x), float(x @ y), float(y @ y), float(x @ z), float(y @ z)
-    # Feet that nearly stand in a line say nothing about the slope across it.
+    # Feet in a line do not determine the slope across it.
     determinant = max(xx * yy - xy * xy, 1e-4)
     return np.array([yy * xz - xy * yz, xx * yz - xy * xz]) / determinant
 

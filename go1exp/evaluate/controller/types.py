@@ -1,4 +1,4 @@
-"""What goes into a controller and what comes out of it, for one robot."""
+"""Interface of a controller of one robot."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from go1exp.robot.messages import LowCmd
+
 Command = tuple[float, float, float]
 """Commanded velocity of the trunk: x, y in m/s, yaw rate in rad/s, trunk frame."""
 
 
 @dataclass(frozen=True)
 class Sensed:
-    """What the robot's computer knows at one instant. Legs and joints in the order of ``robot.py``.
+    """Sensor readings and estimate at one instant. Legs and joints in the order of ``go1exp.robot``.
 
     Attributes:
         joint_pos: (12,) rad.
@@ -32,25 +34,8 @@ class Sensed:
     foot_force: np.ndarray
 
 
-@dataclass(frozen=True)
-class Drive:
-    """What the drives are told: torque = kp (target - q) - kd qd + feedforward, each (12,).
-
-    Attributes:
-        target: rad.
-        kp: N m/rad.
-        kd: N m s/rad.
-        feedforward: N m; None for none.
-    """
-
-    target: np.ndarray
-    kp: np.ndarray
-    kd: np.ndarray
-    feedforward: np.ndarray | None = None
-
-
 class Controller(Protocol):
-    """Moves one robot, called once every ``period``.
+    """Controls one robot, called once every ``period``.
 
     Attributes:
         period: time between two calls, s.
@@ -59,18 +44,18 @@ class Controller(Protocol):
     period: float
 
     def reset(self) -> None:
-        """Forget everything: the next call is the first one."""
+        """Reset: the next call is the first one."""
 
-    def step(self, command: Command, sensed: Sensed) -> Drive:
-        """Return what the drives are told until the next call."""
+    def step(self, command: Command, sensed: Sensed) -> LowCmd:
+        """Return the motors' command until the next call."""
 
 
 @runtime_checkable
 class Savable(Protocol):
-    """A controller that can be put back to an instant; one that cannot is played from its start again."""
+    """A controller whose state can be saved and restored."""
 
     def save(self) -> Any:
-        """Return a copy of everything that it remembers."""
+        """Return a copy of its state."""
 
     def load(self, state: Any) -> None:
-        """Put back what ``save`` returned."""
+        """Restore what ``save`` returned."""
