@@ -334,7 +334,7 @@ def test_a_member_that_is_not_the_one_that_was_hashed_is_named(
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         manifest = archive.read("manifest.json")
     changed = stored({"manifest.json": manifest, **{**members, name: members[name] + b" "}})
-    assert refused(changed).startswith(f"{name}: its SHA-256 is {seal(members[name] + b' ')}, manifest.json says")
+    assert refused(changed).startswith(f"{name}: its SHA-256 is {seal(members[name] + b' ')}, that of manifest.json")
 
 
 @pytest.mark.parametrize("name", ["manifest.json", *MEMBERS])
@@ -345,13 +345,13 @@ def test_a_missing_member_is_named(name: str, data: bytes) -> None:
 
 
 def test_members_that_do_not_belong_there_are_named(data: bytes, members: dict[str, bytes]) -> None:
-    assert refused(pack({**members, "run.sh": b"x"})) == "run.sh: does not belong there"
+    assert refused(pack({**members, "run.sh": b"x"})) == "run.sh: unexpected member"
     turned = {name: members[name] for name in reversed(MEMBERS)}
     assert refused(pack(turned)).startswith("members in the order manifest.json, trace.npz")
     twice = io.BytesIO(data)
     with zipfile.ZipFile(twice, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
         archive.writestr("policy.onnx", b"another")
-    assert refused(twice.getvalue()) == "policy.onnx: is there 2 times"
+    assert refused(twice.getvalue()) == "policy.onnx: duplicate"
 
 
 def test_another_form_of_the_same_archive_is_refused(data: bytes) -> None:
@@ -367,9 +367,9 @@ def test_another_form_of_the_same_archive_is_refused(data: bytes) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: b"{", "no JSON"),
-        (lambda m: as_json([]), "must hold format and sha256"),
-        (lambda m: as_json({**m, "note": "x"}), "must hold format and sha256"),
+        (lambda m: b"{", "invalid JSON"),
+        (lambda m: as_json([]), "must have format and sha256"),
+        (lambda m: as_json({**m, "note": "x"}), "must have format and sha256"),
         (lambda m: as_json({**m, "format": 2}), "format 2, this version reads 1"),
         (lambda m: as_json({**m, "sha256": {}}), "must give the SHA-256 of metadata.json"),
         (lambda m: as_json({**m, "sha256": 5}), "must give the SHA-256 of metadata.json"),
@@ -485,7 +485,7 @@ def test_a_trace_is_never_unpickled(good: Bundle, members: dict[str, bytes]) -> 
         ({"kp": [20.0] * 11 + [-5.0]}, "kp.11 = -5: must be at least 0, as the gain of RL_calf"),
         ({"torque_limit": [0.0] * 12}, "torque_limit.0 = 0: must be greater than 0, as the limit of FR_hip"),
         ({"joint_limits": [[1.0, -1.0]] * 12}, "joint_limits.0: the lower stop of FR_hip, 1, is not below -1"),
-        ({"joints": ["FR_hip"] * 12}, "joints: FR_hip stands there twice"),
+        ({"joints": ["FR_hip"] * 12}, "joints: FR_hip duplicate"),
         ({"command_ranges": {"lin_vel_q": [-1.0, 1.0]}}, "command_ranges.lin_vel_q: unknown axis; those of a command"),
         ({"command_ranges": {"lin_vel_x": [1.0, -1.0]}}, "command_ranges.lin_vel_x: the lowest, 1, is above the"),
         ({"robot": ...}, "robot: missing"),
@@ -500,7 +500,7 @@ def test_wrong_metadata_are_refused_by_key(change: dict[str, Any], message: str,
 
 @pytest.mark.parametrize("name", ["metadata.json", "config.json", "versions.json"])
 def test_what_is_no_json_is_refused(name: str, members: dict[str, bytes]) -> None:
-    assert refused(pack({**members, name: b"{"})).startswith(f"{name}: no JSON")
+    assert refused(pack({**members, name: b"{"})).startswith(f"{name}: invalid JSON")
     assert f"{name}: " in refused(pack({**members, name: b"[]"}))
 
 

@@ -1,7 +1,7 @@
 """The Unitree Go1 in numbers: order of legs and joints, limits, nominal stance, frames.
 
 All other modules take order and names from here. SI units; trunk frame x forward, y left, z up;
-quaternions w-x-y-z. Sources: vendor URDF (unitree_ros, go1.urdf, 2024-05) unless a line says otherwise.
+quaternions w-x-y-z. Source, unless another is given: vendor URDF (unitree_ros, go1.urdf, 2024-05).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOUNT_HINGES = ("mount_roll", "mount_pitch")
 MOUNT = (*MOUNT_SLIDES, *MOUNT_HINGES)
 """Joints between the world and a trunk on a compliant mount, before those of the legs (``sim/physics/scene.py``).
 
-None about z: legs that hang hardly turn a trunk that way, and a fit gets lost in what else it might explain.
+None about z: suspended legs hardly excite the yaw of the trunk, so its compliance is not identifiable.
 """
 
 MIRROR_LEGS = (1, 0, 3, 2)

@@ -17,7 +17,7 @@ ROBOT, ROBOT_PORT = "192.168.123.10", 8007
 
 JOINTS, MOTORS, LEGS = 12, 20, 4
 MOTOR_NAMES = tuple(f"{leg}_{kind}" for leg in ("FR", "FL", "RR", "RL") for kind in ("hip", "thigh", "calf"))
-"""Names of the joints that the motors drive, in the order of the packets."""
+"""Joints of the motors, in the order of the packets."""
 
 PERIOD = 0.002
 """Period at which the vendor's client sends, and at which the robot answers, s."""
@@ -33,13 +33,13 @@ TORQUE_STEP, KP_STEP, KD_STEP, ACCELERATION_STEP = 1.0 / 256.0, 1.0 / 32.0, 1.0 
 
 
 TORQUE_NOTE = f"torques have steps of 1/{1.0 / TORQUE_STEP:g} N m"
-"""What the notes of a recording say of torques that came by the Go1's packets."""
+"""Note of a recording whose torques are those of the packets."""
 
 
 def in_torque_steps(torque: np.ndarray) -> bool:
     """Return whether torques, N m, of any shape, are those of the packets: whole steps, to a tenth as in decimal text.
 
-    Fewer than ten that are not zero tell nothing, nor do torques that are not finite. Coarser steps are not these.
+    False for fewer than ten finite torques that are not zero, and for coarser steps.
     """
     steps = torque[np.isfinite(torque) & (torque != 0.0)] / TORQUE_STEP
     whole = np.rint(steps)
@@ -47,7 +47,7 @@ def in_torque_steps(torque: np.ndarray) -> bool:
 
 
 class Field(NamedTuple):
-    """One field of a packet: NumPy's type, its unit (of the number times ``step``), and where that is known from."""
+    """One field of a packet: NumPy's type, unit (of the number times ``step``), and source."""
 
     name: str
     kind: str
@@ -81,7 +81,7 @@ MOTOR_STATE = (
     Field("q", "<f4", "rad", TRIED),
     Field("dq", "<f4", "rad/s", TRIED),
     Field("ddq", "<i2", "rad/s2", TRIED, ACCELERATION_STEP),
-    Field("tau", "<i2", "N m, estimated by the drive", TRIED, TORQUE_STEP),
+    Field("tau", "<i2", "N m, estimated by the motor", TRIED, TORQUE_STEP),
     Field("q_raw", "<f4", "rad", TRIED),
     Field("dq_raw", "<f4", "rad/s", TRIED),
     Field("ddq_raw", "<i2", "rad/s2", TRIED, ACCELERATION_STEP),

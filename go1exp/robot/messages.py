@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 OVERTAKEN_S = 0.01
-"""How much older than the newest a state may be and still be taken, s: 5 ms of jitter, and as much again."""
+"""Largest age of an accepted state relative to the newest, s: twice a jitter of 5 ms."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class LowState:
         t: when it arrived, on the runtime's own clock, s.
         joint_pos: (J,) rad.
         joint_vel: (J,) rad/s.
-        joint_torque: (J,) N m, as the drives report.
+        joint_torque: (J,) N m, as reported by the motors.
         imu_quat: (4,) w-x-y-z, trunk to world.
         imu_gyro: (3,) rad/s, trunk frame.
         imu_acc: (3,) specific force, m/s2, trunk frame.
@@ -42,13 +42,13 @@ class LowState:
 
 @dataclass(frozen=True)
 class LowCmd:
-    """Command for the drives: torque = kp (joint_target - joint_pos) - kd joint_vel + feedforward.
+    """Command for the motors: torque = kp (joint_target - joint_pos) - kd joint_vel + feedforward.
 
     Attributes:
         joint_target: (J,) rad.
         kp: (J,) N m/rad.
         kd: (J,) N m s/rad.
-        damping: the drives brake: kp is zero, and a link may use the damping mode of its drives.
+        damping: the motors brake: kp is zero, and a link may use the motors' damping mode.
         feedforward: (J,) N m; None for none.
     """
 
@@ -63,7 +63,7 @@ class Link(Protocol):
     """The connection to a robot, real or simulated.
 
     Attributes:
-        sent_at: when the last command left, s on the runtime's clock; NaN before, or if the link does not know.
+        sent_at: time at which the last command was sent, s on the runtime's clock; NaN before.
     """
 
     sent_at: float
@@ -71,17 +71,17 @@ class Link(Protocol):
     def receive(self) -> Sequence[LowState]:
         """Return the states that have arrived since the last call, in the order of arrival, without waiting.
 
-        None comes twice. One that others overtook, by ``OVERTAKEN_S`` at most, comes after them; its ``clock`` tells.
+        Without duplicates. An overtaken one, by ``OVERTAKEN_S`` at most, follows those that overtook it.
         """
 
     def send(self, command: LowCmd) -> None:
         """Send a command, without waiting."""
 
     def repeat(self) -> None:
-        """Send what the robot must hear between two commands, if its protocol wants that; called every 2 ms."""
+        """Send what the protocol requires between two commands; called every 2 ms."""
 
     def rehearse(self, command: LowCmd) -> None:
-        """Do what sending a command takes, without sending it, so that caches are warm."""
+        """Do the work of sending a command, without sending it, so that caches are warm."""
 
     def close(self) -> None:
         """Close the connection."""

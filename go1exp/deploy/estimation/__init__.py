@@ -45,7 +45,7 @@ SOURCES = ("force", "torque", "height")
 
 
 class EstimatorError(Expected):
-    """The compiled filter is missing or cannot be loaded; the message says how to build it."""
+    """The compiled filter is missing or cannot be loaded."""
 
 
 def compiled() -> ModuleType:

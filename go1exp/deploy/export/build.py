@@ -120,8 +120,8 @@ CONVENTIONS = {
     "trunk": "x forward, y left, z up; origin and axes are those of the trunk in the vendor's URDF, the IMU's too",
     "world": "z up",
     "quaternion": "w-x-y-z, trunk to world",
-    "joint": "angles, speeds and torques have the zero and sign of the vendor's SDK, and its motor order",
-    "drive": "torque = kp (joint_target - joint_pos) - kd joint_vel, at the drives' own rate",
+    "joint": "angles, velocities and torques have the zero, sign and order of the vendor's SDK",
+    "actuator": "torque = kp (joint_target - joint_pos) - kd joint_vel, at the motors' rate",
     "rows": "the first axis of every input and output; 1 on the robot",
 }
 
@@ -206,7 +206,7 @@ def metadata(task: TaskConfig, module: DeployedPolicy, about: dict[str, Any]) ->
 
 
 def gains(actuator: Term, name: str) -> tuple[float, ...] | None:
-    """Return ``kp`` or ``kd`` of an actuator, or of the drives its net was fitted to, per joint; None if unknown."""
+    """Return ``kp`` or ``kd`` of an actuator, or of the recordings of its net, per joint; None if unknown."""
     for term, _ in nested_actuators(actuator):
         if name in term.parameters:
             return tuple(spread(term.parameters[name], robot.JOINTS).tolist())

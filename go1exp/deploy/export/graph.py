@@ -35,7 +35,7 @@ J = robot.NUM_JOINTS
 
 
 class ExportError(Expected):
-    """A part of a run that cannot be put into a bundle; the message names it."""
+    """A part of a run that cannot be exported; the message names it."""
 
 
 def _same(reading: Tensor) -> Tensor:
@@ -56,15 +56,15 @@ class Source:
 
 
 READINGS = (
-    Port("joint_pos", J, "rad", "joint", "joint angles, as the encoders say"),
-    Port("joint_vel", J, "rad/s", "joint", "joint speeds, as the drives say"),
+    Port("joint_pos", J, "rad", "joint", "joint angles of the encoders"),
+    Port("joint_vel", J, "rad/s", "joint", "joint velocities of the motors"),
     Port("imu_gyro", 3, "rad/s", "trunk", "angular velocity of the trunk"),
     Port("imu_quat", 4, "1", "trunk to world", "attitude of the trunk, unit quaternion w-x-y-z"),
     Port("base_lin_vel_b", 3, "m/s", "trunk", "velocity of the trunk's origin, from the state estimator"),
-    Port("joint_torque", J, "N m", "joint", "torques that the drives report"),
-    Port("joint_target", J, "rad", "joint", "position targets now in force; the nominal stance at the start"),
+    Port("joint_torque", J, "N m", "joint", "torques reported by the motors"),
+    Port("joint_target", J, "rad", "joint", "present position targets; the nominal stance at the start"),
     Port("command", 3, "m/s, m/s, rad/s", "trunk", "commanded velocity: x, y and yaw rate"),
-    Port("previous_action", J, "1", "joint", "the output `action` of one training period before; zero until then"),
+    Port("previous_action", J, "1", "joint", "the output `action` one training period ago; zero before"),
     Port("walked", 1, "s", "-", "time since walking began: a gait clock is a function of it"),
 )
 """Inputs that the robot's computer can provide. A graph has those that its terms read, in this order."""
@@ -90,8 +90,8 @@ SOURCES = {
 """Field of the Snapshot -> its source. The robot does not measure the other fields."""
 
 OUTPUTS = (
-    Port("joint_target", J, "rad", "joint", "position targets for the drives"),
-    Port("observation", 0, "as each term", "-", "what the network sees: the terms, one after the other"),
+    Port("joint_target", J, "rad", "joint", "position targets for the motors"),
+    Port("observation", 0, "as each term", "-", "input of the network: the concatenated terms"),
     Port("action", J, "1", "joint", "the network's output, clipped: `previous_action` one training period later"),
 )
 """Outputs of the graph; the observation's size is the policy's."""
@@ -146,7 +146,7 @@ def required_inputs(terms: Sequence[Term]) -> tuple[Port, ...]:
     for term in terms:
         if term.entry.remembers:
             raise ExportError(
-                f"observation.{term.key}: remembers the past; what a policy sees on the robot must be of the present"
+                f"observation.{term.key}: has a memory; observations on the robot must be functions of the present"
             )
         # Two rows of zeros: only which fields a term reads matters here.
         sensed = Sensed({port.name: torch.zeros(2, port.size) for port in READINGS}, term.key)

@@ -30,7 +30,7 @@ FORMAT = 1
 
 
 class BundleError(Expected):
-    """A bundle that is refused; the message names the file, the member and the problem."""
+    """An invalid bundle; the message names the file, the member and the problem."""
 
 
 def seal(data: bytes) -> str:
@@ -66,11 +66,11 @@ def unpack(data: bytes, members: tuple[str, ...], source: str) -> dict[str, byte
 
     Args:
         data: the archive.
-        members: what must be in it, in order; nothing else may.
-        source: name of it in messages.
+        members: required ones, in order.
+        source: its name in messages.
 
     Raises:
-        BundleError: if it is not such an archive, or its content is not what was packed.
+        BundleError: if it is not such an archive, or its content has changed.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -87,21 +87,21 @@ def unpack(data: bytes, members: tuple[str, ...], source: str) -> dict[str, byte
     hashes = _hashes(contents.pop(MANIFEST), members, source)
     for name, content in contents.items():
         if seal(content) != hashes[name]:
-            raise BundleError(f"{source}: {name}: its SHA-256 is {seal(content)}, {MANIFEST} says {hashes[name]}")
+            raise BundleError(f"{source}: {name}: its SHA-256 is {seal(content)}, that of {MANIFEST} {hashes[name]}")
     return contents
 
 
 def _check_names(names: list[str], members: tuple[str, ...], source: str) -> None:
-    """Refuse members that are missing, too many, doubled or in another order."""
+    """Refuse missing, unexpected, duplicate or misordered members."""
     wanted = [MANIFEST, *members]
     for name in wanted:
         if name not in names:
             raise BundleError(f"{source}: {name}: missing")
     for name in names:
         if name not in wanted:
-            raise BundleError(f"{source}: {name}: does not belong there")
+            raise BundleError(f"{source}: {name}: unexpected member")
         if names.count(name) > 1:
-            raise BundleError(f"{source}: {name}: is there {names.count(name)} times")
+            raise BundleError(f"{source}: {name}: duplicate")
     if names != wanted:
         raise BundleError(f"{source}: members in the order {', '.join(names)} instead of {', '.join(wanted)}")
 
@@ -116,13 +116,13 @@ def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, source: str) -> byt
 
 
 def _hashes(manifest: bytes, members: tuple[str, ...], source: str) -> dict[str, str]:
-    """Return the hashes of the manifest, which must have these and nothing else."""
+    """Return the hashes of the manifest, which must have exactly these keys."""
     try:
         content = json.loads(manifest)
     except ValueError as error:
-        raise BundleError(f"{source}: {MANIFEST}: no JSON ({error})") from None
+        raise BundleError(f"{source}: {MANIFEST}: invalid JSON ({error})") from None
     if not isinstance(content, dict) or content.keys() != {"format", "sha256"}:
-        raise BundleError(f"{source}: {MANIFEST}: must hold format and sha256, and nothing else")
+        raise BundleError(f"{source}: {MANIFEST}: must have format and sha256 alone")
     if content["format"] != FORMAT:
         raise BundleError(f"{source}: {MANIFEST}: format {content['format']!r}, this version reads {FORMAT}")
     hashes = content["sha256"]
@@ -140,7 +140,7 @@ TOLERANCE = 1e-5
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle that has been read, and whose policy gives the same outputs as in simulation.
+    """A bundle whose policy has reproduced the outputs of simulation.
 
     Attributes:
         source: the file.
@@ -185,7 +185,7 @@ def load(path: str | Path) -> Bundle:
     """Read a bundle and replay its trace.
 
     Raises:
-        BundleError: if it is not a bundle, a member is not what was packed, or the policy gives other outputs here.
+        BundleError: if it is not a bundle, a member has changed, or the policy gives other outputs here.
         OSError: if the file cannot be read.
     """
     return loads(Path(path).read_bytes(), str(path))
@@ -240,7 +240,7 @@ def replay(policy: OnnxPolicy, trace: Mapping[str, np.ndarray], source: str) -> 
 
 
 def _check_action(trace: Mapping[str, np.ndarray], metadata: Metadata, source: str) -> None:
-    """Refuse metadata by which the recorded actions do not give the recorded targets."""
+    """Refuse metadata that map the recorded actions to other targets."""
     action, target = (trace[f"output.{name}"].astype(np.float64) for name in ("action", "joint_target"))
     meant = np.asarray(metadata.nominal_stance) + metadata.action_scale * action
     if not float(np.max(np.abs(meant - target))) <= TOLERANCE:
@@ -260,7 +260,7 @@ def _json(content: bytes, where: str) -> dict[str, Any]:
     try:
         document = json.loads(content)
     except ValueError as error:
-        raise BundleError(f"{where}: no JSON ({error})") from None
+        raise BundleError(f"{where}: invalid JSON ({error})") from None
     if not isinstance(document, dict):
         raise BundleError(f"{where}: must be a mapping")
     return document
@@ -277,7 +277,7 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _trace(content: bytes, metadata: Metadata, source: str) -> dict[str, np.ndarray]:
-    """Return the arrays of the trace, which must be those of the metadata's inputs and outputs, and finite."""
+    """Return the finite arrays of the trace: the metadata's inputs and outputs."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files}

@@ -16,16 +16,16 @@ from go1exp.robot.go1_fields import PERIOD
 from go1exp.robot.messages import OVERTAKEN_S, LowState
 
 FASTEST = 10.0
-"""Speed above which an estimate has diverged, m/s: the top speed of a Go1's joints gives about 6 m/s."""
+"""Speed above which an estimate has diverged, m/s: the joint velocity limits give about 6 m/s."""
 
 BLIND_S = 0.1
-"""Longest time for which the filter may refuse all samples, s; after that its last estimate is too old."""
+"""Longest time for which the filter may leave out all samples, s."""
 
 LONGEST_AHEAD = 0.01
-"""Longest time over which one reading of the accelerometer is taken to last, s: impacts are shorter."""
+"""Longest extrapolation by one reading of the accelerometer, s."""
 
 LOADED: dict[str, Any] = {"contact_low": 20.0, "contact_high": 40.0}
-"""Force, N, up to which a foot that swings may seem loaded, since its leg is quick; and from which it is."""
+"""Apparent force of a swinging foot by the leg's inertia, N, and force from which a foot is loaded."""
 
 TORQUE: dict[str, Any] = {"contact_source": "torque", **LOADED}
 """Contact from the joints' torques, for a robot whose foot sensors are not calibrated (``docs/estimation.md``)."""
@@ -51,12 +51,12 @@ def settings(given: Mapping[str, Any], **changes: Any) -> FilterConfig:
 class KalmanEstimator:
     """Velocity of the trunk from every state of the robot.
 
-    The filter takes states in the order in which they were measured. One that others overtook on the way is waited for,
-    ``OVERTAKEN_S`` at most. Meanwhile, and up to the instant that is asked for, the IMU alone carries the velocity on.
+    The filter takes states in the order of measurement. It waits for an overtaken one, ``OVERTAKEN_S`` at most.
+    Meanwhile, and up to the requested instant, the velocity is extrapolated by the IMU alone.
 
     Attributes:
         refused: number of samples that the filter left out, by ``Status``.
-        restarts: number of times that it initialised the speed again after a gap.
+        restarts: number of restarts after a gap.
     """
 
     def __init__(self, config: FilterConfig, fail: Fail, feet: FootCalibration | None = None) -> None:
@@ -65,7 +65,7 @@ class KalmanEstimator:
         Args:
             config: its settings.
             fail: ``Safety.fail``.
-            feet: of sensors that count instead of saying newtons.
+            feet: calibration of raw foot sensors.
 
         Raises:
             go1exp.deploy.estimation.EstimatorError: if the compiled filter is missing.
@@ -74,53 +74,53 @@ class KalmanEstimator:
         self._both = None if feet is None else LoadByBoth(config, feet)
         self._velocity = np.full(3, np.nan)
         self._row: np.ndarray | None = None  # the sample of that velocity
-        self._turn: list[tuple[float, int, LowState, np.ndarray]] = []  # a heap of what waits: clock, count, sample
+        self._waiting: list[tuple[float, int, LowState, np.ndarray]] = []  # a heap of what waits: clock, count, sample
         self._taken_until, self._count = math.nan, 0
         self._since: float | None = None
         self.refused = {Status.LATE.name: 0, Status.INVALID.name: 0}
         self.restarts = 0
 
     def update(self, state: LowState) -> np.ndarray:
-        """Take a new state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame.
+        """Add a state; return the velocity (3,), m/s, of the trunk's origin in the trunk frame at the newest state.
 
-        It is that at the newest state, and NaN before the first valid one. After a refused sample the last estimate
-        stays in force for ``BLIND_S``; whether the reading itself is a fault is decided by ``Safety``.
+        NaN before the first valid state. The last estimate remains valid for ``BLIND_S`` without a valid sample;
+        invalid readings are a fault by ``Safety``.
         """
-        if math.isnan(state.clock):  # its place among the others is not known
+        if math.isnan(state.clock):  # its order is unknown
             self._take(state, self._sample(state, state.t))
             return self.ahead(0.0)
-        if 0.0 < self._taken_until - state.clock <= OVERTAKEN_S:  # its turn is over
+        if 0.0 < self._taken_until - state.clock <= OVERTAKEN_S:  # too late
             self.refused[Status.LATE.name] += 1
             return self.ahead(0.0)
-        # The robot's own clock is even; times of arrival have the delays of the network.
+        # Intervals of the robot's clock have no network delays.
         row = self._sample(state, state.clock)
-        if not self._turn and self._is_due(state.clock, state.clock):  # as nearly always
+        if not self._waiting and self._is_due(state.clock, state.clock):  # as nearly always
             self._taken_until = state.clock
             self._take(state, row)
             return self._velocity
         self._count += 1
-        heapq.heappush(self._turn, (state.clock, self._count, state, row))
-        newest = max(clock for clock, *_ in self._turn)
-        while self._turn and self._is_due(self._turn[0][0], newest):
-            self._taken_until, _, first, its_row = heapq.heappop(self._turn)
+        heapq.heappush(self._waiting, (state.clock, self._count, state, row))
+        newest = max(clock for clock, *_ in self._waiting)
+        while self._waiting and self._is_due(self._waiting[0][0], newest):
+            self._taken_until, _, first, its_row = heapq.heappop(self._waiting)
             self._take(first, its_row)
         return self.ahead(0.0)
 
     def _is_due(self, clock: float, newest: float) -> bool:
-        """Return whether the filter takes the oldest state that waits: none before it may still come."""
+        """Return whether the oldest waiting state is due: no earlier one can arrive any more."""
         gap = clock - self._taken_until  # NaN at first
         return not 1.5 * PERIOD < gap <= OVERTAKEN_S or newest - clock >= OVERTAKEN_S - 1e-9
 
     def ahead(self, age: float) -> np.ndarray:
         """Return the velocity (3,), m/s, of the trunk's origin in its frame, ``age`` s after the newest state.
 
-        The filter's, then by specific force and turning rate of the states that wait, then by those of the newest one
-        for ``age``, at most ``LONGEST_AHEAD``; NaN stands for 0. That the IMU is not at the origin is left out.
+        The filter's estimate, integrated by specific force and angular velocity of the waiting states, then by
+        those of the newest one for ``age``, at most ``LONGEST_AHEAD``; NaN counts as 0. The IMU's offset is neglected.
         """
         velocity, row = self._velocity, self._row
-        if row is None or not (self._turn or age > 0.0):
+        if row is None or not (self._waiting or age > 0.0):
             return velocity
-        for *_, later in sorted(self._turn, key=lambda one: one[:2]):
+        for *_, later in sorted(self._waiting, key=lambda one: one[:2]):
             half = 0.5 * (later[readings.T] - row[readings.T])
             velocity = velocity + half * (acceleration(row, velocity) + acceleration(later, velocity))
             row = later
@@ -141,14 +141,14 @@ class KalmanEstimator:
         )
 
     def _take(self, state: LowState, row: np.ndarray) -> None:
-        """Give the filter a sample, and see whether it can still be believed."""
+        """Update the filter, and report a fault if its estimate is invalid."""
         status = Status(self._filter.update(row))
         if status.name in self.refused:
             self.refused[status.name] += 1
             self._since = state.t if self._since is None else self._since
             if state.t - self._since > BLIND_S:
                 self._fail(
-                    "estimator", f"the filter has refused every sample for {BLIND_S:g} s ({status.name})", state.t
+                    "estimator", f"the filter has left out every sample for {BLIND_S:g} s ({status.name})", state.t
                 )
             return
         self._since = None
@@ -156,20 +156,20 @@ class KalmanEstimator:
         velocity = np.array(self._filter.velocity_b)
         speed = math.hypot(*velocity)
         if not speed <= FASTEST:  # NaN too
-            self._fail("estimator", f"the filter has diverged: it says {speed:g} m/s", state.t)
+            self._fail("estimator", f"the filter has diverged: {speed:g} m/s", state.t)
         self._velocity, self._row = velocity, row
 
     def _loads(self, state: LowState) -> np.ndarray:
-        """Return what the filter takes for the forces under the feet (4,), N."""
+        """Return the forces under the feet (4,), N, for the filter."""
         if self._both is None:
             return state.foot_force
         return self._both.loads(state.foot_force, state.joint_pos, state.joint_torque, state.imu_quat)
 
 
 def acceleration(row: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Return by how much a velocity (3,), m/s, in the trunk's frame changes in a second, (3,) m/s2.
+    """Return the derivative (3,), m/s2, of a velocity (3,), m/s, in the trunk's frame.
 
-    v' = f - R'(0, 0, 9.81) - w x v, with specific force f, attitude R and turning rate w of a sample ``row`` (51,).
+    v' = f - R'(0, 0, 9.81) - w x v, with specific force f, attitude R and angular velocity w of a sample ``row`` (51,).
     """
     w, x, y, z = row[readings.QUAT].tolist()
     a, b, c = row[readings.GYRO].tolist()
@@ -185,7 +185,7 @@ def acceleration(row: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
 
 class NoEstimator:
-    """For a policy that does not use the velocity: nothing is estimated."""
+    """Estimator of a policy that does not use the velocity."""
 
     def update(self, state: LowState) -> np.ndarray:
         """Return NaN."""

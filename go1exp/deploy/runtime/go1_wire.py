@@ -1,7 +1,7 @@
 """The Go1's low-level UDP protocol: commands of 614 bytes, states of 807, as the vendor's SDK 3.8.6 sends and expects.
 
-Fields, scales and units are in ``go1_fields``. Nothing here was tried on a robot. A packet of another size, head,
-level or checksum is refused (``refusal``). No function here knows a socket.
+Fields, scales and units are in ``go1_fields``. Never tried on a robot. A packet of another size, head, level or
+checksum is rejected (``refusal``).
 """
 
 from __future__ import annotations
@@ -57,17 +57,17 @@ def checksum(packet: bytes | bytearray) -> int:
 
 
 class Refusal(Enum):
-    """Why a packet is refused; the value is for people."""
+    """Reason of the rejection of a packet; the value is its text."""
 
     SIZE = "wrong size"
     HEAD = "wrong head"
     LEVEL = "not of the low level"
     CHECKSUM = "wrong checksum"
-    CONTENT = "a number that cannot be"
+    CONTENT = "impossible number"
 
 
 def refusal(packet: bytes, size: int) -> Refusal | None:
-    """Return why a packet that should have ``size`` bytes is refused; None if it is whole."""
+    """Return the reason to reject a packet that should have ``size`` bytes; None if it is valid."""
     if len(packet) != size:
         return Refusal.SIZE
     if packet[:2] != HEAD:
@@ -102,13 +102,13 @@ def _idle() -> bytes:
 
 
 IDLE = _idle()
-"""The vendor's InitCmdData, byte by byte: asks for no torque at all. The robot answers to whoever sends it."""
+"""The vendor's InitCmdData, byte by byte: a command without any torque, to which the robot answers."""
 
 
 def _bytes_of(kind: np.dtype[Any], *paths: tuple[str, ...]) -> np.ndarray:
-    """Return where in a packet the bytes of these fields are, of the twelve motors one after the other: (bytes,).
+    """Return the byte offsets of fields in a packet, of the twelve motors in order: (bytes,).
 
-    Taking bytes from these places, to view them as numbers, is several times as fast as NumPy's records.
+    Indexing bytes by these offsets is several times as fast as NumPy's records.
     """
     places = []
     for path in paths:
@@ -128,7 +128,7 @@ _REACH = {kind: (int(np.iinfo(kind).min), int(np.iinfo(kind).max)) for kind in (
 
 
 def _whole(values: Sequence[float], step: float, kind: np.dtype[Any]) -> list[int]:
-    """Return values in whole steps, cut towards zero and to a type's range; of a dozen, lists are faster than NumPy."""
+    """Return values in whole steps, cut towards zero and to a type's range; lists of a dozen are faster than NumPy."""
     low, high = _REACH[kind]
     whole = [int(value / step) for value in values]  # exact: a step is a power of two
     return whole if low <= min(whole) and max(whole) <= high else [min(max(n, low), high) for n in whole]
@@ -143,7 +143,7 @@ def _motors(packet: bytearray, kind: np.dtype[Any]) -> np.ndarray:
 def _checked(numbers: Sequence[float]) -> Sequence[float]:
     """Return numbers of a command; raise ValueError if one is beyond any Go1."""
     if not _within(numbers, BEYOND):
-        raise ValueError("a command has a part that is not finite, or beyond any Go1")
+        raise ValueError("a command has a part that is not finite, or impossible")
     return numbers
 
 
@@ -183,7 +183,7 @@ def pack_command(command: LowCmd) -> bytes:
 
 
 def gains_on_wire(kp: np.ndarray, kd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gains (J,) that the robot's drives have when these are commanded: cut to whole steps."""
+    """Return the gains (J,) that a packet carries: cut to whole steps."""
     return np.trunc(np.asarray(kp) / KP_STEP) * KP_STEP, np.trunc(np.asarray(kd) / KD_STEP) * KD_STEP
 
 
@@ -193,15 +193,15 @@ def _sizes(command: LowCmd) -> dict[str, int]:
 
 
 class MotorCommand(NamedTuple):
-    """What a command asks of the twelve motors: torque = kp (q* - q) + kd (dq* - dq) + tau, each (12,).
+    """Command of the twelve motors: torque = kp (q* - q) + kd (dq* - dq) + tau, each (12,).
 
     Attributes:
-        q: rad; where ``kp`` is zero it means nothing.
+        q: rad; without meaning where ``kp`` is zero.
         dq: rad/s.
         tau: N m.
         kp: N m/rad; zero where the packet has POSITION_STOP.
         kd: N m s/rad; zero where it has VELOCITY_STOP.
-        damping: (12,) bool: the motor brakes by itself, whatever else is asked.
+        damping: (12,) bool: the motor brakes, whatever else is commanded.
     """
 
     q: np.ndarray
@@ -213,16 +213,16 @@ class MotorCommand(NamedTuple):
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is asked of any motor."""
+        """Whether no motor gets any torque."""
         return not (self.kp.any() or self.kd.any() or self.tau.any() or self.damping.any())
 
 
 FASTEST, FARTHEST, BEYOND = 1000.0, 100.0, 1e9
-"""Largest |dq| and |q| that a command may ask for, rad/s and rad, and a size that no part of one has (chosen)."""
+"""Largest commanded |dq| and |q|, rad/s and rad, and bound of every other number (chosen)."""
 
 
 def unpack_command(packet: bytes) -> MotorCommand | Refusal:
-    """Return what a packet asks for, or why it is refused."""
+    """Return the command of a packet, or the reason of its rejection."""
     if wrong := refusal(packet, COMMAND_SIZE):
         return wrong
     data = np.frombuffer(packet, _U1)
@@ -254,7 +254,7 @@ NUMBERS = 2**32
 
 @dataclass(frozen=True)
 class Health:
-    """What a state has beside the readings that the runtime uses.
+    """Part of a state that the runtime does not control by.
 
     Attributes:
         charge: of the battery, percent.
@@ -314,7 +314,7 @@ def pack_state(state: LowState, tick: int, health: Health, rpy: np.ndarray) -> b
 
 
 def state_refusal(packet: bytes) -> Refusal | None:
-    """Return why a state's packet is refused; also one of which a reading is not finite, or beyond any Go1."""
+    """Return the reason to reject a state's packet; also for a reading that is not finite, or impossible."""
     if wrong := refusal(packet, STATE_SIZE):
         return wrong
     readings = np.frombuffer(packet, _U1)[_READINGS].view(_F4).tolist()
@@ -327,7 +327,7 @@ def tick_of(packet: bytes) -> int:
 
 
 def unpack_state(packet: bytes, t: float, clock: float) -> LowState:
-    """Return the readings in a state's packet that is not refused.
+    """Return the readings in a valid packet of a state.
 
     Args:
         packet: see ``state_refusal``.
@@ -350,7 +350,7 @@ def unpack_state(packet: bytes, t: float, clock: float) -> LowState:
 
 
 def unpack_health(packet: bytes) -> Health:
-    """Return everything else in a state's packet that is not refused."""
+    """Return everything else in a valid packet of a state."""
     record = np.frombuffer(packet, STATE_TYPE)[0]
     motors, battery = record["motor"][:JOINTS], record["battery"]
     return Health(

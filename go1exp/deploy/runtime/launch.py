@@ -1,4 +1,4 @@
-"""Starts and ends the process of the simulated robot, so that the runtime does not import torch or the engine."""
+"""Process of the simulated robot, so that the runtime imports neither torch nor the engine."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ PATIENCE = 120.0
 
 
 class RobotError(Expected):
-    """The robot is not available; the message says why."""
+    """The robot is not available."""
 
 
 class RefusedError(RobotError):
     """The settings of the simulated robot are wrong.
 
     Attributes:
-        problems: one line for each problem.
+        problems: one line each.
     """
 
     def __init__(self, problems: list[str]) -> None:
-        """Keep the lines."""
+        """Set the problems."""
         super().__init__("; ".join(problems))
         self.problems = problems
 
 
 SPARE, SPARE_S = 1.5, 30.0
-"""The robot keeps more than the log: lost states make the log reach further back, and it lives on after the walk."""
+"""Factor and additional time by which the robot keeps more than the log, which has gaps and ends earlier."""
 
 
 class SimulatedRobot:
@@ -49,7 +49,7 @@ class SimulatedRobot:
     Attributes:
         port: where it listens.
         report: its report of the walk, after ``close``: datagrams, and how it kept real time.
-        truth: the trunk's true motion by column, with ``clock``, after ``close``; empty for a robot that hangs.
+        truth: the trunk's true motion by column, with ``clock``, after ``close``; empty for a suspended robot.
         applied: the applied commands, after ``close``: rows of clock, s, whether one applied, and its targets, rad.
     """
 
@@ -60,14 +60,14 @@ class SimulatedRobot:
 
         Args:
             bundle: the file; the robot in it is that of training.
-            sim: how it is set up (``go1exp.deploy.sim_robot.machine.SimConfig``).
-            other: other choices of ``actuator`` and ``effect``; None keeps those of training.
+            sim: settings (``go1exp.deploy.sim_robot.settings.SimConfig``).
+            other: choices of ``actuator`` and ``effect`` that replace those of training.
             port: where to listen; any that is free if 0.
-            keep: newest seconds of the walk's log, for which the truth and what was in force are kept too.
+            keep: newest seconds of the walk's log, for which truth and applied commands are kept too.
 
         Raises:
             RefusedError: if its settings are wrong.
-            RobotError: if it does not come up.
+            RobotError: if it does not start.
         """
         self._folder = tempfile.TemporaryDirectory(prefix="go1exp-")
         self._truth = Path(self._folder.name) / "truth.npz"

@@ -1,4 +1,4 @@
-"""The log of a walk: kept in arrays that are allocated before the walk begins, and written after its end."""
+"""The log of a walk: arrays that are allocated before the walk, and written after its end."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CYCLE = (
     *(("sent_at", 1), ("age", 1)),
 )
 """Parts of a row: name and width. Times s; ``phase`` an index of ``PHASES``; ``number`` of the command sent, or 0;
-``sent_at`` when it left; ``age`` as in ``Cycle``."""
+``sent_at`` and ``age`` as in ``Cycle``."""
 
 
 class Ring:
@@ -104,7 +104,7 @@ class About:
 
 
 class Log:
-    """Keeps every cycle in memory; writes nothing during the walk.
+    """Keeps every cycle in memory.
 
     Attributes:
         states: every received state.

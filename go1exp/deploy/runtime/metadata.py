@@ -52,27 +52,27 @@ class Trained:
 
 @dataclass(frozen=True)
 class Metadata:
-    """Everything besides the graph that the robot's computer has to know. SI units; joints in the order of ``joints``.
+    """Everything besides the graph that the runtime needs. SI units; joints in the order of ``joints``.
 
     Attributes:
         robot: its name.
-        joints: the J driven joints; every joint quantity has this order.
+        joints: the J actuated joints, in the order of every joint quantity.
         legs: order of quantities per leg.
         inputs: inputs of the graph.
         outputs: outputs of the graph.
         observation: the terms in the flat observation.
-        nominal_stance: (J,) rad, about which actions act.
+        nominal_stance: (J,) rad, the targets of zero action.
         action_scale: rad per unit of action.
         action_clip: largest absolute value of an action; larger ones are clipped.
-        kp: (J,) N m/rad, position gains of the drives in training; None if those have none.
+        kp: (J,) N m/rad, position gains of the actuator in training; None if it has none.
         kd: (J,) N m s/rad.
         joint_limits: (J, 2) rad, the hard stops.
         torque_limit: (J,) N m.
         velocity_limit: (J,) rad/s.
         policy_dt: period of the policy in training, s.
-        physics_dt: period of the drives in training, s.
+        physics_dt: physics step in training, s.
         command_ranges: lowest and highest command in training by name (m/s, m/s, rad/s); empty if there are none.
-        conventions: frames, order of quaternions and signs, in words.
+        conventions: description of frames, quaternions and signs.
         estimator: settings of the state estimator (``deploy.estimation.FilterConfig`` as JSON); empty: those of a Go1.
         trained: the policy's origin.
     """
@@ -113,7 +113,7 @@ class Metadata:
         # Terms follow one another without a gap, from column 0.
         ends = [block.start + block.size for block in self.observation]
         if [block.start for block in self.observation] != [0, *ends[:-1]]:
-            raise ValueError("observation: its terms do not follow one another")
+            raise ValueError("observation: its terms are not contiguous")
         if wrong := [block.key for block in self.observation if block.history < 1 or block.size % block.history]:
             raise ValueError(f"observation: {wrong[0]} has a size that is not that of its history")
         earlier = sum(block.size - block.size // block.history for block in self.observation)
@@ -130,9 +130,9 @@ class Metadata:
                 raise ValueError(f"command_ranges.{name}: the lowest, {low:g}, is above the highest, {high:g}")
 
     def _check_joints(self) -> None:
-        """Raise ValueError with the key of a joint's value that no drive can have."""
+        """Raise ValueError with the key of an impossible value of a joint."""
         if twice := {name for name in self.joints if self.joints.count(name) > 1}:
-            raise ValueError(f"joints: {', '.join(sorted(twice))} stands there twice")
+            raise ValueError(f"joints: {', '.join(sorted(twice))} duplicate")
         for name in ("kp", "kd"):
             for k, value in enumerate(getattr(self, name) or ()):
                 if value < 0:

@@ -25,11 +25,11 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
 class OnnxPolicy:
-    """Sensor readings in, joint targets out: one thread, the same numbers for the same readings.
+    """The exported graph in onnxruntime: one thread, deterministic.
 
     Attributes:
-        inputs: names, sizes and meanings of the inputs, float32 (rows, size) each.
-        outputs: the same of the outputs.
+        inputs: of the graph, float32 (rows, size) each.
+        outputs: of the graph.
     """
 
     def __init__(self, model: bytes, inputs: Sequence[Port], outputs: Sequence[Port]) -> None:
@@ -105,7 +105,7 @@ A = TypeVar("A", bound=Any)  # an array of NumPy or torch
 
 
 class Past(Generic[A]):
-    """The newest values of something, of one training period.
+    """Buffer of the values of one training period.
 
     Args:
         trained: period of the policy in training, s.
@@ -120,23 +120,20 @@ class Past(Generic[A]):
         self._kept: deque[A] = deque(maxlen=self.cycles)
 
     def after(self, newest: A, before: A) -> A:
-        """Add the newest value; return that of one training period before the next cycle, ``before`` if there is none.
-
-        The next cycle then sees what it would have seen in training.
-        """
+        """Add a value; return that of one training period before the next cycle, ``before`` if there is none."""
         self._kept.append(newest)
         return before if len(self._kept) < self.cycles else self._kept[0]
 
 
 class PolicyMemory:
-    """Runs a policy and keeps what its inputs ``previous_action`` and ``past`` are in the next cycle.
+    """Runs a policy and keeps its inputs ``previous_action`` and ``past`` for the next cycle.
 
     Attributes:
-        values: these inputs by name, float32 (rows, size), as far as the policy has them.
+        values: those of these inputs that the policy has, by name, float32 (rows, size).
     """
 
     def __init__(self, about: Metadata, period: float, rows: int = 1) -> None:
-        """Begin an episode of ``rows`` robots; ``period`` of the policy now, s."""
+        """Start an episode of ``rows`` robots; ``period`` is the present one of the policy, s."""
         sizes = {port.name: port.size for port in about.inputs}
         self.values: dict[str, np.ndarray] = {
             name: np.zeros((rows, sizes[name]), np.float32) for name in ("previous_action", "past") if name in sizes
@@ -149,9 +146,9 @@ class PolicyMemory:
     def __call__(
         self, policy: Callable[[Mapping[str, np.ndarray]], dict[str, np.ndarray]], readings: dict[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
-        """Return the policy's outputs for the readings, to which what it remembers is added in place."""
+        """Return the policy's outputs for the readings, to which the remembered inputs are added in place."""
         readings |= self.values
-        if "past" in self.values and self._first is None:  # before the first frame there were others like it
+        if "past" in self.values and self._first is None:  # the first frame stands for those before it
             self._first = policy(readings)["observation"][:, self._columns.newest]
             readings["past"] = self.values["past"] = self._first
         outputs = policy(readings)
