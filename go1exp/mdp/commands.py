@@ -136,7 +136,7 @@ class FixedVelocity(Memory):
     def __init__(
         self, stream: Stream, *, lin_vel_x: Speed = 0.5, lin_vel_y: Speed = 0.0, ang_vel_z: Speed = 0.0
     ) -> None:
-        """Keep the velocity (m/s, m/s, rad/s); ``stream`` only tells the number of environments."""
+        """Keep the velocity (m/s, m/s, rad/s); ``stream`` gives the number of environments alone."""
         velocity = torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z], device=stream.key.device)
         self.value = velocity.repeat(len(stream.key), 1)
 

@@ -18,7 +18,7 @@ class FootTimers(Memory):
     """Running and last completed swing and stance times, (N, 4), s, at the physics rate as Isaac Lab's sensor has them.
 
     ``air`` and ``contact`` are the running phases, one of them zero; ``last_air`` and ``last_contact`` the last
-    completed ones; ``touchdown`` (bool) tells whether a swing ended since ``begin_step``.
+    completed ones; ``touchdown`` (bool) is true where a swing ended since ``begin_step``.
     """
 
     memory = ("air", "contact", "last_air", "last_contact", "touchdown")

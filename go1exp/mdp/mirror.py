@@ -1,7 +1,7 @@
 """The mirror image of columns of numbers across the robot's sagittal (x-z) plane: which column, with which sign.
 
-A robot and its mirror image move alike: if a robot sees o and does a, its image sees M o and does M a. An observation
-says what its M is where it is registered, ``@observation("foot_loads", size=4, mirror=mirror.LEGS)``; the M of actions
+The dynamics are symmetric: if a robot observes o and acts a, its image observes M o and acts M a. An observation
+declares its M where it is registered, ``@observation("foot_loads", size=4, mirror=mirror.LEGS)``; the M of actions
 is ``ACTION``. Order of legs, joints and their signs are those of ``robot.py``.
 """
 

@@ -1,8 +1,8 @@
 """Observation terms: Snapshot -> ``(N, k)`` float32, unscaled by default. The YAML's list is concatenated in its order.
 
-Table II of the paper; a ``scale`` other than 1 is not the paper's. The noise beside a term in the YAML is the
-half-width of a uniform distribution, drawn anew at each policy step and element, of the scaled number. ``mirror`` says
-what a term is in a mirror that swaps left and right (``mdp/mirror.py``).
+Table II of the paper; a ``scale`` other than 1 is not the paper's. A term's ``noise`` in the YAML is the
+half-width of a uniform distribution, drawn anew at each policy step and element, of the scaled number. ``mirror`` is
+the term's image under a swap of left and right (``mdp/mirror.py``).
 """
 
 from __future__ import annotations

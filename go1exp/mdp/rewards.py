@@ -43,7 +43,7 @@ def feet_air_time(s: Snapshot, *, mode_time: Positive = 0.175, speed_threshold: 
     """Steps of the right length: time in the running phase of each foot, s, as long as it is below ``mode_time``.
 
     Moving: sum_i T_i [T_i < m], T_i = max(air, contact time). Standing: sum_i clip(contact - air, -m, m).
-    Swing and stance count alike, so that the best gait changes phase every ``mode_time``. Sum over feet, s;
+    Swing and stance count equally, so that the best gait changes phase every ``mode_time``. Sum over feet, s;
     negative for a standing robot with its feet in the air. Printed: sum_i (t_air,i - 0.175), which rewards never
     landing; source of the form: Isaac Lab, Spot `air_time`.
     """
@@ -360,10 +360,10 @@ class Trot(Memory):
         torch.maximum(self.swing, torch.where(s.foot_touchdown, s.foot_last_air_time, s.foot_air_time), out=self.swing)
         lost = self.since > 2.0 * self.cycle
         landed = s.foot_touchdown & ((self.swing >= (BOUNCE_SHARE * self.cycle).clamp(max=BOUNCE)) | lost)
-        late = torch.minimum(since_last_contact_began(s), torch.full_like(self.since, self._dt))
-        length = self.since - late
+        overdue = torch.minimum(since_last_contact_began(s), torch.full_like(self.since, self._dt))
+        length = self.since - overdue
         # A first step is the beginning of no cycle: any second one ends the shortest.
         cycle = torch.where(length > LONGEST_CYCLE, torch.zeros_like(length), length).clamp(min=SHORTEST_CYCLE)
         self.cycle.copy_(torch.where(landed, cycle, self.cycle))
-        self.since.copy_(torch.where(landed, late, self.since))
+        self.since.copy_(torch.where(landed, overdue, self.since))
         self.swing.copy_(torch.where(landed, s.foot_air_time, self.swing))

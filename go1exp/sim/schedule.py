@@ -118,7 +118,7 @@ def _renamed(problems: list[str], name: str, path: str) -> list[str]:
 
 
 def _contact_problems(path: str, parts: Mapping[str, Any]) -> list[str]:
-    """Refuse a ramp of the contact beside terms that set the contact of each robot."""
+    """Refuse a ramp of the contact together with terms that set the contact of each robot."""
     others = [f"rand.{t.key}" for t in parts.get("rand") or () if _sets_contact(t.entry.traits.get("fields"))]
     others += [f"effect.{t.key}" for t in parts.get("effect") or () if _sets_contact(t.entry.target.fields)]
     return [

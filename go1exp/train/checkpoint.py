@@ -1,6 +1,6 @@
 """Checkpoints: everything that training needs to go on as if it had never stopped.
 
-One file per checkpoint, written beside its final name and renamed when complete, read back without unpickling code.
+One file per checkpoint, written under a temporary name and renamed when complete, read back without unpickling code.
 """
 
 from __future__ import annotations

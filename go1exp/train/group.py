@@ -1,7 +1,7 @@
 """Several GPUs of one host that share a training: each has a share of the robots and of every minibatch.
 
-What is random belongs to a robot (``base/tensors/randomness.py``), or is drawn alike by all, each of which keeps its
-own part. The rollouts are joined after they are collected, so that a minibatch is drawn from all of them, and
+What is random belongs to a robot (``base/tensors/randomness.py``), or is drawn identically by all, each of which keeps
+its own part. The rollouts are joined after they are collected, so that a minibatch is drawn from all of them, and
 gradients are averaged before they are clipped. So a training is that of one GPU with all robots, up to the order of
 sums, and its checkpoints are too.
 """
@@ -311,7 +311,7 @@ def _start(others: Sequence[BaseProcess]) -> None:
 def _member(
     rank: int, size: int, meeting: Path, backend: str, work: Work, container: dict[str, Any], run: Path
 ) -> None:
-    """Do ``work`` as member ``rank``; the first member hears the signals and tells the others."""
+    """Do ``work`` as member ``rank``; the first member handles signals for all."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()

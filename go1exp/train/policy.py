@@ -29,7 +29,7 @@ START = "start.json"
 
 @dataclass(frozen=True)
 class Weights:
-    """The state of a policy, and what ``start.json`` tells of it."""
+    """The state of a policy, and its origin as in ``start.json``."""
 
     policy: dict[str, Any]
     about: dict[str, Any]

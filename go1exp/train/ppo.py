@@ -318,7 +318,7 @@ class AdaptivePPO(PPO):
             self.logger.record("train/gradient_steps", len(figures["loss"]))
 
     def _close_iteration(self) -> None:
-        """Count the iteration that is complete, and tell of it."""
+        """Count and report the iteration that is complete."""
         self.iteration += 1
         self.logger.record("train/kl", float(np.mean(self._kl)))
         self.logger.record("train/learning_rate", float(self.policy.optimizer.param_groups[0]["lr"]))

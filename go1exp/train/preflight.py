@@ -143,7 +143,7 @@ def check_memory(config: TrainConfig, device: torch.device) -> None:
 
 
 def _available(device: torch.device) -> int | None:
-    """Return the free memory of a device, B; None where the system does not tell."""
+    """Return the free memory of a device, B; None where it is unknown."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     return memory.free()

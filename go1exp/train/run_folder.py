@@ -42,7 +42,7 @@ PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco-core", "numpy", "
 
 
 def write(run: Path, container: dict[str, Any]) -> None:
-    """Create a run folder and say what is about to run in it.
+    """Create a run folder with configuration and versions of the run.
 
     Raises:
         OSError: if the folder cannot be written; the message names it.
@@ -150,7 +150,7 @@ def _git(*arguments: str) -> str | None:
 
 
 def _gpus() -> dict[str, Any]:
-    """Return NVIDIA's driver and the GPUs, as the driver tells them; nothing where there is none."""
+    """Return NVIDIA's driver and the GPUs, as the driver reports them; empty without one."""
     place = Path("/proc/driver/nvidia")
     try:
         driver = (place / "version").read_text().splitlines()[0].strip()
@@ -176,7 +176,7 @@ PLUGINS = "plugins"
 
 
 def keep_plugins(run: Path, container: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Copy the files of a configuration's plugins into ``run``; return what ``meta.json`` tells of all its plugins.
+    """Copy the files of a configuration's plugins into ``run``; return their records for ``meta.json``.
 
     One that the configuration does not name (of ``GO1EXP_PLUGINS`` or an entry point) counts if a term of it is used.
 

@@ -90,7 +90,7 @@ class Schedule:
         return named
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what the steps do not tell, as plain data; empty without a trigger."""
+        """Return the state that does not follow from the steps, as plain data; empty without a trigger."""
         return {k: {"recent": list(self._recent[k]), "started": self._started[k]} for k in self._triggers}
 
     def load_state_dict(self, state: Mapping[str, Any], steps: int) -> None:

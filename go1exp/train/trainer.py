@@ -117,13 +117,13 @@ def train(config: TrainConfig, container: dict[str, Any], run: Path, first: Weig
 
 def _close(ppo: AdaptivePPO, logger: Logger, evaluation: AsyncEvaluation, complete: bool) -> None:
     """End the asynchronous evaluation, after its jobs if the training is complete, and close the logs."""
-    late = evaluation.finish(wait=complete)
+    figures = evaluation.finish(wait=complete)
     for problem in evaluation.problems:
         print(problem)
     if evaluation.skipped:
         print(f"{evaluation.skipped} evaluations or videos were skipped: their process is slower than the training")
-    if late:
-        for key, value in late.items():
+    if figures:
+        for key, value in figures.items():
             logger.record(key, value)
         metrics.dump_late(logger, ppo.num_timesteps)
     logger.close()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from go1exp import robot
 
 NOT_COUNTED = 2
-"""State of a foot at a time that does not count, beside 0 for the air and 1 for the ground."""
+"""State of a foot at a time that does not count; 0 is the air, 1 the ground."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ Share = Literal["all", "kind", "none"]
 """One net for all joints, one for each kind of joint (``FR_hip``: ``hip``), or one for each joint."""
 
 Target = Literal["tau_est", "joint_torque"]
-"""What the net was taught: torque that the actuator reports, or torque at the joint from inverse dynamics."""
+"""Training target: torque that the actuator reports, or torque at the joint from inverse dynamics."""
 
 Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, Field(min_length=1)]
@@ -58,7 +58,7 @@ class Provenance:
         recordings: episode -> SHA-256 of its content (``go1exp.gap.actuator_net.dataset.fingerprint``).
         train: episodes whose rows moved the weights.
         validation: episodes that decided when to stop.
-        held_out: episodes that the net never met; ``held_out_rmse`` is theirs.
+        held_out: held-out episodes; ``held_out_rmse`` is theirs.
         held_out_rmse: root mean square error over their rows, N m.
         seed: of split, initial weights and minibatches.
         settings: the fit's other settings, as JSON text.
@@ -77,7 +77,7 @@ class Provenance:
 
 @checked_dataclass(frozen=True, config=STRICT)
 class NetInfo:
-    """What a net says about itself. K is the number of nets in it, J that of joints.
+    """Description of a net. K is the number of nets in it, J that of joints.
 
     Attributes:
         robot: whose joints these are.
@@ -88,7 +88,7 @@ class NetInfo:
         history: taps of each input.
         period: time between taps, s; at another spacing the weights mean another actuator.
         hidden: widths of the hidden layers.
-        target: what it was taught.
+        target: its training target.
         kp: position gains in force during the recordings, N m/rad, one per joint; None where unknown.
         kd: velocity gains, N m s/rad.
         provenance: where it comes from.
@@ -161,10 +161,10 @@ class ActuatorNet:
         tau = output_mean[k] + output_std[k] * (h @ weights[-1][k] + biases[-1][k] + z @ skip[k])
 
     Attributes:
-        info: what it says about itself.
+        info: its description.
         weights: layer by layer ``(K, in, out)``; the last has out = 1.
         biases: layer by layer ``(K, out)``.
-        skip: ``(K, F)`` linear map beside the layers, which learn what it leaves; zeros in the paper's form.
+        skip: ``(K, F)`` linear map parallel to the layers, which learn its residual; zeros in the paper's form.
         input_mean: ``(K, F)``, in the inputs' units.
         input_std: ``(K, F)``, positive.
         output_mean: ``(K,)``, N m.

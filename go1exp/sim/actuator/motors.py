@@ -102,7 +102,7 @@ class DCMotor(_Controller):
         Args:
             setup: the actuators.
             kp: position gain, N m/rad.
-            kd: speed gain, N m s/rad.
+            kd: velocity gain, N m s/rad.
             stall: torque of the line at rest, N m; None, or a joint left out: the robot's peak torque.
             speed: where the line reaches zero, rad/s; None, or a joint left out: the robot's top speed.
         """
@@ -164,7 +164,7 @@ class Voltage(_Controller):
         Args:
             setup: the actuators; the peak torque is what the current limit allows.
             kp: position gain, N m/rad.
-            kd: speed gain of the controller, beside the back EMF, N m s/rad.
+            kd: velocity gain of the controller, without the back EMF, N m s/rad.
             stall: torque at rest with full duty, N m; None, or a joint left out: the robot's peak torque.
             speed: without load at full duty, rad/s; None, or a joint left out: the robot's top speed.
             supply: voltage over the nominal one.

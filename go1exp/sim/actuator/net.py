@@ -51,8 +51,8 @@ class Net(Memory):
 
     tau(t) = net(e(t), e(t - P), e(t - 2P), ..., qd(t), qd(t - P), ...) with e = target - q, clipped at the peak torque.
     The spacing P of the history is the net's own; at another one the same weights are another actuator. The net that
-    walk-these-ways published shows it: fitted at 20 ms, it is kp 20 on the *previous* error with kd 0.5, an actuator
-    that is 20 ms late; stepped at 5 ms, as there and in Isaac Lab, it is 5 ms late with kd 0.75 (computed from its
+    walk-these-ways published shows it: fitted at 20 ms, it is kp 20 on the *previous* error with kd 0.5, a delay
+    of 20 ms; stepped at 5 ms, as there and in Isaac Lab, it has a delay of 5 ms and kd 0.75 (computed from its
     weights). So where P is not the physics step, ``period`` must say what to do:
 
     - ``exact``: refuse.

@@ -1,4 +1,4 @@
-"""What every actuator promises."""
+"""Protocol of actuators, and their gains."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Actuator(Protocol):
         """Return joint torques (N, J), N m, for targets and angles in rad and speeds in rad/s.
 
         An actuator that can be fed forward has a fourth argument, ``feedforward: Tensor | None = None``, (N, J), N m:
-        added to its own torque before the limit, and as late as the target where it delays that (``TakesFeedforward``).
+        added to its own torque before the limit, and delayed as the target is (``TakesFeedforward``).
         """
 
     def reset(self, mask: Tensor) -> None:

@@ -16,7 +16,7 @@ class NumericalFault(Expected):
 
     Attributes:
         quantity: what it was, such as ``reward.foot_force`` or ``gradient of policy.action_net.bias``.
-        dump: arrays that describe the moment, to be saved beside the run.
+        dump: arrays that describe the moment, to be saved in the run folder.
     """
 
     def __init__(self, quantity: str, where: str, dump: Mapping[str, np.ndarray]) -> None:

@@ -79,7 +79,7 @@ class GaitLog(Memory):
         """(N, 3) each: distance to the trot of FL, RR and RL where they landed, in cycles, and a mask.
 
         The phase is the time since FR's touchdown over FR's last stride. Instants are known to the physics step:
-        a foot's contact time tells how long ago it landed.
+        a foot's contact time is the time since it landed.
         """
         elapsed = self.since + self._dt
         ago = s.foot_contact_time[:, FR]
@@ -102,7 +102,7 @@ class GaitLog(Memory):
 
         ``gait/`` is of robots with a non-zero command.
 
-        ``gait/stride_rate``: touchdowns of a foot per second, Hz, bounces that a policy step tells apart included.
+        ``gait/stride_rate``: touchdowns of a foot per second, Hz, bounces longer than a policy step included.
         ``gait/trot_error``: mean circular distance of touchdowns to a trot's, cycles, of the worst foot; 0.25 for
         random ones, and never less than the measure, which averages phases first. ``gait/duty_mean``, ``duty_spread``
         (largest less smallest foot), ``gait/load_share_min``: of the batch's mean force. ``contact/slip_share``,

@@ -3,11 +3,11 @@
 Training, evaluation, recording and identification all step this, so that an effect means the same to each.
 
 Numerics. MuJoCo's Euler step is a leapfrog: qpos belongs to the step's instant, qvel to half a step before it. An
-actuator that took both at face value would react half a step late to the velocity and half a step early to its target,
+actuator that took both at face value would see the velocity of half a step ago and the target of half a step ahead,
 which at 2 ms moves a 0.2 rad step by 5 mrad against 0.25 ms. So the actuator gets the velocity extrapolated to the
 instant of qpos, and a target that changes counts for half of the step in which it changes: second order in the step,
 0.3 mrad. Dry friction changes its sign within the step in which a joint turns. MuJoCo's has the sign of the speed at
-its end all the step long; the difference is given beside it.
+its end all the step long; the difference is added.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Plant:
         self._bounded = self.effects.acts("on_friction") or self.effects.acts("on_load")
         self._dry = self._bounded or FRICTION in self.effects.fields
         self._dry |= bool(backend.compiled(FRICTION).any())
-        self._beside = self._dry or self._rotors is not None or self.effects.acts("on_joint")
+        self._has_joint_torques = self._dry or self._rotors is not None or self.effects.acts("on_joint")
         self._outside: Tensor | None = None  # torque of the links' weight and speed, of a step ago
         if self.effects.acts("on_load"):
             self._bias, self._outside = backend.bias(), setup.zeros()
@@ -158,7 +158,7 @@ class Plant:
         - ``pd``: in the sum that is clipped at the peak torque.
         - ``dc_motor``: in the sum that is clipped at what the motor can make at that speed.
         - ``voltage``: in the duty that is clipped, before the back EMF.
-        - ``delay``: as late as the target, then as the actuator inside says.
+        - ``delay``: delayed as the target is, then as in the actuator inside.
         - ``net``: added to what the net says or holds, and clipped at the peak torque; its history has no part of it.
 
         Args:
@@ -190,8 +190,8 @@ class Plant:
                 bound = effects.on_load(bound, self.torque, self._outside)
             self.backend.field(FRICTION)[:, self._joints] = bound
         geared = effects.on_transmission(self.torque, q, qd)
-        if self._beside:
-            geared = self._act_beside(geared, q, qd, turn)
+        if self._has_joint_torques:
+            geared = self._apply_joint_torques(geared, q, qd, turn)
         if self._floating and effects.acts("on_base"):
             wrench = self.backend.applied()[:, :6]
             wrench.copy_(effects.on_base(torch.zeros_like(wrench)))
@@ -215,20 +215,20 @@ class Plant:
         self._fed.copy_(given)
         return cast("TakesFeedforward", self.actuator).torque(command, *encoder, arriving)
 
-    def _act_beside(self, geared: Tensor, q: Tensor, qd: Tensor, turn: Tensor | None) -> Tensor:
-        """Apply what acts on the joints beside the actuator's torque ``geared``, and return what is left of that."""
-        beside = self.effects.on_joint(q, qd)
+    def _apply_joint_torques(self, geared: Tensor, q: Tensor, qd: Tensor, turn: Tensor | None) -> Tensor:
+        """Apply joint torques other than the actuator's ``geared``; return the part of that which acts rigidly."""
+        extra = self.effects.on_joint(q, qd)
         if turn is not None:
-            beside = beside + self._late_friction(turn)
+            extra = extra + self._friction_correction(turn)
         if self._rotors:
             rigid, through, carried = self._rotors.transmit(self.effects.gears(), geared, self._inertia)
             self.backend.field(ARMATURE)[:, self._joints] = carried
             # The motor's torque limit is not the gears'.
-            geared, beside = torch.where(rigid, geared, 0.0), torch.where(rigid, beside, beside + through)
-        self.backend.applied()[:, self._joints] = beside
+            geared, extra = torch.where(rigid, geared, 0.0), torch.where(rigid, extra, extra + through)
+        self.backend.applied()[:, self._joints] = extra
         return geared
 
-    def _late_friction(self, turn: Tensor) -> Tensor:
+    def _friction_correction(self, turn: Tensor) -> Tensor:
         """Return the torque by which dry friction differs from MuJoCo's, which changes its sign too early.
 
         A joint that goes on to change its speed by ``turn`` (N, J), rad/s, rests after ``share`` of the step; so long

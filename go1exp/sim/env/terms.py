@@ -36,9 +36,9 @@ class StepTerms:
         weights: (R,) times the policy's period.
         sums: (R,) float64, of weighted rewards since ``core.drain_metrics``.
         failed: (N, T) bool, which terminations were true in the last step.
-        left_map: (N,) bool, who was at the edge of the ground in the last step.
-        impossible: (N,) bool, whose feet met a force that physics cannot make in it (``mdp/feet.py``).
-        distrusts: whether such a force ends an episode, or is believed.
+        left_map: (N,) bool, robots at the edge of the ground in the last step.
+        impossible: (N,) bool, robots with an impossible force on a foot in the last step (``mdp/feet.py``).
+        distrusts: whether such a force ends an episode.
         observed: terms of the observation, in the order of their columns; those of the critic are the last ones.
         observation_size: O.
         policy_size: columns that are the policy's.
@@ -82,13 +82,14 @@ class StepTerms:
         # Seen with MuJoCo Warp alone; an engine that evaluates a policy must not hide a fall behind it.
         self.distrusts = isinstance(task.backend, WarpBackend)
         self.left_map, self.impossible = torch.zeros(2, num_envs, dtype=torch.bool, device=device).unbind(0)
-        beside = task.critic if critic else ()
-        self._observation_calls, self._critic_calls = calls("observation", task.observation), calls("critic", beside)
+        privileged = task.critic if critic else ()
+        self._observation_calls = calls("observation", task.observation)
+        self._critic_calls = calls("critic", privileged)
         self._advancing, self._critic_advancing = (
             [part for key, part in self._remembering.items() if key.startswith(f"{group}.")]
             for group in ("observation", "critic")
         )
-        self.observed = (*task.observation, *beside)
+        self.observed = (*task.observation, *privileged)
         self.read = {name for t in self.observed for name in t.entry.traits.get("reads", ())}
         widths = [width(t) for t in self.observed]
         self.observation_size, self.policy_size = sum(widths), sum(widths[: len(task.observation)])

@@ -51,7 +51,7 @@ class PhysicsBackend(Protocol):
         """The values ``(1 or N, ...)`` that randomisation starts from: those of ``rebase``, else the compiled ones."""
 
     def applied(self) -> Tensor:
-        """Live generalised forces (N, nv) beside the actuators' torques, N and N m; kept until they are written anew.
+        """Live generalised forces (N, nv) added to the actuators' torques, N and N m; kept until overwritten.
 
         The first six of a floating trunk are a force on its origin in the world frame and a torque in its own.
         """

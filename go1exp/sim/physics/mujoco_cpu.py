@@ -81,7 +81,7 @@ class MujocoCpu:
         return self._baseline[name] if name in self._baseline else self.compiled(name).unsqueeze(0)
 
     def applied(self) -> Tensor:
-        """Live generalised forces beside the actuators'."""
+        """Live generalised forces added to the actuators'."""
         if self._applied is None:
             self._applied = torch.from_numpy(self._batch.bind("qfrc_applied"))
         return self._applied
@@ -113,7 +113,7 @@ class MujocoCpu:
         return unit_numbers(key, counter, count)
 
     def drain_metrics(self) -> dict[str, float]:
-        """Nothing to tell: MuJoCo makes room for whatever there is."""
+        """Return nothing: MuJoCo allocates as much as it needs."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:

@@ -102,7 +102,7 @@ class MujocoWarp:
             kernels = [wp.get_module(f"{mjw.__name__}._src.{name}") for name in MODULES]
             wp.force_load(self._wp_device, kernels, max_workers=len(kernels))
             self._model = mjw.put_model(supported)
-            self._model.opt.warn_overflow = 0  # kernels that print are slow; ``overflowed`` tells
+            self._model.opt.warn_overflow = 0  # kernels that print are slow; see ``overflowed``
             without_contact_sensors(self._model)
             if not model.dof_damping.any():  # it would factorise the inertia once more for nothing
                 self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
@@ -205,7 +205,7 @@ class MujocoWarp:
         return self._compiled[name]
 
     def applied(self) -> Tensor:
-        """Live generalised forces beside the actuators'."""
+        """Live generalised forces added to the actuators'."""
         return self._qfrc_applied
 
     def bias(self) -> Tensor:

@@ -165,7 +165,7 @@ class PhysxCpu(MujocoCpu):
 
     def _push(self, rows: Sequence[int]) -> None:
         """Give the robots the torques and forces of the step."""
-        joints = self._out["qfrc_smooth"] + self._out["qfrc_bias"]  # what acts beside gravity and inertia
+        joints = self._out["qfrc_smooth"] + self._out["qfrc_bias"]  # all but gravity and inertia
         torque = np.empty((self.num_envs, len(self._order)), dtype=np.float32)
         torque[:, self._order] = joints[:, -len(self._order) :]
         for env in rows:

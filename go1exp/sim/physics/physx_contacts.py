@@ -1,7 +1,7 @@
-"""What PhysX tells of a robot's contacts, laid out as MuJoCo's contact sensors (``go1exp.sim.physics.scene.Sensors``).
+"""Contact readings of PhysX, laid out as MuJoCo's contact sensors (``go1exp.sim.physics.scene.Sensors``).
 
 PhysX gives the normal impulse of each contact point in the step, and no friction. Friction under a foot follows from
-the equation of motion: what the joints of its leg were accelerated by beside all that is known is J^T f of the foot.
+the equation of motion: the torque of its leg's joints that nothing else explains is J^T f of the foot.
 The part of that f along the ground counts, as far as the friction coefficient allows with the normal force of PhysX.
 Where another link of the leg touches too, or dry friction or a stop acts on a joint, that part is of all of them.
 """

@@ -161,7 +161,7 @@ def add_mount(trunk: mujoco.MjsBody) -> None:
 
 
 DECORATION_GROUP = 2
-"""Geom group of the shapes that are only for the eye; they cost kinematics and are left out of training."""
+"""Geom group of the visual shapes; they cost kinematics and are left out of training."""
 
 HELD_HEIGHT = 1.0
 """Height at which a held trunk hangs, m: no foot reaches the ground."""
@@ -219,7 +219,7 @@ def build_model(
         terrain: the ground, which touches every collision shape of the robot; None for a robot that touches nothing and
             is nowhere seen: without shapes, sites and sensors a step is a twentieth shorter.
         physics_dt: timestep, s.
-        decoration: keep the shapes that are only for the eye (they change no trajectory).
+        decoration: keep the visual shapes (they change no trajectory).
         contact: of the feet with the ground.
         imu: add the IMU's sensors (they cost time and a policy does not need them).
         held: orientation w-x-y-z in which the trunk is held in the air, as on a stand; None lets it go. A held robot's
