@@ -19,6 +19,7 @@ from go1exp.config.schema.joint_values import spread
 from go1exp.config.schema.registry import ConfigError, Term, members
 from go1exp.evaluate.bench.env import ACTION_SCALE
 from go1exp.evaluate.bench.measure import Subject, rates, ratio
+from go1exp.evaluate.bench.train import learning
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import make_backend
 from go1exp.sim.env.sb3_env import Go1VecEnv
@@ -99,30 +100,11 @@ def bare_subject(task: TaskConfig, num_envs: int) -> Subject:
     return Subject("bare mujoco-warp", stepped(step, num_envs))
 
 
-def train_subject(config: TrainConfig) -> Subject:
-    """Whole iterations on the device: rollout, advantages, update."""
-    ppo = trainer.build(config)
-    size = config.ppo.num_envs * config.ppo.steps
-
-    def work() -> int:
-        ppo.learn(size, reset_num_timesteps=ppo.iteration == 0)
-        torch.cuda.synchronize()
-        return size
-
-    return Subject("training", work)
-
-
 def border_subject(config: TrainConfig) -> Subject:
     """Training through SB3's own loop and buffer, with every step in numpy."""
     core = Go1Core(config.task, config.ppo.num_envs, config.process.seed, spread_starts=True, critic=True)
     ppo = AdaptivePPO(config.ppo, Go1VecEnv(core), config.process.seed, "cuda")
-    size = config.ppo.num_envs * config.ppo.steps
-
-    def work() -> int:
-        ppo.learn(size, reset_num_timesteps=ppo.iteration == 0)
-        return size
-
-    return Subject("training through numpy", work)
+    return learning(ppo, config, "training through numpy")
 
 
 _FIRST = """
@@ -169,7 +151,8 @@ def run(
     if net is not None:
         actuator = Term("net", members("actuator")["net"], {"file": str(net), "period": "exact"})
         subjects["net"] = env_subject(dataclasses.replace(config.task, actuator=actuator), num_envs)
-    subjects |= {"train": train_subject(config), "numpy": border_subject(config)}
+    training = learning(trainer.build(config), config, "training", torch.cuda.synchronize)
+    subjects |= {"train": training, "numpy": border_subject(config)}
     measured = rates(subjects, rounds, seconds, on_round)
     cold, warm = first_update_seconds([*overrides, f"ppo.num_envs={num_envs}"])
     speed = {f"{name}_steps_per_s": float(np.median(values)) for name, values in measured.items()}

@@ -83,6 +83,8 @@ class Protocol:
     """Whether the robots of a condition move identically where nothing is random."""
     always: ClassVar[tuple[str, ...]] = ()
     """Measures that are always computed."""
+    derived_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the figures of all robots together."""
 
     def terms(self) -> list[Term]:
         """Return the measures; raise ConfigError naming those that do not exist."""
@@ -104,10 +106,6 @@ class Protocol:
         """Return the figures of all robots together."""
         return []
 
-    def derived_names(self) -> list[str]:
-        """Return the names of the derived figures."""
-        return []
-
     def play(self, stage: Stage) -> Played:
         """Play the protocol and return its rows."""
         raise NotImplementedError
@@ -121,11 +119,15 @@ class Protocol:
         return sum(stage.steps(length.seconds, length.policy_dt) * length.robots for length in self.lengths())
 
     def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Return the figures of its report."""
-        return []
+        """Return the figures of the report of one subject."""
+        return [*self.compared({"": played}, {"": summary}), *self.details(played, summary)]
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
-        """Return the figures that compare several subjects, by their labels."""
+        """Return the figures that compare subjects, by their labels; the label of a single one is empty."""
+        return []
+
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Return the figures that show one subject only."""
         return []
 
     def measure(self, motion: Motion, rows: Sequence[Row]) -> None:
@@ -246,7 +248,7 @@ def _check_claims(protocol: Protocol, path: str) -> None:
         columns = protocol.columns()
     except ConfigError as error:
         raise ConfigError([f"{path}.{problem}" for problem in error.problems]) from None
-    known = [*(c.name for c in columns), "falls_per_minute", *protocol.derived_names()]
+    known = [*(c.name for c in columns), "falls_per_minute", *protocol.derived_names]
     wrong = [
         unknown_name(f"{path}.claims.{name}.quantity", claim.quantity, known, "figure")
         for name, claim in protocol.claims.items()

@@ -107,17 +107,19 @@ class EffectStack:
 
     # ------------------------------------------------------------------ the step
 
+    def _chain(self, hook: str, value: Tensor, *others: Tensor) -> Tensor:
+        """Return ``value`` after the hook of one effect after the other."""
+        for effect in self._acting[hook]:
+            value = getattr(effect, hook)(value, *others)
+        return value
+
     def on_target(self, target: Tensor) -> Tensor:
         """Return the position target that the drives act on."""
-        for effect in self._acting["on_target"]:
-            target = effect.on_target(target)
-        return target
+        return self._chain("on_target", target)
 
     def on_feedforward(self, torque: Tensor) -> Tensor:
         """Return the feed-forward torque that reaches the drives."""
-        for effect in self._acting["on_feedforward"]:
-            torque = effect.on_feedforward(torque)
-        return torque
+        return self._chain("on_feedforward", torque)
 
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the drives' encoders read."""
@@ -129,27 +131,19 @@ class EffectStack:
 
     def on_error(self, target: Tensor, q: Tensor) -> Tensor:
         """Return the targets as the drives compare them with the encoders' angles."""
-        for effect in self._acting["on_error"]:
-            target = effect.on_error(target, q)
-        return target
+        return self._chain("on_error", target, q)
 
     def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque that the motors make."""
-        for effect in self._acting["on_actuator"]:
-            torque = effect.on_actuator(torque, q, qd)
-        return torque
+        return self._chain("on_actuator", torque, q, qd)
 
     def on_report(self, torque: Tensor) -> Tensor:
         """Return the torque that the drives report."""
-        for effect in self._acting["on_report"]:
-            torque = effect.on_report(torque)
-        return torque
+        return self._chain("on_report", torque)
 
     def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
         """Return the torque that reaches the joints."""
-        for effect in self._acting["on_transmission"]:
-            torque = effect.on_transmission(torque, q, qd)
-        return torque
+        return self._chain("on_transmission", torque, q, qd)
 
     def gears(self) -> Gears:
         """Return how the gears yield."""
@@ -164,21 +158,15 @@ class EffectStack:
 
     def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:
         """Return the bound of the joints' dry friction."""
-        for effect in self._acting["on_friction"]:
-            bound = effect.on_friction(bound, torque, qd)
-        return bound
+        return self._chain("on_friction", bound, torque, qd)
 
     def on_load(self, bound: Tensor, torque: Tensor, outside: Tensor) -> Tensor:
         """Return the bound of the joints' dry friction with that of the gears' load."""
-        for effect in self._acting["on_load"]:
-            bound = effect.on_load(bound, torque, outside)
-        return bound
+        return self._chain("on_load", bound, torque, outside)
 
     def on_base(self, wrench: Tensor) -> Tensor:
         """Return the external wrench (N, 6) on the trunks."""
-        for effect in self._acting["on_base"]:
-            wrench = effect.on_base(wrench)
-        return wrench
+        return self._chain("on_base", wrench)
 
     def measure(self, true: Measured) -> Measured:
         """Return what the robots' sensors say; the joint readings come from ``on_encoder``."""

@@ -64,22 +64,15 @@ class Corners(Steady):
             shares[name] = [None if np.isnan(v) else round(float(v), 4) for v in mean]
         return {"t": [round(float(v), 4) for v in motion.t], "along": shares}
 
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Draw what is reached, and the steps."""
-        curves = played.curves
-        answer = (
-            "Share of each command that is reached, with 95 % intervals over the robots that stay up; red: with falls."
-        )
-        steps = f"Mean over robots still up of the share of the command, from rest at {self.rest_s:g} s."
-        return [
-            Drawing("answer", "What is reached", answer, partial(_answers, {"": summary})),
-            Drawing("steps", "Steps from rest", steps, partial(_steps, curves)),
-        ]
-
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
-        """Draw what all subjects reach."""
-        text = "Share of each command that is reached, with 95 % intervals over the robots that stay up."
-        return [Drawing("answer", "What is reached", text, partial(_answers, dict(summaries)))]
+        """Draw the answers of all subjects."""
+        text = "Share of each command that is reached, 95 % intervals over robots still standing; red: falls."
+        return [Drawing("answer", "What is reached", text, partial(_answers, summaries))]
+
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw the steps."""
+        text = f"Mean share of the command over robots still standing, from rest at {self.rest_s:g} s."
+        return [Drawing("steps", "Steps from rest", text, partial(_steps, played.curves))]
 
 
 def step_answer(along: NDArray[Any], step: int, settle: int, dt: float) -> Row:

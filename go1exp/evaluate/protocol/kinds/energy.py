@@ -84,23 +84,19 @@ class Energy(Steady):
             dots[kind] = np.concatenate([sample, extremes]).round(3).tolist()
         return {"scatter": dots}
 
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Draw the cost over speed, and torque over speed."""
-        cost = "Positive mechanical work, and all of it, over weight and way; straight ahead and back; 95 % intervals."
-        dots = (
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+        """Draw the cost of transport over speed."""
+        text = "Mechanical work over weight and distance; commands straight ahead and back; 95 % intervals."
+        return [Drawing("cost", "Cost of transport over speed", text, partial(_cost, summaries))]
+
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw torque over speed."""
+        text = (
             "Dots: all robots and commands, drawn at random, and the 50 largest torques."
             " Solid: peak torque and top speed. Dashed: the line from peak torque at rest to top speed, which is"
             " pessimistic."
         )
-        return [
-            Drawing("cost", "Cost of transport over speed", cost, partial(_cost, {"": summary})),
-            Drawing("scatter", "Torque over speed", dots, partial(_scatter, played.curves["scatter"])),
-        ]
-
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
-        """Draw the cost of all subjects."""
-        text = "Positive mechanical work over weight and way; commands straight ahead and back; 95 % intervals."
-        return [Drawing("cost", "Cost of transport over speed", text, partial(_cost, dict(summaries)))]
+        return [Drawing("scatter", "Torque over speed", text, partial(_scatter, played.curves["scatter"]))]
 
 
 def effort(trace: Trace) -> dict[str, NDArray[np.float64]]:

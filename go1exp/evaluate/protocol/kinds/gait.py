@@ -73,25 +73,23 @@ class Gait(Steady):
             feet[name] = {"stances": stances, "phases": phase}
         return {"feet": feet}
 
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Draw gait diagrams, phases on the circle, and figures over speed."""
-        feet = played.curves["feet"]
-        diagram = f"Bars: a foot is on the ground; one robot that stays up, the last {SHOWN:g} s. Commands: m/s, rad/s."
-        circle = (
-            "Touchdowns in FR's stride (cycles), a dot for each robot; up is 0, clockwise. In a trot FL and RR"
-            " are opposite, RL is with FR. Commands: m/s, rad/s."
-        )
-        speed = "Commands straight ahead, with 95 % intervals over robots."
-        return [
-            Drawing("diagram", "Gait diagram", diagram, partial(_diagram, feet)),
-            Drawing("circle", "Phases of the feet", circle, partial(_circle, feet)),
-            Drawing("speed", "Gait over speed", speed, partial(_over_speed, {"": summary})),
-        ]
-
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw the gait of all subjects over speed."""
         text = "Commands straight ahead, with 95 % intervals over robots."
-        return [Drawing("speed", "Gait over speed", text, partial(_over_speed, dict(summaries)))]
+        return [Drawing("speed", "Gait over speed", text, partial(_over_speed, summaries))]
+
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw gait diagrams, and phases on the circle."""
+        feet = played.curves["feet"]
+        diagram = f"Bars: stance of one robot that does not fall, the last {SHOWN:g} s. Commands: m/s, rad/s."
+        circle = (
+            "Touchdowns in the stride of FR (cycles), a dot for each robot; up is 0, clockwise. In a trot FL and RR"
+            " are opposite, RL is with FR. Commands: m/s, rad/s."
+        )
+        return [
+            Drawing("diagram", "Gait diagram", diagram, partial(_diagram, feet)),
+            Drawing("circle", "Phases of the feet", circle, partial(_circle, feet)),
+        ]
 
 
 def _asymmetry(duty: Sequence[float | None]) -> float | None:

@@ -40,6 +40,7 @@ class Hardware(Steady):
     delays_ms: Annotated[tuple[Annotated[float, Field(gt=0, le=LATEST_MS)], ...], Field(min_length=1)]
 
     keys: ClassVar[tuple[str, ...]] = (*AXES, "delay_ms")
+    derived_names: ClassVar[tuple[str, ...]] = ("delay_margin",)
     robot_columns: ClassVar[tuple[Column, ...]] = (
         *ERRORS,
         Column("power_p99", "W", "sum over joints of |tau qd|, 99th percentile over steps", better="lower"),
@@ -95,11 +96,7 @@ class Hardware(Steady):
         text = "largest command delay up to which no robot falls"
         return [Derived("delay_margin", "ms", text, {}, "higher", _margin)]
 
-    def derived_names(self) -> list[str]:
-        """Return its name."""
-        return ["delay_margin"]
-
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw each item against its limit, and falls over the delay."""
         bars = (
             "Figure of the worst command over its upper limit, 95 % interval; beyond the line the limit is not met."

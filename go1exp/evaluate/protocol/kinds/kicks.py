@@ -231,27 +231,22 @@ class Kicks(Protocol):
             curves[name] = [[None if np.isnan(x) else round(float(x), 4) for x in b] for b in bands]
         return curves
 
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Draw the paper's figure, at the policy's rate and at 25 Hz, and what all robots did."""
-        run, around = played.curves["run"], played.curves["kicks"]
-        rate = f"{1.0 / run['dt']:.0f} Hz"
-        one = "One robot: height of the trunk, its nominal height before the first kick, speed; dotted: kicks."
-        every = "Robots up before a kick, by the time since it: median, 10th to 90th percentile."
-        return [
-            Drawing("run", f"Height and speed under kicks, at {rate}", one, partial(_run, run, 1)),
-            Drawing(
-                "coarse", "The same at 25 Hz, as the paper plots", one, partial(_run, run, round(COARSE / run["dt"]))
-            ),
-            Drawing("around", "Around each kick", every, partial(_around, around)),
-            Drawing(
-                "success", "Success", "Shares of robots with Wilson's 95 % interval.", partial(_success, {"": summary})
-            ),
-        ]
-
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw the success of all subjects."""
         text = "Shares of robots with Wilson's 95 % interval."
-        return [Drawing("success", "Success", text, partial(_success, dict(summaries)))]
+        return [Drawing("success", "Success", text, partial(_success, summaries))]
+
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw the figure of the paper, at the rate of the policy and at 25 Hz, and the response of all robots."""
+        run, around = played.curves["run"], played.curves["kicks"]
+        rate, coarse = f"{1.0 / run['dt']:.0f} Hz", round(COARSE / run["dt"])
+        one = "One robot: height of the trunk, its nominal height before the first kick, speed; dotted: kicks."
+        every = "Robots standing before a kick, by the time since it: median, 10th to 90th percentile."
+        return [
+            Drawing("run", f"Height and speed under kicks, at {rate}", one, partial(_run, run, 1)),
+            Drawing("coarse", "The same at 25 Hz, as the paper plots", one, partial(_run, run, coarse)),
+            Drawing("around", "Around each kick", every, partial(_around, around)),
+        ]
 
 
 def _coarse(begin: int, end: int, dt: float) -> NDArray[np.intp]:

@@ -69,6 +69,7 @@ class PushMap(Protocol):
 
     alike: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("direction_deg",)
+    derived_names: ClassVar[tuple[str, ...]] = ("impulse_median", "impulse_p10", "area", "weakest")
     robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("impulse", "N s", "largest impulse that is survived", better="higher"),
     )
@@ -163,26 +164,18 @@ class PushMap(Protocol):
         area = Derived("area", "(N s)^2", "area within the medians of all directions", {}, "higher", _area)
         return [*figures, area, Derived("weakest", "N s", "smallest median of all directions", {}, "higher", _weakest)]
 
-    def derived_names(self) -> list[str]:
-        """Return the names of the derived figures."""
-        return ["impulse_median", "impulse_p10", "area", "weakest"]
-
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Draw the map, and what the phase does."""
-        polar = "Largest impulse survived, N s; up is forward: median with its 95 % interval, 10th percentile."
-        phase = (
-            "Median over robots and directions, 10th to 90th percentile, by the phase of FR's stride at which the kick"
-            " begins; it touches down at 0."
-        )
-        return [
-            Drawing("map", "Impulse map", polar, partial(_map, {"": summary})),
-            Drawing("phase", "By gait phase", phase, partial(_phases, played.rows)),
-        ]
-
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw the maps of all subjects."""
-        text = "Largest impulse survived, N s; up is forward: median with its 95 % interval."
-        return [Drawing("map", "Impulse map", text, partial(_map, dict(summaries)))]
+        text = "Largest impulse survived, N s; up is forward: median with its 95 % interval; dotted: 10th percentile."
+        return [Drawing("map", "Impulse map", text, partial(_map, summaries))]
+
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw the impulse over the phase of the gait."""
+        text = (
+            "Median over robots and directions, 10th to 90th percentile, by the phase in the stride of FR at which the"
+            " kick begins; FR touches down at 0."
+        )
+        return [Drawing("phase", "By gait phase", text, partial(_phases, played.rows))]
 
 
 def largest_survived(

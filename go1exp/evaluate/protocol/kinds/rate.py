@@ -53,6 +53,7 @@ class Rate(Protocol):
     slower_faster: tuple[float, float]
 
     keys: ClassVar[tuple[str, ...]] = ("velocity", "rate_hz", "delay_ms")
+    derived_names: ClassVar[tuple[str, ...]] = ("faster_is_better",)
     robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("rmse_xy", "m/s", "root mean square error of the horizontal velocity, gait included", better="lower"),
         Column("rmse_yaw", "rad/s", "that of the yaw rate", better="lower"),
@@ -127,10 +128,6 @@ class Rate(Protocol):
             for d in self.delays_ms
         ]
 
-    def derived_names(self) -> list[str]:
-        """Return the names of the derived figures."""
-        return ["faster_is_better"]
-
     def _gain(self, rows: Sequence[Row]) -> float:
         """Mean over robots of the difference; a robot drawn twice counts twice in both."""
         slow, fast = ([r for r in rows if r["rate_hz"] == rate] for rate in self.slower_faster)
@@ -139,15 +136,10 @@ class Rate(Protocol):
         difference = values(slow, "rmse_xy") - values(fast, "rmse_xy")
         return float(np.nanmean(difference)) if np.isfinite(difference).any() else np.nan
 
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Draw errors and falls over the rate."""
-        text = "One line for each delay; 95 % intervals over robots; a dot may stand for fewer robots where some fell."
-        return [Drawing("rate", "Error, falls and effort over the rate", text, partial(_over_rate, {"": summary}))]
-
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
-        """Draw errors of all subjects without a delay."""
-        text = "Smallest delay; 95 % intervals over robots."
-        return [Drawing("rate", "Error and falls over the rate", text, partial(_over_rate, dict(summaries)))]
+        """Draw errors, falls and action rate over the rate; of several subjects at the smallest delay."""
+        text = "95 % intervals over robots that did not fall; a line for each delay, of several subjects the smallest."
+        return [Drawing("rate", "Error, falls and effort over the rate", text, partial(_over_rate, summaries))]
 
 
 def _rms(values: Any) -> float:

@@ -108,28 +108,24 @@ class Sinusoid(Protocol):
                 row |= {f"{name}_{axis}": float(v[n, a]) if up and asked else None for name, v in figures.items()}
                 row[f"rmse_{axis}"] = float(rmse[n, a]) if up else None
 
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Draw the paper's rows for each sine, and gain and lag over frequency."""
-        collected = [
-            Drawing(
-                f"sine{k}",
-                f"Velocity, amplitude {name}",
-                "Black: commanded; blue: measured, thin of one robot, thick the mean of those still up with the 10th"
-                " to 90th percentile; orange: error of the mean.",
-                partial(_rows, curve),
-            )
+    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
+        """Draw gain and lag of all subjects over frequency."""
+        text = (
+            "Gain 1 and lag 0 are perfect. 95 % intervals over robots; one line for each amplitude: x (m/s), y (m/s),"
+            " yaw (rad/s), shifted sideways; colours of several subjects are theirs."
+        )
+        return [Drawing("bode", "Gain and lag over frequency", text, partial(_bode, summaries))]
+
+    def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Draw the rows of the paper for each sine."""
+        text = (
+            "Black: commanded; blue: measured, thin of one robot, thick the mean of those still standing with the 10th"
+            " to 90th percentile; orange: error of the mean."
+        )
+        return [
+            Drawing(f"sine{k}", f"Velocity, amplitude {name}", text, partial(_rows, curve))
             for k, (name, curve) in enumerate(played.curves["sines"].items())
         ]
-        bode = (
-            "Gain 1 and lag 0 are perfect. 95 % intervals over robots; one line for each amplitude: x (m/s), y (m/s),"
-            " yaw (rad/s); side by side to be seen."
-        )
-        return [Drawing("bode", "Gain and lag over frequency", bode, partial(_bode, {"": summary})), *collected]
-
-    def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
-        """Draw gain and lag of all subjects."""
-        text = "Gain 1 and lag 0 are perfect. 95 % intervals; colours are subjects, all amplitudes."
-        return [Drawing("bode", "Gain and lag over frequency", text, partial(_bode, dict(summaries)))]
 
 
 def label(sine: Sine) -> str:

@@ -57,6 +57,7 @@ class OnTerrain(Protocol):
 
     alike: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("ground", "speed", "difficulty")
+    derived_names: ClassVar[tuple[str, ...]] = tuple(SHARES)
     robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("passed", "", "came to the end of its lane in time, without a fall", "share", "higher"),
         Column(
@@ -152,14 +153,6 @@ class OnTerrain(Protocol):
                     condition = {"ground": name, "speed": float(speed)}
                     figures.append(Derived(key, UNITS[name], text, condition, "higher", function))
         return figures
-
-    def derived_names(self) -> list[str]:
-        """Return the names of the derived figures."""
-        return list(SHARES)
-
-    def drawings(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Draw the curves of success."""
-        return [_drawing({"": (played.rows, summary)})]
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw the curves of all subjects."""
