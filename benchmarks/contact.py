@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import torch
 
 from go1exp import robot
-from go1exp.cli.runs import shipped_policies
+from go1exp.cli.places import shipped_policies
 from go1exp.config.schema.contact import ContactConfig
 from go1exp.config.schema.registry import bind_list
 from go1exp.evaluate.rollout import EvalConfig, evaluate

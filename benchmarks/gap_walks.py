@@ -104,9 +104,9 @@ def cases(seed: int, scale: int, kinds: Sequence[str], effects: Sequence[str], s
 
 def solved(case: Case, policy: str, episodes: int, seconds: float, phase: str) -> Any:
     """Let a case's robot walk, and return what the search answers (``GapResult``)."""
-    from go1exp.cli.record import RIG
-    from go1exp.cli.runs import trained
-    from go1exp.cli.settings import RecordSettings, parse
+    from go1exp.cli.app import parse
+    from go1exp.cli.places import trained
+    from go1exp.cli.record import RIG, RecordSettings
     from go1exp.config.compose import compose
     from go1exp.gap.result import GapSettings
     from go1exp.gap.stages.explain import explain

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 
 from go1exp.base.paths import data_root
-from go1exp.cli import other_robot
+from go1exp.cli import subjects
 from go1exp.config.compose import compose
 from go1exp.evaluate import table
 from go1exp.evaluate.criteria import ROBOT
@@ -87,11 +87,11 @@ def copy_origin(run: Path, to: Path) -> None:
 
 def judge(task: TaskConfig, policy: Policy, about: dict[str, Any]) -> dict[str, Any]:
     """Return the report of a policy on ``criteria.ROBOT``: 20 robots a command, 10 s, noise; and its delay margin."""
-    other, _ = other_robot.split(compose("eval", list(ROBOT)))
-    changed = other_robot.replaced(task, other)
+    other, _ = subjects.split_robot(compose("eval", list(ROBOT)))
+    changed = subjects.with_robot(task, other)
     commands = (*grid(JUDGED_GRID["x"], JUDGED_GRID["y"], JUDGED_GRID["yaw"], cross=False), COMBINED)
     config = EvalConfig(commands, 20, 10.0, 2.0, True, True, False, False, None, 1)
-    report = {"policy": about, "robot": other_robot.described(other)}
+    report = {"policy": about, "robot": subjects.robot_as_data(other)}
     report |= evaluate(changed, policy, config, measures=every_measure())
     report["delay_margin"] = delay_margin(changed, policy, config, report["distinct_falls"])
     return report

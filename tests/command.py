@@ -40,13 +40,12 @@ compose("train", ["seed=1", "ppo.hidden=[8]"])  # Hydra has looked for its plugi
 """
 
 LIGHT = f"""{COMPOSED}
-from go1exp.cli import MODULES, SUBVERBS, VERBS
-from go1exp.cli.app import defer
-import importlib
+from go1exp.cli import EVERY
+from go1exp.cli.app import app_of, defer
 defer("torch")
-for verb in [*VERBS, *(f"{{verb}}_{{word}}" for verb, words in SUBVERBS.items() for word in words)]:
-    importlib.import_module(f"go1exp.cli.{{MODULES.get(verb, verb)}}")
-import go1exp.sim.task, go1exp.cli.settings, go1exp.logs.excitations, go1exp.logs.importers
+for verb in EVERY:
+    app_of(verb)
+import go1exp.sim.task, go1exp.logs.excitations, go1exp.logs.importers
 """
 """What a refusal needs: neither torch nor an engine. A refusal that loads them is seen, as they are not there yet."""
 

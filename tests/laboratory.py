@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
-from go1exp.cli.record import rig_groups
-from go1exp.cli.settings import RecordSettings, parse
+from go1exp.cli.app import parse
+from go1exp.cli.record import RecordSettings, rig_groups
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.logs.record import plan, simulate

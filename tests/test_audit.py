@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from go1exp.base.paths import data_root
-from go1exp.cli import record_audit
+from go1exp.cli.record import AUDIT
 from go1exp.config.schema import registry
 from go1exp.logs import excitations
 from go1exp.logs.audit import AuditReport, audit, audit_file, clock_flaws, signals
@@ -701,7 +701,7 @@ def test_audit_of_a_folder_tells_of_clocks_apart(tmp_path: Path, capsys: pytest.
         moved = {c: np.roll(v, late) for c, v in sound.channels.items() if c.startswith("q_target")}
         write(tmp_path / f"e{k}.parquet", with_(sound, **moved))
     out = tmp_path / "reports" / "audit.json"
-    assert record_audit.APP.run([f"files=[{tmp_path}]", f"out={out}"]) == 4
+    assert AUDIT.run([f"files=[{tmp_path}]", f"out={out}"]) == 4
     assert [Path(file).stem for file, report in json.loads(out.read_text()).items() if "clocks" in report] == ["e2"]
     assert "e2.parquet: bad: joints answer their commands after -4" in capsys.readouterr().out
 

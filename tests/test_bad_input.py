@@ -15,9 +15,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from go1exp.base.wording import NOT_FOR_TRAINING
 from go1exp.cli import main
-from go1exp.cli.files import choices_from_files
-from go1exp.cli.logs import remove_empty
-from go1exp.cli.quoting import command, protected
+from go1exp.cli.hydra_main import choices_from_files
+from go1exp.cli.places import remove_empty
+from go1exp.cli.verbs import command, protected
 from go1exp.config.choices import config_folder
 from go1exp.config.compose import compose, compose_checked
 from go1exp.config.schema.registry import ConfigError

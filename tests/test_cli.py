@@ -18,9 +18,10 @@ from omegaconf import OmegaConf
 
 from go1exp.base.paths import data_root
 from go1exp.cli import ONE_BLAS_THREAD, SUBVERBS, VERBS, _by_name, main
-from go1exp.cli.files import choices_from_files
-from go1exp.cli.other_robot import CHOICES
-from go1exp.cli.settings import DeploySettings, parse
+from go1exp.cli.app import parse
+from go1exp.cli.deploy import DeploySettings
+from go1exp.cli.hydra_main import choices_from_files
+from go1exp.cli.subjects import ROBOT_GROUPS
 from go1exp.config.compose import compose
 from go1exp.config.schema import registry
 from go1exp.config.schema.registry import ConfigError
@@ -202,7 +203,7 @@ def test_a_wrong_setting_is_refused_at_once_in_words(arguments: str, said: tuple
 )
 def test_a_list_with_wrong_items_is_not_told_to_be_a_word(command: Any, problems: list[str]) -> None:
     """A command may be a word, too; of what is a list, only its items are spoken of."""
-    given = {k: v for k, v in compose("deploy", ["bundle=a.zip"]).items() if k not in CHOICES}
+    given = {k: v for k, v in compose("deploy", ["bundle=a.zip"]).items() if k not in ROBOT_GROUPS}
     with pytest.raises(ConfigError) as refused:
         parse(DeploySettings, {**given, "command": command})
     assert refused.value.problems == problems

@@ -14,9 +14,10 @@ import go1exp.logs.excitations
 import go1exp.logs.importers
 import go1exp.logs.record.motions  # noqa: F401  (registers every importer and excitation)
 from go1exp.base.paths import data_root
-from go1exp.cli import SUBVERBS, VERBS
+from go1exp.cli import EVERY, SUBVERBS, VERBS
+from go1exp.cli.app import app_of
 from go1exp.cli.completion import STAGES, WORDS, _importers, _listed, completions
-from go1exp.cli.settings import SETTINGS, GapVerb
+from go1exp.cli.gap import GapVerb
 from go1exp.config.choices import config_folder, groups_in
 from go1exp.config.schema import registry
 from go1exp.sim.task import PPOConfig
@@ -117,7 +118,10 @@ def test_words_that_are_offered_are_words_that_exist() -> None:
     assert {*STAGES, "all"} == {*get_args(get_type_hints(GapVerb)["stage"])}
     assert {*_importers()} == registry.members("importer").keys()
     assert {*_listed([config_folder()])} == {*registry.groups(), *groups_in(config_folder())}
-    hints = [get_type_hints(kind, include_extras=False) for kind in (*SETTINGS.values(), PPOConfig)]
+    hints = [
+        get_type_hints(kind, include_extras=False)
+        for kind in (*filter(None, (app_of(verb).settings for verb in EVERY)), PPOConfig)
+    ]
     for key in ("viewer", "trunk_velocity", "suite", "what", "support", "share", "target", "schedule"):
         assert {*WORDS[key]} in [{*get_args(hint[key])} for hint in hints if key in hint], key
 

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from yaml import YAMLError
 
 from go1exp.cli.app import App
-from go1exp.cli.files import choices_from_files
+from go1exp.cli.hydra_main import choices_from_files
 from go1exp.config.choices import config_folder
 from go1exp.config.compose import as_hydra_takes_them, compose
 from go1exp.config.hydra_adapter import VerbSource, hydra_for, plain

@@ -22,13 +22,14 @@ import go1exp.logs.importers
 import go1exp.logs.record.motions  # noqa: F401  (registers every importer and excitation)
 from go1exp import cli
 from go1exp.base.paths import data_root
-from go1exp.cli import listing, settings
-from go1exp.cli.files import choices_from_files
+from go1exp.cli import EVERY, listing
+from go1exp.cli.app import app_of, begin
+from go1exp.cli.app import parse as parse_settings
 from go1exp.cli.gap import with_logs
-from go1exp.cli.other_robot import CHOICES
-from go1exp.cli.plugins import begin
+from go1exp.cli.hydra_main import choices_from_files
 from go1exp.cli.record import RIG
 from go1exp.cli.record import _motions as motions
+from go1exp.cli.subjects import ROBOT_GROUPS
 from go1exp.config.compose import compose
 from go1exp.config.hydra_adapter import hydra_for
 from go1exp.config.schema import plugins, registry
@@ -414,7 +415,7 @@ COMMANDS = [
     for line in block.splitlines()
     if re.match(r"go1exp [\w-]+( |$)", line) and " --" not in line
 ]
-VERBS = settings.SETTINGS
+VERBS: dict[str, Any] = {verb: app_of(verb).settings for verb in EVERY if verb != "train"}
 COMPLAINTS = [block for block in fences("console") if block.startswith("$ go1exp train ")]
 
 
@@ -446,9 +447,9 @@ def parse(verb: str, container: dict[str, Any]) -> None:
         parse_train(container)
         return
     own = {f.name for f in fields(VERBS[verb])}
-    checked: Any = settings.parse(VERBS[verb], {k: v for k, v in container.items() if k in own})
+    checked: Any = parse_settings(VERBS[verb], {k: v for k, v in container.items() if k in own})
     others = container.keys() - own
-    assert others <= {*RIG, *CHOICES, "engine", "excitation", "model", "protocol"}
+    assert others <= {*RIG, *ROBOT_GROUPS, "engine", "excitation", "model", "protocol"}
     problems = parse_parts(container, tuple(others - {"excitation", "model", "protocol"}))[1]
     if "protocol" in others:
         chosen(container["protocol"])

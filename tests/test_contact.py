@@ -100,11 +100,13 @@ def test_two_terms_that_set_the_same_are_refused_by_name() -> None:
 
 
 def test_a_policy_is_judged_on_the_contact_that_is_asked_for(make_task: Callable[..., TaskConfig]) -> None:
-    from go1exp.cli import other_robot
+    from go1exp.cli import subjects
 
-    other, rest = other_robot.split({"contact": {"time_constant": 0.01, "cone": "elliptic", "impratio": 5.0}, "run": 1})
-    assert other_robot.replaced(make_task(), other).contact.time_constant == 0.01
-    assert other_robot.described(other) == {"contact": {"time_constant": 0.01, "cone": "elliptic", "impratio": 5.0}}
+    other, rest = subjects.split_robot(
+        {"contact": {"time_constant": 0.01, "cone": "elliptic", "impratio": 5.0}, "run": 1}
+    )
+    assert subjects.with_robot(make_task(), other).contact.time_constant == 0.01
+    assert subjects.robot_as_data(other) == {"contact": {"time_constant": 0.01, "cone": "elliptic", "impratio": 5.0}}
     assert rest == {"run": 1}
     with pytest.raises(ConfigError, match=r"contact\.cone"):
-        other_robot.split({"contact": {"time_constant": 0.01, "cone": "round", "impratio": 5.0}})
+        subjects.split_robot({"contact": {"time_constant": 0.01, "cone": "round", "impratio": 5.0}})

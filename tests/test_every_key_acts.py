@@ -33,11 +33,19 @@ from mujoco.batch import Batch
 from omegaconf import OmegaConf
 
 from go1exp.base.paths import data_root
-from go1exp.cli import settings
 from go1exp.cli.app import App
-from go1exp.cli.other_robot import CHOICES
-from go1exp.cli.record import RIG
+from go1exp.cli.app import parse as parsed
+from go1exp.cli.bench import BenchSettings
+from go1exp.cli.deploy import DeploySettings
+from go1exp.cli.evaluate import EvalSettings
+from go1exp.cli.export import ExportCheckSettings, ExportSettings
+from go1exp.cli.fit_actuator import FitActuatorSettings
+from go1exp.cli.gap import GapVerb
+from go1exp.cli.listing import ListSettings
+from go1exp.cli.play import PlaySettings
+from go1exp.cli.record import RIG, AuditSettings, ImportSettings, RecordSettings
 from go1exp.cli.simulate import BODY
+from go1exp.cli.subjects import ROBOT_GROUPS
 from go1exp.config import compose as composing
 from go1exp.config.schema import registry
 from go1exp.config.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
@@ -474,23 +482,23 @@ def parse(program: str, container: dict[str, Any]) -> Any:
         if problems:
             raise ConfigError(problems)
     kind, elsewhere = SETTINGS[program]
-    return settings.parse(kind, {k: v for k, v in container.items() if k not in (*elsewhere, "plugins")})
+    return parsed(kind, {k: v for k, v in container.items() if k not in (*elsewhere, "plugins")})
 
 
 SETTINGS: dict[str, tuple[type, tuple[str, ...]]] = {
-    "eval": (settings.EvalSettings, ("engine", "protocol")),
-    "play": (settings.PlaySettings, ("engine",)),
-    "record": (settings.RecordSettings, (*RIG, "excitation")),
-    "record_audit": (settings.AuditSettings, ()),
-    "record_import": (settings.ImportSettings, ()),
-    "fit-actuator": (settings.FitActuatorSettings, ("robot",)),
-    "gap": (settings.GapVerb, ("robot", "model")),
-    "export": (settings.ExportSettings, ()),
-    "export_check": (settings.ExportCheckSettings, ()),
-    "deploy": (settings.DeploySettings, CHOICES),
+    "eval": (EvalSettings, ("engine", "protocol")),
+    "play": (PlaySettings, ("engine",)),
+    "record": (RecordSettings, (*RIG, "excitation")),
+    "record_audit": (AuditSettings, ()),
+    "record_import": (ImportSettings, ()),
+    "fit-actuator": (FitActuatorSettings, ("robot",)),
+    "gap": (GapVerb, ("robot", "model")),
+    "export": (ExportSettings, ()),
+    "export_check": (ExportCheckSettings, ()),
+    "deploy": (DeploySettings, ROBOT_GROUPS),
     "sim": (SimSettings, BODY),
-    "list": (settings.ListSettings, ()),
-    "bench": (settings.BenchSettings, ()),
+    "list": (ListSettings, ()),
+    "bench": (BenchSettings, ()),
 }
 """Program -> its schema, and the keys that are checked elsewhere."""
 
@@ -982,15 +990,15 @@ def recorded(files: Mapping[str, bytes]) -> Trace:
 
 def audit_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is said of the recordings, without their names, and where it is written."""
-    from go1exp.cli.record_audit import APP, STATUS
+    from go1exp.cli.record import AUDIT, AUDIT_STATUS
 
-    said, files = outcome(APP, container, walk, tuple(STATUS.values()))
+    said, files = outcome(AUDIT, container, walk, tuple(AUDIT_STATUS.values()))
     yield "findings", [line for line in said.splitlines() if ".parquet" not in line and "written to" not in line]
     yield "files", sorted(files)
 
 
 def import_trace(container: dict[str, Any], walk: Walk) -> Trace:
-    from go1exp.cli.record_import import APP
+    from go1exp.cli.record import IMPORT as APP
 
     yield from recorded(outcome(APP, container, walk)[1])
 
@@ -1069,7 +1077,7 @@ def export_trace(container: dict[str, Any], walk: Walk) -> Trace:
 
 def check_trace(container: dict[str, Any], walk: Walk) -> Trace:
     """What is said of the policy, without the file's name."""
-    from go1exp.cli.export_check import APP
+    from go1exp.cli.export import CHECK as APP
 
     said, _ = outcome(APP, container, walk)
     yield "said", [re.sub(r"\S+\.zip", "", line) for line in said.splitlines()]

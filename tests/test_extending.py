@@ -72,7 +72,7 @@ def test_the_page_has_an_example_of_each_kind_of_term() -> None:
     "go1exp/config/schema/",
     "go1exp/extend/__init__.py",
     "go1exp/extend/testing/",
-    "go1exp/cli/plugins.py",
+    "go1exp/cli/app.py",
 )
 @pytest.mark.parametrize("words", [words for words in commands() if words[0] == "go1exp"], ids=" ".join)
 def test_a_command_of_the_page_works(
@@ -88,7 +88,7 @@ def test_a_command_of_the_page_works(
     "go1exp/config/schema/",
     "go1exp/extend/__init__.py",
     "go1exp/extend/testing/",
-    "go1exp/cli/plugins.py",
+    "go1exp/cli/app.py",
 )
 def test_the_page_s_test_passes() -> None:
     (command,) = [words for words in commands() if words[0] == "pytest"]

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from go1exp.cli.settings import GapVerb
+from go1exp.cli.gap import GapVerb
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.settings import parse

@@ -15,7 +15,7 @@ import torch
 from omegaconf import OmegaConf
 
 import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
-from go1exp.cli.files import choices_from_files
+from go1exp.cli.hydra_main import choices_from_files
 from go1exp.config.compose import compose
 from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.gap import files

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from go1exp.cli.gap import APP, DOES_NOT_HOLD
-from go1exp.cli.logs import long_enough, read_all
+from go1exp.cli.places import long_enough, read_all
 from go1exp.gap import files
 from go1exp.gap.result import EXIT_CODES, GapResult, NamedEffect
 from go1exp.logs.recording import Recording, RecordingError, write

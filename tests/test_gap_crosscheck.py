@@ -16,8 +16,8 @@ from benchmarks.gap import cases
 from benchmarks.gap.motions import MOTIONS, RATE
 from benchmarks.gap.simulate import Episode, simulate
 from benchmarks.gap.truth import Truth, apply
-from go1exp.cli.record import RIG
-from go1exp.cli.settings import RecordSettings, parse
+from go1exp.cli.app import parse
+from go1exp.cli.record import RIG, RecordSettings
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind
 from go1exp.logs.excitations import Motion

@@ -135,7 +135,7 @@ def test_what_cannot_be_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow("go1exp/gap/", "go1exp/cli/gap_loop.py", "conf/gap_loop.yaml", "tests/")
+@pytest.mark.slow("go1exp/gap/", "go1exp/cli/gap_next.py", "conf/gap_loop.yaml", "tests/")
 def test_a_circle_on_the_simulated_robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A larger kd in the logs of one gain is kd or friction; one designed recording leaves kd."""
     monkeypatch.chdir(tmp_path)

@@ -16,7 +16,7 @@ import torch
 from omegaconf import OmegaConf
 
 from go1exp.base.paths import data_root
-from go1exp.cli.files import choices_from_files
+from go1exp.cli.hydra_main import choices_from_files
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError, bind
 from go1exp.gap.answer import name_terms

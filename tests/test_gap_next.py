@@ -418,8 +418,8 @@ def test_the_file_plays_back_through_record(tmp_path: Path) -> None:
 
 
 def playback_recorded(file: Path, overrides: Sequence[str]) -> Recording:
-    from go1exp.cli.record import RIG, _motions
-    from go1exp.cli.settings import RecordSettings, parse
+    from go1exp.cli.app import parse
+    from go1exp.cli.record import RIG, RecordSettings, _motions
     from go1exp.config.compose import compose
     from go1exp.logs.record import plan, simulate
     from go1exp.sim.task import parse_parts

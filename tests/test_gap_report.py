@@ -19,7 +19,8 @@ from markupsafe import escape
 import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp import robot
 from go1exp.base.report.table import NOTHING, Cell, Row
-from go1exp.cli.settings import RecordSettings, parse
+from go1exp.cli.app import parse
+from go1exp.cli.record import RecordSettings
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import bind, members
 from go1exp.gap.report import localisation_text, text, words, write_report

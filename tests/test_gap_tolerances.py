@@ -14,8 +14,8 @@ import pytest
 
 from go1exp.base.report.table import Cell
 from go1exp.cli.app import App
-from go1exp.cli.files import choices_from_files
 from go1exp.cli.gap import APP
+from go1exp.cli.hydra_main import choices_from_files
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import members
 from go1exp.gap import files

@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
-from go1exp.cli.runs import shipped_policies
+from go1exp.cli.places import shipped_policies
 from go1exp.config.compose import compose
 from go1exp.deploy.estimation import go1
 from go1exp.deploy.estimation.feet import CalibrationError, FootCalibration, calibrated, forces_by_torque, kinematics

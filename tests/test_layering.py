@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from go1exp.base.paths import data_root
-from go1exp.cli import MODULES, SUBVERBS, VERBS
+from go1exp.cli import EVERY, MODULES
 from go1exp.config.schema import registry
 
 PACKAGE = data_root() / "go1exp"
@@ -374,6 +374,6 @@ def test_nothing_is_evaluated_from_text() -> None:
 
 
 def test_every_verb_has_a_module_and_a_configuration() -> None:
-    for verb in [*VERBS, *(f"{verb}_{word}" for verb, words in SUBVERBS.items() for word in words)]:
+    for verb in EVERY:
         assert f"cli/{MODULES.get(verb, verb)}.py" in RELATIVE
         assert (data_root() / f"conf/{verb}.yaml").is_file()

@@ -15,8 +15,8 @@ import torch
 
 import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.base import memory
+from go1exp.cli.app import begin
 from go1exp.cli.play import APP as PLAY
-from go1exp.cli.plugins import begin
 from go1exp.cli.record import APP as RECORD
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError, TooLongError, members

@@ -16,7 +16,7 @@ import pytest
 
 from go1exp.base.paths import data_root
 from go1exp.cli import main
-from go1exp.cli.files import choices_from_files
+from go1exp.cli.hydra_main import choices_from_files
 from go1exp.config.compose import compose
 from go1exp.config.schema.settings import attributes
 from go1exp.gap.result import EXIT_CODES, GapSettings

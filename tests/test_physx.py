@@ -18,9 +18,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from go1exp import robot
-from go1exp.cli import engine as engine_choice
-from go1exp.cli import other_robot
-from go1exp.cli.runs import shipped_policies
+from go1exp.cli import subjects
+from go1exp.cli.places import shipped_policies
 from go1exp.config.compose import compose
 from go1exp.config.schema.backends import CpuBackend
 from go1exp.config.schema.registry import ConfigError, Expected
@@ -428,7 +427,7 @@ def test_what_physx_has_no_place_for_is_refused_before_anything_moves(
 def test_without_its_package_the_choice_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError) as caught:
-        engine_choice.split(compose("eval", ["engine=physx"]))
+        subjects.split_engine(compose("eval", ["engine=physx"]))
     (problem,) = caught.value.problems
     assert "pip install 'go1exp[physx]'" in problem
 
@@ -457,7 +456,7 @@ def test_it_trains_nothing(make_task: Callable[..., TaskConfig]) -> None:
 @needs_physx
 def test_a_shipped_policy_walks_in_physx_as_in_mujoco() -> None:
     config, policy, _ = load_run(shipped_policies()["trot"])
-    task = other_robot.replaced(config.task, other_robot.split(compose("eval", ["contact=elliptic"]))[0])
+    task = subjects.with_robot(config.task, subjects.split_robot(compose("eval", ["contact=elliptic"]))[0])
     reports = []
     for engine in (PHYSX, CPU):
         brief = EvalConfig(((1.0, 0.0, 0.0),), 3, 2.0, 1.0, True, True, False, False, None, 5, engine=engine)

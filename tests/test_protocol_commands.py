@@ -14,10 +14,10 @@ import pytest
 
 import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
 from go1exp.cli import compare, evaluate, subjects
+from go1exp.cli.app import begin
+from go1exp.cli.evaluate import chosen_protocols as protocols_chosen
+from go1exp.cli.evaluate import playable
 from go1exp.cli.helptext import show
-from go1exp.cli.plugins import begin
-from go1exp.cli.protocols import chosen as protocols_chosen
-from go1exp.cli.protocols import playable
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.deploy.export.build import build

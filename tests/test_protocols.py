@@ -368,7 +368,7 @@ def test_a_wrong_protocol_is_refused_in_words(overrides: str, said: str) -> None
 def test_a_policy_that_does_not_see_the_velocity_is_refused(agent: PolicyAgent) -> None:
     without = tuple(t for t in agent.task.observation if t.entry.name != "base_linear_velocity")
     blind = PolicyAgent("blind", dataclasses.replace(agent.task, observation=without), agent.policy)
-    from go1exp.cli.protocols import refuse
+    from go1exp.cli.evaluate import refuse
 
     with pytest.raises(ConfigError, match=r"protocol.rate.velocities = 'estimated': the policy of blind"):
         refuse([small("rate")], blind)

@@ -17,8 +17,8 @@ import go1exp.logs.excitations
 import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
 from go1exp import robot
 from go1exp.cli import main
-from go1exp.cli.record import RIG
-from go1exp.cli.settings import RecordSettings, parse
+from go1exp.cli.app import parse
+from go1exp.cli.record import RIG, RecordSettings
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError, bind
 from go1exp.logs.audit import audit

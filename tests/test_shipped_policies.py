@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from go1exp.cli import other_robot
-from go1exp.cli.runs import shipped_policies, trained
+from go1exp.cli import subjects
+from go1exp.cli.places import shipped_policies, trained
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.criteria import ROBOT, evaluated
@@ -89,7 +89,7 @@ KNOWN_MISSES = {
 @pytest.mark.parametrize("name", NAMES)
 def test_a_policy_misses_only_known_criteria(name: str) -> None:
     config, policy, _ = load_run(shipped_policies()[name])
-    task = other_robot.replaced(config.task, other_robot.split(compose("eval", list(ROBOT)))[0])
+    task = subjects.with_robot(config.task, subjects.split_robot(compose("eval", list(ROBOT)))[0])
     commands = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0))
     brief = EvalConfig(
         *(commands, 4, 4.0, 2.0), noise=True, randomize=True, push=False, train_ground=False, policy_dt=None, seed=5

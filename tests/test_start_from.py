@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from go1exp.cli.runs import shipped_policies
+from go1exp.cli.places import shipped_policies
 from go1exp.cli.train import APP
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError

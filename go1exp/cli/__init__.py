@@ -5,13 +5,13 @@ This module imports nothing heavy, so that help and tab completion answer at onc
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import sys
 from types import FrameType
 
 from go1exp.base import signals
+from go1exp.cli.verbs import EVERY as EVERY
 from go1exp.cli.verbs import LISTS as LISTS
 from go1exp.cli.verbs import MODULES as MODULES
 from go1exp.cli.verbs import ONE_BLAS_THREAD as ONE_BLAS_THREAD
@@ -101,7 +101,9 @@ def _run(arguments: list[str]) -> int:
 
         show(verb, f"go1exp {verb.replace('_', ' ')}", rest)
         return 0
-    return _module(verb).APP.run(_by_name(verb, rest))
+    from go1exp.cli.app import app_of
+
+    return app_of(verb).run(_by_name(verb, rest))
 
 
 def _by_name(verb: str, arguments: list[str]) -> list[str]:
@@ -109,7 +111,7 @@ def _by_name(verb: str, arguments: list[str]) -> list[str]:
 
     Options come first: Hydra's parser takes none between overrides.
     """
-    from go1exp.cli.quoting import quoted
+    from go1exp.cli.verbs import quoted
 
     keys = list(POSITIONAL.get(verb, ()))
     words: list[str] = []
@@ -129,7 +131,3 @@ def _by_name(verb: str, arguments: list[str]) -> list[str]:
         if words:
             named.append(f"{key}={quoted(words.pop(0))}")
     return [*options, *settings, *named, *words]
-
-
-def _module(verb: str):  # type: ignore[no-untyped-def]  # a module with an APP
-    return importlib.import_module(f"go1exp.cli.{MODULES.get(verb, verb)}")

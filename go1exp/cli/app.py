@@ -1,4 +1,4 @@
-"""What all verbs share: Hydra around a task function, and errors as one clean message."""
+"""What all verbs share: Hydra around a task function, settings with their groups, errors as one clean message."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ import shutil
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
-from go1exp.cli import hydra_main, plugins
-from go1exp.cli.files import choices_from_files
-from go1exp.cli.quoting import protected
-from go1exp.cli.verbs import FLAGS, VALUED
+import go1exp.cli.hydra_main as hydra_main
+from go1exp.cli.hydra_main import choices_from_files
+from go1exp.cli.verbs import FLAGS, MODULES, VALUED, protected
 from go1exp.config.choices import CONFIG_DIR, given_folders
 from go1exp.config.compose import as_hydra_takes_them, composition_problem
 from go1exp.config.hydra_adapter import REFUSED
+from go1exp.config.schema import plugins
+from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, Expected
 
 BAD_CONFIG, FAILED = 2, 1
@@ -38,6 +39,8 @@ class App:
 
     name: str
     task: Callable[[dict[str, Any]], int | None]
+    settings: type | None = None
+    """Class of the settings that are no group's, for the help; None for ``train``, whose are in ``go1exp.sim.task``."""
     title: str = ""
     """What users call it, where that is not its name."""
     sweep: Callable[[App, Sequence[Path], hydra_main.Sweep], int] | None = None
@@ -53,7 +56,7 @@ class App:
 
         def task(container: dict[str, Any]) -> None:
             try:
-                status.append(self.task(plugins.begin(self.name, container)))
+                status.append(self.task(begin(self.name, container)))
             except Exception as error:
                 if hydra_main.in_multirun():
                     job = hydra_main.job()
@@ -122,6 +125,13 @@ class App:
         if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # the latter is torch's
             return FAILED, f"out of memory: {' '.join(str(error).split())}"
         raise error
+
+
+def app_of(verb: str) -> App:
+    """Return a verb's application; that of a second word, such as ``record_audit``, has this word's name."""
+    module = importlib.import_module(f"go1exp.cli.{MODULES.get(verb, verb)}")
+    app: App = getattr(module, verb.partition("_")[2].upper() or "APP")
+    return app
 
 
 MODES = ("--run", "-r", "--multirun", "-m", "--cfg", "-c", "--info", "-i")
@@ -213,3 +223,91 @@ def spinner(total: int, what: str) -> Callable[[int, int], None]:
             bar.stop()
 
     return update
+
+
+MEANING = "files and packages with terms of your own, such as [my_terms.py] (docs/extending.md)"
+"""Of the key ``plugins``, for the help."""
+
+BY_CONFIGURATION = ("train",)
+"""Verbs whose configuration is parsed with its plugins; the others have the key for themselves."""
+
+
+def begin(verb: str, container: dict[str, Any]) -> dict[str, Any]:
+    """Load the plugins of a command line, and those of the run that it names; return the rest of the configuration.
+
+    Raises:
+        ConfigError: if a plugin is missing, fails, or registers nothing.
+    """
+    if verb in BY_CONFIGURATION:
+        plugins.begin()
+        return container
+    wanted = plugins.names(container.get(plugins.KEY))
+    plugins.begin(wanted)
+    run = container.get("run")
+    if isinstance(run, str) and (Path(run) / "config.yaml").is_file():
+        from go1exp.train import run_folder
+
+        plugins.use(run_folder.with_kept_plugins(Path(run), {})[plugins.KEY])
+    return {key: value for key, value in container.items() if key != plugins.KEY}
+
+
+T = TypeVar("T")
+
+Reader = Callable[[Any], Any]
+"""Turns what stands under a key into what the verb works with; raises ConfigError."""
+
+
+def parse_with_groups(
+    kind: type[T], container: Mapping[str, Any], groups: Sequence[str], **others: Reader
+) -> tuple[T, dict[str, Any]]:
+    """Validate a verb's settings together with its groups.
+
+    Args:
+        kind: the class of the settings.
+        container: the composed configuration.
+        groups: groups of ``go1exp.sim.task`` that the verb has.
+        **others: for each further key the function that reads it.
+
+    Returns:
+        The settings, and what was read of groups and further keys, by key.
+
+    Raises:
+        ConfigError: with every problem of all of them.
+    """
+    from go1exp.sim.task import parse_parts
+
+    parts, problems = parse_parts(container, tuple(groups))
+    for key, read in others.items():
+        try:
+            parts[key] = read(container[key])
+        except ConfigError as error:
+            problems += error.problems
+    try:
+        separate = {*groups, *others} - {f.name for f in fields(kind)}  # type: ignore[arg-type]
+        checked = parse(kind, {key: value for key, value in container.items() if key not in separate})
+    except ConfigError as error:
+        raise ConfigError([*problems, *error.problems]) from None
+    if problems:
+        raise ConfigError(problems)
+    return checked, parts
+
+
+EXAMPLES = {
+    "space": """'space=["ppo.gamma=interval(0.97,0.995)"]'""",
+    "run": "run=runs/NAME",
+    "subjects": "go1exp compare trot paper protocol=kicks",
+    "folders": "go1exp report runs/sweep_NAME",
+    "files": "go1exp record audit recordings/NAME.parquet",
+    "file": "go1exp export check runs/NAME/bundle.zip",
+    "source": "go1exp record import go2_in_air PATH",
+    "path": "go1exp record import go2_in_air PATH",
+    "recordings": "recordings=recordings",
+    "logs": "logs=recordings",
+    "bundle": "go1exp deploy runs/NAME/bundle.zip",
+}
+"""Settings without a default, and how they are given."""
+
+
+def parse(kind: type[T], container: Mapping[str, Any]) -> T:
+    """Validate a composed configuration as ``kind``; raise ConfigError with every problem."""
+    return schema.parse(kind, container, EXAMPLES)

@@ -4,14 +4,44 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
 
 from go1exp.base.files import write_json
-from go1exp.cli.app import App, spinner
-from go1exp.config.schema.registry import ConfigError
+from go1exp.cli.app import App, parse, spinner
+from go1exp.cli.record import RecordSettings
+from go1exp.config.compose import compose
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, Count, Positive
 
 if TYPE_CHECKING:
     from go1exp.sim.task import TaskConfig, TrainConfig
+
+
+@schema.settings
+class BenchSettings:
+    """``conf/bench.yaml``.
+
+    Attributes:
+        suite: env (stepping), train (learning), actuator (nets, effects, recording), deploy (runtime), mpc,
+            report (go1exp report) or gpu (Warp).
+        num_envs: environments of the batch.
+        rounds: alternating measurements of each subject, of which the median counts.
+        seconds: length of a measurement, s.
+        threads: physics threads; 0 takes all cores.
+        overrides: settings of the training that is measured, such as [terrain=rough].
+        out: JSON file for the figures; null writes none.
+    """
+
+    suite: Literal["env", "train", "actuator", "deploy", "mpc", "report", "gpu"]
+    num_envs: Count
+    rounds: Count
+    seconds: Positive
+    threads: Annotated[int, Field(ge=0)]
+    overrides: tuple[str, ...]
+    out: str | None
+
 
 BARS = {
     "env_over_bare": (0.75, "environment over bare mujoco.batch of the same model"),
@@ -44,11 +74,9 @@ BARS = {
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import BenchSettings, parse
 
     settings = parse(BenchSettings, container)
 
-    from go1exp.config.compose import compose
     from go1exp.sim.task import parse_train
 
     on_gpu = settings.suite == "gpu"
@@ -95,8 +123,6 @@ def _task(container: dict[str, Any]) -> None:
 def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
     """Run the suite that also records and fits."""
     import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
-    from go1exp.cli.settings import RecordSettings, parse
-    from go1exp.config.compose import compose
     from go1exp.evaluate.bench import actuator
 
     record = compose("record")
@@ -107,11 +133,10 @@ def _actuator(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
 
 def _mpc(task: TaskConfig, timing: tuple[Any, ...]) -> dict[str, float]:
     """Run the suite of the model predictive controller, with its own settings."""
-    from go1exp.cli import controllers
-    from go1exp.config.compose import compose
+    from go1exp.cli import subjects
     from go1exp.evaluate.bench import mpc
 
-    settings = controllers.chosen(compose("record")["controller"])
+    settings = subjects.chosen_controller(compose("record")["controller"])
     assert settings is not None
     return mpc.run(task, settings, *timing[1:])
 
@@ -128,4 +153,4 @@ def _gpu(config: TrainConfig, overrides: list[str], timing: tuple[Any, ...]) -> 
     return gpu.run(config, overrides, *timing)
 
 
-APP = App("bench", _task)
+APP = App("bench", _task, BenchSettings)

@@ -6,53 +6,52 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp.cli import other_robot
-from go1exp.cli.app import App, spinner
-from go1exp.cli.protocols import RATES
+from go1exp.base.files import write_json, write_text
+from go1exp.cli import subjects
+from go1exp.cli.app import App, parse, spinner
+from go1exp.cli.evaluate import RATES, note_replaced, refuse
+from go1exp.cli.places import writable
+from go1exp.cli.subjects import Named, Variation, agent, varied
 from go1exp.config.schema.registry import ConfigError
+from go1exp.evaluate.protocol.base import CompareSettings
 
 if TYPE_CHECKING:
-    from go1exp.cli.subjects import Named, Variation
     from go1exp.evaluate.protocol.base import Chosen
     from go1exp.evaluate.protocol.playing import Result
 
 
 def _task(container: dict[str, Any]) -> None:
     import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
-    from go1exp.cli.settings import CompareSettings, parse
-    from go1exp.cli.subjects import agent, varied
     from go1exp.evaluate.protocol.base import chosen
 
-    other, container = other_robot.split(container)
+    other, container = subjects.split_robot(container)
     protocols, grid = chosen(container.pop("protocol"))
     settings = parse(CompareSettings, container)
     if grid:
         raise ConfigError(
             ["protocol=grid: go1exp compare plays others, such as protocol=sinusoid; go1exp eval the grid"]
         )
-    subjects = [varied(given, "") for given in settings.subjects]
+    named_subjects = [varied(given, "") for given in settings.subjects]
     if any(c.kind == RATES for c in protocols):
-        _refuse_rates(subjects)
+        _refuse_rates(named_subjects)
     folder = Path(settings.folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError([f"folder = {settings.folder!r}: is a file"])
 
-    from go1exp.cli.logs import writable
-    from go1exp.cli.protocols import note_replaced, refuse
     from go1exp.evaluate.protocol.playing import Rates, play, refuse_lengths
 
-    first = agent(subjects[0][0], other)
+    first = agent(named_subjects[0][0], other)
     robot_of = first.task if settings.same_robot else None
-    agents = [first, *(agent(named, other, robot_of) for named, _ in subjects[1:])]
-    of_each = [_with(protocols, how.trunk_velocity) for _, how in subjects]
-    rates = [Rates(settings.seed, how.policy_dt, settings.physics_dt, how.engine) for _, how in subjects]
+    agents = [first, *(agent(named, other, robot_of) for named, _ in named_subjects[1:])]
+    of_each = [_with(protocols, how.trunk_velocity) for _, how in named_subjects]
+    rates = [Rates(settings.seed, how.policy_dt, settings.physics_dt, how.engine) for _, how in named_subjects]
     for theirs, drives, pace in zip(of_each, agents, rates, strict=True):
         refuse(theirs, drives)
         refuse_lengths(theirs, drives, pace)
     writable(settings.folder, "folder")
     note_replaced(folder, ["compare.json"])
     plays: dict[str, list[Result]] = {}
-    origin = {"robot": other_robot.described(other), "robot_of": settings.subjects[0] if robot_of else "each its own"}
+    origin = {"robot": subjects.robot_as_data(other), "robot_of": settings.subjects[0] if robot_of else "each its own"}
     for k, protocol in enumerate(protocols):
         results = []
         for theirs, drives, pace in zip(of_each, agents, rates, strict=True):
@@ -62,9 +61,9 @@ def _task(container: dict[str, Any]) -> None:
     _report(plays, folder, {**dataclasses.asdict(settings), **origin})
 
 
-def _refuse_rates(subjects: list[tuple[Named, Variation]]) -> None:
+def _refuse_rates(named_subjects: list[tuple[Named, Variation]]) -> None:
     """Raise ConfigError naming a subject whose rate or velocity is not that which protocol=rate varies."""
-    for named, how in subjects:
+    for named, how in named_subjects:
         if named.controller or how.policy_dt or how.trunk_velocity:
             reason = "has a rate of its own" if named.controller else f"is varied in what protocol={RATES} varies"
             raise ConfigError([f"subjects: {named.label} {reason}; leave {RATES} out, also of protocol=paper"])
@@ -82,7 +81,6 @@ def _with(protocols: list[Chosen], trunk_velocity: Any) -> list[Chosen]:
 
 def _report(plays: dict[str, list[Result]], folder: Path, about: dict[str, Any]) -> None:
     """Write page, JSON and rows, and print the verdicts."""
-    from go1exp.base.files import write_json, write_text
     from go1exp.evaluate.protocol import comparing
     from go1exp.evaluate.protocol.playing import as_json
     from go1exp.evaluate.protocol.report.pages import comparison
@@ -124,4 +122,4 @@ def lines(differences: dict[str, Any]) -> list[str]:
     return text_lines
 
 
-APP = App("compare", _task)
+APP = App("compare", _task, CompareSettings)

@@ -4,27 +4,91 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from go1exp.cli import controllers
-from go1exp.cli.app import App
-from go1exp.cli.other_robot import CHOICES
-from go1exp.config.schema.registry import ConfigError
+from pydantic import Field
+
+from go1exp.cli import subjects
+from go1exp.cli.app import EXAMPLES, App, parse
+from go1exp.cli.places import remove_empty, writable
+from go1exp.cli.subjects import ROBOT_GROUPS
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, NonNegative, Positive
+from go1exp.config.schema.settings import subset
+from go1exp.deploy.runtime.controller import Stages
+from go1exp.deploy.sim_robot.settings import SimConfig
 from go1exp.evaluate.controller.settings import MpcSettings
 
 if TYPE_CHECKING:
-    from go1exp.cli.settings import DeploySettings
     from go1exp.deploy.runtime.controller import Mover
     from go1exp.logs.record.motions import PlayedMotion
 
 
-def _task(container: dict[str, Any]) -> int:
-    from go1exp.cli.settings import DeploySettings, parse
-    from go1exp.config.schema.settings import subset
+@schema.settings
+class SinusoidSettings:
+    """Sines of all three velocities.
 
-    other = {name: container[name] for name in CHOICES if container.get(name) is not None}
-    settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in CHOICES})
-    controller = controllers.chosen(settings.controller)
+    Attributes:
+        amplitude: amplitudes of x, y, yaw, m/s, m/s, rad/s.
+        period: their common period, s.
+    """
+
+    amplitude: tuple[float, float, float]
+    period: Positive
+
+
+@schema.settings
+class DeploySettings(Stages):
+    """``conf/deploy.yaml`` without the groups; the times of the stages are those of the runtime.
+
+    Attributes:
+        controller: what moves the robot: policy, that of the bundle, or mpc (robot=sim only).
+        bundle: file that go1exp export wrote; check=true needs none.
+        robot: sim, a simulated robot in another process, or go1, the real one.
+        address: HOST:PORT of robot=go1; null takes 192.168.123.10:8007.
+        check: with robot=go1, only look at the robot and calibrate its foot sensors; no torque is ever asked for.
+        feet: calibration of foot sensors that count, a real robot's or those of sim.feet=raw, which check=true writes;
+            null takes contact from torques alone, and lets check=true write feet.json in out.
+        command: velocity as [x m/s, y m/s, yaw rad/s]; or FILE.csv, sinusoid, keyboard, gamepad.
+        motion: in place of walking, move a robot that hangs: an excitation of go1exp record, or FILE.csv of targets
+            (such as the one of go1exp gap next); its log is a recording for go1exp gap.
+        gains: kp N m/rad and kd N m s/rad of motion; null takes those of the file, or [20, 0.5].
+        sinusoid: the sines of command=sinusoid.
+        rate: rate of policy and commands, Hz; null takes that of training; of a motion, that of its file, or 400.
+        seconds: time under the policy, s; null walks until it is stopped (Ctrl-C). Of a motion that is no file: 20.
+        keep: newest seconds of the walk that the log has room for.
+        stale: time without a state after which the robot counts as lost, s.
+        spin: time before each cycle for which the core is kept busy, s; quicker, and it costs that core.
+        sim: the simulated robot.
+        truth: also record the simulated trunk's true pose and velocity.
+        out: folder for the logs.
+    """
+
+    controller: Any = None
+    bundle: Annotated[str, Field(min_length=1)] | None
+    robot: Literal["sim", "go1"]
+    address: str | None
+    check: bool
+    feet: str | None
+    command: tuple[float, float, float] | str
+    motion: Annotated[str, Field(min_length=1)] | None
+    gains: tuple[NonNegative, NonNegative] | None
+    sinusoid: SinusoidSettings
+    rate: Annotated[float, Field(ge=10, le=1000)] | None
+    seconds: Positive | None
+    keep: Annotated[float, Field(gt=0, le=3600)]
+    stale: Positive
+    spin: Annotated[float, Field(ge=0, le=0.01)]
+    sim: SimConfig
+    truth: bool
+    out: str
+
+
+def _task(container: dict[str, Any]) -> int:
+
+    other = {name: container[name] for name in ROBOT_GROUPS if container.get(name) is not None}
+    settings = parse(DeploySettings, {name: value for name, value in container.items() if name not in ROBOT_GROUPS})
+    controller = subjects.chosen_controller(settings.controller)
     if settings.check:
         return _check(settings)
     _refuse_misfits(settings, other, controller is not None)
@@ -35,7 +99,6 @@ def _task(container: dict[str, Any]) -> int:
     if motion is not None:
         rate, seconds = motion.rate, motion.seconds
 
-    from go1exp.cli.logs import remove_empty, writable
     from go1exp.deploy.runtime.commands import CommandConfig
     from go1exp.deploy.runtime.job import Job, run_job
     from go1exp.deploy.runtime.launch import RefusedError
@@ -71,8 +134,6 @@ def _task(container: dict[str, Any]) -> int:
 
 def _refuse_misfits(settings: DeploySettings, other: dict[str, Any], controlled: bool) -> None:
     """Raise ConfigError if settings do not go together; ``other``: choices of the simulated robot's groups."""
-    from go1exp.cli.settings import EXAMPLES
-
     if settings.bundle is None:
         raise ConfigError([f"bundle: required, such as {EXAMPLES['bundle']}"])
     real = settings.robot != "sim"
@@ -133,4 +194,4 @@ def _motion(settings: DeploySettings, controlled: bool) -> PlayedMotion | None:
     return played(settings.motion, settings.seconds, settings.rate, settings.gains, settings.sim.seed)
 
 
-APP = App("deploy", _task)
+APP = App("deploy", _task, DeploySettings)

@@ -3,17 +3,234 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from go1exp.cli import controllers, engine, other_robot
-from go1exp.cli.app import App, spinner
-from go1exp.config.schema.registry import ConfigError, Term, bind_list
+from pydantic import Field
+
+from go1exp.cli import subjects
+from go1exp.cli.app import App, parse, spinner
+from go1exp.cli.places import checkpoint_file, trained, writable
+from go1exp.cli.subjects import Named, agent, driven, named
+from go1exp.config.choices import config_folder, load
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, Count, Duration, FolderName, NonNegative, Speed, Term, bind_list
 
 if TYPE_CHECKING:
     from go1exp.config.schema.backends import BackendConfig
+    from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.controller.settings import MpcSettings
+    from go1exp.evaluate.protocol.base import Chosen
+    from go1exp.evaluate.protocol.playing import Rates, Result
+
+
+@schema.settings
+class Grid:
+    """Commanded velocities.
+
+    Attributes:
+        x: forward velocities, m/s.
+        y: velocities to the left, m/s.
+        yaw: turning rates, rad/s.
+        cross: every combination of the three axes; false: one axis at a time, the others zero.
+    """
+
+    x: tuple[Speed, ...]
+    y: tuple[Speed, ...]
+    yaw: tuple[Speed, ...]
+    cross: bool
+
+
+@schema.settings
+class EvalSettings:
+    """``conf/eval.yaml``.
+
+    Attributes:
+        controller: what moves the robots: policy, the one of run or policy, or mpc.
+        run: run folder to judge; or give policy.
+        policy: name of a policy that comes with the package, such as paper, in place of run.
+        bundle: file that go1exp export wrote, in place of run; not for protocol=grid.
+        checkpoint: file of the run; null takes the newest.
+        grid: commanded velocities.
+        episodes: episodes of each command, all at once.
+        duration_s: length of an episode, s.
+        settle_s: time at the start of an episode that does not count for tracking, s.
+        noise: add the observation noise of training.
+        randomize: randomise robots and starts as in training; false takes the nominal robot.
+        push: push the robot as in training.
+        train_ground: use the ground of training; false is flat.
+        trunk_velocity: what the policy sees of it, exact, or estimated by the robot's filter from its sensors.
+        policy_dt: another period of the policy, s; null keeps that of training.
+        physics_dt: another physics step, s, such as 0.00125 for policy_dt=0.0025; null keeps that of training.
+        measures: gait and contact measures by name (go1exp list measure), [] for none; null takes all of them. With
+            parameters as {slip_share: {speed: 0.1}}.
+        delay_margin: also run the grid with targets 10, 20, 30 and 40 ms late, until a robot falls.
+        seed: seed of everything random.
+        out: JSON file; null writes eval.json in the run folder (of a shipped policy paper_eval.json here).
+        folder: for the files of other protocols than the grid; null takes protocols in the run folder (of a shipped
+            policy paper_protocols here).
+    """
+
+    controller: Any = None
+    run: FolderName | None
+    policy: str | None
+    bundle: str | None
+    checkpoint: str | None
+    grid: Grid
+    episodes: Count
+    duration_s: Duration
+    settle_s: NonNegative
+    noise: bool
+    randomize: bool
+    push: bool
+    train_ground: bool
+    trunk_velocity: Literal["exact", "estimated"]
+    policy_dt: Annotated[float, Field(gt=0, le=0.1)] | None
+    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
+    measures: Any
+    delay_margin: bool
+    seed: Annotated[int, Field(ge=0)]
+    out: str | None
+    folder: str | None
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.settle_s >= self.duration_s:
+            raise ValueError(f"settle_s = {self.settle_s}: must be shorter than duration_s = {self.duration_s}")
+
+
+RATES = "rate"
+"""Kind of protocol that only policies can play."""
+
+GRID_ONLY = (
+    *("grid", "episodes", "duration_s", "settle_s", "noise", "randomize", "push", "train_ground", "trunk_velocity"),
+    *("measures", "delay_margin", "out"),
+)
+"""Keys of ``go1exp eval`` that are the grid's."""
+
+
+def chosen_protocols(container: dict[str, Any], plain: dict[str, Any]) -> tuple[list[Chosen], bool]:
+    """Return the protocols of a configuration, and whether the grid is among them.
+
+    Args:
+        container: the configuration.
+        plain: ``conf/eval.yaml`` as it stands, to see which keys have been changed.
+
+    Raises:
+        ConfigError: with every problem; also for keys of the grid where it is not played.
+    """
+    import go1exp.evaluate.protocol.kinds  # noqa: F401  (registers them)
+    from go1exp.evaluate.protocol.base import chosen as checked
+
+    protocols, grid = checked(container.get("protocol"))
+    changed = [key for key in GRID_ONLY if not grid and key in plain and container.get(key) != plain[key]]
+    if changed:
+        rule = "is of protocol=grid; others have keys of their own"
+        raise ConfigError([f"{key} = {container[key]!r}: {rule} ({_example(key, protocols)})" for key in changed])
+    return protocols, grid
+
+
+def _example(key: str, protocols: Sequence[Chosen]) -> str:
+    first = protocols[0]
+    equivalent = {"episodes": "robots", "grid": "claims", "out": ""}.get(key, key)
+    if key == "out":
+        return "their folder is folder="
+    return (
+        f"protocol.{first.key}.{equivalent}" if hasattr(first.protocol, equivalent) else "go1exp eval --help protocol"
+    )
+
+
+def refuse(protocols: Sequence[Chosen], agent: Agent) -> None:
+    """Refuse protocols that an agent cannot play; raise ConfigError."""
+    problems = []
+    for c in protocols:
+        for key, velocity in c.protocol.policy_velocities().items():
+            problems += agent.problems(velocity, f"protocol.{c.key}.{key}")
+    if problems:
+        raise ConfigError(problems)
+
+
+def refuse_rates(protocols: Sequence[Chosen], controller: str | None, policy_dt: float | None) -> None:
+    """Raise ConfigError where the rates of a policy cannot be varied.
+
+    Args:
+        protocols: what is to be played.
+        controller: name of another controller with a rate of its own, or None.
+        policy_dt: the period that is asked for, s, or None.
+    """
+    kinds = [c.kind for c in protocols]
+    if controller is not None and set(kinds) == {RATES}:
+        raise ConfigError([f"protocol={RATES}: varies the rate of a policy; {controller} has one of its own"])
+    if policy_dt is not None and RATES in kinds:
+        raise ConfigError([f"policy_dt = {policy_dt:g}: protocol={RATES} has rates of its own, rates_hz"])
+
+
+def playable(protocols: Sequence[Chosen], agent: Agent) -> list[Chosen]:
+    """Return the protocols that an agent can play, and say which one of several it cannot."""
+    if agent.senses and any(c.kind == RATES for c in protocols):
+        print(f"{RATES}: not played, it varies the rate of a policy; {agent.label} has one of its own\n")
+        return [c for c in protocols if c.kind != RATES]
+    return list(protocols)
+
+
+def writable_file(out: Path) -> None:
+    """Make the folder of a file for results, before the work begins; ``/dev/stdout`` and pipes are taken as they are.
+
+    Raises:
+        ConfigError: if nothing can be written there.
+    """
+    if out.exists() and not out.is_file():
+        return
+    try:
+        writable(str(out.resolve().parent))
+    except ConfigError as error:
+        reason = error.problems[0].partition(": ")[2]
+        raise ConfigError([f"out = {str(out)!r}: its folder {reason}"]) from None
+
+
+def note_replaced(folder: Path, files: Sequence[str]) -> None:
+    """Say which results of an earlier call the new ones will replace."""
+    present = [name for name in files if (folder / name).exists()]
+    if present:
+        print(f"note: {folder} holds {', '.join(present)} of an earlier call; new ones replace them (or: folder=NAME)")
+
+
+def play_protocols(
+    protocols: Sequence[Chosen], subject: Named, folder: Path, other: dict[str, Any], rates: Rates
+) -> None:
+    """Play protocols one after the other, write what came of each, and print the verdicts."""
+    from go1exp.evaluate.protocol.playing import play as played
+    from go1exp.evaluate.protocol.playing import refuse_lengths
+    from go1exp.evaluate.protocol.report.pages import write
+
+    drives = agent(subject, other)
+    refuse(protocols, drives)
+    protocols = playable(protocols, drives)
+    refuse_lengths(protocols, drives, rates)
+    writable(str(folder), "folder")
+    note_replaced(folder, [f"{c.key}.json" for c in protocols])
+    for k, c in enumerate(protocols):
+        show = spinner(1, f"{c.key} ({k + 1} of {len(protocols)})")
+        result = played(c, drives, rates, {"robot": subjects.robot_as_data(other)}, show)
+        files = write(result, folder)
+        print("\n".join(result_lines(result)))
+        print(f"  written to {', '.join(map(str, files))}\n", flush=True)
+
+
+def result_lines(result: Result) -> list[str]:
+    """Return what a terminal shows of a result."""
+    from go1exp.base.report.table import interval_text
+    from go1exp.evaluate.protocol.claims import limits
+    from go1exp.evaluate.protocol.report.tables import condition_text, falls
+
+    text_lines = [f"{result.chosen.key}: {result.label}, {result.seconds:.0f} s; {falls(result)}"]
+    for v in result.verdicts:
+        value = interval_text(v.figure.estimate, v.figure.low, v.figure.high)
+        where = condition_text(v.condition)
+        text_lines.append(f"  {v.word:12} {v.claim.quantity} {value}, {limits(v.claim)}, n {v.figure.n} ({where})")
+    return [*text_lines, *(f"  note: {note}" for note in result.played.notes)]
 
 
 def _measures(given: Any) -> list[Term]:
@@ -38,9 +255,6 @@ class _Judged:
 
 def _protocols(settings: Any, protocols: list[Any], judged: _Judged) -> None:
     """Play what is not the grid."""
-    from go1exp.cli.protocols import play, refuse_rates
-    from go1exp.cli.subjects import driven, named
-
     refuse_rates(protocols, judged.controller.name if judged.controller else None, settings.policy_dt)
     if judged.controller is None:
         subject = named(settings.run, settings.policy, settings.bundle, settings.checkpoint, "protocols")
@@ -52,21 +266,17 @@ def _protocols(settings: Any, protocols: list[Any], judged: _Judged) -> None:
     from go1exp.evaluate.protocol.playing import Rates
 
     rates = Rates(settings.seed, settings.policy_dt, settings.physics_dt, judged.engine)
-    play(protocols, subject, folder, judged.other, rates)
+    play_protocols(protocols, subject, folder, judged.other, rates)
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.protocols import chosen as protocols_chosen
-    from go1exp.cli.protocols import writable_file
-    from go1exp.cli.settings import EvalSettings, parse
-    from go1exp.config.choices import config_folder, load
 
-    judge, container = engine.split(container)
-    other, container = other_robot.split(container)
+    judge, container = subjects.split_engine(container)
+    other, container = subjects.split_robot(container)
     choice = {"protocol": container.pop("protocol")}
     settings = parse(EvalSettings, container)
-    protocols, grid_too = protocols_chosen({**container, **choice}, load(config_folder() / "eval.yaml"))
-    judged = _Judged(other, judge, controllers.chosen(settings.controller))
+    protocols, grid_too = chosen_protocols({**container, **choice}, load(config_folder() / "eval.yaml"))
+    judged = _Judged(other, judge, subjects.chosen_controller(settings.controller))
     measures = _measures(settings.measures)
     if judged.controller is not None and settings.checkpoint:
         raise ConfigError([f"checkpoint = {settings.checkpoint!r}: is of a policy; controller=mpc has none"])
@@ -94,10 +304,8 @@ def _check_grid(settings: Any) -> None:
 
 def _of_grid(settings: Any, controller: MpcSettings | None) -> tuple[Path | None, Path | None, Path]:
     """Return run (None for another controller), checkpoint and report; raise ConfigError if they are not there."""
-    from go1exp.cli.runs import checkpoint_file, trained
-
     if controller is not None:
-        return None, None, controllers.conditions(settings.run, settings.policy, "eval.json", settings.out)[1]
+        return None, None, subjects.controller_conditions(settings.run, settings.policy, "eval.json", settings.out)[1]
     run, out = trained(settings.run, settings.policy, "eval.json", settings.out)
     return run, checkpoint_file(run, settings.checkpoint), out
 
@@ -115,14 +323,17 @@ def _grid(settings: Any, measures: list[Term], judged: _Judged, subject: tuple[P
         task = of_run.task
     else:
         assert judged.controller is not None
-        task, _ = controllers.conditions(settings.run, settings.policy, "eval.json", settings.out)
-        make, about = controllers.maker(judged.controller, task), {"controller": dataclasses.asdict(judged.controller)}
+        task, _ = subjects.controller_conditions(settings.run, settings.policy, "eval.json", settings.out)
+        make, about = (
+            subjects.controller_maker(judged.controller, task),
+            {"controller": dataclasses.asdict(judged.controller)},
+        )
     commands = grid(settings.grid.x, settings.grid.y, settings.grid.yaw, settings.grid.cross)
     config = EvalConfig.from_settings(settings, commands=commands, engine=judged.engine)
-    task = other_robot.replaced(task, judged.other)
+    task = subjects.with_robot(task, judged.other)
     report = {
         "policy": about,
-        "robot": other_robot.described(judged.other),
+        "robot": subjects.robot_as_data(judged.other),
         **evaluate(task, policy, config, spinner(1, "evaluating"), measures, make),
     }
     if settings.delay_margin:
@@ -134,4 +345,4 @@ def _grid(settings: Any, measures: list[Term], judged: _Judged, subject: tuple[P
     print(f"\nwritten to {out}")
 
 
-APP = App("eval", _task)
+APP = App("eval", _task, EvalSettings)

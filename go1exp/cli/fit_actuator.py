@@ -7,15 +7,37 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.base.files import write_json
-from go1exp.cli.app import App, spinner
-from go1exp.cli.quoting import command
-from go1exp.config.schema.registry import ConfigError
+from go1exp.cli.app import App, parse_with_groups, spinner
+from go1exp.cli.places import read_all, remove_empty, writable
+from go1exp.cli.verbs import command
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, NonNegative
+from go1exp.config.schema.settings import subset
+from go1exp.gap.actuator_net.settings import FitSettings
 
 if TYPE_CHECKING:
     import numpy as np
 
     from go1exp.logs.recording import Recording
     from go1exp.robot.config import RobotConfig
+
+
+@schema.settings
+class FitActuatorSettings(FitSettings):
+    """``conf/fit-actuator.yaml`` without the group.
+
+    Attributes:
+        recordings: folder of recordings, or a list of folders and files.
+        gains: take only recordings made with these, as [kp N m/rad, kd N m s/rad]; null takes all, which must agree.
+        plots: draw torque over time, measured and predicted.
+        out: folder for net.npz, net.onnx, report.json and the plots.
+    """
+
+    recordings: str | tuple[str, ...]
+    gains: tuple[NonNegative, NonNegative] | None
+    plots: bool
+    out: str
+
 
 GO1 = "go1"
 
@@ -54,13 +76,9 @@ def _with_gains(recordings: list[Recording], gains: tuple[float, float] | None) 
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.parts import parse_with_groups
-    from go1exp.cli.settings import FitActuatorSettings
-    from go1exp.config.schema.settings import subset
 
     settings, parts = parse_with_groups(FitActuatorSettings, container, ("robot",))
 
-    from go1exp.cli.logs import read_all, remove_empty, writable
     from go1exp.gap import actuator_net as fit
 
     recordings = _with_gains(read_all(settings.recordings), settings.gains)
@@ -93,4 +111,4 @@ def _task(container: dict[str, Any]) -> None:
     print(f"now: {command('train', 'actuator=net', settings={'actuator.file': out / 'net.npz'})}")
 
 
-APP = App("fit-actuator", _task)
+APP = App("fit-actuator", _task, FitActuatorSettings)

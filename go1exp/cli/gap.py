@@ -7,20 +7,69 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
 
 from go1exp.base.files import opened, write_json
-from go1exp.cli.app import App, spinner
-from go1exp.cli.play_web import address
-from go1exp.cli.quoting import command
+from go1exp.cli.app import App, parse_with_groups, spinner
+from go1exp.cli.places import long_enough, read_all, writable
+from go1exp.cli.play_web import Port, address, gap
+from go1exp.cli.verbs import SUBVERBS, command
+from go1exp.config.choices import choice_files, config_folder, load
 from go1exp.config.hydra_adapter import read_yaml
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, FolderName, members, nearest, unknown_name
+from go1exp.config.schema.settings import MISSING
+from go1exp.gap.result import Angle, GapSettings
 
 if TYPE_CHECKING:
-    from go1exp.cli.settings import GapVerb
     from go1exp.config.schema.contact import ContactConfig
     from go1exp.gap.result import GapResult
     from go1exp.gap.robots.protocol import Robot
     from go1exp.logs.recording import Recording
+
+
+Logs = str | tuple[str, ...]
+"""A folder of recordings, or folders and files."""
+
+
+def refuse_no_logs(logs: Logs) -> None:
+    """Raise ValueError if no recordings are named: an empty name, as an unset variable leaves it, is a mistake."""
+    if not logs or ("" in logs and not isinstance(logs, str)):
+        given = list(logs) if isinstance(logs, tuple) else logs
+        raise ValueError(f"logs = {given!r}: a folder of recordings is needed, such as logs=recordings")
+
+
+@schema.settings
+class GapVerb:
+    """``conf/gap.yaml`` without the groups.
+
+    Attributes:
+        logs: folder of recordings, or a list of folders and files.
+        stage: check, localise, replay, explain, apply, report or view; all runs explain, apply and report.
+        out: folder for verdict.json, effect.yaml, report.html.
+        train_dt: physics step of training, s, at which the answer must hold; also that of replay.
+        host: interface on which view listens; 127.0.0.1 is this machine alone.
+        port: on which view listens; 0 takes the first free one from 8080 on.
+        accept: error of an angle that you would not care about, in rad or such as 2mrad; then it counts as right.
+        search: how the missing effect is searched for.
+    """
+
+    logs: Logs
+    stage: Literal["all", "check", "localise", "replay", "explain", "apply", "report", "view"]
+    out: FolderName
+    train_dt: Annotated[float, Field(ge=1e-5, le=0.02)]
+    host: str
+    port: Port
+    accept: Angle
+    search: GapSettings
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        if self.stage not in ("report", "view"):  # which read the answer alone
+            refuse_no_logs(self.logs)
+
 
 DOES_NOT_HOLD = 15
 """Exit status if what was found is not as good at the step of training."""
@@ -33,9 +82,6 @@ def with_logs(container: dict[str, Any]) -> dict[str, Any]:
         ConfigError: if a stage was meant to be another verb.
     """
     from go1exp.cli.completion import STAGES
-    from go1exp.cli.verbs import SUBVERBS
-    from go1exp.config.schema.registry import ConfigError, nearest, unknown_name
-    from go1exp.config.schema.settings import MISSING
 
     words, stage = ("all", *STAGES, *SUBVERBS["gap"]), str(container.get("stage", "all"))
     is_verb = nearest(stage, words, 1) in [[verb] for verb in SUBVERBS["gap"]]
@@ -47,8 +93,6 @@ def with_logs(container: dict[str, Any]) -> dict[str, Any]:
 
 
 def _task(container: dict[str, Any]) -> int:
-    from go1exp.cli.parts import parse_with_groups
-    from go1exp.cli.settings import GapVerb
     from go1exp.gap.robots.description import parse_model
 
     groups = ("robot",) if container.get("contact") is None else ("robot", "contact")
@@ -58,7 +102,6 @@ def _task(container: dict[str, Any]) -> int:
         settings = replace(settings, search=replace(settings.search, accept=settings.accept))
     out, where = Path(settings.out), address(settings.host, settings.port)
 
-    from go1exp.cli.logs import long_enough, read_all, writable
     from go1exp.gap import files
     from go1exp.gap.result import EXIT_CODES
 
@@ -101,7 +144,6 @@ def _task(container: dict[str, Any]) -> int:
 def refuse_unknown(effects: Sequence[str]) -> None:
     """Raise ConfigError if no effect has one of the names of ``search.effects``."""
     import go1exp.sim.effects  # noqa: F401  (registers them)
-    from go1exp.config.schema.registry import ConfigError, members, unknown_name
 
     known = members("effect")
     if wrong := [unknown_name("search.effects", name, known, "effect") for name in effects if name not in known]:
@@ -110,10 +152,9 @@ def refuse_unknown(effects: Sequence[str]) -> None:
 
 def _view(settings: GapVerb, parts: dict[str, Any], where: tuple[str, int]) -> int:
     """Show the answer in the browser."""
-    from go1exp.cli.play_web import gap
     from go1exp.gap.robots.choice import robot_of
 
-    gap(settings, robot_of(parts["model"], parts["robot"]), parts["robot"], where)
+    gap(Path(settings.out), robot_of(parts["model"], parts["robot"]), parts["robot"], where)
     return 0
 
 
@@ -228,7 +269,6 @@ def _print_next(lacking: dict[str, Any], robot: Robot, file: Path, contact: Cont
 
 def _contact_choice(contact: ContactConfig | None) -> dict[str, str]:
     """Return the choice of ``contact`` that training needs; nothing if it is the default or not known."""
-    from go1exp.config.choices import choice_files, config_folder, load
     from go1exp.config.schema.contact import MUJOCO_CONTACT, read_contact
 
     if contact is None or contact == MUJOCO_CONTACT:
@@ -249,4 +289,4 @@ def _report(result: GapResult, out: Path) -> int:
     return status
 
 
-APP = App("gap", _task)
+APP = App("gap", _task, GapVerb)

@@ -1,16 +1,77 @@
-"""``go1exp gap next``."""
+"""``go1exp gap next`` and ``go1exp gap loop``."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from go1exp.base.files import write_json
-from go1exp.cli.app import App
-from go1exp.cli.quoting import command
+from go1exp.cli.app import App, parse_with_groups
+from go1exp.cli.gap import Logs, _progress, refuse_no_logs, refuse_unknown
+from go1exp.cli.places import long_enough, read_all, writable
+from go1exp.cli.record import RIG, _motions
+from go1exp.cli.verbs import command
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, FolderName
+from go1exp.gap.design.settings import DesignSettings
+from go1exp.gap.result import GapSettings
+from go1exp.logs.record.plan import RecordingConfig
 
 if TYPE_CHECKING:
+    from go1exp.gap.stages.loop import Turn
     from go1exp.gap.stages.next import NextResult
+
+
+@schema.settings
+class GapNextSettings:
+    """``conf/gap_next.yaml`` without the groups.
+
+    Attributes:
+        logs: the recordings that the answer is of: a folder, or a list of folders and files.
+        out: folder with the answer (verdict.json of go1exp gap), which gets next.csv and next.json.
+        design: what may be designed.
+    """
+
+    logs: Logs
+    out: FolderName
+    design: DesignSettings
+
+    def __post_init__(self) -> None:
+        """Check what a type does not."""
+        refuse_no_logs(self.logs)
+
+
+@schema.settings
+class GapLoopSettings(RecordingConfig):
+    """``conf/gap_loop.yaml`` without the groups.
+
+    Attributes:
+        excitation: motions to begin with, by name, as of go1exp record.
+        physics_dt: physics step of the simulated robot, s.
+        rounds: recordings that may be designed and made, one after the other.
+        search: how the missing effect is searched for in every round.
+        design: what may be designed.
+        out: folder for recordings, answers and designs by round, and the table loop.json.
+    """
+
+    excitation: Any = ()
+    physics_dt: Annotated[float, Field(gt=0, le=0.002)]
+    rounds: Annotated[int, Field(ge=0)]
+    search: GapSettings
+    design: DesignSettings
+    out: FolderName
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        wrong, window = self.empty(), self.search.burn_s + self.search.window_s
+        if self.seconds < window:
+            needed = f"search.burn_s + search.window_s = {window:g} s"
+            wrong.append(f"seconds = {self.seconds:g}: shorter than a window, {needed}")
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
 
 NOT_SEPARABLE = 16
 """Exit status if no recording tells apart what is left."""
@@ -19,11 +80,7 @@ TARGETS, ANSWER = "next.csv", "next.json"
 """Names of the files in the output folder."""
 
 
-def _task(container: dict[str, Any]) -> int:
-    from go1exp.cli.gap import _progress
-    from go1exp.cli.logs import long_enough, read_all
-    from go1exp.cli.parts import parse_with_groups
-    from go1exp.cli.settings import GapNextSettings
+def _next(container: dict[str, Any]) -> int:
     from go1exp.gap import files
     from go1exp.gap.robots.description import parse_model
 
@@ -112,4 +169,71 @@ def _attitude(attitude: Any) -> str:
     return f"the trunk at roll {attitude.roll:g} and pitch {attitude.pitch:g} rad"
 
 
-APP = App("gap_next", _task, title="gap next")
+NEXT = App("gap_next", _next, GapNextSettings, title="gap next")
+
+
+TABLE = "loop.json"
+"""Name of the file with a row for each round."""
+
+
+def _loop(container: dict[str, Any]) -> int:
+    import go1exp.logs.excitations
+    import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
+    from go1exp import robot as go1
+    from go1exp.gap.robots.description import Go1Model, parse_model
+    from go1exp.sim.effects.rules import actuator_problems
+
+    readers: dict[str, Any] = {"excitation": _motions, "model": parse_model}
+    settings, parts = parse_with_groups(GapLoopSettings, container, RIG, **readers)
+    refuse_unknown(settings.search.effects)
+    problems = actuator_problems(parts["actuator"], parts["effect"], go1.JOINTS)
+    if not isinstance(parts["model"], Go1Model):
+        problems.append("model: the simulated robot is a Go1; only model.tolerances can be changed here")
+    if settings.support != "suspended":
+        problems.append(f"support = {settings.support!r}: designs are for a robot that is hung")
+    if any(m.entry.traits.get("closed_loop") for m in parts["excitation"]):
+        problems.append("excitation: motions only; a policy or a controller walks on the ground")
+    if problems:
+        raise ConfigError(problems)
+
+    from go1exp.gap.robots.choice import robot_of
+    from go1exp.gap.stages.loop import loop, table
+    from go1exp.logs.record import plan
+    from go1exp.logs.record.simulate import Rig
+
+    rig = Rig(**{name: parts[name] for name in RIG}, physics_dt=settings.physics_dt)
+    episodes = plan.episodes(parts["excitation"], settings)
+    out = writable(settings.out)
+    rows = loop(
+        rig,
+        episodes,
+        settings.sensors,
+        robot_of(parts["model"], parts["robot"]),
+        settings.search,
+        settings.design,
+        settings.rounds,
+        lambda turn: _keep(turn, out),
+        _progress(),
+    )
+    write_json(out / TABLE, [row.as_dict() for row in rows], indent=1)
+    print(f"\n{table(rows)}\n\nwritten to {out / TABLE}")
+    return 0 if rows[-1].ended == "one name is left" else 1
+
+
+def _keep(turn: Turn, out: Path) -> None:
+    """Write what a round leaves, and say what it found."""
+    from go1exp.gap import files
+    from go1exp.gap.stages.loop import table
+    from go1exp.logs import recording
+
+    folder = out / f"round_{turn.row.number}"
+    (out / "recordings").mkdir(parents=True, exist_ok=True)
+    for r in turn.recordings:
+        recording.write(out / "recordings" / f"{r.meta.episode}.parquet", r)
+    files.save(turn.result, folder)
+    if turn.design:
+        save(turn.design, folder)
+    print(f"\n{table([turn.row])}\n", flush=True)
+
+
+LOOP = App("gap_loop", _loop, GapLoopSettings, title="gap loop")

@@ -86,7 +86,7 @@ def _refuse(title: str, word: str, known: Sequence[str]) -> None:
 
 def _composed(verb: str, arguments: Sequence[str], folders: Sequence[Path]) -> dict[str, Any]:
     """Compose with the overrides among the arguments, or without them where they are wrong: help is for that too."""
-    from go1exp.cli.files import choices_from_files
+    from go1exp.cli.hydra_main import choices_from_files
     from go1exp.config.compose import compose
 
     overrides = [word for word in arguments if "=" in word and not word.startswith("-")]
@@ -151,13 +151,12 @@ def _slots(group: str) -> list[str]:
 
 def texts_of(verb: str) -> dict[str, str]:
     """Return what each setting of a verb means, by key path, groups left out."""
-    from go1exp.cli.plugins import MEANING
-    from go1exp.cli.settings import SETTINGS
+    from go1exp.cli.app import MEANING, app_of
     from go1exp.config.schema.plugins import KEY
     from go1exp.config.schema.settings import lines
 
-    if verb != "train":
-        return {**lines(SETTINGS[verb]), KEY: MEANING}
+    if kind := app_of(verb).settings:
+        return {**lines(kind), KEY: MEANING}
     from go1exp.sim.task import SECTIONS, ProcessConfig
 
     sections = [name for name in SECTIONS if name not in groups_of(verb)]

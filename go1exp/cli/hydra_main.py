@@ -1,21 +1,37 @@
-"""A verb as a Hydra application: composition of its command line, its jobs, and the work for which Hydra is left."""
+"""A verb as a Hydra application: its command line, its jobs, and the work for which Hydra is left."""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import hydra
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from go1exp.config.hydra_adapter import MAIN, composed_once, jobs_of_sweep, plain, seen_by
+from go1exp.base.wording import NOT_FOR_TRAINING
+from go1exp.config.choices import choice_files, config_folder, groups_in, groups_of
+from go1exp.config.hydra_adapter import (
+    MAIN,
+    composed_once,
+    jobs_of_sweep,
+    plain,
+    read_yaml,
+    seen_by,
+    store_choice,
+    stored_choices,
+)
+from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.yaml_file import UNREADABLE, why_unreadable
 
 
 class Left(BaseException):
@@ -143,3 +159,116 @@ def run(
         if before is None:
             os.environ.pop("HYDRA_FULL_ERROR", None)
     return None
+
+
+PATHS = {"model": "mjcf"}
+"""Group -> key of its files that names another file, from where the file itself lies."""
+
+GROUP_IS_FILE = re.compile(r"^(?P<add>\+?)(?P<group>[a-z_]+)=(?P<value>\[?.*\.ya?ml\b.*)$")
+
+
+ITEM = re.compile(r"'(?:\\.|[^'])*'|\"(?:\\.|[^\"])*\"|[^\[\],]+")
+"""One name or path of a list, with the quotes round it."""
+
+
+def choices_from_files(arguments: Sequence[str], verb: str) -> list[str]:
+    """Return the arguments with every ``group=FILE.yaml`` turned into a choice that Hydra knows.
+
+    A list may mix files and names: ``effect=[mine.yaml,payload]``. Quotes round a path are taken off.
+
+    Raises:
+        ConfigError: if a file is missing, empty, no YAML or no mapping; with every such file.
+    """
+    chosen: list[str] = []
+    problems: list[str] = []
+    for argument in arguments:
+        match = GROUP_IS_FILE.match(argument)
+        group = match["group"] if match else ""
+        if match is None or not (group in groups_of(verb) or (match["add"] and group in groups_in(config_folder()))):
+            chosen.append(argument)
+            continue
+
+        def name_of(item: re.Match[str], group: str = group) -> str:
+            file = _unquoted(item[0])
+            if not re.search(r"\.ya?ml$", file):
+                return item[0]
+            try:
+                return _choice(group, file, verb)
+            except ConfigError as error:
+                problems.extend(error.problems)
+                return ""
+
+        chosen.append(f"{match['add']}{group}={ITEM.sub(name_of, match['value'])}")
+    if problems:
+        raise ConfigError(problems)
+    return chosen
+
+
+def _unquoted(item: str) -> str:
+    """Return an item of a list without the spaces and the quotes round it."""
+    item = item.strip()
+    return re.sub(r"\\(.)", r"\1", item[1:-1]) if item[:1] in ("'", '"') else item
+
+
+def _choice(group: str, file: str, verb: str) -> str:
+    """Make a file a choice of ``group`` and return its name there; warn if ``verb`` is what the file is not for."""
+    path, key = Path(file).expanduser(), f"{group}={file}"
+    none = "none" in choice_files(group, [config_folder()])
+    content = _mapping(
+        path,
+        key,
+        f"without any, use {group}=none" if none else "it must describe one",
+        f"as the files of conf/{group} are",
+    )
+    if verb == "train" and NOT_FOR_TRAINING in path.read_text(encoding="utf-8").partition("\n")[0]:
+        warnings.warn(f"{key}: not for training, as its first line says; effect.yaml beside it is", stacklevel=2)
+    named = content.get(PATHS.get(group, ""))
+    if isinstance(named, str):
+        content[PATHS[group]] = str((path.parent / named).resolve())
+    name = _free_name(group, path)
+    store_choice(group, name, content, path)
+    return name
+
+
+def mapping_of(given: Mapping[str, Any] | str | None, key: str) -> dict[str, Any]:
+    """Return a setting that is a mapping or the ``FILE.yaml`` of one; an empty one for None.
+
+    Raises:
+        ConfigError: if the file is missing, empty, no YAML or no mapping, naming ``key``.
+    """
+    if given is None:
+        return {}
+    if not isinstance(given, str):
+        return dict(given)
+    path = Path(given).expanduser()
+    content = _mapping(
+        path, f"{key}={given}", f"without any, leave {key} out", "or a FILE.yaml that holds one", resolve=True
+    )
+    return {str(k): v for k, v in content.items()}
+
+
+def _mapping(path: Path, key: str, when_empty: str, like: str, resolve: bool = False) -> dict[str, Any]:
+    """Return what a YAML file holds; raise ConfigError, beginning with ``key``, if that is no mapping."""
+    if not path.exists():
+        raise ConfigError([f"{key}: no such file"])
+    try:
+        content = read_yaml(path, resolve)
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UNREADABLE as error:
+        raise ConfigError([f"{key}: {why_unreadable(error)}"]) from None
+    if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
+        raise ConfigError([f"{key}: is empty; {when_empty}"])
+    # OmegaConf takes a file that is one text, such as XML, for a key without a value.
+    if not isinstance(content, dict) or isinstance(yaml.safe_load("\n".join(lines)), str):
+        raise ConfigError([f"{key}: must be a mapping, {like}"])
+    return content
+
+
+def _free_name(group: str, path: Path) -> str:
+    """Return a name for a file that no choice of the group has: Hydra would silently take that in place of the file."""
+    name = re.sub(r"\W", "_", str(path.with_suffix("")), flags=re.ASCII)  # else Hydra's grammar refuses it
+    shipped = choice_files(group, [config_folder()])
+    stored = stored_choices(group)
+    while name in shipped or stored.get(name, str(path)) != str(path):
+        name += "_file"
+    return name

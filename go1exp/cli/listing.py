@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any
+from typing import Any, Literal
 
-from go1exp.cli.app import App
+from go1exp.cli.app import App, parse
 from go1exp.config.choices import about, choice_files, groups_in
 from go1exp.config.hydra_adapter import shown_folders
+from go1exp.config.schema import settings as schema
+
+
+@schema.settings
+class ListSettings:
+    """``conf/list.yaml``.
+
+    Attributes:
+        what: terms, groups, or all.
+        group: only this group, such as reward or rand.
+    """
+
+    what: Literal["all", "terms", "groups"]
+    group: str | None
 
 
 def _task(container: dict[str, Any]) -> None:
@@ -15,7 +29,6 @@ def _task(container: dict[str, Any]) -> None:
     import go1exp.logs.excitations
     import go1exp.logs.importers
     import go1exp.logs.record.motions  # noqa: F401  (registers every member)
-    from go1exp.cli.settings import ListSettings, parse
     from go1exp.config.schema import plugins, registry
 
     plugins.installed()
@@ -60,4 +73,4 @@ def _choices() -> dict[str, list[tuple[str, str]]]:
     return {group: [(name, about(file)) for name, file in choice_files(group, folders).items()] for group in groups}
 
 
-APP = App("list", _task)
+APP = App("list", _task, ListSettings)

@@ -8,28 +8,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from go1exp.base import memory
-from go1exp.cli import controllers, engine, other_robot
-from go1exp.cli.app import App, spinner
-from go1exp.cli.play_web import address
+from go1exp.cli import subjects
+from go1exp.cli.app import App, parse, spinner
+from go1exp.cli.evaluate import writable_file
+from go1exp.cli.play_web import PlaySettings, address, log, walk
+from go1exp.cli.subjects import Named, agent, driven, named
 from go1exp.config.schema.registry import ConfigError
 
 if TYPE_CHECKING:
-    from go1exp.cli.settings import PlaySettings
-    from go1exp.cli.subjects import Named
     from go1exp.sim.env.camera import Picture
     from go1exp.sim.env.core import Go1Core
     from go1exp.sim.terrain import TerrainConfig
     from go1exp.train.policy import Policy
+
 
 FORMATS = (".mp4", ".gif")
 """Endings of a clip's file; the picture beside it is a .png."""
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import PlaySettings, parse
 
-    judge, container = engine.split(container)
-    other, container = other_robot.split(container)
+    judge, container = subjects.split_engine(container)
+    other, container = subjects.split_robot(container)
     ground = _ground(container.pop("terrain", None))
     settings = parse(PlaySettings, container)
     where = address(settings.host, settings.port)
@@ -45,18 +45,13 @@ def _task(container: dict[str, Any]) -> None:
     if out.suffix.lower() not in FORMATS:
         raise ConfigError([f"out = {str(out)!r}: a clip is {' or '.join(FORMATS)}"])
     if settings.viewer == "web":
-        from go1exp.cli.play_web import walk
-
         walk(subject, other, ground, judge, settings, where)
         return
 
     live = settings.viewer == "live" or (settings.viewer == "auto" and _has_display())
     if not live:
-        from go1exp.cli.protocols import writable_file
-
         writable_file(out)
 
-    from go1exp.cli.subjects import agent
     from go1exp.evaluate.rollout import EvalConfig, evaluation_task, require_agreement
     from go1exp.sim.env.core import Go1Core
 
@@ -94,16 +89,13 @@ def _log(settings: PlaySettings, where: tuple[str, int]) -> None:
         wrong.append(f"viewer = {settings.viewer!r}: a recording (log=) is shown by viewer=web alone")
     if wrong:
         raise ConfigError(wrong)
-    from go1exp.cli.play_web import log
 
     log(Path(str(settings.log)), where)
 
 
 def _subject(settings: PlaySettings) -> Named:
     """Return who walks; raise ConfigError if that is not there."""
-    from go1exp.cli.subjects import driven, named
-
-    controller = controllers.chosen(settings.controller)
+    controller = subjects.chosen_controller(settings.controller)
     if controller is None:
         return named(settings.run, settings.policy, settings.bundle, settings.checkpoint, "play.mp4")
     return driven(controller, settings.run, settings.policy, settings.bundle, "play.mp4")
@@ -148,4 +140,4 @@ def _has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-APP = App("play", _task)
+APP = App("play", _task, PlaySettings)

@@ -6,16 +6,18 @@ import importlib
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
 
 from go1exp.base.errors import Expected
-from go1exp.cli.runs import shipped_policies
+from go1exp.cli.places import shipped_policies
+from go1exp.cli.subjects import Named, agent, word
 from go1exp.config.choices import choice_files, config_folder, load
-from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, Duration, FolderName, Speed
 
 if TYPE_CHECKING:
-    from go1exp.cli.settings import GapVerb, PlaySettings
-    from go1exp.cli.subjects import Named
     from go1exp.config.schema.backends import BackendConfig
     from go1exp.deploy.sim_robot.machine import Body
     from go1exp.deploy.sim_robot.settings import SimConfig
@@ -24,6 +26,57 @@ if TYPE_CHECKING:
     from go1exp.gap.robots.protocol import Robot
     from go1exp.robot.config import RobotConfig
     from go1exp.sim.terrain import TerrainConfig
+
+Port = Annotated[int, Field(ge=0, le=65535)]
+
+
+@schema.settings
+class PlaySettings:
+    """``conf/play.yaml``.
+
+    Attributes:
+        controller: what moves the robot: policy, the one of run or policy, or mpc.
+        run: run folder to watch; or give policy.
+        policy: name of a policy that comes with the package, such as paper, in place of run.
+        bundle: file of go1exp export, in place of run: its policy as the robot's computer runs it.
+        log: recording to show in the browser, in place of a robot that walks.
+        checkpoint: file of the run; null takes the newest.
+        velocity: commanded velocity, x m/s, y m/s, yaw rad/s; arrow keys change it in the live viewer and the browser.
+        seconds: length of the clip, s.
+        viewer: clip, live (a window), web (a page for the browser), or auto, which is live where there is a display.
+        host: interface on which viewer=web listens; 127.0.0.1 is this machine alone.
+        port: on which it listens; 0 takes the first free one from 8080 on.
+        fps: frames per second of the clip.
+        noise: add the observation noise of training.
+        randomize: randomise the robot as in training; false takes the nominal robot.
+        push: push the robot as in training.
+        train_ground: use the ground of training; false is flat.
+        physics_dt: another physics step, s, such as 0.002 for a policy trained with coarser steps; null keeps that of
+            training.
+        seed: seed of everything random.
+        out: clip (.mp4, .gif); null writes play.mp4 in the run folder. A picture, .png, goes beside it.
+    """
+
+    controller: Any = None
+    run: FolderName | None
+    policy: str | None
+    bundle: str | None
+    log: str | None
+    checkpoint: str | None
+    velocity: tuple[Speed, Speed, Speed]
+    seconds: Duration
+    viewer: Literal["auto", "clip", "live", "web"]
+    host: str
+    port: Port
+    fps: Annotated[int, Field(ge=1, le=50)]
+    noise: bool
+    randomize: bool
+    push: bool
+    train_ground: bool
+    physics_dt: Annotated[float, Field(gt=0, le=0.02)] | None
+    seed: Annotated[int, Field(ge=0)]
+    out: str | None
+
 
 RUNS, MOST_RUNS = Path("runs"), 12
 """Where runs are looked for, and how many of the newest are offered."""
@@ -72,7 +125,7 @@ def walk(
 
     Args:
         subject: who drives first.
-        other: choices of another robot (``other_robot.split``).
+        other: choices of another robot (``subjects.split_robot``).
         ground: to walk on; None takes that of the settings.
         judge: what moves the robot.
         settings: of the verb.
@@ -82,7 +135,6 @@ def walk(
     from go1exp.base.tensors.threads import one_thread
 
     with one_thread():
-        from go1exp.cli.subjects import agent
         from go1exp.evaluate.viewer import web
         from go1exp.evaluate.viewer.drive_window import DriveWindow
         from go1exp.evaluate.viewer.page_server import Gamepad
@@ -113,7 +165,6 @@ def walk(
 
 def _agents(subject: Named, first: Agent, other: dict[str, Any]) -> dict[str, Callable[[], Agent]]:
     """Return who could drive this robot, loaded when they are asked for: shipped policies, newest runs, the MPC."""
-    from go1exp.cli.subjects import agent, word
 
     def loader(name: str) -> Callable[[], Agent]:
         return lambda: agent(word(name, "play"), other, robot_of=first.task)
@@ -202,11 +253,11 @@ def log(file: Path, where: tuple[str, int]) -> None:
     web.run(show, [ReplayWindow(story)], title=f"go1exp: {file.name}", host=where[0], port=where[1])
 
 
-def gap(settings: GapVerb, robot: Robot, config: RobotConfig, where: tuple[str, int]) -> None:
+def gap(folder: Path, robot: Robot, config: RobotConfig, where: tuple[str, int]) -> None:
     """Show the answer of ``go1exp gap`` in a folder, until Ctrl-C.
 
     Args:
-        settings: of the verb.
+        folder: with the answer.
         robot: that it is about.
         config: of the Go1, if it is one.
         where: to listen, host and port.
@@ -215,7 +266,6 @@ def gap(settings: GapVerb, robot: Robot, config: RobotConfig, where: tuple[str, 
     from go1exp.gap import files
     from go1exp.robot import JOINTS
 
-    folder = Path(settings.out)
     result = files.load(folder)
     from go1exp.evaluate.viewer import web
     from go1exp.evaluate.viewer.replay import ReplayShow, model_of, of_result

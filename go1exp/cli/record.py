@@ -1,25 +1,97 @@
-"""``go1exp record``."""
+"""``go1exp record``, ``go1exp record audit`` and ``go1exp record import``."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
-from go1exp.cli.app import App, spinner
-from go1exp.cli.quoting import command
-from go1exp.config.schema.registry import ConfigError, Term, bind_list
+from go1exp.base.files import write_json
+from go1exp.base.wording import counted
+from go1exp.cli.app import App, parse, parse_with_groups, spinner
+from go1exp.cli.places import files_of, trained, writable
+from go1exp.cli.verbs import command
+from go1exp.config.compose import compose
+from go1exp.config.schema import settings as schema
+from go1exp.config.schema.registry import ConfigError, Count, FolderName, Term, bind_list
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
+from go1exp.logs.record.plan import RecordingConfig
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from go1exp.cli.settings import RecordSettings
     from go1exp.logs.record.plan import Episode
     from go1exp.logs.record.simulate import Rig
     from go1exp.logs.recording import Recording
     from go1exp.sim.env.core import Go1Core
+
+
+@schema.settings
+class RecordSettings(RecordingConfig):
+    """``conf/record.yaml`` without the groups.
+
+    Attributes:
+        controller: settings of excitation=[mpc].
+        excitation: motions by name (go1exp list excitation); with parameters as {chirp: {band: [0.2, 5.0]}}.
+        run: run folder of the policy of excitation=[policy]; or give policy.
+        policy: name of a policy that comes with the package, such as paper, in place of run.
+        episodes: robots that walk under a policy.
+        physics_dt: physics step, s.
+        out: folder for the recordings.
+    """
+
+    controller: Any = None
+    excitation: Any = ()
+    run: str | None
+    policy: str | None
+    episodes: Count
+    physics_dt: Annotated[float, Field(gt=0, le=0.002)]
+    out: str
+
+    def __post_init__(self) -> None:
+        """Check what concerns two settings."""
+        wrong = self.empty()
+        ratio = 1.0 / (self.sensors.rate_hz * self.physics_dt)
+        if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6:
+            period = 1 / self.sensors.rate_hz
+            wrong.append(f"physics_dt = {self.physics_dt}: 1 / sensors.rate_hz = {period:g} must be a multiple of it")
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+
+@schema.settings
+class AuditSettings:
+    """``conf/record_audit.yaml``.
+
+    Attributes:
+        files: recordings (.parquet), or folders of them.
+        out: JSON file for the findings; null writes none.
+    """
+
+    files: Annotated[tuple[str, ...], Field(min_length=1)]
+    out: str | None
+
+
+@schema.settings
+class ImportSettings:
+    """``conf/record_import.yaml``.
+
+    Attributes:
+        source: name of the importer (go1exp list importer).
+        path: its file, or a folder of them.
+        options: the importer's own parameters, such as {rate_hz: 100.0}, or a FILE.yaml of them.
+        columns: of source=csv: channel -> column, such as {t: time, q_knee: {column: pos, unit: deg}}, or a FILE.yaml.
+        out: folder for the recordings.
+    """
+
+    source: str
+    path: str
+    options: dict[str, Any] | str | None
+    columns: dict[str, Any] | str | None
+    out: FolderName
+
 
 RIG = ("robot", "actuator", "effect", "terrain", "backend")
 """Groups of the configuration that describe the robot to be recorded."""
@@ -57,13 +129,10 @@ def _unused(settings: RecordSettings) -> list[str]:
     return wrong
 
 
-def _task(container: dict[str, Any]) -> None:
+def _record(container: dict[str, Any]) -> None:
     import go1exp.logs.excitations
     import go1exp.logs.record.motions  # noqa: F401  (registers every excitation)
     from go1exp import robot
-    from go1exp.cli.parts import parse_with_groups
-    from go1exp.cli.runs import trained
-    from go1exp.cli.settings import RecordSettings
     from go1exp.sim.effects.rules import actuator_problems, has_gains
 
     readers = {"excitation": _motions, "controller": parse_controller}
@@ -84,8 +153,6 @@ def _task(container: dict[str, Any]) -> None:
         raise ConfigError(problems)
     walk = trained(settings.run, settings.policy, "", "")[0] if settings.run or settings.policy else None
 
-    from go1exp.base.wording import counted
-    from go1exp.cli.logs import writable
     from go1exp.logs.record import plan
 
     driven = [m for m in motions if m.entry.name not in (POLICY, MPC)]
@@ -145,15 +212,14 @@ def _misfits(settings: RecordSettings, parts: dict[str, Any]) -> list[str]:
 
 def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> list[Recording]:
     """Let a model predictive controller walk simulated robots by targets alone; return a recording of each."""
-    from go1exp.cli import controllers
-    from go1exp.config.compose import compose
+    from go1exp.cli import subjects
     from go1exp.evaluate.controller.adapters import AsTargets
     from go1exp.evaluate.controller.batch import Driven
     from go1exp.logs.record import simulate
     from go1exp.sim.task import parse_train
 
     task = parse_train(compose("train", [f"command={COMMANDS}"])).task
-    make = controllers.maker(controller, task)
+    make = subjects.controller_maker(controller, task)
     gains = [np.array(simulate.configured(rig.actuator, name)) for name in ("kp", "kd")]
     names = [f"mpc_{settings.seed}_{k}" for k in range(settings.episodes)]
 
@@ -166,7 +232,6 @@ def _record_mpc(rig: Rig, controller: MpcSettings, settings: RecordSettings) -> 
 
 def _write(out: Path, recordings: list[Recording]) -> None:
     """Write the recordings and print what to do with them."""
-    from go1exp.base.wording import counted
     from go1exp.logs import recording
 
     for r in recordings:
@@ -176,4 +241,114 @@ def _write(out: Path, recordings: list[Recording]) -> None:
     print(f"now: {command('record', 'audit', str(out))}")
 
 
-APP = App("record", _task)
+APP = App("record", _record, RecordSettings)
+
+
+AUDIT_STATUS = {"ok": 0, "suspect": 3, "bad": 4}
+"""Exit status of each verdict; the worst counts."""
+
+
+def _audit(container: dict[str, Any]) -> int:
+    from go1exp.logs.recording import RecordingError
+
+    settings = parse(AuditSettings, container)
+
+    from go1exp.logs.audit import AuditReport, audit_file, clock_flaws
+
+    reports: dict[str, Any] = {}
+    folders: dict[Path, dict[Path, AuditReport]] = {}
+    unreadable: list[str] = []
+    status = 0
+    for file in files_of(settings.files):
+        try:
+            report = audit_file(file)
+        except RecordingError as error:
+            unreadable.append(str(error))
+            reports[str(file)] = {"verdict": "unreadable", "message": str(error)}
+            continue
+        print(f"{file}\n{report.text()}\n")
+        reports[str(file)] = report.as_dict()
+        folders.setdefault(file.parent, {})[file] = report
+        status = max(status, AUDIT_STATUS[report.verdict])
+    for together in folders.values():
+        flaws = clock_flaws(list(together.values()))
+        for file, report in together.items():
+            if report.episode in flaws:
+                print(f"{file}: bad: {flaws[report.episode]}")
+                reports[str(file)] |= {"verdict": "bad", "clocks": flaws[report.episode]}
+                status = max(status, AUDIT_STATUS["bad"])
+    if settings.out:
+        out = Path(settings.out)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(out, reports)
+        print(f"written to {out}")
+    if unreadable:  # the others have been judged all the same
+        raise RecordingError("\n".join(unreadable))
+    return status
+
+
+AUDIT = App("record_audit", _audit, AuditSettings, title="record audit")
+
+
+NAMED = 3
+"""Most files that a note names."""
+
+
+def _import(container: dict[str, Any]) -> None:
+    from go1exp.cli.hydra_main import mapping_of
+    from go1exp.logs import recording
+    from go1exp.logs.importers import import_recordings
+
+    settings = parse(ImportSettings, container)
+    options = mapping_of(settings.options, "options")
+    if settings.columns is not None:
+        options["columns"] = mapping_of(settings.columns, "columns")
+    recordings = import_recordings(settings.source, Path(settings.path), options)
+    _refuse_one_name(settings.path, [r.meta.episode for r in recordings])
+    out = writable(settings.out)
+    files = [out / f"{r.meta.episode}.parquet" for r in recordings]
+    if present := [file.name for file in files if file.exists()]:
+        print(f"note: {out} holds {_listed(present)} of an earlier call; new ones replace them (or: out=FOLDER)")
+    for file, r in zip(files, recordings, strict=True):
+        recording.write(file, r)
+    total = sum(float(r.t[-1] - r.t[0]) for r in recordings)
+    print(f"{counted(len(recordings), 'recording')}, {total:.0f} s, in {out}")
+    for note in [*_wrong_steps(recordings), *dict.fromkeys(r.meta.notes for r in recordings if r.meta.notes)]:
+        print(f"note: {note}")
+
+
+def _refuse_one_name(path: str, names: Sequence[str]) -> None:
+    """Raise RecordingError if two recordings of one call have one name: the second would replace the first."""
+    from go1exp.logs.recording import RecordingError
+
+    twice = [name for name, times in Counter(names).items() if times > 1]
+    if twice:
+        raise RecordingError(
+            f"{path}: two files in it would both be {twice[0]}.parquet; "
+            "import each of their folders with an out of its own"
+        )
+
+
+def _wrong_steps(recordings: Sequence[Recording]) -> list[str]:
+    """Return what is wrong with clocks whose steps are too long or too short, one line for all of one kind."""
+    from go1exp.logs.audit.limits import LEAST_STEP
+    from go1exp.logs.audit.signals import Log
+    from go1exp.logs.audit.single import wrong_steps
+
+    flaws: dict[str, list[str]] = {}
+    for r in recordings:
+        log = Log(r)
+        if len(r.t) > 1 and (message := wrong_steps(log)):
+            unit = "ms" if log.dt > LEAST_STEP else "s"
+            remedy = f"with source=csv, columns gives the unit: t: {{column: NAME, unit: {unit}}}"
+            flaws.setdefault(f"t {message}; {remedy}", []).append(r.meta.episode)
+    return [f"{_listed(episodes)}: {message}" for message, episodes in flaws.items()]
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
+    rest = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {rest} more" if rest > 0 else "")
+
+
+IMPORT = App("record_import", _import, ImportSettings, title="record import")

@@ -8,18 +8,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp.cli.app import App, spinner
+from go1exp.cli.app import App, parse, spinner
 from go1exp.config.schema.registry import ConfigError
+from go1exp.evaluate.report.settings import ReportSettings
 
 if TYPE_CHECKING:
     from go1exp.evaluate.protocol.base import Chosen
     from go1exp.evaluate.report.made import Report
-    from go1exp.evaluate.report.settings import ReportSettings
     from go1exp.evaluate.report.study import Study
 
 
 def _task(container: dict[str, Any]) -> None:
-    from go1exp.cli.settings import ReportSettings, parse
 
     container = dict(container)
     protocols = _protocols(container.pop("protocol"), bool(container.get("eval")))
@@ -100,4 +99,4 @@ def lines(made: Report) -> list[str]:
     return text_lines
 
 
-APP = App("report", _task)
+APP = App("report", _task, ReportSettings)

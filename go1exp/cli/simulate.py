@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from go1exp.cli.app import App
+from go1exp.cli.app import App, parse_with_groups
+from go1exp.cli.play_web import address, sim
 from go1exp.config.schema.registry import ConfigError
 from go1exp.config.schema.settings import subset
+from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
 
 BODY = ("robot", "actuator", "effect", "contact", "terrain")
 """Groups of the configuration that describe the robot and its ground."""
@@ -14,11 +16,8 @@ BODY = ("robot", "actuator", "effect", "contact", "terrain")
 
 def _task(container: dict[str, Any]) -> int:
     from go1exp import robot
-    from go1exp.cli.parts import parse_with_groups
-    from go1exp.cli.play_web import address
     from go1exp.deploy.runtime.udp import parsed_address
     from go1exp.deploy.sim_robot.machine import Body, Robot
-    from go1exp.deploy.sim_robot.settings import SimConfig, SimSettings
     from go1exp.sim.effects.rules import actuator_problems
 
     settings, parts = parse_with_groups(SimSettings, container, BODY)
@@ -27,8 +26,6 @@ def _task(container: dict[str, Any]) -> int:
     where, page = parsed_address(settings.address, HERE), address(settings.host, settings.port)
     body, config = Body(**parts, tile=settings.tile), subset(SimConfig, settings)
     if settings.viewer == "web":
-        from go1exp.cli.play_web import sim
-
         groups = {name: container[name] for name in BODY}
         sim(body, groups, config, where, settings.seconds, page)
         return 0
@@ -51,4 +48,4 @@ def _task(container: dict[str, Any]) -> int:
 HERE = ("127.0.0.1", 8007)
 """Where it listens unless told otherwise: nobody else in the network can reach it."""
 
-APP = App("sim", _task)
+APP = App("sim", _task, SimSettings)

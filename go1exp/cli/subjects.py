@@ -1,23 +1,148 @@
-"""Who is judged: a run, a shipped policy, a bundle or another controller, as it is named on the command line."""
+"""What a verb works with: a run, a shipped policy, a bundle or another controller, on which robot and engine."""
 
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from go1exp.cli import controllers, engine, other_robot
-from go1exp.cli.runs import checkpoint_file, run_folder, shipped_policies, trained
+from go1exp.cli.places import checkpoint_file, run_folder, shipped_policies, trained
 from go1exp.config.choices import choice_files, config_folder, load
-from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError, Term
+from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 
 if TYPE_CHECKING:
     from go1exp.config.schema.backends import BackendConfig
     from go1exp.evaluate.agents import Agent
-    from go1exp.evaluate.controller.settings import MpcSettings
+    from go1exp.evaluate.controller.types import Controller
     from go1exp.sim.task import TaskConfig
+
+
+ENGINE = "engine"
+
+
+def split_engine(container: dict[str, Any]) -> tuple[BackendConfig, dict[str, Any]]:
+    """Return the checked engine, and what is left of the configuration.
+
+    Raises:
+        ConfigError: with every problem of its settings, or if it is not installed.
+    """
+    from go1exp.config.schema.backends import PhysxBackend
+    from go1exp.sim.task import parse_parts
+
+    parts, problems = parse_parts(container, (ENGINE,))
+    if isinstance(parts.get(ENGINE), PhysxBackend) and importlib.util.find_spec("sapien") is None:
+        problems.append("engine = physx: needs the package sapien: pip install 'go1exp[physx]', or use engine=mujoco")
+    if problems:
+        raise ConfigError(problems)
+    return parts[ENGINE], {name: value for name, value in container.items() if name != ENGINE}
+
+
+ROBOT_GROUPS = ("actuator", "effect", "contact")
+"""Groups that a run's own choice can be replaced in; null or absent keeps it."""
+
+
+def split_robot(container: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the checked choices of another robot, by group, and what is left of the configuration.
+
+    Raises:
+        ConfigError: with every problem of the choices.
+    """
+    from go1exp.sim.task import parse_parts
+
+    chosen = {name: container[name] for name in ROBOT_GROUPS if container.get(name) is not None}
+    parts, problems = parse_parts(chosen, tuple(chosen))
+    if problems:
+        raise ConfigError(problems)
+    return parts, {name: value for name, value in container.items() if name not in ROBOT_GROUPS}
+
+
+def with_robot(task: TaskConfig, parts: dict[str, Any]) -> TaskConfig:
+    """Return the task with the other robot in it.
+
+    Raises:
+        ConfigError: if actuator and effects do not go together.
+    """
+    from go1exp import robot
+    from go1exp.sim.effects.rules import actuator_problems
+
+    changed = dataclasses.replace(task, **parts)
+    if problems := actuator_problems(changed.actuator, changed.effect, robot.JOINTS):
+        raise ConfigError(problems)
+    return changed
+
+
+def robot_as_data(parts: dict[str, Any]) -> dict[str, Any]:
+    """Return the choices as plain data, for a report."""
+
+    def plain(part: Any) -> Any:
+        if isinstance(part, tuple):
+            return [plain(term) for term in part]
+        return {"term": part.entry.name, **part.parameters} if isinstance(part, Term) else dataclasses.asdict(part)
+
+    return {name: plain(part) for name, part in parts.items()}
+
+
+CONDITIONS = "hop"
+"""Shipped policy whose robot, ground and noise another controller walks under where no run is named."""
+
+
+def chosen_controller(given: Any) -> MpcSettings | None:
+    """Return the settings of another controller than a policy, from a verb's group ``controller``; None for a policy.
+
+    Raises:
+        ConfigError: with every problem of the settings.
+        go1exp.evaluate.controller.forces.SolverError: if the controller's solver is not installed.
+    """
+    settings = parse_controller({"name": "policy"} if given is None else given)
+    if not isinstance(settings, MpcSettings):
+        return None
+    from go1exp.evaluate.controller.forces import solver
+
+    solver()  # before anything is built
+    return settings
+
+
+def controller_conditions(run: str | None, policy: str | None, file: str, out: str | None) -> tuple[TaskConfig, Path]:
+    """Return the task in which another controller walks, and the file for results; arguments as ``runs.trained``'s.
+
+    The task is that of the run or the shipped policy that is named, else that of ``CONDITIONS``.
+    """
+    return task_of_run(controlled_robot(run, policy)), results_of_controller(run, policy, file, out)
+
+
+def controlled_robot(run: str | None, policy: str | None) -> Path:
+    """Return the folder of the run whose robot another controller moves.
+
+    Raises:
+        ConfigError: if there is no such run or policy.
+    """
+    named = run is not None or policy is not None
+    return trained(run, policy if named else CONDITIONS, "", None)[0]
+
+
+def results_of_controller(run: str | None, policy: str | None, file: str, out: str | None) -> Path:
+    """Return where results go: ``out``, or ``mpc_FILE`` here."""
+    named = run is not None or policy is not None
+    return trained(run, policy if named else CONDITIONS, file, out)[1] if out else Path(f"mpc_{file}")
+
+
+def task_of_run(run: Path) -> TaskConfig:
+    """Return the task of a run folder."""
+    from go1exp.train import run_folder
+
+    return run_folder.read_parsed(run).task
+
+
+def controller_maker(settings: MpcSettings, task: TaskConfig) -> Callable[[], Controller]:
+    """Return what makes one robot's controller."""
+    from go1exp.evaluate.controller.mpc import Mpc
+
+    return lambda: Mpc(settings, task.robot.inertia)
 
 
 @dataclass(frozen=True)
@@ -49,8 +174,8 @@ def driven(controller: MpcSettings, run: str | None, policy: str | None, bundle:
     """
     if bundle is not None:
         raise ConfigError([f"bundle = {bundle!r}: is a policy; controller=mpc takes none"])
-    folder = controllers.place(run, policy, file, None)
-    return Named("mpc", folder, run=controllers.robot_of(run, policy), controller=controller)
+    folder = results_of_controller(run, policy, file, None)
+    return Named("mpc", folder, run=controlled_robot(run, policy), controller=controller)
 
 
 def named(run: str | None, policy: str | None, bundle: str | None, checkpoint: str | None, file: str) -> Named:
@@ -110,7 +235,7 @@ def varied(given: str, file: str) -> tuple[Named, Variation]:
         elif change in VELOCITIES:
             variation = dataclasses.replace(variation, trunk_velocity=VELOCITIES[change])
         elif change in _choices("engine"):
-            moves, _ = engine.split({"engine": load(_choices("engine")[change])})
+            moves, _ = split_engine({"engine": load(_choices("engine")[change])})
             variation = dataclasses.replace(variation, engine=moves)
         else:
             known = f"a rate of 10 to 1000 hz, exact, estimated, {' or '.join(_choices('engine'))}"
@@ -125,7 +250,7 @@ def _choices(group: str) -> dict[str, Path]:
 def word(given: str, file: str) -> Named:
     """Return the subject that one word names: a bundle's file, a run folder, or a shipped policy."""
     if given == "mpc":
-        settings = controllers.chosen(load(_choices("controller")[given]))
+        settings = chosen_controller(load(_choices("controller")[given]))
         assert settings is not None
         return driven(settings, None, None, None, file)
     if given.endswith(".zip"):
@@ -145,7 +270,7 @@ def agent(subject: Named, other: dict[str, Any], robot_of: TaskConfig | None = N
 
     Args:
         subject: who.
-        other: choices of another robot (``other_robot.split``).
+        other: choices of another robot (``split_robot``).
         robot_of: the task whose robot, drives, effects, contact and randomisation are taken; None takes its own.
 
     Raises:
@@ -175,9 +300,9 @@ def _controlled(subject: Named, controller: MpcSettings, other: dict[str, Any], 
     from go1exp.evaluate.agents import ControllerAgent
 
     assert subject.run is not None
-    task = _robot(controllers.task_of(subject.run), other, robot_of)
+    task = _robot(task_of_run(subject.run), other, robot_of)
     about = {"controller": dataclasses.asdict(controller), "robot_of_run": str(subject.run)}
-    return ControllerAgent(subject.label, task, controllers.maker(controller, task), about)
+    return ControllerAgent(subject.label, task, controller_maker(controller, task), about)
 
 
 SAME = ("robot", "actuator", "effect", "contact", "rand", "termination")
@@ -187,4 +312,4 @@ SAME = ("robot", "actuator", "effect", "contact", "rand", "termination")
 def _robot(task: TaskConfig, other: dict[str, Any], robot_of: TaskConfig | None) -> TaskConfig:
     if robot_of is not None:
         task = dataclasses.replace(task, **{part: getattr(robot_of, part) for part in SAME})
-    return other_robot.replaced(task, other)
+    return with_robot(task, other)

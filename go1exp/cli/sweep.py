@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from go1exp.base.signals import STOPPED
 from go1exp.cli import hydra_main
 from go1exp.cli.app import FAILED, App, spinner
-from go1exp.cli.quoting import command, quoted
+from go1exp.cli.verbs import command, quoted
 from go1exp.config.compose import compose
 from go1exp.config.schema.registry import ConfigError
 from go1exp.train.sweep.command import CORES, PARENT, Command, Ended

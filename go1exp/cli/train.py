@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from go1exp.base.signals import STOPPED
 from go1exp.cli import hydra_main, sweep
 from go1exp.cli.app import App, discard
-from go1exp.cli.quoting import command
-from go1exp.cli.runs import run_folder as existing
-from go1exp.cli.runs import shipped_policies
+from go1exp.cli.places import run_folder as existing
+from go1exp.cli.places import shipped_policies
+from go1exp.cli.verbs import command
 from go1exp.config.choices import config_folder
 from go1exp.config.compose import key_values
 from go1exp.config.hydra_adapter import read_yaml, with_values

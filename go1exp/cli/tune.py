@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from go1exp.cli.app import FAILED, App
-from go1exp.cli.quoting import command
+from go1exp.cli.app import FAILED, App, parse
+from go1exp.cli.verbs import command
 from go1exp.config.compose import compose_checked
 from go1exp.config.hydra_adapter import sweep_range
 from go1exp.config.schema.registry import ConfigError
+from go1exp.train.sweep.settings import TuneSettings
 
 if TYPE_CHECKING:
     from go1exp.train.sweep.tune import Range
@@ -54,7 +55,6 @@ def _empty(drawn: Range) -> str | None:
 
 
 def _task(container: dict[str, Any]) -> int | None:
-    from go1exp.cli.settings import TuneSettings, parse
 
     settings = parse(TuneSettings, container)
     ranges = _ranges(settings.space)
@@ -83,4 +83,4 @@ def _task(container: dict[str, Any]) -> int | None:
     return None
 
 
-APP = App("tune", _task)
+APP = App("tune", _task, TuneSettings)

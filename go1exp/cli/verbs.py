@@ -1,6 +1,11 @@
-"""The words of the command line: verbs, their second words, settings by position, Hydra's options."""
+"""The words of the command line: verbs, their second words, settings by position, Hydra's options, quotes."""
 
 from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
 
 VERBS = {
     "train": "train a policy from configuration",
@@ -20,11 +25,23 @@ VERBS = {
 }
 """Verb -> one line; the module has the verb's name (``list`` is ``listing``)."""
 
-MODULES = {"eval": "evaluate", "fit-actuator": "fit_actuator", "list": "listing", "sim": "simulate"}
-"""Modules that cannot have their verb's name."""
+MODULES = {
+    "eval": "evaluate",
+    "fit-actuator": "fit_actuator",
+    "list": "listing",
+    "sim": "simulate",
+    "record_audit": "record",
+    "record_import": "record",
+    "export_check": "export",
+    "gap_loop": "gap_next",
+}
+"""Modules that do not have their verb's name."""
 
 SUBVERBS = {"record": ("audit", "import"), "export": ("check",), "gap": ("next", "loop")}
-"""Second words of a verb that are verbs of their own; module and configuration are called VERB_WORD."""
+"""Second words of a verb that are verbs of their own; the configuration is called VERB_WORD."""
+
+EVERY = (*VERBS, *(f"{verb}_{word}" for verb, words in SUBVERBS.items() for word in words))
+"""All verbs that have a configuration."""
 
 POSITIONAL: dict[str, tuple[str, ...]] = {
     "record_audit": ("files",),
@@ -52,3 +69,40 @@ FLAGS = (
 ONE_BLAS_THREAD = ("OPENBLAS_NUM_THREADS", "1")
 """Variable and value, read when NumPy is first imported: its matrices are small here, and threads that wait for each
 other spin. On two busy cores matrix products of ``go1exp gap`` took 40 times as long with two threads as with one."""
+
+
+PATH_KEYS = {
+    *("run", "resume", "start_from", "policy", "checkpoint", "logs", "recordings", "files", "file", "path", "bundle"),
+    *("out", "dir", "mjcf", "baseline", "folder", "options", "columns", "motion", "feet", "plugins"),
+}
+"""Last words of the keys whose value is a file, a folder or a name, which may hold =."""
+
+FILE_OF_COMMANDS = re.compile(r"command=.*\.csv$")
+"""``command`` is a group of choices, too, which must stay without quotes."""
+
+_MEANT_FOR_HYDRA = re.compile(r"""$|null$|['"\[{]|.*\$\{|\w+\(.*\)$""")
+"""A value with quotes of its own, a list, an interpolation, a function such as ``glob(*)``."""
+
+
+def quoted(text: str) -> str:
+    """Write a text so that Hydra takes it as it is: backslashes mean something before a quote only."""
+    return "'" + re.sub(r"(\\+)$", r"\1\1", re.sub(r"(\\*)'", r"\1\1\'", text)) + "'"
+
+
+def protected(argument: str) -> str:
+    """Return a setting with its path in quotes, so that no character of it has a meaning for Hydra.
+
+    Several paths with commas between them are a sweep, unless there is a file of that very name.
+    """
+    key, equals, value = argument.partition("=")
+    names_path = key.lstrip("+").rsplit(".", 1)[-1] in PATH_KEYS or FILE_OF_COMMANDS.match(argument)
+    is_path = equals and not key.startswith("-") and names_path
+    if not is_path or _MEANT_FOR_HYDRA.match(value) or ("," in value and not Path(value).exists()):
+        return argument
+    return f"{key}={quoted(value)}"
+
+
+def command(*words: str, settings: dict[str, Any] | None = None) -> str:
+    """Return a command line to be copied: ``go1exp`` with words and settings, quoted for the shell where need be."""
+    pairs = [f"{key}={shlex.quote(str(value))}" for key, value in (settings or {}).items()]
+    return " ".join(["go1exp", *map(shlex.quote, words), *pairs])

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
-from go1exp.cli.engine import split as engine_of
+from go1exp.cli.subjects import split_engine as engine_of
 from go1exp.config.compose import compose
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.engine import make_backend

@@ -33,6 +33,8 @@ STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+CountOrZero = Annotated[int, Field(ge=0)]
 Duration = Annotated[float, Field(gt=0, le=1e9)]
 """A length of time of which steps are counted, s; at most 32 years."""
 Fraction = Annotated[float, Field(ge=0, le=1)]
