@@ -120,6 +120,7 @@ def test_values_are_written_in_place_where_a_captured_step_reads_them() -> None:
     assert {name: tensor.data_ptr() for name, tensor in now.items()} == places
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_captured_step_sees_what_was_changed() -> None:
     stiff, late = (
