@@ -380,7 +380,7 @@ def test_a_drive_at_its_limit_is_a_fact_and_below_it_a_flaw() -> None:
     report = audit(limited)
     at_limit = [f for f in report.by_check("saturation") if f.verdict == "ok"]
     assert len(at_limit) >= 3
-    assert "the drive's limit" in at_limit[0].message
+    assert "the actuator's limit" in at_limit[0].message
     assert report.flaws == []
     report = audit(Recording(replace(limited.meta, tau_limit=META.tau_limit), limited.channels))
     assert {f.check for f in report.flaws} == {"saturation"}

@@ -8,13 +8,13 @@ column                                                 meaning
 =====================================================  =================================================================
 ``t``                                                  s, the logger's clock, strictly increasing; required
 ``q_J``, ``qd_J``, ``q_target_J``                      rad, rad/s, rad; J is a joint, the target the one in force at t
-``tau_est_J``, ``tau_cmd_J``                           N m, reported by the drive; commanded
+``tau_est_J``, ``tau_cmd_J``                           N m, reported by the actuator; commanded
 ``imu_gyro_x/y/z``, ``imu_acc_x/y/z``                  rad/s, m/s2, in the IMU's frame
 ``imu_quat_w/x/y/z``                                   attitude that the IMU reports
 ``foot_force_L``                                       N; L is a leg
 ``base_pos_x/y/z_w``, ``base_lin_vel_x/y/z_w``         m, m/s, ground truth in the world frame
 ``base_quat_w/x/y/z``, ``base_ang_vel_x/y/z_b``        -, rad/s, ground truth; angular velocity in the trunk's frame
-``torque_enable``                                      bool, false while the drives are off
+``torque_enable``                                      bool, false while the actuators are off
 =====================================================  =================================================================
 
 A recording has a quantity for all its joints (or axes) or for none. Columns hold numbers only; nothing is unpickled.

@@ -147,7 +147,7 @@ class CompareSettings:
     Attributes:
         subjects: two or more, each a shipped policy, a run folder or a bundle (.zip); with @100hz at that rate, with
             @estimated or @exact velocity. All others are compared with the first.
-        same_robot: all on the robot of the first: its drives, effects, contact, randomisation and falls; false takes
+        same_robot: all on the robot of the first: its actuators, effects, contact, randomisation and falls; false takes
             each one's own.
         seed: seed of everything random, the same for all.
         physics_dt: another physics step, s; null keeps that of training.

@@ -1,4 +1,4 @@
-"""Actuator nets: what a drive makes of a command, learnt from recordings. ``fit`` is the way in.
+"""Actuator nets: what an actuator makes of a command, learnt from recordings. ``fit`` is the way in.
 
 Names are loaded at their first use: settings are checked before torch and SciPy are imported.
 """

@@ -154,7 +154,7 @@ def _signal(
 
 
 def _whole(recording: Recording, oldest: np.ndarray, period: float) -> np.ndarray:
-    """Return which rows (T,) have their whole window in the recording, without a gap and with drives on."""
+    """Return which rows (T,) have their whole window in the recording, without a gap and with actuators on."""
     t = recording.t
     first = np.searchsorted(t, oldest + EDGE, side="right") - 1  # last sample at or before the oldest tap
     inside = oldest >= t[0] - EDGE
@@ -301,7 +301,7 @@ def smooth_motion(recording: Recording, window: float = WINDOW) -> SmoothMotion:
     """Differentiate the measured angles with a Savitzky-Golay filter (third order, symmetric: no lag).
 
     The angles are resampled linearly to the median step of the clock, filtered, and read off at the recording's own
-    time stamps. Only ``q`` is used: the ``qd`` of a drive has already been filtered.
+    time stamps. Only ``q`` is used: the ``qd`` of an actuator has already been filtered.
 
     Args:
         recording: any with ``q``.

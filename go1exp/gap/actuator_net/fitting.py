@@ -77,7 +77,7 @@ def fit(
     shares = _share_out(rows, parts, episodes, np.array(info.group_of))
     held_out = shares["held_out"]
     if len(held_out.rows) == 0:
-        raise FitError("no rows to report on: the held-out episodes are shorter than the history, or drives are off")
+        raise FitError("no rows to report on: the held-out episodes are shorter than the history, or actuators are off")
     trained = _train_groups("net", info.groups, shares, settings, settings.hidden, on_progress)
     net = _assemble(info, trained, shares["train"])
     torque = _predict(net, held_out)

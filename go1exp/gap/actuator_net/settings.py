@@ -22,19 +22,19 @@ class FitSettings:
     """How to fit. Wrong types, names or ranges raise pydantic's ``ValidationError``.
 
     The network's form is the paper's (three layers of 64, softsign). ``skip`` adds a linear map, least squares in the
-    same inputs, so that the layers learn only what it leaves: on held-out open-loop episodes of an AK80 drive 0.040
+    same inputs, so that the layers learn only what it leaves: on held-out open-loop episodes of an AK80 actuator 0.040
     instead of 0.050 N m after as many epochs (``benchmarks/actuator_net_ak80.py --all``). False: the paper's alone.
 
     Attributes:
-        inputs: inputs of the net, each with ``history`` taps; ``tau_cmd`` for drives that are commanded a torque.
+        inputs: inputs of the net, each with ``history`` taps; ``tau_cmd`` for actuators that are commanded a torque.
         history: taps of each input (Walk These Ways: 3).
         period: time between taps, s; None takes the recordings' nominal sampling period.
         hidden: widths of the hidden layers.
         skip: whether a linear map is added to them.
         share: ``all``, one net for all joints (the paper's way), ``kind``, one each for hip, thigh and calf, or
             ``none``, one per joint.
-        target: ``tau_est``, what the drive reports, or ``joint_torque``, by inverse dynamics (``go1exp fit-actuator``:
-            of a suspended Go1).
+        target: ``tau_est``, what the actuator reports, or ``joint_torque``, by inverse dynamics (``go1exp
+            fit-actuator``: of a suspended Go1).
         smoothing: window over which the inputs' angle and speed are smoothed first, s; None takes them as measured.
         epochs: passes over the training rows, at most; the learning rate falls to zero over them (cosine).
         batch: rows per step.

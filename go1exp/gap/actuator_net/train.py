@@ -60,7 +60,7 @@ def train(
     """
     for part, name in ((rows, "training"), (validation, "validation")):
         if len(part) == 0:
-            raise FitError(f"no rows for {name}: its episodes are shorter than the history, or their drives are off")
+            raise FitError(f"no rows for {name}: its episodes are shorter than the history, or their actuators are off")
     mean, std = rows.x.mean(axis=0), rows.x.std(axis=0)
     std = np.where(std > 0, std, 1.0)  # an input that never changes must not be divided by zero
     output_mean = float(rows.y.mean())

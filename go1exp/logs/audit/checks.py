@@ -46,7 +46,7 @@ def audit(recording: Recording) -> AuditReport:
     if off:
         total = sum(b - a for a, b in off)
         stretches = "1 stretch" if len(off) == 1 else f"{len(off)} stretches"
-        findings.append(finding("torque_off", "torque_enable", "ok", total, "s", f"drives off in {stretches}"))
+        findings.append(finding("torque_off", "torque_enable", "ok", total, "s", f"actuators off in {stretches}"))
     if (share := float(log.still.mean())) > limits.STILL_SHARE:
         findings.append(
             finding("still", "all", "suspect", share, "", "no joint moves: nothing can be learned from this")

@@ -20,7 +20,7 @@ from go1exp.logs.recording import joint_channel
 SMOOTH = 0.2
 """s of smoothing: order and sign are checked below about 3 Hz, where a joint follows its target at any gains."""
 LONGEST_LAG = 0.12
-"""s by which a joint may trail its target (chosen: longer than the response of any drive under position control)."""
+"""s by which a joint may trail its target (chosen: longer than the response of any actuator under position control)."""
 LONGEST_TRAIL = 0.3
 """s; the same for a soft position servo."""
 
@@ -38,7 +38,7 @@ def order_and_sign(log: Log) -> Iterator[Finding]:
             message = f"moves with q_{other} (correlation {match[j, partner[j]]:.2f}), not with its own joint"
             message += f" ({match[j, j]:.2f}): "
             swap = partner[partner[j]] == j
-            message += f"{joint} and {other} are swapped" if swap else f"what is called {other} is the joint it drives"
+            message += f"{joint} and {other} are swapped" if swap else f"what is called {other} is the joint it moves"
             yield finding("order", joint_channel("q_target", joint), "bad", match[j, partner[j]], "", message)
         elif match[j, j] < -limits.CLEARLY:
             message = f"goes against q_target_{joint} (correlation {match[j, j]:.2f}): a sign is flipped"
@@ -68,7 +68,7 @@ def _enough(log: Log) -> bool:
 def _matches_inputs(log: Log) -> tuple[np.ndarray, np.ndarray]:
     """Return targets and angles (T, J), smoothed and without their mean.
 
-    While the drives are off, both keep their last values: a free joint does not follow its target.
+    While the actuators are off, both keep their last values: a free joint does not follow its target.
     """
     n = log.samples(SMOOTH)
     held = np.maximum.accumulate(np.where(log.on, np.arange(len(log.t)), 0))
@@ -127,7 +127,7 @@ def timing(log: Log) -> tuple[list[Finding], dict[str, Delay]]:
 
 
 def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
-    """Report by how much joints of unknown delay trail their targets: delay and response of the drive together."""
+    """Report by how much joints of unknown delay trail their targets: delay and response of the actuator together."""
     if log.command != "q_target" or not joints:
         return
     n, most = log.samples(0.05), log.samples(LONGEST_TRAIL)
@@ -145,7 +145,7 @@ def _trailing(log: Log, joints: list[str]) -> Iterator[Finding]:
         low, high = min(trail.values()), max(trail.values())
         verb, by = ("trails its target" if len(trail) == 1 else "trail their targets"), f"{low:.3g}"
         by += f" to {high:.3g}" if f"{high:.3g}" != by else ""
-        message = f"{', '.join(trail)} {verb} by {by} ms, delay and drive together; "
+        message = f"{', '.join(trail)} {verb} by {by} ms, delay and actuator together; "
         yield finding("trail", "q", "ok", high, "ms", message + "this motion cannot separate them")
 
 
@@ -176,13 +176,13 @@ def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray
     method of Shinbrot, 1957), so no derivative of a noisy signal is taken; a, b, c, ... are fitted for each joint, and
     d is the delay with the smallest residual. Its standard error comes from a jackknife over ten stretches of time, is
     multiplied by ``limits.DELAY_FACTOR``, and has ``limits.DELAY_SAMPLES`` of a sample added in quadrature.
-    The result is dead time and fast lag together: drive, bus, or an offset between the clocks of command and state.
+    The result is dead time and fast lag together: actuator, bus, or an offset between the clocks of command and state.
 
     Args:
         t: clock (T,), s.
         command: what was commanded (T, J), angle or torque; held until the next sample.
         q: joint angles (T, J), rad.
-        usable: (T,) bool; false where the drives are off.
+        usable: (T,) bool; false where the actuators are off.
     """
     # Everything is computed on an even grid, finer than the samples, so that shifts are whole numbers of its points.
     dt = float(np.median(np.diff(t)))
@@ -197,7 +197,7 @@ def delays(t: np.ndarray, command: np.ndarray, q: np.ndarray, usable: np.ndarray
     smooth_u = signal.fftconvolve(command[held] - command.mean(axis=0), kernels[0][:, None], mode="same", axes=0)
     first, last = (int(np.floor(d / fine)) for d in limits.DELAY_RANGE)
     good = usable[held] & (np.diff(t, append=t[-1] + dt)[held] < 3 * dt)
-    # A kernel or a shift must not reach into a gap, or into a time without drives.
+    # A kernel or a shift must not reach into a gap, or into a time without actuators.
     for a, b in signals.stretches(~good):
         good[max(0, a - reach) : b + reach + last] = False
     good[: reach + last] = False

@@ -23,7 +23,7 @@ GAPS = (0.0, 0.02)
 LONGEST_GAP = 0.1
 """s; longer ones are bad: half a stride is missing."""
 LEAST_STEP = 5e-5
-"""s; no joint is logged in shorter steps (20 kHz; chosen: drives that log each turn of their control loop reach 10)."""
+"""s; no joint is logged in shorter steps (20 kHz; chosen: actuators that log every control cycle reach 10)."""
 
 # ---------------------------------------------------------------------- single channels
 
@@ -38,7 +38,7 @@ ENOUGH_NOISE = 500
 COARSE_ANGLE = 4e-3
 """rad; a coarser encoder than any known one (the coarsest, 2 pi / 4096, is 1.5e-3)."""
 NOISE = {"rad": (5e-3, 2e-2), "rad/s": (0.5, 2.0), "N m": (1.0, 5.0), "m/s2": (2.0, 10.0)}
-"""White noise by unit: about five times that of drives of this class (0.2 to 1 mrad, 0.05 rad/s, 0.15 N m)."""
+"""White noise by unit: about five times that of actuators of this class (0.2 to 1 mrad, 0.05 rad/s, 0.15 N m)."""
 WHITE = (0.8, 1.25)
 """Estimates of noise by third and by fifth differences agree within this ratio if the signal is noise, not motion."""
 FROZEN_TIME, FROZEN_ANGLE = 1.0, 0.5
@@ -89,7 +89,7 @@ TORQUE_LAG = 0.04
 """s: largest lag of a torque behind the control law; commands to a Go1 arrive up to 40 ms late."""
 FARTHER = 2.0
 """Factor on 180 / pi within which an angle that moves so many times as far as its target has another unit: the answer
-of a drive is between a half and twice its target."""
+of an actuator is between a half and twice its target."""
 UNIT_SCALES = {"degrees instead of radians": 180 / math.pi, "milliseconds instead of seconds": 1e-3}
 """Scales that have a name, recognised within a tenth."""
 RELATED = 0.5
@@ -101,16 +101,16 @@ BETTER = 0.25
 LEAST_TIME = 2.0
 """s of motion below which order, sign and delay are not checked: any two slow curves of one second look alike."""
 DELAY = 8e-3
-"""s beyond one sample period: an intact bus and drive respond within it. (A Go1 under a policy has 20 ms.)"""
+"""s beyond one sample period: an intact bus and actuator respond within it. (A Go1 under a policy has 20 ms.)"""
 DELAY_SPREAD = 5e-3
 """s between joints, beyond their uncertainty: they were not sampled together."""
 DELAY_RECORDINGS = 8e-3
 """s between recordings of one robot, beyond their uncertainty: other gains change what a joint answers by less. (102
-sound simulated sets with hidden effects, drives that lag among them: up to 3 ms.)"""
+sound simulated sets with hidden effects, actuators that lag among them: up to 3 ms.)"""
 DELAY_JOINTS = 0.5
 """Share of a recording's joints that must show a delay before it is one of the recording."""
 DELAY_RANGE = (-0.11, 0.16)
-"""s; delays that are searched. Longer ones are not delays of a drive."""
+"""s; delays that are searched. Longer ones are not delays of an actuator."""
 DELAY_POWER = 0.6
 """Share of the acceleration left unexplained by angle, speed and neighbours that the command must explain: below it
 the delay is not given."""
@@ -128,7 +128,7 @@ TILT = (10.0, 30.0)
 POSITION_MARGIN = (0.08, 0.3)
 """rad beyond a hard stop: 5 degrees can be play, a soft stop and a zero offset; 17 are a wrong unit, order or sign."""
 EXCEEDED = 1.25
-"""Torque and speed may exceed their limit by this factor: limits are nominal, and an ideal drive has no speed limit."""
+"""Torque and speed may exceed their limit by this factor: limits are nominal; an ideal actuator has no speed limit."""
 
 # ---------------------------------------------------------------------- motion in the episode
 

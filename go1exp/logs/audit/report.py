@@ -76,7 +76,7 @@ class AuditReport:
         rate_hz: one over the median step of ``t``.
         channels: one line for each column, ``t`` first.
         findings: flaws first, then facts.
-        torque_off: stretches without drives, (start, end) in s.
+        torque_off: stretches without actuators, (start, end) in s.
         still: stretches in which no joint moves, (start, end) in s.
     """
 
@@ -119,7 +119,8 @@ class AuditReport:
             f"{self.episode}: {self.verdict}",
             f"{self.samples} samples, {self.duration:.2f} s at {self.rate_hz:.4g} Hz; "
             + ", ".join(f"{n} channel{'s' if n > 1 else ''} {v}" for v, n in counts.items() if n),
-            *(f"{name}: {_stretches(s)}" for name, s in (("drives off", self.torque_off), ("still", self.still)) if s),
+            *([f"actuators off: {_stretches(self.torque_off)}"] if self.torque_off else []),
+            *([f"still: {_stretches(self.still)}"] if self.still else []),
             "",
         ]
         head = ("channel", "verdict", "unit", "low", "high", "step", "noise", "repeats", "delay ms")

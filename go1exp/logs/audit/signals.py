@@ -248,7 +248,7 @@ class Log:
 
     @cached_property
     def on(self) -> np.ndarray:
-        """(T,) bool: drives on."""
+        """(T,) bool: actuators on."""
         return self.recording.channels.get("torque_enable", np.ones(len(self.t), dtype=bool))
 
     @cached_property

@@ -153,7 +153,7 @@ def noise(log: Log, repeats: dict[str, float]) -> tuple[list[Finding], dict[str,
         if white and unit in limits.NOISE and (verdict := graded(sigma, limits.NOISE[unit])) != "ok":
             usual = limits.NOISE[unit][0]
             message = (
-                f"white noise of {sigma:.3g} {unit} (standard deviation); drives of this class stay below {usual:g}"
+                f"white noise of {sigma:.3g} {unit} (standard deviation); actuators of this class stay below {usual:g}"
             )
             findings.append(finding("noise", name, verdict, sigma, unit, message))
     return findings, floors
@@ -233,7 +233,7 @@ def saturation(log: Log) -> Iterator[Finding]:
         if quantity in ("q", "base_pos", "imu_quat", "base_quat", "foot_force"):
             continue  # an angle may rest where it is largest, and a force at zero, without being clipped
         values = log.recording.channels[name]
-        # Without drives the torque is zero, which is not a limit.
+        # Without actuators the torque is zero, which is not a limit.
         use = log.on if quantity == "tau_est" else np.ones(len(values), dtype=bool)
         if use.sum() < limits.ENOUGH or np.ptp(values[use]) == 0:
             continue
@@ -249,7 +249,9 @@ def saturation(log: Log) -> Iterator[Finding]:
             if limit is None or all(abs(abs(v) / limit - 1) < 0.02 for v in levels):
                 verdict = "ok"
                 message += (
-                    ": the drive's limit" if limit else ": perhaps the drive's limit, which the file does not give"
+                    ": the actuator's limit"
+                    if limit
+                    else ": perhaps the actuator's limit, which the file does not give"
                 )
             else:
                 message += f", but the limit is {limit:.4g} N m"

@@ -28,11 +28,11 @@ class Motion:
 
     Attributes:
         target: joint angles (T, J), rad; row i is in force from ``t[i]`` to ``t[i + 1]``.
-        torque_enable: (T,) bool; false while the drives are off.
+        torque_enable: (T,) bool; false while the actuators are off.
         start: joint angles (J,) at t = 0, rad.
         support: ``suspended``, on the ``ground``, or ``either``.
         height: height of the base above its standing height at the start, m; for drops.
-        soft_start: each time the drives come back on, the player should blend from the measured angles to ``target``
+        soft_start: each time the actuators come back on, the player should blend from the measured angles to ``target``
             within this time, s. Without that the joints are pulled back at once. ``target`` rests at the centre
             meanwhile; the command in force differs from it only during the blend.
     """
@@ -46,7 +46,7 @@ class Motion:
 
 
 def always_on(target: np.ndarray, support: Literal["suspended", "ground", "either"], height: float = 0.0) -> Motion:
-    """Return a motion with drives on throughout that starts at its first target."""
+    """Return a motion with actuators on throughout that starts at its first target."""
     return Motion(target, np.ones(len(target), dtype=bool), target[0].copy(), support, height)
 
 

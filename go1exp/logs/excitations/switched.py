@@ -1,4 +1,4 @@
-"""Motions with sudden changes: steps of the target, and drives switched off. The robot is suspended."""
+"""Motions with sudden changes: steps of the target, and actuators switched off. The robot is suspended."""
 
 from __future__ import annotations
 
@@ -145,12 +145,12 @@ def torque_off(
     move: Positive = 0.6,
     settle: Positive = 0.4,
 ) -> Motion:
-    """Take up a pose, switch the drives off and let the joints swing; then switch on and go to the next pose.
+    """Take up a pose, switch the actuators off and let the joints swing; then switch on and go to the next pose.
 
-    Without the drives only the mechanism acts, so that friction is identifiable against the velocity gain. In two
+    Without the actuators only the mechanism acts, so that friction is identifiable against the velocity gain. In two
     successive swings each joint starts once on either side of ``centre``, so that at least one starts away from where
     the joint hangs. Only whole swings are made; one takes up to 2 * ``move`` + ``settle`` + ``off[1]``. While the
-    drives are off the target goes to ``centre`` and waits there; :attr:`Motion.soft_start` asks for a blend from the
+    actuators are off the target goes to ``centre`` and waits there; :attr:`Motion.soft_start` asks for a blend from the
     measured angles.
 
     Args:
@@ -159,8 +159,8 @@ def torque_off(
         limits: lowest and highest target (J, 2), rad.
         rng: gives poses and times.
         amplitude: farthest pose to each side, rad, per kind of joint; the nearest is 0.6 of it.
-        off: shortest and longest time without drives, s.
-        move: time to go to a pose, and time at ``centre`` after the drives are back, s.
+        off: shortest and longest time without actuators, s.
+        move: time to go to a pose, and time at ``centre`` after the actuators are back, s.
         settle: rest in the pose, s.
 
     Raises:

@@ -19,11 +19,11 @@ SHOULDER_ELBOW = ("shoulder", "elbow")
 PENDULUM_NOTES = (
     "Design {design}. The shoulder's angle counts from hanging down, the elbow's from the first link. "
     "tau_est comes from the motor current, not from a torque sensor. The clock jitters by milliseconds. "
-    "Joint gains are unknown: the drives were given torques. "
+    "Joint gains are unknown: the actuators were given torques. "
 )
 OPEN_LOOP = "The torques were played open loop; there is no target."
 FOLLOWED = (
-    "A controller on the computer followed q_target, with torques up to 8 N m of which the drives report "
+    "A controller on the computer followed q_target, with torques up to 8 N m of which the actuators report "
     "a part only. Its target velocities have no column."
 )
 
@@ -96,7 +96,7 @@ PENDULUM = "pendulum"
 SERVO_NOTES = (
     "{mass:g} kg at {length:g} m on the horn of an {motor}; the mass of the arm itself is not given. "
     "Position gain {gain:g} in the firmware's own unit, not N m/rad. Supply {low:g} to {high:g} V ({vin:g} V nominal), "
-    "case {cold:g} to {warm:g} C. Torque is not measured: the drive's raw word 'load' has no unit and is left out. "
+    "case {cold:g} to {warm:g} C. Torque is not measured: the actuator's raw word 'load' has no unit and is left out. "
     "The angle counts from hanging down."
 )
 

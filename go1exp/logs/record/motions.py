@@ -72,7 +72,7 @@ def playback(
         centre: not used; it says how many joints there are (J,).
         limits: lowest and highest target (J, 2), rad.
         rng: not used.
-        file: CSV with t, q_target_JOINT of every joint and, if drives are off at times, torque_enable.
+        file: CSV with t, q_target_JOINT of every joint and, if actuators are off at times, torque_enable.
 
     Raises:
         ExcitationError: if the file is none, has targets of other joints, or goes beyond ``limits``.
@@ -138,7 +138,7 @@ class PlayedMotion:
         """Take a motion of a suspended robot, whose rows are ``1 / rate`` s apart.
 
         Raises:
-            ConfigError: if the motion is not for a suspended robot, or has the drives off at times.
+            ConfigError: if the motion is not for a suspended robot, or has the actuators off at times.
         """
         if motion.support == "ground":
             raise ConfigError(

@@ -36,7 +36,7 @@ class Episode:
         excitation: name of the motion.
         motion: what to command, at the logger's rate.
         kp: position gain, N m/rad.
-        kd: speed gain, N m s/rad.
+        kd: velocity gain, N m s/rad.
         hang: roll and pitch at which a held trunk hangs, rad; None on the ground.
         repeat_of: name of the episode that this one repeats.
         seed: seed of the logger's noise.

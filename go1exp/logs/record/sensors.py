@@ -39,7 +39,7 @@ class SensorConfig:
         dropped: share of the samples that are lost.
         q: joint angle, rad.
         qd: joint velocity, rad/s.
-        tau_est: torque that the drive reports, N m.
+        tau_est: torque that the actuator reports, N m.
         gyro: angular velocity, rad/s.
         acc: specific force, m/s2.
         attitude: error of the reported attitude as a small rotation, rad (its ``step`` is of the quaternion).

@@ -40,7 +40,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Rig:
-    """The robots of a recording: model, drives, effects, ground, engine, and the physics step, s.
+    """The robots of a recording: model, actuators, effects, ground, engine, and the physics step, s.
 
     ``contact`` is that of the feet. None is MuJoCo's own for motions, and for a policy the one that it was trained on.
     """
@@ -138,14 +138,14 @@ def _follow_motions(
 ) -> None:
     """Send every robot the targets of its motion, one each ``per_sample`` physics steps, while ``tape`` records.
 
-    When drives come back on, the target moves from the measured angle to the commanded one within ``soft_start``: a
+    When actuators come back on, the target moves from the measured angle to the commanded one within ``soft_start``: a
     sudden pull would hit the joint's torque limit.
     """
     targets = torch.as_tensor(np.stack([e.motion.target for e in episodes], axis=1), dtype=plant.q.dtype)  # (T, n, 12)
     enabled = torch.as_tensor(np.stack([e.motion.torque_enable for e in episodes], axis=1))  # (T, n)
     rows = len(targets)
     soft = torch.tensor([[e.motion.soft_start] for e in episodes], dtype=plant.q.dtype)
-    # s since the drives came back on; infinite at the start, where nothing is blended
+    # s since the actuators came back on; infinite at the start, where nothing is blended
     since, origin = torch.full_like(soft, torch.inf), targets[0].clone()
     plant.enabled = enabled[0]
     for row in range(rows):

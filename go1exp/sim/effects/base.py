@@ -118,7 +118,7 @@ class Effect(Memory):
     On the way of a torque, the hooks are called in this order, and among the effects of one hook in that of ``order``:
     ``on_target`` and ``on_feedforward``, ``on_encoder``, ``on_error``, the actuator, ``on_actuator``,
     ``on_transmission``, ``on_gears``, then ``on_joint``, ``on_friction``, ``on_load`` and ``on_base`` beside it.
-    Whoever reads the drives' torques asks ``on_report``.
+    Whoever reads the actuators' torques asks ``on_report``.
     """
 
     title: ClassVar[str] = ""
@@ -166,23 +166,23 @@ class Effect(Memory):
     # ------------------------------------------------------------------ where an effect may act
 
     def on_target(self, target: Tensor) -> Tensor:
-        """Return the position target that the drive acts on."""
+        """Return the position target that the actuator acts on."""
         return target
 
     def on_feedforward(self, torque: Tensor) -> Tensor:
-        """Return the feed-forward torque that reaches the drive; only called where there is any (``Plant.step``)."""
+        """Return the feed-forward torque that reaches the actuator; only called where there is any (``Plant.step``)."""
         return torque
 
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the angle and speed that the drive's encoder reads. Called more than once a step: changes nothing."""
+        """Return angle and velocity that the encoder reads. Called more than once a step: changes nothing."""
         return q, qd
 
     def on_error(self, target: Tensor, q: Tensor) -> Tensor:
-        """Return the target as the drive compares it with ``q``, the angle that its encoder reads."""
+        """Return the target as the actuator compares it with ``q``, the angle that its encoder reads."""
         return target
 
     def on_gains(self, kp: Tensor, kd: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gains that the drive really has."""
+        """Return the gains that the actuator really has."""
         return kp, kd
 
     def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
@@ -190,7 +190,7 @@ class Effect(Memory):
         return torque
 
     def on_report(self, torque: Tensor) -> Tensor:
-        """Return what the drive reports of its ``torque``. Called more than once a step: changes nothing."""
+        """Return what the actuator reports of its ``torque``. Called more than once a step: changes nothing."""
         return torque
 
     def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
@@ -202,17 +202,17 @@ class Effect(Memory):
         return gears
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return a further torque that acts on the joint and is not the drive's."""
+        """Return a further torque that acts on the joint and is not the actuator's."""
         raise NotImplementedError
 
     def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:
-        """Return the bound of the joint's dry friction under the drive's ``torque``; ``bound`` is that so far."""
+        """Return the bound of the joint's dry friction under the actuator's ``torque``; ``bound`` is that so far."""
         return bound
 
     def on_load(self, bound: Tensor, torque: Tensor, outside: Tensor) -> Tensor:
         """Return the bound of the joint's dry friction with that of its loaded gears; ``bound`` is that so far.
 
-        ``torque`` is the drive's, ``outside`` what weight, Coriolis and centrifugal forces of the links make at the
+        ``torque`` is the actuator's, ``outside`` what weight, Coriolis and centrifugal forces of the links make at the
         joint. A weight that is held at rest has ``outside = -torque``.
         """
         return bound

@@ -1,4 +1,4 @@
-"""``effect=dead_band``: a drive does nothing about small errors."""
+"""``effect=dead_band``: an actuator does nothing about small errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @effect("dead_band")
 class DeadBand(Effect):
-    """Within ``band`` of its target a drive takes the angle that its encoder reads for the target.
+    """Within ``band`` of its target an actuator takes the angle that its encoder reads for the target.
 
     Servos have it so that they do not buzz at rest: Feetech's STS3215 by a register of 0 to 32 steps of its encoder
     (1.5 mrad each, so 0.05 rad, the bound), one of which it is delivered with. Beyond it the whole error counts, and
@@ -24,7 +24,7 @@ class DeadBand(Effect):
     torque that it begins with grows with kp here, and not there.
     """
 
-    title = "a dead band of the drive"
+    title = "a dead band of the actuator"
     params = (Param("band", "rad", 0.0, 0.05, 0.0, 0.001, "joint", "largest error that is left alone"),)
     identification = Identification(
         levels=({"band": 0.002}, {"band": 0.005}, {"band": 0.015}, {"band": 0.03}),

@@ -52,7 +52,7 @@ class Delayed(Effect):
 
 @effect("command_delay")
 class CommandDelay(Delayed):
-    """The drive acts on the target of a while ago: target(t - delay); its own feedback is not delayed.
+    """The actuator acts on the target of a while ago: target(t - delay); its own feedback is not delayed.
 
     Computer, bus and motor controller take their time: 2 to 40 ms on robots of this class (estimate). The published
     Go1 actuator net acts one policy step (20 ms) late. A log whose commands and states have clocks of their own shows a
@@ -101,7 +101,7 @@ class CommandDelay(Delayed):
 
 @effect("torque_delay")
 class TorqueDelay(Delayed):
-    """The motor makes the torque that the drive asked for a while ago: tau(t) = demand(t - delay).
+    """The motor makes the torque that the actuator asked for a while ago: tau(t) = demand(t - delay).
 
     Feedback is late too, unlike with ``command_delay``, so that a joint rings: the delay acts like a kd that is smaller
     by kp delay. Loops that run over the bus have 1 to 8 ms (estimate). To first order the same as ``lag``; sharp

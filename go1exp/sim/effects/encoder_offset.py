@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @effect("encoder_offset")
 class EncoderOffset(Effect):
-    """The encoder reads the angle plus a constant, and so do the drive, the policy and the log: q_read = q + offset.
+    """The encoder reads the angle plus a constant, and so do the actuator, the policy and the log: q_read = q + offset.
 
     Walk-these-ways randomises +-0.02 rad on a Go1; calibration by hand against the hard stops is good to some 10 mrad.
     In one pose a tilted trunk, a shifted centre of mass or a constant torque of kp offset look the same.

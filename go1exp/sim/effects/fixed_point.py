@@ -1,4 +1,4 @@
-"""``effect=fixed_point``: gains and torques travel to the drives as whole numbers."""
+"""``effect=fixed_point``: gains and torques travel to the actuators as whole numbers."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class FixedPoint(Effect):
 
     A Go1's packets carry kp in steps of 1/32 N m/rad, kd of 1/16 N m s/rad, torque of 1/256 N m both ways
     (``robot/go1_fields.py``, read off the vendor's client), so that kd = 0.3 becomes 0.25 and kd = 0.5 stays. Targets
-    are floats and stay as they are. The torque that acts is not cut, only what the drive reports of it: policies that
-    observe it, recordings and the replay of ``gap`` have its steps. The packets' range is never reached by a Go1. What
-    moves differently are gains and torques that are fed forward, so recordings at one gain cannot tell it from
+    are floats and stay as they are. The torque that acts is not cut, only what the actuator reports of it: policies
+    that observe it, recordings and the replay of ``gap`` have its steps. The packets' range is never reached by a Go1.
+    What moves differently are gains and torques that are fed forward, so recordings at one gain cannot tell it from
     ``kp_scale``, ``kd_scale``, ``viscous``.
     """
 

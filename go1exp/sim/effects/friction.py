@@ -73,14 +73,14 @@ class Coulomb(Effect):
 
 @effect("load_friction")
 class LoadFriction(Effect):
-    """Dry friction that grows with the load of the gears: bound + coefficient |drive torque - external * outside|.
+    """Dry friction that grows with the load of the gears: bound + coefficient |actuator torque - external * outside|.
 
-    The drive's torque is what the motor makes, as the drive reports it, before the transmission; ``outside`` is the
-    torque of the links' weight, Coriolis and centrifugal forces. ``external`` says how much of that counts. At 1 this
-    is the law of Duclusaud et al. (BAM, arXiv 2410.08650), model M3: a weight that turns a joint whose drive is off
-    rubs too, and one that is held counts twice. At other values it is the directional law of their M5, without its
+    The actuator's torque is what the motor makes, as the actuator reports it, before the transmission; ``outside`` is
+    the torque of the links' weight, Coriolis and centrifugal forces. ``external`` says how much of that counts. At 1
+    this is the law of Duclusaud et al. (BAM, arXiv 2410.08650), model M3: a weight that turns a joint whose actuator is
+    off rubs too, and one that is held counts twice. At other values it is the directional law of their M5, without its
     Stribeck part, with coefficients of the motor ``coefficient`` and of the load ``coefficient * external``. At 0 the
-    load is the drive's torque alone, and a joint that is pushed while its drive is off has no such friction.
+    load is the actuator's torque alone, and a joint that is pushed while its actuator is off has no such friction.
 
     BAM's files have 0.02 to 0.26 for servos at 1; at 0 a held weight takes twice that for the same friction. The forces
     on the feet of a robot that stands are not in ``outside``, so that its gears rub too little at 1. At a constant load
@@ -161,7 +161,7 @@ class Viscous(Effect):
 
     Published Go1 models have 0.01 to 0.5 N m s/rad, the larger ones in place of kd. It acts on the joint, not in the
     drive: the drive's torque limit and its report do not include it. While the drive does not saturate it is
-    ``kd_scale``, unless kd is varied, the drive switched off or its torque measured well.
+    ``kd_scale``, unless kd is varied, the actuator switched off or its torque measured well.
     """
 
     title = "viscous friction"

@@ -5,7 +5,7 @@ play b and a structural damping time t, the torque F that reaches the joint obey
 
     J (x'' + q'') = torque - F          s F = e + t e'          e = x - clamp(x, -b/2, b/2)
 
-The drive's encoder reads the rotor: q + x. Both effects together are one spring and one dead zone in series.
+The actuator's encoder reads the rotor: q + x. Both effects together are one spring and one dead zone in series.
 
 Numerics. The joint's own motion is the engine's, in leapfrog: it kicks the joint once a step by F. A stiff spring would
 make that unstable, and a rigid gear (s = 0) has no spring at all. So F is taken at the instant of the kick by the
@@ -44,7 +44,7 @@ LIGHTEST = 1e-5
 class Backlash(Effect):
     """The joint is free within a gap of the gears: no torque passes while |rotor angle - joint angle| < gap / 2.
 
-    Flanks meet without bouncing; the drive reads the rotor. The law is that of ``sim/effects/gears.py``, where
+    Flanks meet without bouncing; the actuator reads the rotor. The law is that of ``sim/effects/gears.py``, where
     ``flexibility`` is in series. 5 to 40 mrad are likely (estimate). It shows at reversals and as a small cycle at
     rest; within the gap the joint has lost its rotor, which ``armature`` mimics in part.
     """
@@ -64,12 +64,12 @@ class Backlash(Effect):
 
 @effect("flexibility")
 class Flexibility(Effect):
-    """The gears twist under load: rotor angle - joint angle = compliance torque, and the drive reads the rotor.
+    """The gears twist under load: rotor angle - joint angle = compliance torque, and the actuator reads the rotor.
 
     Rotor and joint swing against each other at sqrt((1 / J_rotor + 1 / J_joint) / compliance); the law is that of
     ``sim/effects/gears.py``. Stiffnesses of 60 to 400 N m/rad are likely at robots of this size (estimate). Dry
-    friction stays at the joint. To a slow drive it looks like a smaller kp, below the resonance like ``lag`` or
-    ``armature``. A drive with kd > J_rotor / physics step (2.2 N m s/rad for a hip at 2 ms)
+    friction stays at the joint. To a slow actuator it looks like a smaller kp, below the resonance like ``lag`` or
+    ``armature``. An actuator with kd > J_rotor / physics step (2.2 N m s/rad for a hip at 2 ms)
     shakes the rotor.
     """
 

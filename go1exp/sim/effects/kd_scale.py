@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 @effect("kd_scale", gains=True)
 class KdScale(Effect):
-    """The drives' speed gain is a multiple of the configured one: kd = scale kd.
+    """The actuators' velocity gain is a multiple of the configured one: kd = scale kd.
 
-    Walk-these-ways randomises 0.5 to 1.5; +-15 to 75 % are likely (estimate). While the drive does not saturate it
+    Walk-these-ways randomises 0.5 to 1.5; +-15 to 75 % are likely (estimate). While the actuator does not saturate it
     is ``viscous``, unless kd is varied or the torque is measured well; and ``torque_delay`` takes kp delay away from
     kd. New values count from ``Plant.refresh`` on.
     """
 
-    title = "a change of the speed gain"
+    title = "a change of the velocity gain"
     params = (Param("scale", "-", 0.0, 3.0, 1.0, 0.15, "joint", "real gain over configured gain"),)
     identification = Identification(
         nominal=True,

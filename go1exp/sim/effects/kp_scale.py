@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @effect("kp_scale", gains=True)
 class KpScale(Effect):
-    """The drives' position gain is a multiple of the configured one: kp = scale kp.
+    """The actuators' position gain is a multiple of the configured one: kp = scale kp.
 
     Walk-these-ways randomises 0.8 to 1.3; +-5 to 30 % are likely (estimate). At rest it is not identifiable
     against ``strength``, in a narrow band not against ``command_delay``. New values count from ``Plant.refresh`` on.

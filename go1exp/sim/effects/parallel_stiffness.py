@@ -1,4 +1,4 @@
-"""``effect=parallel_stiffness``: a spring beside the drive."""
+"""``effect=parallel_stiffness``: a spring beside the actuator."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 @effect("parallel_stiffness")
 class ParallelStiffness(Effect):
-    """A spring between the links beside the drive: tau = -stiffness (q - rest).
+    """A spring between the links beside the actuator: tau = -stiffness (q - rest).
 
-    Cables and covers: 0.5 to 5 N m/rad (estimate). It acts on the joint, so the drive neither limits nor reports it;
+    Cables and covers: 0.5 to 5 N m/rad (estimate). It acts on the joint, so the actuator neither limits nor reports it;
     ``rest`` is the true angle without its torque. It resembles ``kp_scale`` and, within a small range of angles,
     gravity.
     """
 
-    title = "a spring beside the drive"
+    title = "a spring beside the actuator"
     params = (
         Param("stiffness", "N m/rad", 0.0, 20.0, 0.0, 0.1, "joint", "torque per angle"),
         Param("rest", "rad", -5.0, 5.0, 0.0, math.inf, "joint", "angle without torque"),

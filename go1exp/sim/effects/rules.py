@@ -1,4 +1,4 @@
-"""What a configuration of drives and effects must satisfy beyond each one's own schema."""
+"""What a configuration of actuators and effects must satisfy beyond each one's own schema."""
 
 from __future__ import annotations
 

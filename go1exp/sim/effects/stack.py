@@ -114,15 +114,15 @@ class EffectStack:
         return value
 
     def on_target(self, target: Tensor) -> Tensor:
-        """Return the position target that the drives act on."""
+        """Return the position target that the actuators act on."""
         return self._chain("on_target", target)
 
     def on_feedforward(self, torque: Tensor) -> Tensor:
-        """Return the feed-forward torque that reaches the drives."""
+        """Return the feed-forward torque that reaches the actuators."""
         return self._chain("on_feedforward", torque)
 
     def on_encoder(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the drives' encoders read."""
+        """Return what the actuators' encoders read."""
         if self.rotors:
             q, qd = self.rotors.motor(q, qd)
         for effect in self._acting["on_encoder"]:
@@ -130,7 +130,7 @@ class EffectStack:
         return q, qd
 
     def on_error(self, target: Tensor, q: Tensor) -> Tensor:
-        """Return the targets as the drives compare them with the encoders' angles."""
+        """Return the targets as the actuators compare them with the encoders' angles."""
         return self._chain("on_error", target, q)
 
     def on_actuator(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
@@ -138,7 +138,7 @@ class EffectStack:
         return self._chain("on_actuator", torque, q, qd)
 
     def on_report(self, torque: Tensor) -> Tensor:
-        """Return the torque that the drives report."""
+        """Return the torque that the actuators report."""
         return self._chain("on_report", torque)
 
     def on_transmission(self, torque: Tensor, q: Tensor, qd: Tensor) -> Tensor:
@@ -153,7 +153,7 @@ class EffectStack:
         return gears
 
     def on_joint(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the sum of all torques on the joints that are not the drives'."""
+        """Return the sum of all torques on the joints that are not the actuators'."""
         return sum((e.on_joint(q, qd) for e in self._acting["on_joint"]), start=torch.zeros_like(q))
 
     def on_friction(self, bound: Tensor, torque: Tensor, qd: Tensor) -> Tensor:
@@ -178,7 +178,7 @@ class EffectStack:
 
     @property
     def senses(self) -> bool:
-        """Whether any effect changes what the sensors or the drives say."""
+        """Whether any effect changes what the sensors or the actuators say."""
         hooks = ("on_sensor", "on_encoder", "on_report")
         return any(self.acts(hook) for hook in hooks) or self.rotors is not None
 

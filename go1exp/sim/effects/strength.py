@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 @effect("strength")
 class Strength(Effect):
-    """The motor makes a multiple of the torque that its drive asks for: tau = scale demand.
+    """The motor makes a multiple of the torque that its actuator asks for: tau = scale demand.
 
     Walk-these-ways randomises 0.9 to 1.1 on a Go1; +-5 to 30 % are likely (estimate). Slow motion cannot tell it
     from ``kp_scale``, and dynamics scaled the other way round (payload and armature together) look much the same.
     """
 
-    title = "a change of drive strength"
+    title = "a change of actuator strength"
     params = (Param("scale", "-", 0.3, 1.5, 1.0, 0.05, "joint", "torque made over torque asked for"),)
     identification = Identification(
         nominal=True,

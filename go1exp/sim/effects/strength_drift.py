@@ -25,7 +25,7 @@ class StrengthDrift(Effect):
     20 s. t is the time since the episode began. The mean of it is ``strength``.
     """
 
-    title = "a loss of drive strength over time"
+    title = "a loss of actuator strength over time"
     params = (
         Param("rate", "1/s", 0.0, 0.2, 0.0, 0.0025, "joint", "strength lost per time"),
         Param("floor", "-", 0.1, 1.0, 0.5, math.inf, "joint", "strength at which the loss ends"),

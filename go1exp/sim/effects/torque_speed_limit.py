@@ -28,7 +28,7 @@ class TorqueSpeedLimit(Effect):
     that is down by a fifth (and ``peak`` 0.8). ``stall`` = 1 lets torque fall from rest on, as Isaac Lab and mjlab have
     it for the Go1; the 30 N m at rest that the authors of walk-these-ways report make it 1.27. No one has published a
     measured line. A small ``droop`` does nothing until a motion reaches the line: big fast steps show it, walking does
-    not. It comes last in the drive, so that ``strength`` shrinks what it limits.
+    not. It comes last in the actuator, so that ``strength`` shrinks what it limits.
 
     With ``peak`` 1 and ``droop`` 0 torques pass as they are, without a limit beyond the actuator's and the model's own.
     """

@@ -1,4 +1,4 @@
-"""``protocol=energy``: what walking asks of the drives and the battery."""
+"""``protocol=energy``: what walking asks of the actuators and the battery."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from go1exp.evaluate.protocol.plan import Motion
 
 SATURATED = 0.99
-"""Share of the peak torque from which on a drive counts as saturated."""
+"""Share of the peak torque from which on an actuator counts as saturated."""
 
 POINTS = 1500
 """Most dots of one kind of joint in the scatter."""
