@@ -63,5 +63,5 @@ def test_causes_that_are_alike_are_refused_no_more_often_than_said(spread: float
 
 
 def test_what_one_fault_may_give_to_all_joints_is_known_of_the_effects_themselves() -> None:
-    alike = {name for name in members("effect") if tolerances.identification(name).alike}
+    alike = {name for name in members("effect") if tolerances.identification(name).uniform}
     assert alike == {"strength", "kp_scale", "link_mass", "encoder_offset"}

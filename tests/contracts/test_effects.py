@@ -341,7 +341,7 @@ def test_a_confounded_effect_exists_and_both_say_the_same_of_how_to_tell_them_ap
 @each
 def test_a_place_is_joints_of_which_all_have_one_value_or_the_robot(entry: Entry) -> None:
     how = kind(entry).identification
-    if how.common or how.weighs_on_legs or how.alike:
+    if how.common or how.weighs_on_legs or how.uniform:
         assert {p.per for p in sizes(entry)} == {"joint"}
     assert how.nominal or how.rank == LAST
 

@@ -79,7 +79,7 @@ class Protocol:
     """Columns that identify the condition of a row."""
     robot_columns: ClassVar[tuple[Column, ...]] = ()
     """Further figures of a robot."""
-    alike: ClassVar[bool] = True
+    identical: ClassVar[bool] = True
     """Whether the robots of a condition move identically where nothing is random."""
     always: ClassVar[tuple[str, ...]] = ()
     """Measures that are always computed."""

@@ -110,7 +110,7 @@ def play(
     refuse(chosen, stage)
     stage.expect(protocol.steps(stage))
     played = protocol.play(stage)
-    rows = distinct(played.rows, protocol.keys, protocol.noise or protocol.randomize or not protocol.alike)
+    rows = distinct(played.rows, protocol.keys, protocol.noise or protocol.randomize or not protocol.identical)
     repeats, played.rows = len(played.rows) - len(rows), rows
     figures = summarised(chosen, rows)
     stage.finished()

@@ -95,7 +95,7 @@ def clearest(begun: Scorer, state: State) -> Sought:
     train, select, dt = state.splits.train, state.splits.select, state.dt
     none = profile_likelihood.cost(begun, {}, train, dt)
     of_trunk = [n for n in tolerances.nominal(begun.replayer.machine) if tolerances.identification(n).needs_ground]
-    of_joints = [effect for effect in members("effect") if tolerances.identification(effect).alike]
+    of_joints = [effect for effect in members("effect") if tolerances.identification(effect).uniform]
     fits = {
         effect: profile_likelihood.fitted(begun, sizes(effect), train, dt, none) for effect in (*of_trunk, *of_joints)
     }

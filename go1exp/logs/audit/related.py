@@ -104,8 +104,7 @@ def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def torque(log: Log) -> Iterator[Finding]:
     """Compare the reported torque with the commanded one, or with the law of the joint controller, at the best lag.
 
-    Two kinds of lag are tried: the command alone is late (a delay before the controller), or the whole torque is late
-    (a delay behind it).
+    Two kinds of lag are tried: a delayed command (before the controller), or a delayed torque (behind it).
     """
     r = log.recording
     if not r.has("tau_est"):

@@ -23,7 +23,7 @@ class Finding:
         check: ``rate``, ``repeats``, ``sign``, ``delay``, ...
         channel: column, or ``t``, or ``all`` where it concerns the whole recording.
         verdict: ``ok`` if it is information and not a flaw.
-        size: the number that was judged, or None.
+        size: the number compared with the limits, or None.
         unit: of ``size``.
         message: a sentence.
     """

@@ -21,7 +21,7 @@ class Cogging(Effect):
 
     Slots that attract magnets, teeth that mesh. Amplitudes of 0.1 to 0.8 N m are likely (estimate). ``count``
     periods make one turn of the joint; its usual value of 38 is six for each turn of a rotor behind the Go1's gear
-    ratio of 6.333, an assumption: nobody has published the Go1's. It conserves energy, but data that are not sorted by
+    ratio of 6.333, an assumption (not published). It conserves energy, but data that are not sorted by
     angle show it as ``coulomb``. A step must not skip a period: count times speed times step should stay below 1.
     """
 

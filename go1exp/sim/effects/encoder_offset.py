@@ -25,7 +25,7 @@ class EncoderOffset(Effect):
     identification = Identification(
         nominal=True,
         rank=8,
-        alike=True,
+        uniform=True,
         excitation="slow_ramps",
         confounded=("base_tilt", "link_com"),
         separated_by=TWO_ATTITUDES,

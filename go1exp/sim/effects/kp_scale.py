@@ -26,7 +26,7 @@ class KpScale(Effect):
         nominal=True,
         rank=0,
         weighs_on_legs=True,
-        alike=True,
+        uniform=True,
         confounded=("armature", "link_mass", "strength"),
         separated_by=TWO_GAIN_SETS,
     )

@@ -27,7 +27,7 @@ class LinkMass(Effect):
         nominal=True,
         rank=6,
         weighs_on_legs=True,
-        alike=True,
+        uniform=True,
         confounded=("armature", "kp_scale", "strength"),
         separated_by=TWO_GAIN_SETS,
     )

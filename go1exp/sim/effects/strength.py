@@ -26,7 +26,7 @@ class Strength(Effect):
         nominal=True,
         rank=2,
         weighs_on_legs=True,
-        alike=True,
+        uniform=True,
         confounded=("armature", "kp_scale", "link_mass"),
         separated_by=TWO_GAIN_SETS,
     )

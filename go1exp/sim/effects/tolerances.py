@@ -54,7 +54,7 @@ class Tolerances:
         )
 
     def on(self, contact: ContactConfig) -> Tolerances:
-        """Return those of the same robot on its feet, which have this contact."""
+        """Return the tolerances of the same robot standing, with this contact of its feet."""
         return dataclasses.replace(self, contact=contact)
 
     def param(self, key: Key) -> Param:

@@ -83,7 +83,7 @@ class Kicks(Protocol):
     jitter_s: NonNegative
     recovery: Recovery
 
-    alike: ClassVar[bool] = False
+    identical: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("impulse",)
     robot_columns: ClassVar[tuple[Column, ...]] = (
         Column("survived", "", "of those still up before this kick", "share", "higher"),

@@ -67,7 +67,7 @@ class PushMap(Protocol):
     halvings: Count
     watch_s: Annotated[float, Field(ge=LEAST_WATCH)]
 
-    alike: ClassVar[bool] = False
+    identical: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("direction_deg",)
     derived_names: ClassVar[tuple[str, ...]] = ("impulse_median", "impulse_p10", "area", "weakest")
     robot_columns: ClassVar[tuple[Column, ...]] = (

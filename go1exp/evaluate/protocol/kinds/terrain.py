@@ -55,7 +55,7 @@ class OnTerrain(Protocol):
     gravel_friction: PositiveRange
     ground_seed: Annotated[int, Field(ge=0)]
 
-    alike: ClassVar[bool] = False
+    identical: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("ground", "speed", "difficulty")
     derived_names: ClassVar[tuple[str, ...]] = tuple(SHARES)
     robot_columns: ClassVar[tuple[Column, ...]] = (
