@@ -57,7 +57,7 @@ class Identification:
         common: its parameters have one value for all joints at which it is. For effects that few joints ever show.
         weighs_on_legs: one such error, equal at all joints, moves the legs of a standing robot as a change of weight
             does; an effect of the trunk must explain recordings better than it.
-        uniform: one fault may give all joints the same value of it (a low battery, a wrong pose at calibration), so it is
+        uniform: one fault may give all joints the same value of it (a low battery, a wrong pose at calibration). It is
             tried as the one cause of all model errors of a standing robot, with one value.
         levels: changes from null, by parameter, in its unit, at which it is probed; each may become the start of a fit.
             For effects with a threshold, or far from linear. Empty: twice the tolerance of each parameter.
