@@ -37,7 +37,7 @@ GROUPS = {
 """Group of the registry -> title of its page."""
 
 API = {
-    "go1exp": ["make"],
+    "go1exp.sim.env.batch": ["make"],
     "go1exp.sim.env.core": ["Go1Core"],
     "go1exp.sim.env.gym_env": ["Go1Env"],
     "go1exp.mdp.types": ["Snapshot", "StepResult", "TermSetup"],

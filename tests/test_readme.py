@@ -131,6 +131,16 @@ def test_links_lead_to_pages_and_headings_that_exist(page: Path) -> None:
     assert dead == []
 
 
+def test_pages_that_code_and_files_name_exist() -> None:
+    files = [
+        file for folder in ("go1exp", "conf", "benchmarks", "assets/policies") for file in (ROOT / folder).rglob("*")
+    ]
+    texts = [file.read_text() for file in files if file.suffix in (".py", ".yaml", ".md", ".hpp")]
+    pages = {page for text in texts for page in re.findall(r"docs/[\w/]+\.md", text)}
+    assert len(pages) > 10
+    assert sorted(page for page in pages if not (ROOT / page).exists()) == []
+
+
 def test_guides_stay_short() -> None:
     guides = (ROOT / "docs").glob("*.md")
     assert sum(len(guide.read_text().split()) for guide in guides) <= 35_000
