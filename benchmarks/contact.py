@@ -16,7 +16,7 @@ import torch
 
 from go1exp import robot
 from go1exp.cli.places import shipped_policies
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import bind_list
 from go1exp.evaluate.rollout import EvalConfig, evaluate
 from go1exp.sim.env.core import Go1Core

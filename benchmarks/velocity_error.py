@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from go1exp.base.tensors.threads import one_thread
-from go1exp.config.schema.backends import CpuBackend
+from go1exp.config.schema.physics import CpuBackend
 from go1exp.evaluate.agents import EstimatedVelocity
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import parse_train

@@ -16,8 +16,8 @@ import torch
 
 from go1exp.cli.train import _refuse_other
 from go1exp.config.compose import compose
-from go1exp.config.schema.beside import ROWS, StopRule
 from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.training import ROWS, StopRule
 from go1exp.evaluate.asynchronous import answered, score
 from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, early_stop, run_folder, trainer

@@ -12,7 +12,7 @@ import torch
 
 from go1exp import robot
 from go1exp.config.compose import compose
-from go1exp.config.schema.contact import MUJOCO_CONTACT
+from go1exp.config.schema.physics import MUJOCO_CONTACT
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu

@@ -23,7 +23,7 @@ from go1exp import cli, robot
 from go1exp.base.errors import Expected
 from go1exp.base.paths import data_root
 from go1exp.config.compose import compose
-from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.config.schema.registry import ConfigError, Term, members
 from go1exp.deploy.estimation import from_json, go1, make_filter, sample, to_json
 from go1exp.deploy.export.build import build

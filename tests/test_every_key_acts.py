@@ -48,8 +48,8 @@ from go1exp.cli.simulate import BODY
 from go1exp.cli.subjects import ROBOT_GROUPS
 from go1exp.config import compose as composing
 from go1exp.config.schema import registry
-from go1exp.config.schema.learner import CheckpointConfig, LoggerConfig, PPOConfig
 from go1exp.config.schema.registry import ConfigError, Expected, Range
+from go1exp.config.schema.training import CheckpointConfig, LoggerConfig, PPOConfig
 from go1exp.deploy.export import graph
 from go1exp.deploy.export.build import build
 from go1exp.deploy.export.graph import DeployedPolicy

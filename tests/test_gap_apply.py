@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 import go1exp.logs.excitations  # noqa: F401  (registers every excitation)
 from go1exp.cli.hydra_main import choices_from_files
 from go1exp.config.compose import compose
-from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare
 from go1exp.gap.result import AngleErrors, Candidate, Floors, GapResult, GapSettings, Localisation, NamedEffect, Overlay

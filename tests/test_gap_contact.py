@@ -16,7 +16,7 @@ from go1exp import robot
 from go1exp.base.report.table import Cell
 from go1exp.cli.gap import APP
 from go1exp.config.compose import compose
-from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.config.schema.registry import ConfigError, bind
 from go1exp.gap import files
 from go1exp.gap.comparison import prepare

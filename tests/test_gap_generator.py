@@ -56,7 +56,7 @@ def test_the_tolerances_are_those_of_the_library() -> None:
     import math
 
     import go1exp.sim.task  # noqa: F401  (registers every effect)
-    from go1exp.config.schema.contact import MUJOCO_CONTACT
+    from go1exp.config.schema.physics import MUJOCO_CONTACT
     from go1exp.config.schema.registry import members
     from go1exp.sim.effects.tolerances import Tolerances
 

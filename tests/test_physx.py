@@ -21,7 +21,7 @@ from go1exp import robot
 from go1exp.cli import subjects
 from go1exp.cli.places import shipped_policies
 from go1exp.config.compose import compose
-from go1exp.config.schema.backends import CpuBackend
+from go1exp.config.schema.physics import CpuBackend
 from go1exp.config.schema.registry import ConfigError, Expected
 from go1exp.evaluate import rollout
 from go1exp.evaluate.rollout import EvalConfig, evaluate

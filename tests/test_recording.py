@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.logs import recording as rec
 from go1exp.logs.recording import Meta, Recording, RecordingError
 from go1exp.robot import JOINTS, LEGS

@@ -27,8 +27,7 @@ from go1exp.sim.task import parse_train
 from go1exp.train import run_state, wandb_writer
 from go1exp.train.sweep import trials
 from go1exp.train.sweep.command import Ended
-from go1exp.train.sweep.settings import TuneSettings
-from go1exp.train.sweep.tune import Range, Search
+from go1exp.train.sweep.tune import Range, Search, TuneSettings
 from tests.command import environment
 from tests.command import run as cli
 from tests.small_run import SMALL

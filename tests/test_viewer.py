@@ -15,7 +15,7 @@ from go1exp.base.errors import Expected
 from go1exp.cli.play_web import _agents, _grounds
 from go1exp.cli.subjects import agent, named
 from go1exp.config.compose import compose
-from go1exp.config.schema.contact import MUJOCO_CONTACT
+from go1exp.config.schema.physics import MUJOCO_CONTACT
 from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.viewer import requests as ask
 from go1exp.evaluate.viewer.page_server import Gate, listening, words

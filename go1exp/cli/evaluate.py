@@ -19,7 +19,7 @@ from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, Count, Duration, FolderName, NonNegative, Speed, Term, bind_list
 
 if TYPE_CHECKING:
-    from go1exp.config.schema.backends import BackendConfig
+    from go1exp.config.schema.physics import BackendConfig
     from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.controller.settings import MpcSettings
     from go1exp.evaluate.protocol.base import Chosen

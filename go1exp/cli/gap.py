@@ -24,7 +24,7 @@ from go1exp.config.schema.settings import MISSING
 from go1exp.gap.result import Angle, GapSettings
 
 if TYPE_CHECKING:
-    from go1exp.config.schema.contact import ContactConfig
+    from go1exp.config.schema.physics import ContactConfig
     from go1exp.gap.result import GapResult
     from go1exp.gap.robots.protocol import Robot
     from go1exp.logs.recording import Recording
@@ -269,7 +269,7 @@ def _print_next(lacking: dict[str, Any], robot: Robot, file: Path, contact: Cont
 
 def _contact_choice(contact: ContactConfig | None) -> dict[str, str]:
     """Return the choice of ``contact`` that training needs; nothing if it is the default or not known."""
-    from go1exp.config.schema.contact import MUJOCO_CONTACT, read_contact
+    from go1exp.config.schema.physics import MUJOCO_CONTACT, read_contact
 
     if contact is None or contact == MUJOCO_CONTACT:
         return {}

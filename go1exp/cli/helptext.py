@@ -136,8 +136,8 @@ def _group_page(
 
 def _slots(group: str) -> list[str]:
     """Explain the keys that every term of a group may have beside its own parameters."""
-    from go1exp.config.schema.schedule import Ramp
     from go1exp.config.schema.settings import attributes
+    from go1exp.config.schema.training import Ramp
     from go1exp.sim.task import MANY_TERMS
 
     slots = MANY_TERMS.get(group, Ramp if group == "schedule" else None)
@@ -165,7 +165,7 @@ def texts_of(verb: str) -> dict[str, str]:
 
 def _texts_of_group(group: str, settings: Mapping[str, Any]) -> dict[str, str]:
     """Return what the keys of a group mean: those of a section by its class, a term by its docstring."""
-    from go1exp.config.schema.backends import BACKENDS
+    from go1exp.config.schema.physics import BACKENDS
     from go1exp.config.schema.registry import members
     from go1exp.config.schema.settings import lines
     from go1exp.evaluate.controller.settings import CONTROLLERS

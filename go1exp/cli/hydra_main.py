@@ -19,7 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from go1exp.base.wording import NOT_FOR_TRAINING
-from go1exp.config.choices import choice_files, config_folder, groups_in, groups_of
+from go1exp.config.choices import UNREADABLE, choice_files, config_folder, groups_in, groups_of, why_unreadable
 from go1exp.config.hydra_adapter import (
     MAIN,
     composed_once,
@@ -31,7 +31,6 @@ from go1exp.config.hydra_adapter import (
     stored_choices,
 )
 from go1exp.config.schema.registry import ConfigError
-from go1exp.config.schema.yaml_file import UNREADABLE, why_unreadable
 
 
 class Left(BaseException):

@@ -18,7 +18,7 @@ from go1exp.config.schema import settings as schema
 from go1exp.config.schema.registry import ConfigError, Duration, FolderName, Speed
 
 if TYPE_CHECKING:
-    from go1exp.config.schema.backends import BackendConfig
+    from go1exp.config.schema.physics import BackendConfig
     from go1exp.deploy.sim_robot.machine import Body
     from go1exp.deploy.sim_robot.settings import SimConfig
     from go1exp.evaluate.agents import Agent

@@ -16,7 +16,7 @@ from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.evaluate.controller.settings import MpcSettings, parse_controller
 
 if TYPE_CHECKING:
-    from go1exp.config.schema.backends import BackendConfig
+    from go1exp.config.schema.physics import BackendConfig
     from go1exp.evaluate.agents import Agent
     from go1exp.evaluate.controller.types import Controller
     from go1exp.sim.task import TaskConfig
@@ -31,7 +31,7 @@ def split_engine(container: dict[str, Any]) -> tuple[BackendConfig, dict[str, An
     Raises:
         ConfigError: with every problem of its settings, or if it is not installed.
     """
-    from go1exp.config.schema.backends import PhysxBackend
+    from go1exp.config.schema.physics import PhysxBackend
     from go1exp.sim.task import parse_parts
 
     parts, problems = parse_parts(container, (ENGINE,))

@@ -27,8 +27,8 @@ from go1exp.train.sweep.command import CORES, PARENT, Command, Ended
 
 if TYPE_CHECKING:
     from go1exp.train.sweep import index
+    from go1exp.train.sweep.command import Launcher, Task
     from go1exp.train.sweep.index import Index
-    from go1exp.train.sweep.task import Launcher, Task
 
 LOG = "job.log"
 """In the run folder of a job that ran in a process of its own: what it printed."""
@@ -234,7 +234,7 @@ class _Watch:
 def _launch(rules: Rules, app: App, folder: Path, known: Index, runs: Launcher, overrides: list[str]) -> int:
     """Run what is not done in a folder that is locked; tell of the sweep; return the exit status."""
     from go1exp.train.sweep import index
-    from go1exp.train.sweep.task import Task
+    from go1exp.train.sweep.command import Task
 
     fresh = tuple(replace(job, state="waiting", cause="") for job in known.jobs)
     watch = _Watch(folder, index.looked_at(replace(known, jobs=fresh), folder))

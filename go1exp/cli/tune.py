@@ -13,7 +13,7 @@ from go1exp.cli.verbs import command
 from go1exp.config.compose import compose_checked
 from go1exp.config.hydra_adapter import sweep_range
 from go1exp.config.schema.registry import ConfigError
-from go1exp.train.sweep.settings import TuneSettings
+from go1exp.train.sweep.tune import TuneSettings
 
 if TYPE_CHECKING:
     from go1exp.train.sweep.tune import Range

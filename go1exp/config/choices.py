@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml import MarkedYAMLError, YAMLError
 
 from go1exp.base.paths import data_root
 
@@ -99,3 +100,18 @@ def about(file: Path) -> str:
         if not line.startswith("# @package"):
             comments.append(line[1:].strip())
     return " ".join(comments).split(". ")[0].rstrip(".")
+
+
+UNREADABLE = (UnicodeDecodeError, YAMLError, OSError)
+"""What reading a YAML file raises."""
+
+
+def why_unreadable(error: Exception) -> str:
+    """Return what is wrong with a file whose reading raised one of ``UNREADABLE``, with the line where there is one."""
+    if isinstance(error, UnicodeDecodeError):
+        return f"not UTF-8 (byte {error.start})"
+    if isinstance(error, MarkedYAMLError):
+        mark = error.problem_mark or error.context_mark
+        return f"no YAML ({f'line {mark.line + 1}: ' if mark else ''}{error.problem})"
+    why = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
+    return f"cannot be read ({why})"

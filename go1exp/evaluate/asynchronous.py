@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from go1exp.config.schema.backends import CpuBackend
+from go1exp.config.schema.physics import CpuBackend
 from go1exp.evaluate.rollout import EvalConfig, evaluate, evaluation_task, grid
 from go1exp.train.policy import load_run
 

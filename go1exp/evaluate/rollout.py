@@ -12,7 +12,7 @@ import torch
 
 from go1exp.base import memory
 from go1exp.base.wording import counted
-from go1exp.config.schema.backends import BackendConfig, CpuBackend
+from go1exp.config.schema.physics import BackendConfig, CpuBackend
 from go1exp.config.schema.registry import ConfigError, Term, TooLongError, members
 from go1exp.evaluate.agents import Agent, ControllerAgent, PolicyAgent
 from go1exp.evaluate.controller.types import Controller

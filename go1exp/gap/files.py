@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from go1exp.base.files import write_json
-from go1exp.config.schema.contact import ContactConfig, read_contact
+from go1exp.config.schema.physics import ContactConfig, read_contact
 from go1exp.config.schema.registry import Expected
 from go1exp.gap.result import (
     EXIT_CODES,

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import STRICT, Fraction, NonNegative, Positive
 
 Verdict = Literal["no gap", "explained", "partly explained", "unexplained", "not excited", "bad log"]

@@ -35,7 +35,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from go1exp.base.files import opened
 from go1exp.base.wording import counted
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import STRICT, Expected, NonNegative, Positive, explain, nearest
 from go1exp.robot import JOINTS, LEGS
 

@@ -1,6 +1,6 @@
 """The group ``schedule``: which settings of a task may change while a policy is trained, and within what bounds.
 
-A name of the group is one ramp (``config/schema/schedule.py``)::
+A name of the group is one ramp (``config/schema/training.py``)::
 
     soft_landings: {set: reward.touchdown_speed.weight, from: 0.0, to: -20.0, start: 70e6, over: 30e6}
     smooth: {set: reward.action_smoothness.weight, from: -0.5, to: -1.5, start: 70e6, over: 30e6}
@@ -18,9 +18,9 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import Term, as_json, explain, unknown_name
-from go1exp.config.schema.schedule import Ramp, Value
+from go1exp.config.schema.training import Ramp, Value
 
 DELAY = "actuator.command"
 CONTACT_TIME = "contact.time_constant"

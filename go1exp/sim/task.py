@@ -17,13 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 import go1exp.mdp  # noqa: F401  (registers every term)
 from go1exp import robot
 from go1exp.config.schema import plugins
-from go1exp.config.schema.backends import BACKENDS, BackendConfig, CpuBackend
-from go1exp.config.schema.beside import BESIDE, EVALUATED, EvalDuring, StopRule, VideoDuring
-from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
-from go1exp.config.schema.learner import CheckpointConfig as CheckpointConfig
-from go1exp.config.schema.learner import LoggerConfig as LoggerConfig
-from go1exp.config.schema.learner import PPOConfig as PPOConfig
-from go1exp.config.schema.learner import WandbConfig as WandbConfig
+from go1exp.config.schema.physics import BACKENDS, MUJOCO_CONTACT, BackendConfig, ContactConfig, CpuBackend
 from go1exp.config.schema.registry import (
     STRICT,
     ConfigError,
@@ -36,7 +30,11 @@ from go1exp.config.schema.registry import (
     explain,
     unknown_name,
 )
-from go1exp.config.schema.schedule import Ramp
+from go1exp.config.schema.training import BESIDE, EVALUATED, EvalDuring, Ramp, StopRule, VideoDuring
+from go1exp.config.schema.training import CheckpointConfig as CheckpointConfig
+from go1exp.config.schema.training import LoggerConfig as LoggerConfig
+from go1exp.config.schema.training import PPOConfig as PPOConfig
+from go1exp.config.schema.training import WandbConfig as WandbConfig
 from go1exp.mdp import mirror
 from go1exp.robot.config import RobotConfig
 from go1exp.sim import schedule

@@ -24,7 +24,7 @@ from typing import Any
 import torch
 
 from go1exp.base.files import opened, write_bytes, write_json, write_text
-from go1exp.config.schema.beside import EVALUATED, ROWS
+from go1exp.config.schema.training import EVALUATED, ROWS
 from go1exp.sim.task import TrainConfig
 from go1exp.train.checkpoint import FORMAT, SUFFIX
 from go1exp.train.ppo import AdaptivePPO

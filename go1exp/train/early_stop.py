@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from go1exp.base.files import write_json
-from go1exp.config.schema.beside import EVALUATED, ROWS, StopRule
 from go1exp.config.schema.registry import unknown_name
+from go1exp.config.schema.training import EVALUATED, ROWS, StopRule
 
 FILE = "stopped_early.json"
 """In the run folder: the rule that ended it, at which iteration and why."""

@@ -11,7 +11,7 @@ from typing import Any
 from stable_baselines3.common.logger import HParam, KVWriter, Logger, TensorBoardOutputFormat
 
 from go1exp.base.files import write_text
-from go1exp.config.schema.beside import EVALUATED
+from go1exp.config.schema.training import EVALUATED
 from go1exp.sim.task import LoggerConfig
 from go1exp.train.wandb_writer import WandbWriter
 from go1exp.train.wandb_writer import check_account as check_account

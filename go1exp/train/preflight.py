@@ -8,7 +8,7 @@ import torch
 
 from go1exp import robot
 from go1exp.base import memory
-from go1exp.config.schema.backends import PhysxBackend, WarpBackend
+from go1exp.config.schema.physics import PhysxBackend, WarpBackend
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.effects.rules import nested_actuators
 from go1exp.sim.env.core import Go1Core

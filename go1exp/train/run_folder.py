@@ -24,11 +24,11 @@ from typing import Any
 from go1exp import __version__
 from go1exp.base.files import write_bytes, write_json, write_text
 from go1exp.base.paths import data_root
+from go1exp.config.choices import UNREADABLE, why_unreadable
 from go1exp.config.hydra_adapter import read_yaml, to_yaml
 from go1exp.config.schema import plugins
 from go1exp.config.schema.plugins import Plugin
 from go1exp.config.schema.registry import ConfigError
-from go1exp.config.schema.yaml_file import UNREADABLE, why_unreadable
 from go1exp.sim.actuator.net import find
 from go1exp.sim.task import MANY_TERMS, ONE_TERM, REGISTERED_AS, TrainConfig, parse_train
 

@@ -9,10 +9,9 @@ from typing import Any
 
 import torch
 
-from go1exp.config.schema.backends import WarpBackend
-from go1exp.config.schema.beside import EVALUATED
+from go1exp.config.schema.physics import WarpBackend
 from go1exp.config.schema.registry import ConfigError, unknown_name
-from go1exp.config.schema.schedule import Ramp, Value
+from go1exp.config.schema.training import EVALUATED, Ramp, Value
 from go1exp.sim.env.core import Go1Core
 from go1exp.sim.env.metrics import GaitLog, TaskLog
 from go1exp.sim.schedule import WEIGHT

@@ -18,8 +18,8 @@ from typing import Any
 from stable_baselines3.common.logger import KVWriter
 
 from go1exp.base.files import write_text
-from go1exp.config.schema.beside import ROWS
 from go1exp.config.schema.registry import ConfigError, Expected
+from go1exp.config.schema.training import ROWS
 from go1exp.sim.task import LoggerConfig, WandbConfig
 from go1exp.train.asynchronous import BEST
 

@@ -24,8 +24,8 @@ from go1exp.base.paths import data_root
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.base.tensors.rotation import rotate_inverse
 from go1exp.config.compose import compose
-from go1exp.config.schema.contact import MUJOCO_CONTACT
 from go1exp.config.schema.joint_values import JointValues, numbers, spread
+from go1exp.config.schema.physics import MUJOCO_CONTACT
 from go1exp.config.schema.registry import Entry, Term, bind, members
 from go1exp.robot.actuators import ActuatorSetup
 from go1exp.sim.effects.base import Effect, Measured, Param

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from go1exp import __version__, robot
 from go1exp.base.tensors.threads import one_thread
-from go1exp.config.schema.backends import CpuBackend
 from go1exp.config.schema.history import history_columns
 from go1exp.config.schema.joint_values import spread
+from go1exp.config.schema.physics import CpuBackend
 from go1exp.config.schema.registry import Term
 from go1exp.deploy.estimation import go1, to_json
 from go1exp.deploy.export.graph import DeployedPolicy, ExportError, blocks, to_onnx

@@ -17,7 +17,7 @@ from go1exp.deploy.runtime.controller import PHASES, Cycle
 from go1exp.deploy.runtime.metadata import Metadata
 
 if TYPE_CHECKING:
-    from go1exp.config.schema.contact import ContactConfig
+    from go1exp.config.schema.physics import ContactConfig
     from go1exp.logs.recording import Meta, Recording
 
 STATES_PER_S = 500.0
@@ -257,7 +257,7 @@ def _meta(about: About, channels: Mapping[str, np.ndarray], notes: str) -> Meta:
 
 def _contact(trained: Mapping[str, Any]) -> ContactConfig | None:
     """Return the contact of a run, None if it cannot be read; one of an older version had MuJoCo's own."""
-    from go1exp.config.schema.contact import MUJOCO_CONTACT, read_contact
+    from go1exp.config.schema.physics import MUJOCO_CONTACT, read_contact
 
     if not trained:
         return None

@@ -10,7 +10,7 @@ import torch
 
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.deploy.runtime.controller import LYING
 from go1exp.deploy.runtime.safety import DEFAULT_KD

@@ -12,7 +12,7 @@ from typing import Any
 from go1exp import __version__
 from go1exp.base import memory
 from go1exp.base.wording import counted
-from go1exp.config.schema.backends import BackendConfig
+from go1exp.config.schema.physics import BackendConfig
 from go1exp.config.schema.registry import ConfigError, TooLongError
 from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.protocol.base import Chosen, Played, Protocol

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from go1exp.config.schema.backends import BackendConfig
+from go1exp.config.schema.physics import BackendConfig
 from go1exp.config.schema.registry import Entry, Term, members
 from go1exp.evaluate.agents import Agent, Progress
 from go1exp.evaluate.observed import TrunkVelocity

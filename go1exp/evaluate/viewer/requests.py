@@ -10,9 +10,8 @@ from typing import Any, Literal, get_args
 
 from go1exp import robot
 from go1exp.config.choices import choice_files, config_folder, load
-from go1exp.config.schema.backends import BackendConfig
-from go1exp.config.schema.contact import ContactConfig
 from go1exp.config.schema.joint_values import JointValues, numbers
+from go1exp.config.schema.physics import BackendConfig, ContactConfig
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.evaluate.protocol.ground import UNITS, GroundName, Lanes
 from go1exp.evaluate.protocol.stage import delay_of_effects

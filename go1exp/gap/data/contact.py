@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from go1exp.base.wording import counted
-from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig, contact_text
+from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig, contact_text
 from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.result import GapResult
 from go1exp.logs.recording import Recording

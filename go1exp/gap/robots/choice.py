@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import ConfigError
 from go1exp.gap.robots.description import Go1Model, ModelConfig
 from go1exp.gap.robots.fixed_base import FixedBase

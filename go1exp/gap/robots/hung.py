@@ -10,7 +10,7 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.gap.data.contact import contact_of
 from go1exp.gap.data.cutting import cut
 from go1exp.gap.data.prepare import Ready

@@ -10,7 +10,7 @@ import numpy as np
 
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
-from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.gap.data.contact import contact_warnings
 from go1exp.gap.data.prepare import Ready
 from go1exp.gap.data.standing import StandingWindows, cut_standing, for_feet

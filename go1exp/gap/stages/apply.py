@@ -14,8 +14,8 @@ import numpy as np
 from go1exp.base.files import write_text
 from go1exp.base.tensors.threads import one_thread
 from go1exp.base.wording import NOT_FOR_TRAINING
-from go1exp.config.schema.contact import contact_text
 from go1exp.config.schema.joint_values import spread
+from go1exp.config.schema.physics import contact_text
 from go1exp.config.schema.registry import Term, members
 from go1exp.gap.comparison import Comparison, compare, robot_from
 from go1exp.gap.data.contact import tolerances_of

@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from go1exp import __version__, robot
 from go1exp.base.tensors.randomness import EnvRandom
-from go1exp.config.schema.backends import BackendConfig
-from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
 from go1exp.config.schema.joint_values import spread
+from go1exp.config.schema.physics import MUJOCO_CONTACT, BackendConfig, ContactConfig
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.logs.record.plan import Episode
 from go1exp.logs.record.sensors import SensorConfig, log

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field
 
 from go1exp.base.tensors.memory import Memory
-from go1exp.config.schema.contact import ContactConfig
 from go1exp.config.schema.joint_values import JointValues, each_within
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.robot.actuators import ActuatorSetup, ModelFields
 from go1exp.sim.effects.identification import Identification
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from go1exp import robot
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import effect
 from go1exp.robot.actuators import ModelFields
 from go1exp.sim.effects.base import Effect, Param

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from go1exp.config.schema.contact import ContactConfig
+from go1exp.config.schema.physics import ContactConfig
 from go1exp.config.schema.registry import members, unknown_name
 from go1exp.sim.effects.base import Effect, Param
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from go1exp import robot
 from go1exp.base.tensors.randomness import EnvRandom
 from go1exp.base.tensors.rotation import projected_gravity, rotate_inverse
-from go1exp.config.schema.schedule import Value
+from go1exp.config.schema.training import Value
 from go1exp.mdp.actions import clipped, joint_target, of_shape
 from go1exp.mdp.commands import UniformVelocity
 from go1exp.mdp.feet import Feet

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from go1exp.base.tensors.randomness import EnvRandom
-from go1exp.config.schema.backends import BackendConfig, CpuBackend, PhysxBackend, WarpBackend
+from go1exp.config.schema.physics import BackendConfig, CpuBackend, PhysxBackend, WarpBackend
 from go1exp.mdp.types import StepResult
 from go1exp.sim.physics.backend import PhysicsBackend
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu
@@ -46,7 +46,7 @@ def _physx(config: PhysxBackend, model: Any, sensors: Sensors, num_envs: int) ->
 
 
 BUILDERS: dict[str, Callable[..., PhysicsBackend]] = {"cpu": _cpu, "warp": _warp, "physx": _physx}
-"""How each engine is built, by the names of ``go1exp.config.schema.backends.BACKENDS``."""
+"""How each engine is built, by the names of ``go1exp.config.schema.physics.BACKENDS``."""
 
 
 class Captures(Protocol):

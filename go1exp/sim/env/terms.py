@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from go1exp.config.schema.backends import WarpBackend
 from go1exp.config.schema.history import frame_width, width
+from go1exp.config.schema.physics import WarpBackend
 from go1exp.config.schema.registry import ConfigError, Term
 from go1exp.mdp.feet import impossible
 from go1exp.mdp.types import Snapshot, TermSetup

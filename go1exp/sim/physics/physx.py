@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from go1exp.base.tensors.rotation import rotate, rotate_inverse
-from go1exp.config.schema.backends import PhysxBackend
+from go1exp.config.schema.physics import PhysxBackend
 from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.physics.agreement import Built
 from go1exp.sim.physics.mujoco_cpu import MujocoCpu

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from go1exp.config.schema.backends import PhysxBackend
+from go1exp.config.schema.physics import PhysxBackend
 from go1exp.config.schema.registry import Expected
 from go1exp.sim.physics.scene import FLOOR
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from go1exp import robot
 from go1exp.base.paths import data_root
-from go1exp.config.schema.contact import MUJOCO_CONTACT, ContactConfig
+from go1exp.config.schema.physics import MUJOCO_CONTACT, ContactConfig
 from go1exp.robot import MOUNT_HINGES, MOUNT_SLIDES
 from go1exp.robot.config import RobotConfig
 from go1exp.sim.terrain import Terrain

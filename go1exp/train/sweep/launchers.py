@@ -10,14 +10,14 @@ from typing import Any
 
 from go1exp.config.schema.registry import ConfigError, nearest
 from go1exp.config.schema.settings import parse
-from go1exp.train.sweep.settings import BasicSettings, JoblibSettings, RaySettings, SlurmSettings
-from go1exp.train.sweep.task import Launcher
+from go1exp.train.sweep import local, ray_cluster, slurm
+from go1exp.train.sweep.command import Launcher
 
 LAUNCHERS: dict[str, Any] = {
-    "basic": BasicSettings,
-    "joblib": JoblibSettings,
-    "slurm": SlurmSettings,
-    "ray": RaySettings,
+    "basic": local.BasicSettings,
+    "joblib": local.JoblibSettings,
+    "slurm": slurm.SlurmSettings,
+    "ray": ray_cluster.RaySettings,
 }
 """Name -> class of its settings."""
 
@@ -32,7 +32,7 @@ def chosen(container: Mapping[str, Any]) -> Any:
         ConfigError: with everything that is wrong with them, or if it is not one of ours.
     """
     if container.get("_target_") == HYDRAS_BASIC:
-        return BasicSettings(name="basic")
+        return local.BasicSettings(name="basic")
     name = container.get("name")
     if name not in LAUNCHERS:
         given = container.get("_target_", name)
@@ -47,7 +47,5 @@ def chosen(container: Mapping[str, Any]) -> Any:
 
 def built(settings: Any) -> Launcher:
     """Return the launcher with these settings; what it runs on is imported now."""
-    from go1exp.train.sweep import local, ray_cluster, slurm
-
     kinds: dict[str, Any] = {"joblib": local.Local, "slurm": slurm.Slurm, "ray": ray_cluster.Ray}
     return local.Basic() if settings.name == "basic" else kinds[settings.name](settings)

@@ -10,12 +10,45 @@ from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from go1exp.base import signals
-from go1exp.config.schema.registry import ConfigError
-from go1exp.train.sweep.command import Command, Ended, Running
-from go1exp.train.sweep.settings import JoblibSettings
-from go1exp.train.sweep.task import Task, Watch
+from go1exp.config.schema.registry import ConfigError, CountOrZero
+from go1exp.config.schema.settings import settings
+from go1exp.train.sweep.command import Command, Ended, Running, Task, Watch
+
+
+@settings
+class BasicSettings:
+    """One job after the other, in this process.
+
+    Attributes:
+        name: basic.
+    """
+
+    name: Literal["basic"]
+
+
+@settings
+class JoblibSettings:
+    """``conf/launcher/joblib.yaml``: several jobs at once on the cores of this machine.
+
+    Attributes:
+        name: joblib.
+        n_jobs: jobs at once; -1 for one on each core.
+        threads: cores of each job, 0 shares all of them out.
+    """
+
+    name: Literal["joblib"]
+    n_jobs: Annotated[int, Field(ge=-1)]
+    threads: CountOrZero
+
+    def __post_init__(self) -> None:
+        """Refuse no jobs at all."""
+        if self.n_jobs == 0:
+            raise ValueError("n_jobs = 0: give the number of jobs at once, or -1 for one on each core")
 
 
 class Basic:

@@ -13,14 +13,35 @@ import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from go1exp.base.errors import Expected
-from go1exp.config.schema.registry import ConfigError
+from go1exp.config.schema.registry import ConfigError, Count, CountOrZero
+from go1exp.config.schema.settings import settings
 from go1exp.train.sweep import command
-from go1exp.train.sweep.command import Ended
-from go1exp.train.sweep.settings import RaySettings
-from go1exp.train.sweep.task import Task, Watch
+from go1exp.train.sweep.command import Ended, Task, Watch
+
+
+@settings
+class RaySettings:
+    """``conf/launcher/ray.yaml``: jobs as Ray tasks.
+
+    Attributes:
+        name: ray.
+        address: of a running cluster, auto for the one of this machine; null starts one here for this sweep.
+        cpus: cores of a job.
+        gpus: GPUs of a job; less than 1 lets jobs share one.
+        retries: times that a job is started again when its node dies; it goes on from its checkpoint.
+    """
+
+    name: Literal["ray"]
+    address: str | None
+    cpus: Count
+    gpus: Annotated[float, Field(ge=0)]
+    retries: CountOrZero
+
 
 LOOK_S = 2.0
 """Time between two looks at the run folders, s."""

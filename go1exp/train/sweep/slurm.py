@@ -18,14 +18,53 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from go1exp.base.errors import Expected
 from go1exp.base.files import write_json
-from go1exp.config.schema.registry import ConfigError
-from go1exp.train.sweep.command import Command, Ended, Running
-from go1exp.train.sweep.settings import SlurmSettings
-from go1exp.train.sweep.task import Task, Watch
+from go1exp.config.schema.registry import ConfigError, Count, CountOrZero
+from go1exp.config.schema.settings import settings
+from go1exp.train.sweep.command import Command, Ended, Running, Task, Watch
+
+
+@settings
+class SlurmSettings:
+    """``conf/launcher/slurm.yaml``: an array of jobs on a Slurm cluster.
+
+    Attributes:
+        name: slurm.
+        partition: partition, or several with commas; null is the cluster's default.
+        time_min: time limit of a job, minutes; at its end a job saves a checkpoint and queues again.
+        warning_s: time before the limit at which Slurm warns a job, s; longer than one iteration.
+        requeues: times that a job may reach its limit; what is preempted does not count.
+        cpus: cores of a job.
+        mem_gb: memory of a job, GB.
+        gpus: GPUs of a job.
+        at_once: jobs of the array that may run at once.
+        account: account to charge, null for the user's default.
+        qos: quality of service, null for the default.
+        setup: shell lines before a job starts, such as 'module load cuda'.
+        options: further options of sbatch, as name and value, such as {constraint: a100}.
+        poll_s: time between two looks at the queue, s.
+    """
+
+    name: Literal["slurm"]
+    partition: str | None
+    time_min: Count
+    warning_s: Annotated[int, Field(ge=1)]
+    requeues: CountOrZero
+    cpus: Count
+    mem_gb: Annotated[float, Field(gt=0)]
+    gpus: CountOrZero
+    at_once: Count
+    account: str | None
+    qos: str | None
+    setup: tuple[str, ...]
+    options: dict[str, Any]
+    poll_s: Annotated[float, Field(gt=0, le=600)]
+
 
 FOLDER = "slurm"
 """In the sweep's folder: scripts, logs and results of submitit, and ``jobs.json``: run folder -> id of its job."""

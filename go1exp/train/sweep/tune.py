@@ -17,16 +17,53 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from go1exp.base.errors import Expected
 from go1exp.base.files import write_json
-from go1exp.config.schema.beside import EVALUATED, ROWS
+from go1exp.config.schema.registry import Count
+from go1exp.config.schema.settings import settings
+from go1exp.config.schema.training import EVALUATED, ROWS
 from go1exp.train.sweep import index, trials
 from go1exp.train.sweep.command import CORES, PARENT, Command, Ended, Running
 from go1exp.train.sweep.local import shares
-from go1exp.train.sweep.settings import TuneSettings
 from go1exp.train.sweep.trials import FOLDER, LOOK_S
+
+
+@settings
+class TuneSettings:
+    """``conf/tune.yaml``.
+
+    Attributes:
+        space: what to draw from, such as ["ppo.gamma=interval(0.97,0.995)"]; also tag(log,interval(..)), range(..),
+            choice(..).
+        overrides: settings of every trial, such as ["experiment=five_minutes"].
+        trials: trainings of the whole search, those of earlier commands and of other machines counted.
+        workers: trainings at once on this machine, its cores shared out.
+        metric: column of metrics.csv that says how good a training is, or eval/score and others of eval.every.
+        direction: whether more of it is better.
+        average: newest rows that the metric is averaged over.
+        warmup: iterations before a training may be ended early.
+        prune: end a training whose metric is below the median of the others at the same iteration.
+        storage: where trials are kept, as Optuna names databases; null is a SQLite file in out.
+        seed: of the draws; with one worker the same search from nothing draws the same.
+        out: folder of the search: a run folder for each trial, and an index as sweeps have.
+    """
+
+    space: tuple[str, ...]
+    overrides: tuple[str, ...]
+    trials: Count
+    workers: Count
+    metric: Annotated[str, Field(min_length=1)]
+    direction: Literal["maximize", "minimize"]
+    average: Count
+    warmup: Annotated[int, Field(ge=0)]
+    prune: bool
+    storage: str | None
+    seed: Annotated[int, Field(ge=0)]
+    out: Annotated[str, Field(min_length=1)]
 
 
 @dataclass(frozen=True)
