@@ -18,7 +18,7 @@ from go1exp.config.compose import compose
 from go1exp.config.schema.physics import MUJOCO_CONTACT
 from go1exp.config.schema.registry import ConfigError
 from go1exp.evaluate.viewer import requests as ask
-from go1exp.evaluate.viewer.page_server import Gate, listening, words
+from go1exp.evaluate.viewer.page_server import Gate, instructions, listening
 from go1exp.evaluate.viewer.replay import (
     Choose,
     Magnify,
@@ -288,10 +288,10 @@ def test_a_host_that_is_not_ours_is_refused_in_one_line() -> None:
 
 
 def test_the_words_say_where_to_look_and_how_to_get_there() -> None:
-    text = words("127.0.0.1", 8083, "secret")
+    text = instructions("127.0.0.1", 8083, "secret")
     assert "http://127.0.0.1:8083/?token=secret" in text
     assert f"ssh -L 8083:127.0.0.1:8083 {socket.gethostname()}" in text
-    everywhere = words("0.0.0.0", 8083, "secret")
+    everywhere = instructions("0.0.0.0", 8083, "secret")
     assert f"http://{socket.gethostname()}:8083/?token=secret" in everywhere
     assert "nothing is encrypted" in everywhere
 

@@ -1,5 +1,5 @@
-"""A robot in the browser, driven while it runs; recordings and answers of ``go1exp gap`` in the same window.
+"""A simulated robot in the browser, commanded while it runs; recordings and results of ``go1exp gap``.
 
 ``session.py`` and ``replay.py`` are plain classes that know no browser; ``web.py`` shows them by MuJoCo Studio's web
-viewer, and the panels beside it draw what they hold and send what a user asks for (``requests.py``).
+viewer, and its panels draw their content and send the user's requests (``requests.py``).
 """

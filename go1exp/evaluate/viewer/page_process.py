@@ -19,10 +19,10 @@ from go1exp.base.signals import ending
 
 
 class Mailbox:
-    """One end of a pipe that carries Studio's messages.
+    """One end of a pipe for Studio's messages.
 
-    Events are carried in order. Of snapshots only the newest of each type counts: they wait here until the other end
-    has taken those before, so that neither end ever waits for the other one.
+    Events are sent in order. Of snapshots only the newest of each type is kept, until the other end has taken the ones
+    before, so that neither end waits for the other one.
     """
 
     def __init__(self, pipe: Connection) -> None:
@@ -77,7 +77,7 @@ class Mailbox:
         return events
 
     def new_snapshots(self) -> list[messages.Snapshot]:
-        """Return the snapshots that came with the events of the call before: never one of a model not yet told."""
+        """Return the snapshots that arrived with the last events: never one of a model that is not loaded yet."""
         newest, self._newest = list(self._newest.values()), {}
         return newest
 
@@ -87,7 +87,7 @@ class Mailbox:
 
 
 class _Events(messages.EventChannel):
-    """The events of a mailbox, as Studio asks for them."""
+    """The events of a mailbox by Studio's interface."""
 
     def __init__(self, box: Mailbox) -> None:
         self._box = box
@@ -103,7 +103,7 @@ class _Events(messages.EventChannel):
 
 
 class _Snapshots(messages.SnapshotChannel):
-    """The snapshots of a mailbox, as Studio asks for them."""
+    """The snapshots of a mailbox by Studio's interface."""
 
     def __init__(self, box: Mailbox) -> None:
         self._box = box

@@ -1,6 +1,6 @@
 """What the page's server adds to MuJoCo Studio's: a token, a socket on one interface, and the browser's gamepad.
 
-Studio's server authenticates nobody and listens on every interface. Its page does not read gamepads, so a script is
+Studio's server has no authentication and listens on every interface. Its page does not read gamepads, so a script is
 added to it. The script uses the Gamepad API (https://www.w3.org/TR/gamepad/) and sends changes in the query of
 ``/gamepad``, which needs the token too.
 """
@@ -21,7 +21,7 @@ from typing import Any
 from go1exp.base.errors import Expected
 
 FIRST_PORT, PORTS = 8080, 20
-"""Where a free port is looked for, and among how many."""
+"""First port and number of ports of the search for a free one."""
 
 REFUSAL = "go1exp: open the address that the command printed; without the token in it nothing is shown\n"
 
@@ -29,14 +29,14 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 class Gate:
-    """Lets in requests that carry the token: in the address, or as the cookie that a page with it was given.
+    """Accepts requests with the token: in the address, or as the cookie of a page that was opened with it.
 
     Another page in the same browser can neither read the cookie nor open a connection with it: the cookie is of this
     server's pages alone, and a connection from a page of another origin is refused.
     """
 
     def __init__(self, port: int) -> None:
-        """Make a token that nobody can guess."""
+        """Create a random token."""
         self.token = secrets.token_urlsafe(16)
         self._cookie = f"go1exp_{port}"  # cookies are shared by all ports of a host
 
@@ -101,8 +101,8 @@ def listening(host: str, port: int) -> socket.socket:
     raise Expected(f"{where}: cannot be listened on ({problem}); port=0 takes the first free one from {FIRST_PORT}")
 
 
-def words(host: str, port: int, token: str) -> str:
-    """Say where to look, and how to get there from another computer."""
+def instructions(host: str, port: int, token: str) -> str:
+    """Return the page's address, and the way to it from another computer."""
     everywhere = host in ("", "0.0.0.0", "::")
     name = "127.0.0.1" if host in LOOPBACK else socket.gethostname() if everywhere else host
     name = f"[{name}]" if ":" in name else name
@@ -112,28 +112,28 @@ def words(host: str, port: int, token: str) -> str:
         tunnel = f"ssh -L {port}:127.0.0.1:{port} {socket.gethostname()}"
         lines.append(f"from another computer: {tunnel}   and open the same address there")
     else:
-        lines.append(f"anyone who can reach {name}:{port} and knows the token can drive it; nothing is encrypted")
+        lines.append(f"anyone who can reach {name}:{port} and knows the token can command it; nothing is encrypted")
     return "\n".join([*lines, "Ctrl-C ends it"])
 
 
 PATH = "/gamepad"
-"""Where the page's script tells of it."""
+"""Path to which the script sends."""
 
 AXES = (1, 0, 2)
 """Axis of each part of the command in the standard mapping: left stick up and left, right stick left are -1."""
 
 DEAD = 0.15
-"""Share of a stick's way that counts as let go: worn sticks do not come back to their middle."""
+"""Dead zone of a stick: worn sticks do not return to their centre."""
 
 SILENT_S = 1.0
-"""After so long without a word a held stick counts as let go, s: its page may be gone. The script says it twice."""
+"""Time without a message after which a held stick counts as released, s. The script sends twice as often."""
 
 STAND, PUSH = 0, 1
 """Buttons of the standard mapping: the lower one and the right one of the four."""
 
 SCRIPT = f"""<script>
 (() => {{
-  let said = "", at = 0, busy = false;
+  let sent = "", at = 0, busy = false;
   setInterval(() => {{
     const pad = [...navigator.getGamepads()].find((p) => p && p.connected && p.mapping === "standard");
     if (!pad || busy) return;
@@ -141,32 +141,32 @@ SCRIPT = f"""<script>
     const held = pad.buttons.map((b, k) => (b.pressed ? k : -1)).filter((k) => k >= 0).join();
     const word = `axes=${{axes}}&held=${{held}}`, now = performance.now();
     const resting = pad.axes.every((v) => Math.abs(v) < {DEAD});
-    if (word === said && (resting || now - at < {500.0 * SILENT_S})) return;
-    [said, at, busy] = [word, now, true];
-    fetch("{PATH}?" + word).catch(() => {{ said = ""; }}).finally(() => {{ busy = false; }});
+    if (word === sent && (resting || now - at < {500.0 * SILENT_S})) return;
+    [sent, at, busy] = [word, now, true];
+    fetch("{PATH}?" + word).catch(() => {{ sent = ""; }}).finally(() => {{ busy = false; }});
   }}, 40);
 }})();
 </script>
 """
-"""Tells of the first gamepad 25 times a second at most, while something changes or a stick is held."""
+"""Sends the first gamepad's state at most 25 times a second, while it changes or a stick is held."""
 
 
 class Gamepad:
-    """What the gamepad last said. The server's thread writes it, the window's reads it."""
+    """State of the gamepad. The server's thread writes it, the window's reads it."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Know no gamepad yet."""
+        """Start without a gamepad."""
         self._clock, self._heard = clock, -math.inf
         self._axes: tuple[float, ...] = ()
         self._held: frozenset[int] = frozenset()
         self._presses: deque[int] = deque(maxlen=20)
 
     def hear(self, query: str) -> bool:
-        """Take in what the script says; return whether it is understood."""
-        words = urllib.parse.parse_qs(query)
+        """Parse a message of the script; return whether it is valid."""
+        fields = urllib.parse.parse_qs(query)
         try:
-            axes = tuple(float(v) for v in words["axes"][0].split(","))
-            held = frozenset(int(k) for k in words["held"][0].split(",")) if "held" in words else frozenset()
+            axes = tuple(float(v) for v in fields["axes"][0].split(","))
+            held = frozenset(int(k) for k in fields["held"][0].split(",")) if "held" in fields else frozenset()
         except (KeyError, ValueError):
             return False
         if not all(-1.0 <= v <= 1.0 for v in axes):  # NaN too
@@ -176,11 +176,11 @@ class Gamepad:
         return True
 
     def presses(self) -> list[int]:
-        """Return the buttons that were pressed since the call before."""
+        """Return the buttons pressed since the last call."""
         return [self._presses.popleft() for _ in range(len(self._presses))]
 
     def sticks(self) -> tuple[float, ...] | None:
-        """Return how far each part of the command is pushed, -1 to 1; None while no stick is held."""
+        """Return the stick deflection of each axis of the command, -1 to 1; None while no stick is held."""
         if self._clock() - self._heard > SILENT_S or len(self._axes) <= max(AXES):
             return None
         pushed = tuple(
@@ -208,5 +208,5 @@ class Gamepad:
 
 
 def steered(pushed: Sequence[float], limits: Sequence[tuple[float, float]]) -> list[float]:
-    """Return the command of sticks that are pushed so far: a stick at its end asks for the slider's end."""
+    """Return the command of pushed sticks: a stick at its end commands the slider's end."""
     return [v * high if v > 0.0 else -v * low for v, (low, high) in zip(pushed, limits, strict=True)]

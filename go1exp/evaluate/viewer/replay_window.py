@@ -1,4 +1,4 @@
-"""The window of a recording, or of an answer of ``go1exp gap``: a time line, and the joint's curves."""
+"""The window of a recording, or of a result of ``go1exp gap``: a time line, and the joint's curves."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ COLOURS: dict[str, tuple[float, float, float, float]] = {
 
 SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
 
-NAMES = {"q": "angle", "qd": "speed", "tau_est": "torque, reported", "tau_cmd": "torque, commanded"}
+NAMES = {"q": "angle", "qd": "velocity", "tau_est": "torque, reported", "tau_cmd": "torque, commanded"}
 
 HEIGHT = 165.0
 """Of a plot, pixels."""
@@ -132,7 +132,7 @@ class ReplayWindow(Window):
         changed, index = imgui.Combo("speed", near, [f"{v:g}x" for v in SPEEDS])
         if changed:
             self.ask(Play(view.running, SPEEDS[index]))
-        if self._story.kind == "log":  # two robots side by side are followed by nobody
+        if self._story.kind == "log":  # the camera cannot follow two robots
             imgui.SameLine()
             _, self.follow = imgui.Checkbox("follow", self.follow)
         imgui.SetNextItemWidth(-40.0)
@@ -147,11 +147,9 @@ class ReplayWindow(Window):
         changed, times = imgui.SliderFloat("magnified", view.magnify, 1.0, MOST, "%.0f times")
         if changed:
             self.ask(Magnify(times))
-        paragraph("errors, as they are drawn in the scene; curves and numbers are not magnified")
+        paragraph("errors in the scene only; curves and numbers are not magnified")
         _, self._ghosts_shown = imgui.Checkbox("measured, and after", self._ghosts_shown)
-        paragraph(
-            "Left: before, the model as it was. Right, green: after, with what was named. Blue, over both: measured."
-        )
+        paragraph("Left: before, the nominal model. Right, green: after, with the identified effects. Blue: measured.")
 
     def _joints(self, piece: Piece) -> None:
         errors = piece.errors()

@@ -170,7 +170,7 @@ def active(
         contact: of the feet.
 
     Raises:
-        ConfigError: if a name is not known, or effects and drives do not go together.
+        ConfigError: if a name is unknown, or effects and actuator are incompatible.
     """
     if strange := [name for name in sizes if name not in effects]:
         raise ConfigError([f"effect {strange[0]!r}: known are {', '.join(effects)}"])

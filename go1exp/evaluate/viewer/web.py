@@ -19,38 +19,38 @@ from typing import Any, Protocol
 import mujoco
 
 from go1exp.base.errors import Expected
-from go1exp.evaluate.viewer.page_server import Gamepad, Gate, listening, words
+from go1exp.evaluate.viewer.page_server import Gamepad, Gate, instructions, listening
 from go1exp.evaluate.viewer.requests import Ended
 
 FRAME_S = 1.0 / 33.0
-"""Least time from picture to picture, s. A browser asks for up to 60 in a second; each costs the panels anew."""
+"""Shortest frame period, s. A browser requests up to 60 frames per second, and each draws all panels."""
 
 SLOWEST_FRAME_S = 0.1
-"""Time from picture to picture where the computer is too slow for robot and pictures, s."""
+"""Longest frame period, of a computer that cannot keep real time, s."""
 
 DECISION_S = 1.0
-"""How often the time from picture to picture is decided on, s."""
+"""Period of the adaptation of the frame period, s."""
 
 LOST_SHARE = 0.02
-"""Share of its time that the robot may lose before pictures become fewer."""
+"""Share of real time that the simulation may lose before the frame period grows."""
 
 LONGER, SHORTER = 1.3, 0.95
-"""Factors of the time from picture to picture when the robot loses time, and when it does not."""
+"""Factors of the frame period with and without lost time."""
 
 
 class PictureRate:
-    """Fewer pictures while the robot loses time, and slowly more again.
+    """Frame period that grows while the simulation loses time, and slowly shrinks again.
 
     Attributes:
-        every: least time from picture to picture, s.
+        every: frame period, s.
     """
 
     def __init__(self, now: float) -> None:
-        """Begin at the time ``now``, s, with as many pictures as are ever drawn."""
+        """Start at the time ``now``, s, with the shortest frame period."""
         self.every, self._begin, self._lost = FRAME_S, now, 0.0
 
     def note(self, now: float, lost: float) -> bool:
-        """Take in that the robot lost ``lost`` s of its time just now; return whether ``every`` has changed."""
+        """Add ``lost`` s of lost time; return whether ``every`` has changed."""
         self._lost += lost
         passed = now - self._begin
         if passed < DECISION_S:
@@ -74,63 +74,63 @@ except ImportError as error:
     ) from None
 
 READY_S = 20.0
-"""How long the server may take to answer, s."""
+"""Longest time until the server answers, s."""
 
 LAG_S = 0.1
-"""Time by which the robot may be late before that time is given up, s."""
+"""Delay behind real time from which it is not made up, s."""
 
 
 @dataclass(frozen=True)
 class Ask(messages.Event):
-    """From the window to the loop: what a user asks for."""
+    """From the window to the loop: a request of the user."""
 
     request: Any
 
 
 @dataclass(frozen=True)
 class Shown(messages.Snapshot):
-    """From the loop to the window: what is to be drawn. The newest one counts."""
+    """From the loop to the window: the content of the panels. Only the newest one is drawn."""
 
     view: Any
 
 
 @dataclass(frozen=True)
 class Draw(messages.Event):
-    """From the loop to the page: the least time from picture to picture, s."""
+    """From the loop to the page: the frame period, s."""
 
     every: float
 
 
 class Show(Protocol):
-    """Something that passes time and is seen: ``session.Session`` with its scene, or a recording."""
+    """A simulation or a recording with its scene."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
 
     def ask(self, request: Any) -> None:
-        """Do what a user asks for."""
+        """Apply a request of the user."""
 
     def tick(self) -> float:
-        """Let a moment pass, and return how long it is in real time, s; raises ``Ended`` when all is over."""
+        """Advance; return the real time until the next call, s; raise ``Ended`` at the end."""
 
     def view(self) -> Any | None:
-        """Return what the window shall draw; None if nothing has changed."""
+        """Return the content of the panels; None if nothing has changed."""
 
 
 class _Viewer(web_viewer.WebViewer):
-    """Studio's viewer, which takes no models from the browser, is silent on the terminal, and draws not too often."""
+    """Studio's viewer without models from the browser, terminal output, and with a frame period."""
 
     _due, _every = 0.0, FRAME_S
 
     def prepare_next_frame(self) -> bool:
-        """Wait until another picture is due, then for the browser; return whether there is one to draw for."""
+        """Wait until a frame is due, then for the browser; return whether to draw."""
         time.sleep(max(0.0, self._due - time.monotonic()))
         wanted = super().prepare_next_frame()
         self._due = time.monotonic() + self._every
         return bool(wanted)
 
     def get_drop_file(self) -> str:
-        """Return no file: what is dropped onto the page would replace the robot."""
+        """Return no file: a file dropped onto the page would replace the robot."""
         while not self._drop_queue.empty():
             self._drop_queue.get_nowait()
         return ""
@@ -149,9 +149,9 @@ _opening = threading.Lock()
 
 @contextmanager
 def _behind(gate: Gate, pad: Gamepad, sock: Any) -> Iterator[None]:
-    """Let the server that is made inside use ``sock``, ask ``gate``, and hear ``pad``.
+    """Let the server that is created inside use ``sock``, ``gate`` and ``pad``.
 
-    Studio has settings for neither yet. ``_refuses_strangers`` sees to it that the gate is in force in what runs.
+    Studio has no settings for them. ``_refuses_strangers`` verifies the gate of the running server.
     """
     usual = web_server.serve, web_server.bind_public_socket, web_viewer._print_url_banner
     started = threading.Event()
@@ -173,7 +173,7 @@ def _behind(gate: Gate, pad: Gamepad, sock: Any) -> Iterator[None]:
 
 
 class _Messenger(plugin.SimPlugin):
-    """Collects what the window asks for."""
+    """Passes the window's requests on."""
 
     def __init__(self, show: Show) -> None:
         self._show = show
@@ -184,11 +184,11 @@ class _Messenger(plugin.SimPlugin):
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def _on_load(self, event: messages.LoadModelEvent) -> bool:
-        return True  # the robot is ours: nothing is loaded over it
+        return True  # nothing replaces the robot
 
 
 def _not_a_browser_that_left(record: logging.LogRecord) -> bool:
-    """Return whether a message of the server's loop is about anything else than a page that was closed."""
+    """Return whether a message of the server's loop is not about a closed page."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, ConnectionClosed | ConnectionError)
 
@@ -209,10 +209,10 @@ def _opened(
 
 
 def _refuses_strangers(port: int, host: str) -> None:
-    """Wait for the server and make sure that it refuses who has no token.
+    """Wait for the server and verify that it rejects requests without a token.
 
     Raises:
-        Expected: if it does not answer, or shows itself to anyone.
+        Expected: if it does not answer, or answers without a token.
     """
     name = host if host not in ("", "0.0.0.0", "::") else "127.0.0.1"
     address = f"http://{f'[{name}]' if ':' in name else name}:{port}/"
@@ -220,7 +220,7 @@ def _refuses_strangers(port: int, host: str) -> None:
     while time.monotonic() < ends:
         try:
             with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(address, timeout=2.0):
-                raise Expected("this version of MuJoCo Studio shows itself without a token: it was closed")
+                raise Expected("this version of MuJoCo Studio answers without a token: it was closed")
         except urllib.error.HTTPError as error:
             if error.code == 403:
                 return
@@ -240,16 +240,16 @@ def run(
     pad: Gamepad | None = None,
     on_open: Callable[[str], None] = print,
 ) -> None:
-    """Show something in the browser until Ctrl-C.
+    """Run a show in the browser until Ctrl-C.
 
     Args:
-        show: what.
+        show: a simulation or a recording.
         windows: panels, which send ``Ask`` and take ``Shown``.
         title: of the page.
         host: interface to listen on.
         port: to listen on; 0 takes the first free one.
-        pad: hears of the gamepad at the browser; the windows have it too.
-        on_open: called with the text that says where to look.
+        pad: the browser's gamepad, which the windows read.
+        on_open: called with the page's address and instructions.
 
     Raises:
         Expected: if the port is taken, or the server cannot be guarded.
@@ -263,14 +263,14 @@ def run(
         with handle:
             handle.set_model(show.model, data=show.data)
             _refuses_strangers(bound, host)
-            on_open(words(host, bound, gate.token))
+            on_open(instructions(host, bound, gate.token))
             _loop(handle, show)
     except (KeyboardInterrupt, Ended):
-        pass  # the way to end it, or its time is over
+        pass  # the regular end
 
 
 def _loop(handle: viewer_handle.ViewerHandle, show: Show) -> None:
-    """Let time pass, in step with the clock."""
+    """Advance in real time."""
     due = time.perf_counter()
     rate = PictureRate(due)
     while handle.is_running():

@@ -1,5 +1,5 @@
 // Velocity of a legged robot's trunk from its IMU, its joints and its feet's contacts: a linear Kalman
-// filter in the world frame. docs/estimation.md derives it; go1exp/deploy/estimation/kalman.py is the same law in NumPy.
+// filter in the world frame. docs/estimation.md derives it; tests/kalman.py is the same law in NumPy.
 //
 // State x (24): position r and velocity v of the IMU, bias b of its accelerometer (IMU frame), feet p0..p3, height g of
 // the ground below r and its slope m along x and y.

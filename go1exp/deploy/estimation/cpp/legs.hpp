@@ -19,7 +19,7 @@ struct Foot {
   Mat3 turning;   // 1, angular velocity of the foot's link against the trunk = turning * dq/dt
 };
 
-// Hip about x, then thigh and calf about y: at q = 0 the leg hangs straight down.
+// Hip about x, then thigh and calf about y: at q = 0 the leg points straight down.
 struct Chain {
   Vec3 hip;      // m, where the hip's axis meets the thigh's plane
   Vec3 lengths;  // m: sideways to the thigh (+ left), thigh, calf
