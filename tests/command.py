@@ -1,25 +1,29 @@
-"""The command line in a process of its own, for tests: exit status, both streams, and nothing left in pytest's process.
+"""The command line for tests: exit status and both streams.
 
-``run`` forks it from a process that has already imported what the command line imports, which costs a tenth of a
-second instead of several. ``run_alone`` starts a new interpreter as a user does; a few smoke tests need no less.
+``refuse`` runs it in pytest's process: for settings that are refused. ``run`` forks it from a process that has already
+imported what the command line imports, which costs a tenth of a second instead of several, and leaves nothing in
+pytest's process. ``run_alone`` starts a new interpreter as a user does; a few smoke tests need no less.
 """
 
 from __future__ import annotations
 
 import atexit
+import io
 import json
 import os
 import select
 import signal
 import subprocess
 import sys
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest import mock
 
 from go1exp.base.paths import data_root
-from go1exp.cli import ONE_BLAS_THREAD
+from go1exp.cli import ONE_BLAS_THREAD, main
 
 COMMAND_LINE = "import sys; from go1exp.cli import main; sys.exit(main())"
 
@@ -171,6 +175,23 @@ def environment(**changes: str) -> dict[str, str]:
     inherited = {k: v for k, v in os.environ.items() if k not in ("HYDRA_FULL_ERROR", "DISPLAY", "WAYLAND_DISPLAY")}
     path = os.pathsep.join([str(data_root()), *filter(None, [os.environ.get("PYTHONPATH")])])
     return {**inherited, "PYTHONPATH": path, **changes}
+
+
+def refuse(cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run ``go1exp ARGUMENTS``, which do no work, in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        chdir(cwd),
+        mock.patch.object(sys, "argv", ["go1exp", *arguments]),
+        mock.patch.dict(os.environ, environment(), clear=True),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
+        try:
+            status = main()
+        except SystemExit as leaving:
+            status = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+    return subprocess.CompletedProcess(["go1exp", *arguments], status, out.getvalue(), err.getvalue())
 
 
 def run(

@@ -1,4 +1,4 @@
-"""The whole chain: train, export, check, deploy against a robot in another process, read the log, replay it."""
+"""The whole chain: train, export, check, deploy against the simulated robot, read the log, replay it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import json
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from go1exp.gap.stages.replay import Part, replay
 from go1exp.logs import recording
 from go1exp.logs.recording import Recording, joint_channels
 from go1exp.sim.task import parse_parts
+from tests.lockstep import lockstep
 from tests.small_run import SMALL
 
 STEP = 0.002
@@ -56,15 +58,21 @@ def replayed(log: Recording, shift: int) -> Part:
     return part
 
 
+@pytest.mark.parametrize(
+    "real_time",
+    [False, pytest.param(True, marks=pytest.mark.slow("go1exp/deploy/", "go1exp/gap/stages/replay.py"))],
+    ids=["in lock-step", "in real time"],
+)
 def test_from_training_to_the_replayed_log(
-    verb: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    real_time: bool, verb: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert verb("train", *SMALL, *LIVELY, "hydra.run.dir=run") == 0
     assert verb("export", "run=run", "out=walk.zip", "seconds=0.2") == 0
     assert verb("export", "check", "walk.zip") == 0
     words = ["command=[0.4,0,0]", "seconds=1", "stand_up=0.5", "lie_down=1.5", "brake=0.5", "stale=5"]
     robot = ["sim.start=lying", "sim.noise=0.1", "truth=true"]
-    assert verb("deploy", "walk.zip", *words, *robot, "out=logs") == 0
+    with nullcontext() if real_time else lockstep():
+        assert verb("deploy", "walk.zip", *words, *robot, "out=logs") == 0
     (kept,) = (tmp_path / "logs").glob("*.parquet")
     account = json.loads(kept.with_suffix(".json").read_text())
     assert account["ended"] == "walked to the end"

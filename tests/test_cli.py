@@ -28,36 +28,25 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.env.camera import RenderingUnavailable, choose_gl
 from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
-from tests.command import LIGHT, WITH_MODULES, run_alone
+from tests.command import WITH_MODULES, refuse, run_alone
 from tests.command import run as cli
+from tests.small_run import SMALL as SMALLEST
 
-SMALL = (
-    "ppo=paper",
-    "ppo.num_envs=4",
-    "ppo.steps=4",
-    "ppo.minibatches=2",
-    "ppo.epochs=1",
-    "ppo.hidden=[16]",
-    "ppo.iterations=2",
-    "backend.threads=1",
-    "torch_threads=1",
-    "logger.tensorboard=false",
-)
+SMALL = ("ppo=paper", *SMALLEST)
 HEAVY = {"mujoco", "stable_baselines3", "gymnasium", "torch.nn", "wandb", "tensorboard", "matplotlib", "scipy"}
 
 
 def assert_refused(tmp_path: Path, arguments: list[str], *said: str) -> None:
-    """Status 2, one message with everything of ``said``, nothing heavy loaded, nothing left behind."""
-    here, modules = tmp_path / "here", tmp_path / "modules.json"
+    """Status 2, one message with everything of ``said``, nothing left behind."""
+    here = tmp_path / "here"
     here.mkdir()
-    done = cli(here, *arguments, code=WITH_MODULES, preload=LIGHT, MODULES=str(modules))
+    done = refuse(here, *arguments)
     first, *others = done.stderr.splitlines()
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     assert re.match(r"go1exp( [\w-]+){0,2}: ", first)
     assert all(line.startswith("  ") for line in others), done.stderr
     assert not [text for text in said if text not in done.stderr], done.stderr
-    assert not HEAVY & set(json.loads(modules.read_text()))
     assert done.stdout == ""
     assert [p for p in here.rglob("*") if p != here / "runs"] == []
 
@@ -212,7 +201,7 @@ def test_a_list_with_wrong_items_is_not_told_to_be_a_word(command: Any, problems
 def test_a_key_that_the_chosen_group_does_not_have_is_not_proposed_for_itself(tmp_path: Path) -> None:
     arguments = ["train", "rand=none", "rand.foot_friction.range=[0,1]"]
     assert_refused(tmp_path, arguments, "rand.foot_friction.range=[0,1]: no such key")
-    done = cli(tmp_path, *arguments)
+    done = refuse(tmp_path, *arguments)
     assert "did you mean 'rand.foot_friction" not in done.stderr
 
 
@@ -256,7 +245,7 @@ def test_effects_come_from_files_by_any_path_and_from_names(tmp_path: Path) -> N
         "effect=[sub/mine.yaml,other.yaml]": {"coulomb": {"bound": 0.3}, "payload": {"mass": 2.0}},
         "effect=[viscous,./other.yaml]": {**compose("train", ["effect=viscous"])["effect"], "payload": {"mass": 2.0}},
     }.items():
-        done = cli(tmp_path, "train", "--cfg", "job", given)
+        done = refuse(tmp_path, "train", "--cfg", "job", given)
         assert done.returncode == 0, done.stderr
         assert OmegaConf.create(done.stdout).effect == expected, given
 
@@ -273,10 +262,10 @@ def test_a_file_can_be_added_where_a_verb_has_no_choice_of_the_group(tmp_path: P
 
 
 def test_what_only_the_fit_knows_is_refused_in_words_too(tmp_path: Path) -> None:
-    done = cli(tmp_path, "fit-actuator", "recordings=nowhere", "inputs=[speed]")
+    done = refuse(tmp_path, "fit-actuator", "recordings=nowhere", "inputs=[speed]")
     assert done.returncode == 2
     assert "inputs.0 = 'speed': input should be 'position_error', 'velocity'" in done.stderr
-    done = cli(tmp_path, "fit-actuator", "recordings=nowhere", "holdout=[a]", "validation=[a,b]")
+    done = refuse(tmp_path, "fit-actuator", "recordings=nowhere", "holdout=[a]", "validation=[a,b]")
     assert (done.returncode, done.stderr) == (2, "go1exp fit-actuator: validation: a cannot be held out too\n")
 
 
@@ -290,7 +279,7 @@ def test_what_only_the_fit_knows_is_refused_in_words_too(tmp_path: Path) -> None
     ],
 )
 def test_a_recording_that_is_not_there_is_named(arguments: str, said: str, tmp_path: Path) -> None:
-    done = cli(tmp_path, *arguments.split())
+    done = refuse(tmp_path, *arguments.split())
     assert (done.returncode, done.stdout, done.stderr) == (1, "", f"{said}\n")
 
 
@@ -386,13 +375,13 @@ def test_words_by_position_become_settings(verb: str, given: list[str], named: l
 
 def test_a_path_by_position_may_hold_anything(tmp_path: Path) -> None:
     folder = tmp_path / "it's [a] {folder}, $x"
-    done = cli(tmp_path, "record", "audit", str(folder), "second one")
+    done = refuse(tmp_path, "record", "audit", str(folder), "second one")
     said = f"go1exp record audit: {folder}: no such file\nsecond one: no such file\n"
     assert (done.returncode, done.stderr) == (1, said)
 
 
 def test_the_value_of_an_option_is_no_setting(tmp_path: Path) -> None:
-    done = cli(tmp_path, "record", "import", "--cfg", "job", "go2_in_air", "logs", "options={rate_hz: 100.0}")
+    done = refuse(tmp_path, "record", "import", "--cfg", "job", "go2_in_air", "logs", "options={rate_hz: 100.0}")
     assert done.returncode == 0, done.stderr
     expected: dict[str, Any] = {
         "source": "go2_in_air",
@@ -434,7 +423,7 @@ def accepted(verb: str, word: str) -> bool:
 
 
 def test_cfg_job_prints_the_configuration_and_runs_nothing(tmp_path: Path) -> None:
-    done = cli(tmp_path, "train", "--cfg", "job", "rand=none", "ppo.iterations=7")
+    done = refuse(tmp_path, "train", "--cfg", "job", "rand=none", "ppo.iterations=7")
     assert done.returncode == 0, done.stderr
     printed = OmegaConf.create(done.stdout)
     assert printed == compose("train", ["rand=none", "ppo.iterations=7"])
@@ -446,7 +435,7 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
     pyproject = (data_root() / "pyproject.toml").read_text()
     version = re.search(r'^version = "(.+)"$', pyproject, re.MULTILINE)
     assert version
-    assert cli(tmp_path, "--version").stdout == f"go1exp {version.group(1)}\n"
+    assert refuse(tmp_path, "--version").stdout == f"go1exp {version.group(1)}\n"
 
 
 @pytest.mark.parametrize("given", [None, "3"])
@@ -465,7 +454,7 @@ def test_blas_has_one_thread_unless_the_user_says_otherwise(given: str | None, m
 
 
 def test_list_prints_every_registered_term_with_its_first_line_and_every_choice(tmp_path: Path) -> None:
-    done = cli(tmp_path, "list")
+    done = refuse(tmp_path, "list")
     assert done.returncode == 0, done.stderr
     sections: dict[str, list[str]] = {}
     for line in done.stdout.splitlines():
@@ -494,7 +483,7 @@ def test_a_reader_may_leave(words: str, first: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("word", ["effect", "effects", "group=effect"])
 def test_list_takes_a_group_by_position_in_singular_and_plural(word: str, tmp_path: Path) -> None:
-    done = cli(tmp_path, "list", word)
+    done = refuse(tmp_path, "list", word)
     assert done.returncode == 0, done.stderr
     first, *lines = done.stdout.splitlines()
     assert first == "effect"
@@ -603,7 +592,7 @@ def test_a_place_for_results_that_cannot_be_written_to_is_refused_before_the_wor
 ) -> None:
     (tmp_path / "file").touch()
     subject = "subjects=[paper,hop]" if words[0] == "compare" else f"run={run}"
-    done = cli(tmp_path, words[0], subject, *words[1:])
+    done = refuse(tmp_path, words[0], subject, *words[1:])
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
     assert done.stderr.startswith(f"go1exp {words[0]}: {key} cannot be written to (")
@@ -618,7 +607,7 @@ def test_a_checkpoint_is_named_as_a_file_in_the_run_folder(run: Path, tmp_path: 
 
 
 def test_an_empty_grid_is_refused(run: Path, tmp_path: Path) -> None:
-    done = cli(tmp_path, "eval", f"run={run}", "grid.cross=true", "grid.x=[]", "out=report.json")
+    done = refuse(tmp_path, "eval", f"run={run}", "grid.cross=true", "grid.x=[]", "out=report.json")
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     assert "grid" in done.stderr
@@ -626,7 +615,7 @@ def test_an_empty_grid_is_refused(run: Path, tmp_path: Path) -> None:
 
 def test_a_policy_period_that_physics_cannot_keep_is_refused(run: Path, tmp_path: Path) -> None:
     """2.5 physics steps would become 2, and every time and speed in the report would be of another clock."""
-    done = cli(tmp_path, "eval", f"run={run}", *GRID, "out=report.json", "policy_dt=0.005")
+    done = refuse(tmp_path, "eval", f"run={run}", *GRID, "out=report.json", "policy_dt=0.005")
     assert done.returncode == 2, done.stdout
     assert "policy_dt = 0.005" in done.stderr
 

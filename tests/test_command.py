@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -35,18 +36,15 @@ MORE = {
     "list efects": "did you mean 'effect'",
     "bench suite=fast": "suite = 'fast'",
 }
-"""For ``make test-all``: forks of a light process refuse the same in tests/test_cli.py, and show what was imported."""
-
-slow = pytest.mark.slow(
-    "go1exp/cli/", "go1exp/__init__.py", "go1exp/sim/task.py", "go1exp/config/schema/", "tests/command.py"
-)
+"""Forked from a process without torch; tests/test_cli.py has more refusals, in its own process."""
 
 
-@pytest.mark.parametrize("words", [*SMOKE, *(pytest.param(words, marks=slow) for words in MORE)])
+@pytest.mark.parametrize("words", [*SMOKE, *MORE])
 def test_the_real_command_refuses_at_once_and_loads_nothing_heavy(words: str, tmp_path: Path) -> None:
     here, modules = tmp_path / "here", tmp_path / "modules.json"
     here.mkdir()
-    done = run_alone(here, *words.split(), code=WITH_MODULES, MODULES=str(modules))
+    start = run_alone if words in SMOKE else partial(run, preload=LIGHT)
+    done = start(here, *words.split(), code=WITH_MODULES, MODULES=str(modules))
     assert (done.returncode, done.stdout) == (2, "")
     assert re.search(r"^go1exp( [\w-]+){1,2}: ", done.stderr, re.MULTILINE)
     assert (SMOKE | MORE)[words] in done.stderr
