@@ -63,8 +63,10 @@ demo: setup ## train for five minutes, evaluate the policy, render a video, find
 	@$(BIN)/go1exp gap logs=assets/demo/suspended_go1 out=runs/demo/gap || [ $$? -eq 10 ]
 
 # SLOW: none, all, or a commit: then the slow tests that are about a file changed since (tests/selection.py).
+# SLOW_SECONDS: after so many in each process, slow tests are skipped.
 SLOW ?= none
-PYTEST = $(BIN)/python -m pytest -n $(or $(JOBS),2) --dist worksteal -q
+SLOW_SECONDS ?= inf
+PYTEST = $(BIN)/python -m pytest -n $(or $(JOBS),2) --dist loadscope -q
 
 # Files that need neither a training nor another process nor a search. Others: make quick T=tests/test_ppo.py
 T ?= $(addprefix tests/,contracts/test_actuators.py contracts/test_terms.py $(addprefix test_,$(addsuffix .py, \
@@ -77,7 +79,7 @@ quick: setup ## run tests that take seconds, while working; of certain files: ma
 
 test: setup ## run the tests that must hold
 	@echo "test: pytest"
-	@$(PYTEST) --slow=$(SLOW) --durations=15
+	@$(PYTEST) --slow=$(SLOW) --slow-seconds=$(SLOW_SECONDS) --durations=15
 
 test-all: SLOW := all
 test-all: test ## run every test

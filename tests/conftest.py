@@ -6,12 +6,13 @@ import gc
 import os
 import signal
 import threading
+import time
 
 from go1exp.cli import ONE_BLAS_THREAD
 
 os.environ.setdefault(*ONE_BLAS_THREAD)  # before NumPy is imported; tests run side by side
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from copy import deepcopy
 from functools import cache
 from itertools import pairwise
@@ -34,12 +35,16 @@ from tests.selection import changed_since, chosen
 torch.set_num_threads(1)
 
 CHANGED = pytest.StashKey[frozenset[str] | None]()
+SPENT = pytest.StashKey[float]()
+SPENT_ALL = "the time for slow tests is spent"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the choice of slow tests: tests/selection.py."""
     text = "slow tests: all, none, or those about files that changed since a commit (default: all)"
     parser.addoption("--slow", default="all", metavar="WHICH", help=text)
+    text = "skip the slow tests that are left when this process has spent so long on slow tests (default: no limit)"
+    parser.addoption("--slow-seconds", default=float("inf"), type=float, metavar="S", help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -48,6 +53,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
     slow = str(config.getoption("--slow"))
+    config.stash[SPENT] = 0.0
     config.stash[CHANGED] = None if slow in ("all", "none") else changed_since(slow, config.rootpath)
 
 
@@ -57,6 +63,26 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     if slow not in ("all", "none"):
         about = "all, as git cannot tell what changed" if changed is None else f"about the {len(changed)} files changed"
         terminalreporter.write_line(f"slow tests: {about} since {slow}")
+    left = [report for report in terminalreporter.stats.get("skipped", []) if SPENT_ALL in str(report.longrepr)]
+    if left:
+        terminalreporter.write_line(f"slow tests: {len(left)} of them skipped, {SPENT_ALL}; make test-all runs them")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Count the time of slow tests."""
+    begin = time.monotonic()
+    result = yield
+    if item.get_closest_marker("slow"):
+        item.config.stash[SPENT] += time.monotonic() - begin
+    return result
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a slow test where their time is spent."""
+    if item.get_closest_marker("slow") and item.config.stash[SPENT] >= item.config.getoption("--slow-seconds"):
+        pytest.skip(SPENT_ALL)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -30,9 +30,9 @@ from go1exp.sim.task import parse_train
 from go1exp.train import run_folder, trainer
 from tests.command import WITH_MODULES, refuse, run_alone
 from tests.command import run as cli
-from tests.small_run import SMALL as SMALLEST
+from tests.small_run import small
 
-SMALL = ("ppo=paper", *SMALLEST)
+SMALL = small("ppo=paper")
 HEAVY = {"mujoco", "stable_baselines3", "gymnasium", "torch.nn", "wandb", "tensorboard", "matplotlib", "scipy"}
 
 

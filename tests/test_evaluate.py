@@ -24,6 +24,7 @@ from go1exp.sim.env.core import Go1Core
 from go1exp.sim.task import TaskConfig, TrainConfig, parse_train
 from go1exp.train import checkpoint, run_folder, trainer
 from go1exp.train.policy import Policy, load_policy
+from tests.small_run import small
 
 MakeTask = Callable[..., TaskConfig]
 
@@ -387,19 +388,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainConfig
     run = tmp_path_factory.mktemp("evaluate") / "run"
     container = compose(
         "train",
-        [
-            "ppo=cpu",
-            "ppo.num_envs=4",
-            "ppo.steps=4",
-            "ppo.minibatches=2",
-            "ppo.epochs=2",
-            "ppo.hidden=[16,8]",
-            "ppo.iterations=2",
-            "backend.threads=1",
-            "torch_threads=1",
-            "checkpoint.every=1",
-            "logger.tensorboard=false",
-        ],
+        small("ppo=cpu", "checkpoint.every=1", epochs=2),
     )
     config = parse_train(container)
     run_folder.write(run, container)

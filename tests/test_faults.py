@@ -30,20 +30,10 @@ from go1exp.train.group import Group
 from go1exp.train.metrics import CsvWriter
 from go1exp.train.ppo import AdaptivePPO
 from tests.command import run as cli
+from tests.small_run import small
 
-SMALL = (
-    "ppo=paper",
-    "ppo.num_envs=8",
-    "ppo.steps=8",
-    "ppo.minibatches=2",
-    "ppo.epochs=2",
-    "ppo.hidden=[16]",
-    "ppo.iterations=4",
-    "backend.threads=1",
-    "torch_threads=1",
-    "logger.tensorboard=false",
-    "checkpoint.every=1",
-    "sim.spread_starts=false",
+SMALL = small(
+    *("ppo=paper", "checkpoint.every=1", "sim.spread_starts=false"), num_envs=8, steps=8, epochs=2, iterations=4
 )
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="/dev/full, a disk without space, is Linux's")
@@ -204,6 +194,7 @@ def test_on_the_command_line_a_fault_is_a_message_and_a_status(run: Path) -> Non
 import sys
 from go1exp.cli import main
 from go1exp.sim.env.core import Go1Core
+from tests.small_run import small
 snapshot = Go1Core.snapshot
 def broken(self):
     s = snapshot(self)

@@ -22,6 +22,7 @@ from go1exp.config.schema.registry import Expected
 from go1exp.sim.task import LoggerConfig, WandbConfig, parse_train
 from go1exp.train import metrics, run_folder, trainer, wandb_writer
 from go1exp.train.metrics import CsvWriter, make_logger
+from tests.small_run import small
 
 ROUGH_NUMBERS = (1 / 3, -1e-17, 12345678.9, 0.1 + 0.2, float("nan"), 6.02e23)
 
@@ -107,18 +108,7 @@ def test_a_file_in_which_nothing_was_written_yet_is_begun_anew(tmp_path: Path) -
 def train(run: Path, *overrides: str) -> None:
     container = compose(
         "train",
-        [
-            "ppo=paper",
-            "ppo.num_envs=4",
-            "ppo.steps=8",
-            "ppo.minibatches=2",
-            "ppo.epochs=1",
-            "ppo.hidden=[16]",
-            "ppo.iterations=4",
-            "backend.threads=1",
-            "torch_threads=1",
-            *overrides,
-        ],
+        small("ppo=paper", "logger.tensorboard=true", *overrides, steps=8, iterations=4),
     )
     run_folder.write(run, container)
     trainer.train(parse_train(container), container, run)

@@ -27,15 +27,10 @@ from go1exp.sim.task import PPOConfig, parse_train
 from go1exp.train import trainer
 from go1exp.train.loss import ppo_loss
 from go1exp.train.ppo import AdaptivePPO, GaussianPolicy, adapted_rate, gaussian_kl, linear_rate, policy_settings
+from tests.small_run import small
 
-TINY = (
-    "ppo=paper",
-    "ppo.num_envs=8",
-    "ppo.steps=8",
-    "ppo.minibatches=2",
-    "ppo.epochs=2",
-    "ppo.hidden=[16]",
-    "ppo.matmul_precision=highest",
+TINY = small(
+    *("ppo=paper", "ppo.matmul_precision=highest"), num_envs=8, steps=8, epochs=2, hidden="[16]", iterations=5000
 )
 
 

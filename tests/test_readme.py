@@ -20,6 +20,7 @@ from go1exp.base.paths import data_root
 from go1exp.cli import VERBS
 from go1exp.config.schema import registry
 from tests.command import run
+from tests.small_run import small
 
 ROOT = data_root()
 README = (ROOT / "README.md").read_text()
@@ -29,10 +30,7 @@ PAGES = [
 ]
 PAGES = [page for page in PAGES if "reference" not in page.parts]
 
-TRAINING = (
-    *("ppo.num_envs=4", "ppo.steps=4", "ppo.minibatches=2", "ppo.epochs=1", "ppo.iterations=1", "ppo.hidden=[16,8]"),
-    *("backend.threads=1", "torch_threads=1", "logger.tensorboard=false"),
-)
+TRAINING = small(iterations=1)
 BUDGETS: dict[str, tuple[str, ...]] = {
     "train": TRAINING,
     "eval": ("grid.x=[0.5]", "grid.y=[]", "grid.yaw=[]", "episodes=1", "duration_s=0.4", "settle_s=0.1"),

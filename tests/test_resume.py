@@ -26,16 +26,10 @@ from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, metrics, run_folder, trainer
 from tests.command import COMMAND_LINE, run_alone
 from tests.command import run as cli
+from tests.small_run import small
 
 SMALL = (
-    "ppo.num_envs=8",
-    "ppo.steps=8",
-    "ppo.minibatches=2",
-    "ppo.epochs=2",
-    "ppo.hidden=[16]",
-    "backend.threads=1",
-    "torch_threads=1",
-    "logger.tensorboard=false",
+    *small(num_envs=8, steps=8, epochs=2),
     "checkpoint.every=2",
     "checkpoint.keep=2",
     # within six iterations, 0.96 s, everything that can happen happens
@@ -62,6 +56,7 @@ SIGNALLED = """
 import os, signal, sys
 from go1exp.cli import main
 from go1exp.train.metrics import CsvWriter
+from tests.small_run import small
 write = CsvWriter.write
 def signalled(self, values, excluded, step=0):
     write(self, values, excluded, step)

@@ -18,11 +18,9 @@ from go1exp.config.schema.registry import ConfigError
 from go1exp.sim.task import parse_train
 from go1exp.train import checkpoint, policy, run_folder, trainer
 from go1exp.train.policy import load_run
+from tests.small_run import small
 
-SMALL = (
-    *("ppo.num_envs=4", "ppo.steps=4", "ppo.minibatches=2", "ppo.epochs=1", "ppo.iterations=1", "ppo.hidden=[16]"),
-    *("backend.threads=1", "torch_threads=1", "logger.tensorboard=false"),
-)
+SMALL = small(iterations=1, hidden="[16]")
 
 Train = Callable[..., Any]
 
