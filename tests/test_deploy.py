@@ -922,8 +922,9 @@ def children(pid: int) -> list[int]:
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="children are found in Linux's /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("way", ["go1exp.deploy", "go1exp"])
+@pytest.mark.parametrize("seconds", [60.0, pytest.param(2.0, marks=pytest.mark.slow("go1exp/deploy/", "go1exp/cli/"))])
 def test_a_signal_while_the_robot_starts_ends_both_at_once(
-    file: str, tmp_path: Path, way: str, number: signal.Signals
+    file: str, tmp_path: Path, seconds: float, way: str, number: signal.Signals
 ) -> None:
     arguments = ["deploy", file, "out=logs"] if way == "go1exp" else [file, "--out", "logs"]
     process, pipe = begun(tmp_path, "-m", way, *arguments)
@@ -934,13 +935,11 @@ def test_a_signal_while_the_robot_starts_ends_both_at_once(
         time.sleep(0.001)
     time.sleep(0.05)  # it has begun to import, which takes seconds
     process.send_signal(number)
-    begin = time.monotonic()
     try:
-        rest, errors = process.communicate(timeout=60)
+        rest, errors = process.communicate(timeout=seconds)
     finally:
         process.kill()
         process.wait()
-    assert time.monotonic() - begin < 2.0
     assert errors == ""
     assert rest == "stopped before the walk began: nothing was commanded\n"
     assert process.returncode == STATUS["operator_stop"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -72,3 +73,12 @@ def test_all_none_and_those_of_what_changed() -> None:
 def test_the_places_of_every_slow_test_exist(request: pytest.FixtureRequest) -> None:
     marks = [mark for item in request.session.items for mark in item.iter_markers("slow")]
     assert [place for mark in marks for place in mark.args if not (data_root() / place).exists()] == []
+
+
+def test_the_files_of_make_quick_exist() -> None:
+    command = subprocess.run(
+        ["make", "-n", "quick"], cwd=data_root(), capture_output=True, text=True, check=True
+    ).stdout
+    files = re.findall(r"tests/\S+\.py", command)
+    assert len(files) > 9
+    assert [file for file in files if not (data_root() / file).exists()] == []
