@@ -123,7 +123,7 @@ class Server:
             start_new_session=True,  # Ctrl-C ends pytest, which ends this
         )
         atexit.register(self.close)
-        assert self._answer(120.0) == "ready"
+        assert self._answer(600.0) == "ready"
 
     def close(self) -> None:
         """End the process and wait for it."""

@@ -194,7 +194,6 @@ def test_on_the_command_line_a_fault_is_a_message_and_a_status(run: Path) -> Non
 import sys
 from go1exp.cli import main
 from go1exp.sim.env.core import Go1Core
-from tests.small_run import small
 snapshot = Go1Core.snapshot
 def broken(self):
     s = snapshot(self)

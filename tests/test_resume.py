@@ -56,7 +56,6 @@ SIGNALLED = """
 import os, signal, sys
 from go1exp.cli import main
 from go1exp.train.metrics import CsvWriter
-from tests.small_run import small
 write = CsvWriter.write
 def signalled(self, values, excluded, step=0):
     write(self, values, excluded, step)
