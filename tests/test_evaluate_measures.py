@@ -192,9 +192,15 @@ def test_the_tables_fit_a_terminal_and_say_n_and_what_does_not_count(task: TaskC
     text = table.text(report)
     lines = text.split("\n")
     assert max(len(line) for line in lines if "RMSE over all" not in line) <= 120
-    for part in ("phase FL RR RL", "load % FR FL RR RL", "CoT", "0 of 2 different robots", "4 of 6 episodes repeat"):
+    for part in (
+        "phase FL RR RL",
+        "load % FR FL RR RL",
+        "CoT",
+        "0 of 2 distinct robots",
+        "4 of 6 episodes are repeats",
+    ):
         assert part in text
-    assert "largest delay of the target without a fall: 20 ms (falls: 0 ms 0 of 2, 30 ms 1 of 2)" in text
+    assert "largest command delay without a fall: 20 ms (falls: 0 ms 0 of 2, 30 ms 1 of 2)" in text
     tables = table.measure_tables(report)
     assert [len(t) for t in tables] == [3, 3]
     assert [row[-1] for row in tables[0]] == ["n", "1", "1"]

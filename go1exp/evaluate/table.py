@@ -6,27 +6,29 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import go1exp.base.report.table as kit
+from go1exp.base.report.table import aligned
 from go1exp.evaluate.criteria import Verdict, evaluated
 from go1exp.evaluate.rollout import AXES
 
 HEADER = ("command x, y, yaw", "mean x, y, yaw", "RMSE x, y, yaw", "falls", "mean time s")
 
 Show = Callable[[Any], str]
-"""Writes one cell from what a report has of a measure, None included."""
+"""Text of one cell from the entry of a measure in a report, which may be None."""
 
 Columns = dict[str, tuple[str, Show]]
-"""Header -> measure and how it is written."""
+"""Header -> measure and its format."""
 
 NO_FIGURE = "-"
 
 FEET = "FR FL RR RL"
 
 WIDTH = 120
-"""Columns of text that a table of further measures may take; more measures get a second one."""
+"""Largest width of a table of further measures, in characters."""
 
 
 def _numbers(form: str, factor: float = 1.0) -> Show:
-    """Return what writes the mean of a measure, or those of the four feet."""
+    """Return the format of the mean of a measure, or of its four feet."""
 
     def show(entry: Any) -> str:
         if entry is None:
@@ -40,17 +42,17 @@ def _numbers(form: str, factor: float = 1.0) -> Show:
 
 
 def _phases(entry: Any) -> str:
-    """Write the phases of FL, RR and RL; that of FR is 0."""
+    """Return the phases of FL, RR and RL relative to FR."""
     return " ".join(_numbers(".2f")(entry).split(" ")[1:]) or NO_FIGURE
 
 
 def _most(entry: Any) -> str:
-    """Write the name that most robots have."""
+    """Return the most frequent name."""
     return next(iter(entry or {}), NO_FIGURE)
 
 
 def _any(entry: Any) -> str:
-    """Write a measure of whatever kind."""
+    """Return a measure of any kind as text."""
     return _numbers(".3g")(entry) if entry is None or "mean" in entry else _most(entry)
 
 
@@ -85,11 +87,11 @@ FIXED = frozenset(measure for columns in (GAIT, CONTACT) for measure, _ in colum
 """Measures that these two tables show."""
 
 JSON_ONLY = frozenset({"foot_load", "gait_clarity", "phase_consistency", "sink_p99", "slip_distance", "slip_share"})
-"""Measures of the package that stand in the JSON alone where the report has all of the package's: nobody chose them."""
+"""Measures that the tables omit where the report has all measures of the package."""
 
-LEGEND = """error: of the touchdowns to a trot's, phase: after FR, both in cycles; feet: FR FL RR RL; pitch: nose down;
-touchdown and peak (body weights): 95th percentile; step of the target in 20 ms; tau, qd, line: share of peak torque,
-top speed and the motors' torque-speed line; step, tau, qd and line: 99th percentile; CoT: positive work / (m g way)."""
+LEGEND = """error: touchdown times relative to a trot, phase: relative to FR, in cycles; feet: FR FL RR RL; pitch: nose down;
+touchdown and peak (body weights): 95th percentile; step: action rate over 20 ms; tau, qd, line: share of peak
+torque, top speed and the torque-speed line; step, tau, qd and line: 99th percentile; CoT: positive work / (m g d)."""
 
 MEANS = "Means over n robots; the JSON has intervals and all measures."
 
@@ -122,12 +124,6 @@ def _summary(report: dict[str, Any]) -> str:
     )
 
 
-def _laid(lines: list[tuple[str, ...]]) -> list[str]:
-    """Lay cells out in columns."""
-    widths = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
-    return ["  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)) for line in lines]
-
-
 def _short(command: Any) -> str:
     return " ".join(f"{v:+.1f}" if abs(10 * v - round(10 * v)) < 1e-9 else f"{v:+.2f}" for v in command)
 
@@ -152,7 +148,7 @@ def _further(report: dict[str, Any]) -> list[list[tuple[str, ...]]]:
     tables: list[list[tuple[str, ...]]] = []
     taken: list[tuple[str, ...]] = []
     for column in _columns(report, shown):
-        if taken and len(_laid(_table(report, [*taken, column]))[0]) > WIDTH:
+        if taken and len(aligned(_table(report, [*taken, column]), 0)[0]) > WIDTH:
             tables.append(_table(report, taken))
             taken = []
         taken.append(column)
@@ -181,21 +177,20 @@ def _table(report: dict[str, Any], columns: list[tuple[str, ...]]) -> list[tuple
 
 
 def _falls(report: dict[str, Any]) -> str:
-    """Say how many of the robots that differ fell, with the interval, and how many do."""
+    """Return the number of falls of distinct robots with its interval, and the number of repeats."""
     falls = report["distinct_falls"]
     same = report["episodes"] - falls["n"]
-    repeats = "repeat another one and do not count"
-    alike = f"; {same} of {report['episodes']} episodes {repeats}" if same else ""
+    alike = f"; {same} of {report['episodes']} episodes are repeats and excluded" if same else ""
     low, high = (100.0 * falls[k] for k in ("low", "high"))
-    return f"falls {falls['count']} of {falls['n']} different robots (95 %: {low:.1f} to {high:.1f} %){alike}"
+    return f"falls {falls['count']} of {falls['n']} distinct robots (95 %: {low:.1f} to {high:.1f} %){alike}"
 
 
 def _delay(report: dict[str, Any]) -> str:
-    """Say how late targets may come."""
+    """Return the delay margin."""
     margin = report["delay_margin"]
     runs = ", ".join(f"{ms} ms {f['count']} of {f['n']}" for ms, f in margin["falls"].items())
-    held = "none: robots fall without any" if margin["ms"] is None else f"{margin['ms']} ms"
-    return f"largest delay of the target without a fall: {held} (falls: {runs})"
+    held = "none: robots fall without delay" if margin["ms"] is None else f"{margin['ms']} ms"
+    return f"largest command delay without a fall: {held} (falls: {runs})"
 
 
 def acceptance(report: dict[str, Any]) -> list[str]:
@@ -217,10 +212,10 @@ def acceptance(report: dict[str, Any]) -> list[str]:
 
 def text(report: dict[str, Any]) -> str:
     """Return the report as text for a terminal; m/s and rad/s."""
-    lines = _laid([HEADER, *rows(report)])
+    lines = aligned([HEADER, *rows(report)], 0)
     tables = measure_tables(report)
     for table in tables:
-        lines += ["", *_laid(table)]
+        lines += ["", *aligned(table, 0)]
     measured = any(c.get("measures") for c in report["commands"])
     if measured:
         fixed = len(tables) > len(_further(report))
@@ -233,5 +228,4 @@ def text(report: dict[str, Any]) -> str:
 
 def markdown(report: dict[str, Any]) -> str:
     """Return the report as a Markdown table."""
-    lines = [f"| {' | '.join(line)} |" for line in [HEADER, ("---",) * len(HEADER), *rows(report)]]
-    return "\n".join([*lines, "", _summary(report)])
+    return "\n".join([*kit.markdown(HEADER, rows(report)), "", _summary(report)])

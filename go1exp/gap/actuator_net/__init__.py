@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from go1exp.gap.actuator_net.dataset import SmoothMotion, smooth_motion
     from go1exp.gap.actuator_net.fitting import FitResult, fit
-    from go1exp.gap.actuator_net.plots import plot
-    from go1exp.gap.actuator_net.report import Report, text
+    from go1exp.gap.actuator_net.report import Report, plot, text
     from go1exp.gap.actuator_net.settings import FitError, FitSettings
 
 __all__ = [
@@ -29,8 +28,7 @@ __all__ = [
 
 _MODULES = {
     **dict.fromkeys(("FitResult", "fit"), "fitting"),
-    "plot": "plots",
-    **dict.fromkeys(("Report", "text"), "report"),
+    **dict.fromkeys(("Report", "plot", "text"), "report"),
     **dict.fromkeys(("FitError", "FitSettings"), "settings"),
     **dict.fromkeys(("SmoothMotion", "smooth_motion"), "dataset"),
 }

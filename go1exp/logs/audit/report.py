@@ -1,10 +1,13 @@
-"""The result of an audit, and how it is printed."""
+"""The result of an audit, as data and as text."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
+
+from go1exp.base.report.table import aligned
+from go1exp.base.wording import counted
 
 Verdict = Literal["ok", "suspect", "bad"]
 ORDER: tuple[Verdict, ...] = ("ok", "suspect", "bad")
@@ -22,7 +25,7 @@ class Finding:
     Attributes:
         check: ``rate``, ``repeats``, ``sign``, ``delay``, ...
         channel: column, or ``t``, or ``all`` where it concerns the whole recording.
-        verdict: ``ok`` if it is information and not a flaw.
+        verdict: ``ok`` for information, else a flaw.
         size: the number compared with the limits, or None.
         unit: of ``size``.
         message: a sentence.
@@ -38,7 +41,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Channel:
-    """One column in numbers; None where a number could not be had or makes no sense.
+    """One column in numbers; None where a number is undefined.
 
     Attributes:
         name: column.
@@ -47,9 +50,9 @@ class Channel:
         low: smallest value.
         high: largest value.
         step: quantisation; 0 where values are continuous.
-        noise: standard deviation of what changes from sample to sample, an upper bound while the joint moves fast.
+        noise: standard deviation between samples, an upper bound while the joint moves fast.
         repeats: share of stale samples while the channel moves.
-        delay_ms: time from command to answer, ms, on the columns ``q_J``.
+        delay_ms: delay from command to response, ms, of the columns ``q_J``.
         delay_sd_ms: its standard error, ms.
     """
 
@@ -76,7 +79,7 @@ class AuditReport:
         rate_hz: one over the median step of ``t``.
         channels: one line for each column, ``t`` first.
         findings: flaws first, then facts.
-        torque_off: stretches without actuators, (start, end) in s.
+        torque_off: stretches with actuators off, (start, end) in s.
         still: stretches in which no joint moves, (start, end) in s.
     """
 
@@ -105,34 +108,24 @@ class AuditReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain values that JSON can hold."""
-        plain = asdict(self)
-        for key in ("channels", "findings"):
-            plain[key] = list(plain[key])
-        for key in ("torque_off", "still"):
-            plain[key] = [list(stretch) for stretch in plain[key]]
-        return {"verdict": self.verdict, **plain}
+        plain = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
+        stretches = {key: [list(stretch) for stretch in plain[key]] for key in ("torque_off", "still")}
+        return {"verdict": self.verdict, **plain, **stretches}
 
     def text(self) -> str:
         """Return a table of the channels, and below it the findings, one to a line."""
         counts = {v: sum(c.verdict == v for c in self.channels) for v in ORDER}
+        channels = ", ".join(f"{counted(n, 'channel')} {v}" for v, n in counts.items() if n)
+        stretches = (("actuators off", self.torque_off), ("still", self.still))
+        head = ("channel", "verdict", "unit", "low", "high", "step", "noise", "repeats", "delay ms")
         lines = [
             f"{self.episode}: {self.verdict}",
-            f"{self.samples} samples, {self.duration:.2f} s at {self.rate_hz:.4g} Hz; "
-            + ", ".join(f"{n} channel{'s' if n > 1 else ''} {v}" for v, n in counts.items() if n),
-            *([f"actuators off: {_stretches(self.torque_off)}"] if self.torque_off else []),
-            *([f"still: {_stretches(self.still)}"] if self.still else []),
+            f"{self.samples} samples, {self.duration:.2f} s at {self.rate_hz:.4g} Hz; {channels}",
+            *(f"{name}: {_stretches(those)}" for name, those in stretches if those),
             "",
+            *aligned([head, *map(_row, self.channels)], 3),
         ]
-        head = ("channel", "verdict", "unit", "low", "high", "step", "noise", "repeats", "delay ms")
-        rows = [head, *map(_row, self.channels)]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-        for row in rows:
-            left = [cell.ljust(w) for cell, w in zip(row[:3], widths[:3], strict=True)]
-            right = [cell.rjust(w) for cell, w in zip(row[3:], widths[3:], strict=True)]
-            lines.append("  ".join([*left, *right]).rstrip())
-        if self.findings:
-            lines += ["", *_grouped(self.findings)]
-        return "\n".join(lines)
+        return "\n".join([*lines, *(["", *_grouped(self.findings)] if self.findings else [])])
 
 
 def _grouped(findings: tuple[Finding, ...]) -> list[str]:
