@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from go1exp.evaluate.protocol.claims import Claim, evaluated, verdict
-from go1exp.evaluate.protocol.comparing import word
 from go1exp.evaluate.quantities import FELL, FINGERPRINT, MOVING, Column, distinct, summary
+from go1exp.evaluate.statistics.compare import verdict_by_interval
 from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,
@@ -134,7 +134,7 @@ def test_the_bootstrap_agrees_with_students_interval() -> None:
 @pytest.mark.parametrize("n", [2, 3, 4, 8, 40])
 def test_of_equal_pairs_one_in_twenty_is_told_apart_by_chance(n: int) -> None:
     rng = np.random.default_rng(n)
-    words = [word(paired_mean_interval(rng.normal(size=n)), "lower") for _ in range(2000)]
+    words = [verdict_by_interval(paired_mean_interval(rng.normal(size=n)), "lower") for _ in range(2000)]
     significant = sum(w != "no significant difference" for w in words)
     assert stats.binomtest(significant, 2000, 0.05).pvalue > 0.001
 
@@ -142,7 +142,7 @@ def test_of_equal_pairs_one_in_twenty_is_told_apart_by_chance(n: int) -> None:
 def test_pairs_that_all_differ_alike_tell_nothing_and_equal_pairs_are_equal() -> None:
     same = paired_mean_interval([0.41 - 0.35, 0.43 - 0.37])  # kicks are timed by the policy's period
     assert same.estimate == pytest.approx(0.06)
-    assert word(same, "lower") == "no significant difference"
+    assert verdict_by_interval(same, "lower") == "no significant difference"
     assert pairs_needed([0.41 - 0.35, 0.43 - 0.37]) is None
     none = paired_mean_interval([0.0, 0.0, 0.0])
     assert (none.estimate, none.low, none.high) == (0.0, 0.0, 0.0)
@@ -176,9 +176,9 @@ def test_the_pairs_that_would_tell_do_tell() -> None:
 
 
 def test_words_of_differences() -> None:
-    assert word(Interval(0.2, 0.1, 0.3, 9), "higher") == "better"
-    assert word(Interval(0.2, 0.1, 0.3, 9), "lower") == "worse"
-    assert word(Interval(-0.2, -0.3, -0.1, 9), "lower") == "better"
-    assert word(Interval(0.0, -0.1, 0.1, 9), "lower") == "no significant difference"
-    assert word(Interval(0.1, NAN, NAN, 1), "lower") == "no significant difference"
-    assert word(Interval(0.0, 0.0, 0.0, 9), "lower") == "no significant difference"
+    assert verdict_by_interval(Interval(0.2, 0.1, 0.3, 9), "higher") == "better"
+    assert verdict_by_interval(Interval(0.2, 0.1, 0.3, 9), "lower") == "worse"
+    assert verdict_by_interval(Interval(-0.2, -0.3, -0.1, 9), "lower") == "better"
+    assert verdict_by_interval(Interval(0.0, -0.1, 0.1, 9), "lower") == "no significant difference"
+    assert verdict_by_interval(Interval(0.1, NAN, NAN, 1), "lower") == "no significant difference"
+    assert verdict_by_interval(Interval(0.0, 0.0, 0.0, 9), "lower") == "no significant difference"

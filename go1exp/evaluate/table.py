@@ -89,8 +89,8 @@ FIXED = frozenset(measure for columns in (GAIT, CONTACT) for measure, _ in colum
 JSON_ONLY = frozenset({"foot_load", "gait_clarity", "phase_consistency", "sink_p99", "slip_distance", "slip_share"})
 """Measures that the tables omit where the report has all measures of the package."""
 
-LEGEND = """error: touchdown times relative to a trot, phase: relative to FR, in cycles; feet: FR FL RR RL; pitch: nose down;
-touchdown and peak (body weights): 95th percentile; step: action rate over 20 ms; tau, qd, line: share of peak
+LEGEND = """error: touchdown times relative to a trot, phase: relative to FR, in cycles; feet: FR FL RR RL; pitch: nose
+down; touchdown and peak (body weights): 95th percentile; step: action rate over 20 ms; tau, qd, line: share of peak
 torque, top speed and the torque-speed line; step, tau, qd and line: 99th percentile; CoT: positive work / (m g d)."""
 
 MEANS = "Means over n robots; the JSON has intervals and all measures."

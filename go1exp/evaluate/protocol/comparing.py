@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from go1exp.evaluate.protocol.playing import Result
 from go1exp.evaluate.quantities import ROBOT, Column, Derived, Row, about, by_condition, plain, values
-from go1exp.evaluate.statistics.compare import Word as Word
-from go1exp.evaluate.statistics.compare import word as word
+from go1exp.evaluate.statistics.compare import Word, verdict_by_interval
 from go1exp.evaluate.statistics.intervals import (
     Interval,
     bootstrap_interval,
@@ -87,7 +86,7 @@ def _difference(
     a, b = a[both], b[both]
     between = paired_share_interval(a, b) if column.how == "share" else paired_mean_interval(b - a)
     assert column.better is not None
-    verdict = word(between, column.better)
+    verdict = verdict_by_interval(between, column.better)
     needed = pairs_needed(b - a) if verdict == "no significant difference" else None
     means = (float(a.mean()), float(b.mean())) if len(a) else (math.nan, math.nan)
     return Difference(subject, column.name, column.unit, condition, *means, between, verdict, needed)
@@ -106,7 +105,7 @@ def _of_all(subject: str, a: Derived, b: Derived, first: Sequence[Row], other: S
         lambda sample: b.function(drawn(1, sample)) - a.function(drawn(0, sample)), len(robots), DRAWS
     )
     assert a.better is not None
-    verdict, needed = word(between, a.better), None
+    verdict, needed = verdict_by_interval(between, a.better), None
     half = 0.5 * (between.high - between.low)
     if verdict == "no significant difference" and math.isfinite(half) and between.estimate:
         needed = max(2, math.ceil(between.n * (half * POWER / between.estimate) ** 2))

@@ -11,7 +11,7 @@ from go1exp.evaluate.report.evaluations import Evaluation, check_figures, evalua
 from go1exp.evaluate.report.results import Figure, Sensitivity, Verdict, by_condition, compared, figures, sensitivities
 from go1exp.evaluate.report.settings import ReportSettings
 from go1exp.evaluate.report.study import Group, Study, baseline, groups
-from go1exp.evaluate.statistics.compare import runs_that_can_tell
+from go1exp.evaluate.statistics.compare import runs_for_significance
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Outcome:
         figures: quantities over all conditions.
         by_condition: quantities of each condition.
         verdicts: comparisons with the baseline; none for a single group.
-        can_tell: least number of runs per group with which a difference can be significant; None for none.
+        runs_required: least number of runs per group with which a difference can be significant; None for none.
         sensitivities: correlates of the main quantities.
     """
 
@@ -31,7 +31,7 @@ class Outcome:
     figures: list[Figure]
     by_condition: list[Figure]
     verdicts: list[Verdict]
-    can_tell: int | None
+    runs_required: int | None
     sensitivities: list[Sensitivity]
 
 
@@ -79,7 +79,7 @@ def report(study: Study, settings: ReportSettings, plain: dict[str, Any]) -> Rep
         if not any(run.folder in each.runs for run in first.runs):
             study.notes.append(f"{each.name}: the baseline has none, so that nothing is compared with it")
         together = max(len(verdicts), 1) if settings.correction == "holm" else 1
-        can_tell = runs_that_can_tell(settings.paired, together)
+        runs_required = runs_for_significance(settings.paired, together)
         conditions, correlates = by_condition(each, made), sensitivities(each, made)
-        outcomes.append(Outcome(each, figures(each, made), conditions, verdicts, can_tell, correlates))
+        outcomes.append(Outcome(each, figures(each, made), conditions, verdicts, runs_required, correlates))
     return Report(study, made, first, drawn, outcomes, plain)

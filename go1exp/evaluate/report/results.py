@@ -180,7 +180,7 @@ def compared(
     entries = []
     for (group, column), (a, b), d, p in zip(subjects, samples, differences, adjusted, strict=True):
         assert column.better is not None
-        word, needed = compare.worded(d.estimate.estimate, p, column.better), None
+        word, needed = compare.verdict_by_p(d.estimate.estimate, p, column.better), None
         if word == compare.ORDER[-1]:
             level = compare.ALPHA / max(family, 1)
             needed = compare.runs_needed(a[np.isfinite(a)], b[np.isfinite(b)], alpha=level)

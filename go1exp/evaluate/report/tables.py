@@ -90,10 +90,10 @@ def _verdicts(outcome: Outcome, baseline: str) -> Table:
     note = f"Compared with {baseline}. {COMPARED}"
     if hopeless := sum(v.hopeless for v in outcome.verdicts):
         note += f" {hopeless} of {len(outcome.verdicts)} comparisons could not be significant whatever the values:"
-        if outcome.can_tell is None:
+        if outcome.runs_required is None:
             note += f" too many comparisons for {RESAMPLES:,} permutations; name fewer with figures=."
         else:
-            note += f" too few runs; use at least {outcome.can_tell} runs per group, or more of the baseline."
+            note += f" too few runs; use at least {outcome.runs_required} runs per group, or more of the baseline."
     return Table(f"{outcome.evaluation.name}: comparison with the baseline", header, rows, note)
 
 

@@ -21,7 +21,7 @@ from go1exp.evaluate.statistics.compare import ORDER
 NOTES = (
     "A run is one training seed, and intervals are over runs: robots moved by one policy are no independent samples of"
     " a configuration. Intervals of 95 % are studentised, with critical values simulated for each number of runs"
-    " (docs/studies.md has their measured coverage); of shares: Wilson's with the design effect of the runs.",
+    " (docs/notebook/studies.md has their measured coverage); of shares: Wilson's with the design effect of the runs.",
     "Comparisons: permutation test of mean ranks over runs, two-sided, with Holm's correction over all comparisons of"
     " an evaluation. Evaluations are included if their settings, commands and seed are the same for all.",
 )

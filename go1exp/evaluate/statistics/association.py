@@ -1,4 +1,4 @@
-"""Which quantities go with a figure: rank correlation with its test, and the importance of each beside the others."""
+"""Correlates of a quantity: rank correlation with its test, and permutation importance."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 RESAMPLES = 9_999
-"""Permutations of a test; where there are fewer, all of them."""
+"""Most permutations of a test."""
 
 FOLDS = 5
-"""Parts of the data, each of which is predicted from the others."""
+"""Folds of the cross-validation."""
 
 SHUFFLES = 20
-"""Times that a quantity is shuffled."""
+"""Permutations of a quantity for its importance."""
 
 LARGE = 500
-"""More values than these are tested by Student's approximation, which then agrees with the permutations."""
+"""Largest number of values with a permutation test; more are tested by Student's approximation."""
 
 
 @dataclass(frozen=True)
 class Association:
-    """How one quantity goes with a figure.
+    """Correlation of one quantity with another.
 
     Attributes:
         name: of the quantity.
-        spearman: rank correlation; NaN for quantities that are not numbers.
-        p: of it, or of the differences between the values of a quantity that is no number; two-sided, by permutation.
-        importance: share of the figure's variance that it explains; 0 or less is none.
-        n: values.
+        spearman: rank correlation; NaN for categories.
+        p: of the correlation, two-sided, or of the variance between categories; by permutation.
+        importance: explained share of the variance; 0 or less is none.
+        n: number of values.
     """
 
     name: str
@@ -65,7 +65,7 @@ def spearman(x: ArrayLike, y: ArrayLike, seed: int = 0) -> tuple[float, float]:
 
 
 def explained_by_names(names: ArrayLike, y: ArrayLike, seed: int = 0) -> float:
-    """Return the p that y (n,) has nothing to do with names (n,): the variance between names, by permutation."""
+    """Return the p of the variance of y (n,) between categories ``names`` (n,), by permutation."""
     from scipy import stats
 
     values = stats.rankdata(y)
@@ -92,11 +92,10 @@ def explained_by_names(names: ArrayLike, y: ArrayLike, seed: int = 0) -> float:
 
 
 def associations(quantities: Mapping[str, ArrayLike], figure: ArrayLike, seed: int = 0) -> list[Association]:
-    """Return how each of several quantities (n,) goes with a figure (n,), the most important first.
+    """Return the correlation of each of several quantities (n,) with ``figure`` (n,), the most important first.
 
-    Rows in which anything is not finite are left out, and quantities that do not vary. The importance is that of a
-    linear model of ranks (names: one column each), by cross-validation: what it cannot see are effects that are not
-    monotone, and those of two quantities together.
+    Rows with undefined values and constant quantities are ignored. The importance is that of a cross-validated linear
+    model of ranks (one column per category), which misses effects that are not monotone, and interactions.
     """
     y = np.asarray(figure, dtype=np.float64)
     kept = np.isfinite(y)
@@ -120,10 +119,10 @@ def associations(quantities: Mapping[str, ArrayLike], figure: ArrayLike, seed: i
 def permutation_importance(
     columns: Mapping[str, NDArray[Any]], y: NDArray[np.float64], seed: int = 0
 ) -> dict[str, float]:
-    """Return, by quantity, the share of y's rank variance that it explains; NaN with few rows.
+    """Return the share of y's rank variance that each quantity explains; NaN with few rows.
 
-    Each row is predicted from the other folds; shuffling a quantity raises the mean square error by twice the share
-    that is its own (Breiman 2001, with a linear model in place of a forest).
+    Each row is predicted from the other folds; shuffling a quantity raises the mean square error by twice its
+    share (Breiman 2001, with a linear model in place of a forest).
     """
     from scipy import stats
 
@@ -159,7 +158,7 @@ def permutation_importance(
 
 
 def _features(values: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the columns of a quantity: its ranks, or one for each name but the first."""
+    """Return the columns of a quantity: its ranks, or one for each category but the first."""
     from scipy import stats
 
     if values.dtype.kind in "fiub":

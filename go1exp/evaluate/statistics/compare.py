@@ -1,4 +1,4 @@
-"""Two groups of training runs: permutation tests, Holm's correction, effect sizes, and the words for what came out."""
+"""Comparison of two groups of training runs: permutation tests, Holm's correction, effect sizes, verdicts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from go1exp.evaluate.statistics.intervals import LEVEL, Interval, alike
+from go1exp.evaluate.statistics.intervals import LEVEL, Interval, constant
 from go1exp.evaluate.statistics.runs import TRIM, WINSORISED_FROM, iqm, iqm_interval
 
 Word = Literal["better", "worse", "no significant difference"]
@@ -23,18 +23,18 @@ RESAMPLES = 20_000
 """Permutations of a test; where there are fewer, all of them."""
 
 LEAST_RANDOM_P = 2.0 / (RESAMPLES + 1)
-"""Smallest two-sided p of random permutations, of which what came counts as one."""
+"""Smallest two-sided p of random permutations, which include the observed one."""
 
 ALPHA = 1.0 - LEVEL
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One figure of a group against that of the baseline.
+    """Difference of a group from the baseline.
 
     Attributes:
-        estimate: interquartile mean of the group less that of the baseline, with Yuen's interval; n counts the runs of
-            the smaller group, or the pairs.
+        estimate: interquartile mean of the group minus that of the baseline, with Yuen's interval; n is the number of
+            runs of the smaller group, or of pairs.
         p: of the permutation test, two-sided.
         effect: Hedges' g, in standard deviations.
         improvement: probability that a run of the group has more than one of the baseline; ties count half.
@@ -49,13 +49,13 @@ class Difference:
 
 
 def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False, seed: int = 0) -> Difference:
-    """Return how the runs (n,) of a group differ from those (m,) of the baseline; NaNs are left out.
+    """Return the difference of the runs (n,) of a group from those (m,) of the baseline; NaNs are ignored.
 
     Args:
         group: one value per run.
-        baseline: the same of the baseline; in the same order if ``paired``.
-        paired: the k-th of both belong together.
-        seed: of the permutations, where not all are made.
+        baseline: one value per run, in the same order if ``paired``.
+        paired: whether the k-th runs of both are pairs.
+        seed: of random permutations.
     """
     a, b = np.asarray(group, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     if paired:
@@ -73,10 +73,10 @@ def difference(group: ArrayLike, baseline: ArrayLike, paired: bool = False, seed
 
 
 def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, seed: int = 0) -> float:
-    """Return the two-sided p that runs (n,) and (m,) differ; NaN with fewer than two runs in a group.
+    """Return the two-sided p of the difference of runs (n,) and (m,); NaN with fewer than two runs in a group.
 
-    Runs change groups, or, ``paired``, the two of a pair change places, in every way or in 20,000, which is exact for
-    any distribution. What is compared are mean ranks (Wilcoxon 1945): one run that failed does not hide the others.
+    A permutation test of mean ranks (Wilcoxon 1945) over all, or 20,000, permutations of the runs, or within pairs. It
+    is exact for any distribution, and robust to single failed runs.
     """
     from scipy import stats
 
@@ -87,14 +87,14 @@ def permutation_p(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool =
         signed = stats.rankdata(np.abs(gain)) * np.sign(gain)
         return _p_of_ranks((tuple(np.sort(signed).tolist()),), seed) if gain.any() else 1.0
     together = stats.rankdata(np.concatenate([a, b]))
-    if alike(np.concatenate([a, b])):
+    if constant(np.concatenate([a, b])):
         return 1.0
     return _p_of_ranks(tuple(tuple(np.sort(each).tolist()) for each in np.split(together, [len(a)])), seed)
 
 
 @lru_cache(maxsize=4096)
 def _p_of_ranks(ranks: tuple[tuple[float, ...], ...], seed: int) -> float:
-    """Return the p of one sample of signed ranks, or of two of ranks; the same few ranks come again and again."""
+    """Return the p of one sample of signed ranks, or of two samples of ranks; cached, since ranks recur."""
     from scipy import stats
 
     kind = "samples" if len(ranks) == 1 else "independent"
@@ -111,26 +111,23 @@ def _p_of_ranks(ranks: tuple[tuple[float, ...], ...], seed: int) -> float:
 
 
 def _mean_difference(*ranks: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
-    """Return the mean of the first, less that of the second if there is one."""
+    """Return the mean of the first sample, minus that of a second one."""
     first = ranks[0].mean(axis=axis)
     return np.asarray(first - ranks[1].mean(axis=axis) if len(ranks) > 1 else first)
 
 
 def least_p(n: int, m: int, paired: bool = False) -> float:
-    """Return the smallest two-sided p that ``permutation_p`` of n and m runs can give.
-
-    Where not all ways are made, the one that came counts as a permutation of its own, so that p never is zero.
-    """
+    """Return the smallest possible two-sided p of ``permutation_p`` of n and m runs."""
     if min(n, m) < 2:
         return math.nan
     ways = 2**n if paired else math.comb(n + m, n)
     return min(1.0, max(2.0 / ways, LEAST_RANDOM_P))
 
 
-def runs_that_can_tell(paired: bool = False, figures: int = 1, alpha: float = ALPHA) -> int | None:
-    """Return the least number of runs in each group with which one of ``figures`` can be told apart at all.
+def runs_for_significance(paired: bool = False, figures: int = 1, alpha: float = ALPHA) -> int | None:
+    """Return the least number of runs per group with which one of ``figures`` comparisons can be significant.
 
-    None where no number can: so many figures are more than random permutations can tell.
+    None if no number suffices, for too many comparisons for the number of random permutations.
     """
     if LEAST_RANDOM_P * figures > alpha:
         return None
@@ -141,7 +138,7 @@ def runs_that_can_tell(paired: bool = False, figures: int = 1, alpha: float = AL
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values adjusted for their number (Holm 1979), in the same order; NaNs stay and do not count."""
+    """Return p-values adjusted for their number (Holm 1979), in the same order; NaNs stay and are not counted."""
     p = np.asarray(p_values, dtype=np.float64)
     adjusted = np.full_like(p, np.nan)
     order = [int(k) for k in np.argsort(p) if np.isfinite(p[k])]
@@ -155,8 +152,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, level: float = LEVEL) -> Interval:
     """Return the difference of interquartile means with Yuen's interval (1974); of pairs, that of their differences.
 
-    Where runs are all alike within both groups, or all pairs differ alike, nothing says how sure a difference is: the
-    interval is NaN, unless there is no difference.
+    The interval is NaN where both groups, or the differences of pairs, are constant and the estimate is not zero.
     """
     from scipy import stats
 
@@ -168,12 +164,12 @@ def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, l
     if n < 2:
         return Interval(estimate, math.nan, math.nan, n)
     trim = TRIM if n >= WINSORISED_FROM else 0.0
-    if all(alike(part, trim) for part in parts):
+    if all(constant(part, trim) for part in parts):
         bound = 0.0 if estimate == 0.0 else math.nan
         return Interval(estimate, bound, bound, n)
     if paired:
         return iqm_interval(parts[0], level)
-    centred = (part - np.median(part) for part in parts)  # exact where one group is alike; only the width counts
+    centred = (part - np.median(part) for part in parts)  # exact for a constant group; only the width is used
     bounds = stats.ttest_ind(*centred, equal_var=False, trim=trim).confidence_interval(level)
     shift = estimate - 0.5 * (bounds.low + bounds.high)
     return Interval(estimate, float(bounds.low + shift), float(bounds.high + shift), n)
@@ -182,7 +178,7 @@ def yuen(a: NDArray[np.float64], b: NDArray[np.float64], paired: bool = False, l
 def hedges(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """Return Hedges' g: the difference of means in pooled standard deviations, corrected for few runs; or NaN."""
     n, m = len(a), len(b)
-    if min(n, m) < 2 or (alike(a) and alike(b)):
+    if min(n, m) < 2 or (constant(a) and constant(b)):
         return math.nan
     pooled = math.sqrt(((n - 1) * a.var(ddof=1) + (m - 1) * b.var(ddof=1)) / (n + m - 2))
     return float((a.mean() - b.mean()) / pooled * (1.0 - 3.0 / (4.0 * (n + m) - 9.0)))
@@ -201,7 +197,7 @@ def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0.8, alpha: float = ALPHA) -> int | None:
-    """Return how many runs in each group would tell a difference like the one seen; None if no number would.
+    """Return the runs per group needed to detect the observed difference with this power; None if undefined.
 
     The normal approximation for two groups, with a quarter of the squared quantile for Student's: n = (z_alpha +
     z_power)^2 (s_a^2 + s_b^2) / d^2 + z_alpha^2 / 4.
@@ -213,19 +209,19 @@ def runs_needed(a: NDArray[np.float64], b: NDArray[np.float64], power: float = 0
     z_alpha, z_power = float(stats.norm.ppf(1.0 - 0.5 * alpha)), float(stats.norm.ppf(power))
     ratio = (a.var(ddof=1) + b.var(ddof=1)) / (a.mean() - b.mean()) ** 2
     needed = (z_alpha + z_power) ** 2 * ratio + 0.25 * z_alpha**2
-    least = runs_that_can_tell(alpha=alpha)
+    least = runs_for_significance(alpha=alpha)
     return max(least, math.ceil(needed)) if least is not None and needed < 1e6 else None
 
 
-def worded(estimate: float, p: float, better: Direction, alpha: float = ALPHA) -> Word:
-    """Return the word for a difference (group less baseline) with its p, which is adjusted already."""
+def verdict_by_p(estimate: float, p: float, better: Direction, alpha: float = ALPHA) -> Word:
+    """Return the verdict on a difference, group - baseline, by its adjusted p."""
     if not (math.isfinite(p) and p <= alpha) or estimate == 0.0:
         return "no significant difference"
     return "better" if (estimate > 0.0) == (better == "higher") else "worse"
 
 
-def word(between: Interval, better: Direction) -> Word:
-    """Return the word for a difference (other less first) whose interval is clear of zero or not."""
+def verdict_by_interval(between: Interval, better: Direction) -> Word:
+    """Return the verdict on a difference, other - first, by whether its interval excludes zero."""
     if not (math.isfinite(between.low) and math.isfinite(between.high)):
         return "no significant difference"
     if between.low > 0.0 or between.high < 0.0:

@@ -1,4 +1,4 @@
-"""Intervals of figures over robots: means, phases, shares, rates, thresholds, differences between pairs."""
+"""Confidence intervals over robots: means, phases, shares, rates, thresholds, differences of pairs."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 LEVEL = 0.95
 
 ROUNDING = 1e-9
-"""Values that vary by less than this share of their largest are the same."""
+"""Relative variation below which values are constant."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its confidence interval, and the number of robots that it stands on."""
+    """An estimate with its confidence interval and the number of samples."""
 
     estimate: float
     low: float
@@ -24,10 +24,10 @@ class Interval:
     n: int
 
 
-def alike(values: ArrayLike, trim: float = 0.0) -> bool:
-    """Return whether values are the same but for rounding; NaNs, and a share ``trim`` at each end, are left out.
+def constant(values: ArrayLike, trim: float = 0.0) -> bool:
+    """Return whether values are equal up to rounding, ignoring NaNs and a share ``trim`` at each end.
 
-    Of such values nothing says how sure they are: no interval and no effect size can be made of them.
+    Intervals and effect sizes of such values are undefined.
     """
     each = np.asarray(values, dtype=np.float64).ravel()
     each = np.sort(each[np.isfinite(each)])
@@ -37,10 +37,7 @@ def alike(values: ArrayLike, trim: float = 0.0) -> bool:
 
 
 def mean_interval(values: ArrayLike, level: float = LEVEL) -> Interval:
-    """Return the mean of one value per robot with Student's t interval; NaNs (undefined) are left out.
-
-    The interval is of the mean over robots like these; it is NaN with fewer than two.
-    """
+    """Return the mean of one value per robot with Student's t interval, NaN with fewer than two; NaNs are ignored."""
     from scipy import stats  # takes a moment to load
 
     each = np.asarray(values, dtype=np.float64).ravel()
@@ -67,7 +64,7 @@ def phase_interval(phases: ArrayLike, level: float = LEVEL) -> Interval:
 
 
 def share_interval(count: int, n: int, level: float = LEVEL) -> Interval:
-    """Return the share ``count`` / ``n`` with Wilson's interval, which is sound for few and for none."""
+    """Return the share ``count`` / ``n`` with Wilson's interval."""
     from scipy import stats
 
     if n < 1:
@@ -96,8 +93,8 @@ def bootstrap_interval(
 ) -> Interval:
     """Return ``function`` of all of n robots, with its percentile interval over robots drawn with replacement.
 
-    For what has no interval of its own, such as thresholds and areas. It is too narrow for few: of the mean of normal
-    values it holds the truth in 79, 86 and 90 of 100 studies of 4, 6 and 10 robots (docs/notebook/experiments.md).
+    For quantities without an analytic interval, such as thresholds and areas. It is too narrow for few robots: for
+    means of normal values it covers the truth in 79, 86 and 90 % of 4, 6 and 10 robots (docs/notebook/experiments.md).
 
     Args:
         function: a figure of the robots with these numbers (n,), each in 0 to n - 1; NaN where it is not defined.
@@ -112,7 +109,7 @@ def bootstrap_interval(
     rng = np.random.default_rng(seed)
     each = np.array([function(rng.integers(n, size=n)) for _ in range(draws)])
     each = each[np.isfinite(each)]
-    if len(each) < 0.5 * draws:  # mostly undefined: nothing can be said
+    if len(each) < 0.5 * draws:  # mostly undefined
         return Interval(estimate, np.nan, np.nan, n)
     low, high = np.quantile(each, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
     return Interval(estimate, float(low), float(high), n)
@@ -165,23 +162,21 @@ def logistic_fit(x: ArrayLike, success: ArrayLike) -> Logistic | None:
 
 
 def paired_mean_interval(difference: ArrayLike, level: float = LEVEL) -> Interval:
-    """Return the mean of one difference per robot with Student's t interval; NaNs are left out.
+    """Return the mean of one difference per robot with Student's t interval; NaNs are ignored.
 
-    Not the bootstrap's, which is too narrow for few: of two robots it is clear of zero every other time although
-    nothing differs. Where all differences are the same and not zero, as those of coarse figures of few robots can be,
-    nothing says how sure that is: the interval is NaN.
+    The bootstrap is too narrow for few robots. The interval is NaN where all differences are equal and not zero.
     """
     around = mean_interval(difference, level)
-    if around.n > 1 and around.estimate != 0.0 and alike(difference):
+    if around.n > 1 and around.estimate != 0.0 and constant(difference):
         return Interval(around.estimate, np.nan, np.nan, around.n)
     return around
 
 
 def paired_share_interval(first: ArrayLike, second: ArrayLike, level: float = LEVEL) -> Interval:
-    """Return the share of ``second`` less that of ``first``, of the same robots, with Agresti and Min's interval.
+    """Return the share of ``second`` minus that of ``first``, of the same robots, with Agresti and Min's interval.
 
     Half a robot is added to each of the four outcomes of a pair (Agresti and Min, Statistics in Medicine 24, 2005),
-    so that no interval has the width zero, as the bootstrap's has where all pairs agree.
+    which avoids intervals of zero width where all pairs agree.
     """
     from scipy import stats
 
@@ -197,14 +192,14 @@ def paired_share_interval(first: ArrayLike, second: ArrayLike, level: float = LE
 
 
 def stratified_mean_interval(values: ArrayLike, strata: ArrayLike, level: float = LEVEL) -> Interval:
-    """Return the mean of the strata's means with Student's interval of what varies within them; NaNs are left out.
+    """Return the mean of the strata's means with Student's interval from the variance within strata; NaNs are ignored.
 
-    For one value per robot under several conditions, which are the same in every evaluation: that conditions differ
-    makes nothing uncertain. The variance is pooled over the strata. The interval is NaN where nothing varies.
+    For one value per robot under fixed conditions, whose differences are no uncertainty. The variance is pooled over
+    the strata; the interval is NaN without variance.
 
     Args:
         values: (n,).
-        strata: (n,) which stratum each is of.
+        strata: (n,) stratum of each value.
         level: of the interval.
     """
     from scipy import stats
@@ -226,7 +221,7 @@ def stratified_mean_interval(values: ArrayLike, strata: ArrayLike, level: float 
 
 
 def pairs_needed(difference: ArrayLike, power: float = 0.8, level: float = LEVEL) -> int | None:
-    """Return how many robots would tell a mean difference like the one seen from zero; None if it is zero or constant.
+    """Return the robots needed to detect the observed mean difference with this power; None if undefined.
 
     The normal approximation of a paired test: ((z_level + z_power) sd / mean)^2.
     """
@@ -234,7 +229,7 @@ def pairs_needed(difference: ArrayLike, power: float = 0.8, level: float = LEVEL
 
     each = np.asarray(difference, dtype=np.float64).ravel()
     each = each[np.isfinite(each)]
-    if len(each) < 2 or each.mean() == 0.0 or alike(each):
+    if len(each) < 2 or each.mean() == 0.0 or constant(each):
         return None
     z = float(stats.norm.ppf(0.5 + 0.5 * level) + stats.norm.ppf(power))
     return max(2, int(np.ceil((z * each.std(ddof=1) / each.mean()) ** 2)))

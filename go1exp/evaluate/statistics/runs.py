@@ -1,14 +1,13 @@
-"""Figures over training runs, of which there are few: interquartile mean, its interval, falls in clusters, bootstrap.
+"""Statistics over few training runs: interquartile mean with its interval, clustered shares, bootstrap.
 
-A run is one training seed. Robots that one policy moved are no independent tries of a configuration, so that intervals
-here are over runs. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (NeurIPS
-2021), recommend the interquartile mean with a stratified bootstrap; with fewer than ten runs that interval holds the
-truth in 77 to 93 of 100 studies instead of 95 (docs/notebook/studies.md), so that ``iqm_interval`` is studentised.
+A run is one training seed. Robots of one policy are no independent samples of a configuration, so that intervals are
+over runs. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (NeurIPS
+2021), recommend the interquartile mean with a stratified bootstrap; with fewer than ten runs that interval covers the
+truth in 77 to 93 % instead of 95 % (docs/notebook/studies.md), so that ``iqm_interval`` is studentised.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -17,13 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 from go1exp.evaluate.statistics.intervals import LEVEL, Interval, share_interval
 
 TRIM = 0.25
-"""Share of the values that the interquartile mean leaves out at each end."""
+"""Share of the values that the interquartile mean omits at each end."""
 
 WINSORISED_FROM = 6
-"""Least number of runs of which the spread is taken without the extremes: of fewer, too little would be left of it."""
+"""Least number of runs with a winsorised standard error."""
 
 SIMULATED = 40_000
-"""Samples of normal values that a critical value is from: it is then within 1 % of the true one."""
+"""Normal samples for a critical value, which is then accurate to 1 %."""
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +35,7 @@ def iqm(values: ArrayLike, axis: int | None = -1) -> Floats:
 
 
 def iqm_interval(values: ArrayLike, level: float = LEVEL) -> Interval:
-    """Return the interquartile mean of one value per run with its interval over runs; NaNs are left out.
+    """Return the interquartile mean of one value per run with its interval over runs; NaNs are ignored.
 
     The interval is NaN with fewer than two runs. See ``iqm_band``.
     """
@@ -76,7 +75,7 @@ def _standard_error(values: Floats) -> Floats:
 
 @cache
 def _critical(n: int, level: float) -> float:
-    """Return how many standard errors the interquartile mean of n normal values is off in 1 - ``level`` of tries."""
+    """Return the ``level`` quantile of |error| / standard error of the interquartile mean of n normal values."""
     from scipy import stats
 
     if n > 40:
@@ -85,35 +84,13 @@ def _critical(n: int, level: float) -> float:
     return float(np.quantile(np.abs(iqm(sample)) / _standard_error(sample), level))
 
 
-def stratified_bootstrap(
-    values: ArrayLike,
-    function: Callable[[Floats], float],
-    draws: int = 2000,
-    level: float = LEVEL,
-    seed: int = 0,
-) -> Interval:
-    """Return ``function`` of scores (n, tasks) with its percentile interval; runs are drawn within each task.
-
-    This is rliable's ``get_interval_estimates``: for many tasks, or ten runs and more. n is that of the runs.
-    """
-    each = np.asarray(values, dtype=np.float64)
-    n, tasks = each.shape
-    estimate = float(function(each))
-    if n < 2:
-        return Interval(estimate, np.nan, np.nan, n)
-    rng = np.random.default_rng(seed)
-    drawn = [function(each[rng.integers(n, size=(n, tasks)), np.arange(tasks)]) for _ in range(draws)]
-    low, high = np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
-    return Interval(estimate, float(low), float(high), n)
-
-
 # ---------------------------------------------------------------------- falls
 
 
 def clustered_share(counts: ArrayLike, totals: ArrayLike, level: float = LEVEL) -> Interval:
-    """Return the share of falls with its interval over runs, whose robots fall together or not at all.
+    """Return the share of falls with its interval over runs, within which falls are correlated.
 
-    Wilson's interval with as many robots as tell as much (their number over the design effect, which is 1 or more) and
+    Wilson's interval with the effective number of robots (their number over the design effect, at least 1) and
     Student's quantile of the runs less one (Korn and Graubard 1998, with Wilson's interval). n is that of the runs.
 
     Args:
@@ -144,7 +121,7 @@ def clustered_share(counts: ArrayLike, totals: ArrayLike, level: float = LEVEL) 
 def share_bootstrap(
     counts: ArrayLike, totals: ArrayLike, draws: int = 2000, level: float = LEVEL, seed: int = 0
 ) -> Interval:
-    """Return the share of falls with the percentile interval over runs drawn with replacement: too narrow for few."""
+    """Return the share of falls with the percentile bootstrap interval over runs: too narrow for few runs."""
     fell, robots = np.asarray(counts, dtype=np.float64), np.asarray(totals, dtype=np.float64)
     fell, robots = fell[robots > 0], robots[robots > 0]
     n = len(robots)
@@ -158,5 +135,5 @@ def share_bootstrap(
 
 
 def pooled_share(counts: ArrayLike, totals: ArrayLike, level: float = LEVEL) -> Interval:
-    """Return the share of falls with Wilson's interval over all robots: of these policies, not of others like them."""
+    """Return the share of falls with Wilson's interval over all robots: of these policies alone."""
     return share_interval(int(np.sum(counts)), int(np.sum(totals)), level)
