@@ -46,7 +46,7 @@ class Table:
         header: names of the columns; empty for a table without a header.
         rows: cells, or headings of rows.
         note: explanation.
-        look: class of the table on the page: empty, ``heat`` or ``plain``.
+        look: class of the table on the page: empty, ``heat`` or ``hash``.
     """
 
     title: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,10 +37,19 @@ class RunRows:
     Attributes:
         table: columns (n,) by name.
         settings: of the evaluation, plain data; only equal ones are compared.
+        keys: columns with the condition and the robot of a row.
+        protocol: None for the grid.
     """
 
     table: dict[str, NDArray[Any]]
     settings: dict[str, Any]
+    keys: tuple[str, ...]
+    protocol: Protocol | None
+
+    @property
+    def sign(self) -> str:
+        """Key that is equal for comparable runs."""
+        return json.dumps([self.settings, self.keys], sort_keys=True)
 
 
 @dataclass
@@ -115,23 +124,9 @@ def _listed(labels: Sequence[str]) -> str:
     return labels[0] if len(labels) == 1 else f"{len(labels)} runs ({shown})"
 
 
-@dataclass(frozen=True)
-class _File:
-    """One file of an evaluation: its rows, its protocol (None: the grid), its key columns."""
-
-    rows: RunRows
-    protocol: Protocol | None
-    keys: tuple[str, ...]
-
-    @property
-    def sign(self) -> str:
-        """Key that is equal for comparable files."""
-        return json.dumps([self.rows.settings, self.keys], sort_keys=True)
-
-
 def _evaluation(name: str, study: Study) -> Evaluation:
     """Read one evaluation of all runs; keep the runs with the most frequent settings."""
-    entries: dict[Path, _File] = {}
+    entries: dict[Path, RunRows] = {}
     for run in study.runs:
         if name not in names(run):
             continue
@@ -152,12 +147,12 @@ def _evaluation(name: str, study: Study) -> Evaluation:
     others = [run.label for run in study.runs if run.folder in entries and run.folder not in kept]
     if others:
         other = next(e for e in entries.values() if e.sign != usual)
-        differ = _differing(first.rows.settings, other.rows.settings) or "columns of the rows"
+        differ = _differing(first.settings, other.settings) or "columns of the rows"
         study.notes.append(f"{name}: {_listed(others)} excluded, evaluated with other settings ({differ}) than most")
-    return _described(name, first, {folder: e.rows for folder, e in kept.items()})
+    return _described(name, first, kept)
 
 
-def _read(name: str, file: Path) -> _File:
+def _read(name: str, file: Path) -> RunRows:
     """Read a file of an evaluation and its rows.
 
     Raises:
@@ -167,17 +162,17 @@ def _read(name: str, file: Path) -> _File:
     about = json.loads(file.read_text())
     if not isinstance(about, dict):
         raise TypeError("holds no evaluation")
-    rows = RunRows(_table(rows_file(file)), _settings(name, about))
+    table, settings = _table(rows_file(file)), _settings(name, about)
     if name == GRID:
-        if ROBOT not in rows.table:
+        if ROBOT not in table:
             raise ValueError(f"its rows have no column {ROBOT!r}")
-        return _File(rows, None, tuple(key for key in KEYS if key in rows.table))
+        return RunRows(table, settings, tuple(key for key in KEYS if key in table), None)
     from go1exp.evaluate.protocol.base import chosen
 
     if not isinstance(about.get("kind"), str) or not isinstance(about.get("settings"), dict):
         raise ConfigError(["it has no kind, or no settings, of a protocol"])
     protocol = chosen({name: {**about["settings"], "term": about["kind"]}})[0][0].protocol
-    return _File(rows, protocol, tuple(key for key in (*protocol.keys, ROBOT) if key in rows.table))
+    return RunRows(table, settings, tuple(key for key in (*protocol.keys, ROBOT) if key in table), protocol)
 
 
 def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
@@ -214,9 +209,9 @@ def _table(file: Path) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def _described(name: str, first: _File, runs: dict[Path, RunRows]) -> Evaluation:
+def _described(name: str, first: RunRows, runs: dict[Path, RunRows]) -> Evaluation:
     """Return an evaluation with its columns and distinct rows; ``first`` is one of its files."""
-    settings, protocol = first.rows.settings, first.protocol
+    settings, protocol = first.settings, first.protocol
     if protocol is None:
         random = any(settings.get(key) for key in ("noise", "randomize", "push", "train_ground"))
         distinct = {f: e if random else _first_robots(e) for f, e in runs.items()}
@@ -236,7 +231,7 @@ def _present(columns: Sequence[Column], runs: Mapping[Path, RunRows]) -> tuple[C
 def _first_robots(evaluated: RunRows) -> RunRows:
     """Return one row of each command: without randomness all robots do the same."""
     first = evaluated.table[ROBOT] == 0.0
-    return RunRows({name: values[first] for name, values in evaluated.table.items()}, evaluated.settings)
+    return replace(evaluated, table={name: values[first] for name, values in evaluated.table.items()})
 
 
 def draws(evaluated: RunRows) -> dict[str, NDArray[np.float64]]:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from go1exp.gap.actuator_net.dataset import SmoothMotion, smooth_motion
     from go1exp.gap.actuator_net.fitting import FitResult, fit
-    from go1exp.gap.actuator_net.report import Report, plot, text
+    from go1exp.gap.actuator_net.plots import plot
+    from go1exp.gap.actuator_net.report import Report, text
     from go1exp.gap.actuator_net.settings import FitError, FitSettings
 
 __all__ = [
@@ -28,7 +29,8 @@ __all__ = [
 
 _MODULES = {
     **dict.fromkeys(("FitResult", "fit"), "fitting"),
-    **dict.fromkeys(("Report", "plot", "text"), "report"),
+    "plot": "plots",
+    **dict.fromkeys(("Report", "text"), "report"),
     **dict.fromkeys(("FitError", "FitSettings"), "settings"),
     **dict.fromkeys(("SmoothMotion", "smooth_motion"), "dataset"),
 }

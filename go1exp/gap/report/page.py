@@ -67,8 +67,8 @@ def page(result: GapResult) -> str:
 def _effect(result: GapResult, named: NamedEffect) -> Card:
     rivals = words.rivals(named)
     sizes = [
-        (f"{s.name} {s.short}", f"{s.spread}; ± is the mean half width of the 95 % intervals" if s.spread else "")
-        for s in words.sizes(named)
+        (f"{name} {mean}", f"{spread}; ± is the mean half width of the 95 % intervals" if spread else "")
+        for name, mean, spread in words.sizes(named)
     ]
     notes = []
     if rivals:

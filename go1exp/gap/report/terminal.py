@@ -70,15 +70,15 @@ def _rows(result: GapResult) -> list[tuple[str, ...]]:
         every = words.sizes(named)
         if not every:
             rows.append((name, at, NOTHING, NOTHING, named.status, stable))
-        for k, size in enumerate(every):
-            pairs = named.interval.get(size.name, {}).values()
+        for k, (parameter, mean, _) in enumerate(every):
+            pairs = named.interval.get(parameter, {}).values()
             interval = NOTHING
             if pairs:
                 low, high = min(a for a, _ in pairs), max(b for _, b in pairs)
                 interval = f"{number(low)} to {number(high)}"
             first = (name, at) if k == 0 else ("", "")
             last = (named.status, stable) if k == 0 else ("", "")
-            rows.append((*first, f"{size.name} {size.short}", interval, *last))
+            rows.append((*first, f"{parameter} {mean}", interval, *last))
     return rows
 
 

@@ -130,52 +130,18 @@ def place(effect: str, joints: Sequence[str], all_joints: Sequence[str]) -> str:
     return where(joints, all_joints)
 
 
-@dataclass(frozen=True)
-class Size:
-    """One parameter of an identified effect.
-
-    Attributes:
-        name: of the parameter.
-        value: mean over its joints.
-        half: mean half width of their 95 % intervals.
-        low: smallest value over the joints.
-        high: largest.
-        count: number of joints.
-        unit: empty for none.
-    """
-
-    name: str
-    value: float
-    half: float
-    low: float
-    high: float
-    count: int
-    unit: str
-
-    @property
-    def short(self) -> str:
-        """``0.42 ± 0.05 N m``."""
-        return f"{number(self.value)} ± {number(self.half, 2)} {self.unit}".strip()
-
-    @property
-    def spread(self) -> str:
-        """``0.38 to 0.47 N m over 4 joints``, empty for one value."""
-        if self.count < 2:
-            return ""
-        return f"{number(self.low)} to {number(self.high)} {self.unit}".strip() + f" over {self.count} joints"
-
-
-def sizes(named: NamedEffect) -> list[Size]:
-    """Return the magnitudes of an identified effect."""
+def sizes(named: NamedEffect) -> list[tuple[str, str, str]]:
+    """Return (parameter, mean ± half width of the 95 % interval, spread over joints) of each magnitude of an effect."""
     rows = []
     for name, by_joint in named.params.items():
         values = np.array(list(by_joint.values()), dtype=float)
         if not len(values) or not is_size(named.effect, name):
             continue
         widths = [0.5 * (b - a) for a, b in named.interval.get(name, {}).values()]
-        half = float(np.mean(widths)) if widths else math.nan
-        low, high = float(values.min()), float(values.max())
-        rows.append(Size(name, float(values.mean()), half, low, high, len(values), unit(named.effect, name)))
+        half, of = number(float(np.mean(widths)) if widths else math.nan, 2), unit(named.effect, name)
+        mean = f"{number(float(values.mean()))} ± {half} {of}".rstrip()
+        spread = f"{number(float(values.min()))} to {number(float(values.max()))} {of}".rstrip()
+        rows.append((name, mean, f"{spread} over {len(values)} joints" if len(values) > 1 else ""))
     return rows
 
 

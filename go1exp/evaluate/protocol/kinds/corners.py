@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from go1exp.evaluate.protocol.plan import Motion
 
 RISEN = 0.9
-"""Share of the reached velocity at which a step counts as risen."""
+"""Share of the steady-state velocity at which a step has risen."""
 
 
 @protocol("corners")
 @settings
 class Corners(Steady):
-    """Fastest, slowest and combined commands as steps from rest: what is reached, how quickly, errors, falls."""
+    """Fastest, slowest and combined commands as steps from rest: steady-state velocity, rise time, errors, falls."""
 
     robot_columns: ClassVar[tuple[Column, ...]] = (
         *ERRORS,
-        Column("answer", "", "share of the command that is reached, along the command", better="higher"),
-        Column("rise_s", "s", "time from the step until 90 % of what is reached", better="lower"),
-        Column("overshoot", "", "largest mean over 0.36 s beyond what is reached, over that", better="lower"),
+        Column("answer", "", "steady-state velocity along the command, as a share of the command", better="higher"),
+        Column("rise_s", "s", "time from the step until 90 % of the steady-state velocity", better="lower"),
+        Column("overshoot", "", "largest mean over 0.36 s beyond the steady-state velocity, relative", better="lower"),
     )
 
     def also(self, motion: Motion, rows: Sequence[Row], settle: int) -> None:
@@ -50,7 +50,7 @@ class Corners(Steady):
             row |= step_answer(along, step, settle, motion.dt)
 
     def curves(self, motion: Motion, rows: Sequence[Row], settle: int) -> dict[str, Any]:
-        """Return the mean share of each command that is reached, over time."""
+        """Return the mean velocity along each command, as a share of the command, over time."""
         shares = {}
         for k, command in enumerate(self.commands):
             robots, c = slice(k * self.robots, (k + 1) * self.robots), np.array(command)
@@ -67,7 +67,7 @@ class Corners(Steady):
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw the answers of all subjects."""
         text = "Share of each command that is reached, 95 % intervals over robots still standing; red: falls."
-        return [Drawing("answer", "What is reached", text, partial(_answers, summaries))]
+        return [Drawing("answer", "Steady-state velocity", text, partial(_answers, summaries))]
 
     def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
         """Draw the steps."""
@@ -79,9 +79,9 @@ def step_answer(along: NDArray[Any], step: int, settle: int, dt: float) -> Row:
     """Return how a step of a command at row ``step`` was answered.
 
     Args:
-        along: (T,) share of the command that is reached.
+        along: (T,) velocity along the command, as a share of the command.
         step: row of the step.
-        settle: row from which on what is reached is the mean.
+        settle: first row of the steady state.
         dt: period, s.
     """
     reached = float(along[settle:].mean())

@@ -86,8 +86,8 @@ class Kicks(Protocol):
     identical: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ("impulse",)
     robot_columns: ClassVar[tuple[Column, ...]] = (
-        Column("survived", "", "of those still up before this kick", "share", "higher"),
-        Column("up", "", "still up after this kick, of all", "share", "higher"),
+        Column("survived", "", "survival rate of the robots still standing before this kick", "share", "higher"),
+        Column("up", "", "still standing after this kick, of all", "share", "higher"),
         Column(
             "recovered",
             "",
@@ -96,9 +96,9 @@ class Kicks(Protocol):
             "higher",
         ),
         Column("recovery_s", "s", "time until then, of those that did", better="lower"),
-        Column("min_height", "m", "lowest height of the trunk, falls left out", better="higher"),
+        Column("min_height", "m", "lowest height of the trunk, excluding falls", better="higher"),
         Column("min_height_25hz", "m", "the same of samples at 25 Hz, as the paper plots"),
-        Column("peak_speed", "m/s", "largest change of the horizontal velocity, falls left out"),
+        Column("peak_speed", "m/s", "largest change of the horizontal velocity, excluding falls"),
         Column("peak_speed_25hz", "m/s", "the same of samples at 25 Hz"),
     )
 
@@ -299,7 +299,7 @@ def _around(kicks: Sequence[Mapping[str, Any]]) -> Figure:
 def _success(summaries: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     figure, axes = plots.panels(1, height=2.2)
     ax = axes[0, 0]
-    names = (("survived", "survived, if up before"), ("up", "still up"), ("recovered", "came back, if up before"))
+    names = (("survived", "survival rate"), ("up", "still standing"), ("recovered", "recovered"))
     for w, (who, summary) in enumerate(summaries.items()):
         at = [e["condition"]["impulse"] * (1.0 + 0.01 * w) for e in summary]
         for k, (name, text) in enumerate(names if len(summaries) == 1 else names[1:2]):

@@ -54,7 +54,7 @@ class PushMap(Protocol):
         point: where it acts, from the trunk's origin in its frame, m.
         largest: of the kicks, N s.
         halvings: of the interval in which the threshold lies, from ``largest`` on.
-        watch_s: time after the kick's begin for which a robot must stay up, s.
+        watch_s: time after the start of the kick without a fall, s.
     """
 
     command: Signal
@@ -71,7 +71,7 @@ class PushMap(Protocol):
     keys: ClassVar[tuple[str, ...]] = ("direction_deg",)
     derived_names: ClassVar[tuple[str, ...]] = ("impulse_median", "impulse_p10", "area", "weakest")
     robot_columns: ClassVar[tuple[Column, ...]] = (
-        Column("impulse", "N s", "largest impulse that is survived", better="higher"),
+        Column("impulse", "N s", "largest impulse without a fall", better="higher"),
     )
 
     def __post_init__(self) -> None:
@@ -137,13 +137,13 @@ class PushMap(Protocol):
             row["moving_s"] += later[n]["moving_s"]
             row["impulse"] = float(figures[n]) if up else None
         censored = int((figures >= self.largest).sum())
-        notes = [f"{censored} robots survived the largest impulse of {self.largest:g} N s: theirs may be larger."]
+        notes = [f"{censored} robots withstood the largest impulse of {self.largest:g} N s: their limit may be larger."]
         return Played(rows, {}, notes if censored else [])
 
     def _trial(
         self, session: Session, state: Any, settle: int, kicks: Any, start: Array, steps: int
     ) -> NDArray[np.bool_]:
-        """Return who is still up ``watch_s`` after its kick."""
+        """Return which robots still stand ``watch_s`` after their kick."""
         session.load(state, settle)
         session.use(kicks)
         motion = session.run(steps)
@@ -157,7 +157,7 @@ class PushMap(Protocol):
             Derived(name, "N s", meaning, {"direction_deg": angle}, "higher", partial(_percentile, percent=percent))
             for angle in angles
             for name, percent, meaning in (
-                ("impulse_median", 50.0, "median of the largest impulse survived"),
+                ("impulse_median", 50.0, "median of the largest impulse without a fall"),
                 ("impulse_p10", 10.0, "its 10th percentile: nine of ten robots and phases survive it"),
             )
         ]
@@ -166,7 +166,7 @@ class PushMap(Protocol):
 
     def compared(self, plays: Mapping[str, Played], summaries: Mapping[str, Any]) -> list[Drawing]:
         """Draw the maps of all subjects."""
-        text = "Largest impulse survived, N s; up is forward: median with its 95 % interval; dotted: 10th percentile."
+        text = "Largest impulse without a fall, N s; up is forward: median with 95 % interval; dotted: 10th percentile."
         return [Drawing("map", "Impulse map", text, partial(_map, summaries))]
 
     def details(self, played: Played, summary: Sequence[Mapping[str, Any]]) -> list[Drawing]:
